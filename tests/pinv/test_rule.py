@@ -1,0 +1,235 @@
+"""The one derivative rule: against differences along directions of constant rank, in every mode, to second order and beyond."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.linalg import expm
+
+from udkjax.pinv import SVD, Plus, Pseudoinverse, Varga
+
+rng = np.random.default_rng(7)
+SIZE = 12
+NAMES = ["fivebar_J_c3_5_s4_5", "fivebar_J_collinear", "proj12_rank11", "magic8", "redundant_rows"]
+LEFT, RIGHT = rng.normal(size=(2, 2, SIZE, SIZE)) / SIZE
+B, DB, WEIGHTS = rng.normal(size=SIZE), rng.normal(size=(2, SIZE)), rng.normal(size=(SIZE, SIZE))
+
+
+@pytest.fixture(scope="module")
+def matrices(exact):
+    """Repeated singular values at every rank, of the linkage and of a partial isometry; a rank of three; one of full rank."""
+    chosen = {m.name: m.a for m in exact}
+    padded = [np.pad(chosen[k], [(0, SIZE - size) for size in chosen[k].shape]) for k in NAMES]
+    return jnp.array([*padded, rng.normal(size=(SIZE, SIZE))])
+
+
+def make(entry):
+    return entry.make() if entry.own_threshold else entry.make(1e-9)
+
+
+def moved(a, p):
+    """A matrix of the same rank, two parameters away, and a right-hand side."""
+    x = jnp.tensordot(p, LEFT, 1)
+    y = jnp.tensordot(p, RIGHT, 1)
+    return expm(x) @ a @ expm(y), B + p @ DB
+
+
+def solution(method):
+    return lambda a, p: method.solve(*moved(a, p)).x
+
+
+def differences(f, h):
+    """Gradient and Hessian by central differences of fourth order of f(p), p of two numbers; along the last axis of the result."""
+    stencil = [(-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12)]
+    e = h * jnp.eye(2)
+    first = [sum(w * f(k * e[i]) for k, w in stencil) / h for i in (0, 1)]
+    second = [
+        sum(v * w * f(k * e[i] + l * e[j]) for k, v in stencil for l, w in stencil) / h**2  # noqa: E741
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    ]
+    return jnp.stack(first, -1), jnp.stack(second, -1)
+
+
+def triangle(hessian):
+    return jnp.stack([hessian[..., 0, 0], hessian[..., 0, 1], hessian[..., 1, 1]], -1)
+
+
+def close(actual, expected, tol):
+    """Relative to the largest entry of each matrix of the batch."""
+    actual, expected = np.asarray(actual), np.asarray(expected)
+    assert actual.shape == expected.shape
+    size = np.abs(expected).max(axis=tuple(range(1, expected.ndim)), keepdims=True)
+    np.testing.assert_array_less(np.abs(actual - expected), np.broadcast_to(tol * size, expected.shape))
+
+
+def test_checker_sees_what_is_wrong():
+    with pytest.raises(AssertionError):
+        close(np.ones((2, 3)) + 1e-6, np.ones((2, 3)), 1e-7)
+    with pytest.raises(AssertionError):
+        close(np.full((2, 3), np.nan), np.ones((2, 3)), 1e-7)
+    gradient, hessian = differences(lambda p: jnp.array([p[0] ** 2 + 3 * p[0] * p[1] + p[1]]), 1e-2)
+    np.testing.assert_allclose(gradient, [[0, 1]], atol=1e-12)
+    np.testing.assert_allclose(hessian, [[2, 3, 0]], atol=1e-10)
+
+
+def test_derivatives_against_differences(entry, matrices):
+    f = solution(make(entry))
+    zero = jnp.zeros(2)
+    value = jax.jit(jax.vmap(f, (0, None)))
+    first, second = differences(lambda p: value(matrices, p), 2e-2)
+    forward = jax.jit(jax.vmap(jax.jacfwd(f, 1), (0, None)))(matrices, zero)
+    close(forward, first, 1e-6)
+    reverse_of_reverse = jax.jit(jax.vmap(jax.jacrev(jax.jacrev(f, 1), 1), (0, None)))(matrices, zero)
+    close(triangle(reverse_of_reverse), second, 1e-5)
+
+
+@pytest.fixture(scope="module")
+def reference(matrices):
+    return jax.jit(jax.vmap(derivatives(SVD(1e-9))))(matrices)
+
+
+def derivatives(method):
+    """Of all entries of A at once: also in directions that break the rank the formula gives a number, the same for all."""
+
+    def number(a, p):
+        return jnp.sum(WEIGHTS * jnp.sin(method(expm(p[0] * LEFT[0]) @ a)))
+
+    def all_of_them(a):
+        gradient = jax.grad(number)(a, jnp.ones(2))
+        x, tangent = jax.jvp(lambda p: solution(method)(a, p), (jnp.zeros(2),), (jnp.array([0.3, -1.2]),))
+        hessian = jax.hessian(lambda p: jnp.sum(solution(method)(a, p) ** 2))(jnp.zeros(2))
+        return gradient, x, tangent, hessian
+
+    return all_of_them
+
+
+def test_all_methods_agree(entry, matrices, reference):
+    for actual, expected in zip(jax.jit(jax.vmap(derivatives(make(entry))))(matrices), reference):
+        close(actual, expected, 1e-10)
+
+
+def test_forward_and_reverse_are_transposes(entry, matrices):
+    method = make(entry)
+
+    def product(a, da, db, ct):
+        f = lambda a, b: method.solve(a, b).x  # noqa: E731
+        _, dx = jax.jvp(f, (a, B), (da, db))
+        ct_a, ct_b = jax.vjp(f, a, B)[1](ct)
+        return ct @ dx, jnp.sum(ct_a * da) + ct_b @ db
+
+    u, v = jax.jit(jax.vmap(product, (0, None, None, None)))(matrices, LEFT[0], DB[0], DB[1])
+    np.testing.assert_allclose(u, v, rtol=1e-10)
+
+
+@pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("inner", [jax.jacfwd, jax.jacrev])
+def test_second_derivatives_in_every_mode(matrices, outer, inner):
+    f = solution(Varga(1e-9))
+    a = matrices[:2]
+    expected = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(f, 1), 1), (0, None)))(a, jnp.zeros(2))
+    close(jax.jit(jax.vmap(outer(inner(f, 1), 1), (0, None)))(a, jnp.zeros(2)), expected, 1e-11)
+    unjitted = outer(inner(f, 1), 1)(a[0], jnp.zeros(2))
+    close(unjitted[None], expected[:1], 1e-11)
+
+
+def test_third_derivative():
+    """x(s) = A(s)^+ b with A(s) = u(s) v^T, |u|, |v| = 1, is v (u . b): three derivatives in closed form, at rank one."""
+    v = jnp.array([0.6, 0.8, 0.0])
+
+    def f(s):
+        u = jnp.array([jnp.cos(s), jnp.sin(s)])
+        return SVD().solve(jnp.outer(u, v), jnp.array([1.0, 2.0])).x
+
+    s = 0.3
+    expected = v * (np.sin(s) - 2 * np.cos(s))
+    for third in (jax.jacfwd(jax.jacrev(jax.jacfwd(f))), jax.jacrev(jax.jacrev(jax.jacrev(f)))):
+        np.testing.assert_allclose(jax.jit(third)(s), expected, atol=1e-13)
+
+
+def test_no_factorization_is_differentiated_or_repeated():
+    """However many derivatives: one factorization of the value of A."""
+
+    def factorizations(f):
+        return str(jax.make_jaxpr(f)(jnp.ones((3, 4)), jnp.ones(3))).count("svd")
+
+    f = lambda a, b: SVD().solve(a, b).x  # noqa: E731
+    once = factorizations(f)
+    assert once >= 1
+    assert factorizations(jax.jacrev(f)) == factorizations(jax.jacrev(jax.jacrev(f))) == factorizations(jax.jacfwd(f)) == once
+
+
+def test_transforms_compose():
+    """A batch within a scan within a gradient."""
+    a = jnp.array(rng.normal(size=(4, 3, 2)) @ rng.normal(size=(4, 2, 5)))
+    b = jnp.array(rng.normal(size=(4, 3)))
+
+    def scanned(a):
+        def step(carry, b):
+            x = jax.vmap(lambda a, b: SVD(1e-9).solve(a, b + carry).x, (0, None))(a, b)
+            return x.sum(), x
+
+        return jnp.sum(jax.lax.scan(step, 0.0, b)[1] ** 2)
+
+    def looped(a):
+        carry, total = 0.0, 0.0
+        for i in range(4):
+            x = jnp.stack([SVD(1e-9)(a[j]) @ (b[i] + carry) for j in range(4)])
+            carry, total = x.sum(), total + jnp.sum(x**2)
+        return total
+
+    np.testing.assert_allclose(jax.jit(jax.grad(scanned))(a), jax.jit(jax.grad(looped))(a), rtol=1e-9, atol=1e-9)
+
+
+class Scaled(eqx.Module):
+    """The operator diag(d) padded to (m, n): a pytree that is not a matrix, with an integer leaf."""
+
+    d: jax.Array
+    where: jax.Array  # columns of the diagonal
+
+
+class Factors(eqx.Module):
+    inverse: jax.Array
+    where: jax.Array
+    rank: jax.Array
+
+
+class ForScaled(Pseudoinverse):
+    def admit(self, D):
+        return D
+
+    def shape(self, D):
+        return len(D.d), len(D.d) + 1
+
+    def matvec(self, D, x):
+        return D.d * x[D.where]
+
+    def rmatvec(self, D, y):
+        return jnp.zeros(len(D.d) + 1).at[D.where].add(D.d * y)
+
+    def factor(self, D):
+        kept = jnp.abs(D.d) > 1e-9
+        return Factors(jnp.where(kept, 1 / jnp.where(kept, D.d, 1), 0), D.where, kept.sum())
+
+    def apply(self, factors, b):
+        return jnp.zeros(len(b) + 1).at[factors.where].add(factors.inverse * b)
+
+    def apply_transpose(self, factors, c):
+        return factors.inverse * c[factors.where]
+
+
+def test_the_rule_serves_any_operator():
+    where = jnp.array([2, 0, 1])
+    d, b = jnp.array([2.0, 0.0, -0.5]), jnp.array([1.0, 2.0, 3.0])
+    free = jnp.array([1.0, 0.0, 1.0])  # the second stays zero: constant rank
+
+    def sparse(d, b):
+        return ForScaled().solve(Scaled(free * d, where), b).x
+
+    def dense(d, b):
+        return SVD(1e-9).solve(jnp.zeros((3, 4)).at[jnp.arange(3), where].set(free * d), b).x
+
+    for derivative in (lambda f: f, jax.jacrev, jax.jacfwd, lambda f: jax.jacrev(jax.jacrev(f)), jax.hessian):
+        np.testing.assert_allclose(derivative(sparse)(d, b), derivative(dense)(d, b), atol=1e-12)
+    assert isinstance(ForScaled().plus(Scaled(d, where)), Plus)
+    np.testing.assert_allclose(ForScaled()(Scaled(d, where)) @ b, sparse(d, b))

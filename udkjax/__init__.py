@@ -1,0 +1,108 @@
+"""Planar mechanisms with any redundancy of constraints: simulated, batched and differentiated in JAX.
+
+Nothing is imported before it is used, so that the command line answers at once. Importing this package turns float64 on in
+JAX, unless the environment says `JAX_ENABLE_X64=0`.
+"""
+
+import os
+import sys
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # the public names, for type checkers and editors; a test compares them with those below
+    from udkjax import equations as equations
+    from udkjax import pinv as pinv
+    from udkjax.equations import Baumgarte as Baumgarte
+    from udkjax.equations import ConstrainedSystem as ConstrainedSystem
+    from udkjax.equations import accelerations as accelerations
+    from udkjax.equations import energy as energy
+    from udkjax.equations import reactions as reactions
+    from udkjax.equations import violation as violation
+    from udkjax.equations.assembly import State as State
+    from udkjax.equations.assembly import assemble as assemble
+    from udkjax.integrate import Projection as Projection
+    from udkjax.integrate import Solution as Solution
+    from udkjax.integrate import simulate as simulate
+    from udkjax.pinv import SVD as SVD
+    from udkjax.pinv import Auto as Auto
+    from udkjax.pinv import Elimination as Elimination
+    from udkjax.pinv import GramSchmidt as GramSchmidt
+    from udkjax.pinv import Greville as Greville
+    from udkjax.pinv import Householder as Householder
+    from udkjax.pinv import Varga as Varga
+    from udkjax.scene import GROUND as GROUND
+    from udkjax.scene import Angle as Angle
+    from udkjax.scene import Body as Body
+    from udkjax.scene import Cam as Cam
+    from udkjax.scene import Constraint as Constraint
+    from udkjax.scene import Distance as Distance
+    from udkjax.scene import Driver as Driver
+    from udkjax.scene import Force as Force
+    from udkjax.scene import ForceElement as ForceElement
+    from udkjax.scene import Frame as Frame
+    from udkjax.scene import Friction as Friction
+    from udkjax.scene import Gear as Gear
+    from udkjax.scene import Joint as Joint
+    from udkjax.scene import Mechanism as Mechanism
+    from udkjax.scene import Motion as Motion
+    from udkjax.scene import Point as Point
+    from udkjax.scene import Polynomial as Polynomial
+    from udkjax.scene import Prismatic as Prismatic
+    from udkjax.scene import Rack as Rack
+    from udkjax.scene import Revolute as Revolute
+    from udkjax.scene import SceneError as SceneError
+    from udkjax.scene import Sine as Sine
+    from udkjax.scene import Slot as Slot
+    from udkjax.scene import Spline as Spline
+    from udkjax.scene import Spring as Spring
+    from udkjax.scene import Torque as Torque
+    from udkjax.scene import TorsionSpring as TorsionSpring
+    from udkjax.scene import Weld as Weld
+    from udkjax.scene import dumps as dumps
+    from udkjax.scene import library as library
+    from udkjax.scene import load as load
+    from udkjax.scene import loads as loads
+    from udkjax.scene import save as save
+
+_MODULES = {"pinv": "udkjax.pinv", "equations": "udkjax.equations", "library": "udkjax.scene.library"}
+_NAMES = {
+    "udkjax.scene": """
+        load loads save dumps SceneError
+        Mechanism Body GROUND Frame Point Constraint Joint Driver Motion ForceElement
+        Revolute Prismatic Slot Weld Distance Angle Gear Rack Cam
+        Polynomial Sine Spline
+        Spring TorsionSpring Force Torque Friction""",
+    "udkjax.pinv": "SVD Varga Greville Householder GramSchmidt Elimination Auto",
+    "udkjax.equations.assembly": "State assemble",
+    "udkjax.equations": "ConstrainedSystem Baumgarte accelerations violation energy reactions",
+    "udkjax.integrate": "simulate Solution Projection",
+}
+_HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+__version__ = "0.1.0"
+__all__ = [*_MODULES, *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str):
+    if name in _MODULES:
+        value = import_module(_MODULES[name])
+    elif name in _HOME:
+        value = getattr(import_module(_HOME[name]), name)
+    else:
+        raise AttributeError(f"module 'udkjax' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__():
+    return sorted({*globals(), *__all__})
+
+
+def _enable_float64():
+    os.environ["JAX_ENABLE_X64"] = os.environ.get("JAX_ENABLE_X64") or "1"
+    wanted = os.environ["JAX_ENABLE_X64"].lower() not in ("0", "n", "no", "f", "false", "off")
+    if wanted and "jax" in sys.modules:  # it has read its environment already
+        sys.modules["jax"].config.update("jax_enable_x64", True)
+
+
+_enable_float64()

@@ -1,0 +1,114 @@
+"""The programs of one structure: what has to be computed for a method and a stabilization, and nothing else."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import jax
+import numpy as np
+
+from udkjax.equations.expressions import Expressions, expressions
+from udkjax.pinv.sparse import Pattern, Row, all_of, factorize, multipliers, pattern, transpose_times
+from udkjax.scene.mechanism import Mechanism
+from udkjax.straightline import Program, Scalar, frontier
+
+# Operations between two optimization barriers. Without barriers XLA repeats everything for each output; with too many it cannot fuse.
+CUT_EVERY = 48
+
+
+class Code:
+    """Named programs over one graph. Each takes the constants, t, q and, where it needs them, v.
+
+    On all rows of Psi (D as the values of `pattern`) and, with the suffix `_kept`, on the rows not left out (`kept_pattern`):
+
+    rows       D, b, a_F, M^(-1/2)        closure    D, Psi, M^(-1/2)        rate    D, Psi_dot, M^(-1/2)
+
+    and for elimination: `accelerations` (a, whether all pivots are safe), `factor` (the factors at (t, q), whether safe), `step`
+    (the change of q or v that removes a residual, given the factors), `psi` and `psi_dot` (of the rows kept).
+    """
+
+    def __init__(self, equations: Expressions, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None):
+        self.equations, self.elimination = equations, elimination
+        graph = self.graph = equations.graph
+        self.gains = [graph.input(name, "parameter") for name in ("alpha", "beta")] if baumgarte else []
+        self.drop = graph.input("drop", "parameter")
+        self.n = len(equations.q)
+        self.root = [graph.sqrt(graph.constant(1.0) / m) for m in equations.mass]
+        everything = list(range(len(equations.psi)))
+        self.kept = [i for i in everything if i not in left_out]
+        self.D: list[Row] = [{k: entry * self.root[k] for k, entry in row.items()} for row in equations.psi_q]
+        self.pattern, self.values = pattern(self.D, self.n)
+        self.kept_pattern, self.kept_values = pattern([self.D[i] for i in self.kept], self.n)
+
+        self.outputs: dict[str, list[Scalar]] = {}
+        self._describe("", everything, self.values)
+        if elimination:
+            self._describe("_kept", self.kept, self.kept_values)
+            self._eliminate()
+        self._programs: dict[str, Program] = {}
+        wanted = [s for name, outputs in self.outputs.items() for s in outputs]
+        self.constants = frontier(graph, wanted, lambda node: node.depends <= {"parameter"})
+        self.prologue = Program(graph, [*equations.inputs, *self.gains, self.drop], self.constants)
+
+    def _describe(self, suffix: str, rows: Sequence[int], values: list[Scalar]):
+        e = self.equations
+        self.outputs["rows" + suffix] = [*values, *(self._b(i) for i in rows), *e.free, *self.root]
+        self.outputs["closure" + suffix] = [*values, *(e.psi[i] for i in rows), *self.root]
+        self.outputs["rate" + suffix] = [*values, *(e.psi_dot[i] for i in rows), *self.root]
+        self.outputs["psi" + suffix] = [e.psi[i] for i in rows]
+        self.outputs["psi_dot" + suffix] = [e.psi_dot[i] for i in rows]
+
+    def _b(self, i: int) -> Scalar:
+        """gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F of one row."""
+        e = self.equations
+        b = e.gamma[i] - sum((entry * e.free[k] for k, entry in e.psi_q[i].items()), self.graph.constant(0.0))
+        if self.gains:
+            alpha, beta = self.gains
+            b = b - alpha * 2.0 * e.psi_dot[i] - beta * beta * e.psi[i]
+        return b
+
+    def _eliminate(self):
+        """The equation for rows D that are independent: x = D^T y with D D^T y = b."""
+        graph, rows = self.graph, [self.D[i] for i in self.kept]
+        factors = factorize(rows, self.drop, replace=self.elimination == "drop")
+        safe = all_of(factors.kept, graph)
+
+        def scaled(b: list[Scalar]) -> list[Scalar]:
+            x = transpose_times(rows, multipliers(factors, b), self.n, graph.constant(0.0)) if b else [graph.constant(0.0)] * self.n
+            return [r * s for r, s in zip(self.root, x, strict=True)]
+
+        a = [f + s for f, s in zip(self.equations.free, scaled([self._b(i) for i in self.kept]), strict=True)]
+        self.outputs["accelerations"] = [*a, safe]
+        self.residual = [graph.input(f"r{k}", "residual") for k in range(len(rows))]
+        self.outputs["step"] = scaled(self.residual)
+        early = frontier(graph, self.outputs["step"], lambda node: "residual" not in node.depends)
+        self.factors = [s for s in early if not s.node.depends <= {"parameter"}]
+        self.outputs["factor"] = [*self.factors, safe]
+
+    def program(self, name: str) -> Program:
+        if name not in self._programs:
+            e = self.equations
+            state = [*self.factors, *self.residual] if name == "step" else [e.t, *e.q, *e.v]
+            self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name], CUT_EVERY)
+        return self._programs[name]
+
+
+@lru_cache(maxsize=64)
+def _code(tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None) -> Code:
+    return Code(expressions(tree, shapes), left_out, baumgarte, elimination)
+
+
+def code(mechanism: Mechanism, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None) -> Code:
+    """Return the code for a mechanism's structure; `elimination` is None, "drop" or "check"."""
+    return _code(*structure(mechanism), left_out, baumgarte, elimination)
+
+
+def structure(mechanism: Mechanism) -> tuple[Any, tuple]:
+    """Return what the code depends on: the tree of the mechanism and the shapes of its numbers, not their values."""
+    leaves, tree = jax.tree.flatten(mechanism)
+    return tree, tuple((np.shape(leaf), jax.numpy.result_type(leaf)) for leaf in leaves)
+
+
+def scalars(leaves: Sequence[Any]) -> list[Any]:
+    """All numbers of some arrays, in the order in which the graph counts them."""
+    return [leaf[place] for leaf in leaves for place in np.ndindex(*np.shape(leaf))]

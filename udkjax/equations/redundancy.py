@@ -1,0 +1,126 @@
+"""Which rows of Psi are redundant: found once, when a mechanism is built, so that no run computes them.
+
+Redundancy is a matter of numbers (three equal cranks), not of topology alone, and a single position does not show it: at a
+singular configuration more rows are dependent than elsewhere. So the mechanism is closed and led along a random motion, and rows
+are chosen whose absence never makes the others dependent. For a left null space N of D (N^T D = 0), the rows outside S are
+independent exactly where N[S] is invertible: of an x and a y row that depend on each other as cos and sin of an angle, the one is
+the right choice where the other vanishes, and the motion tells which. All of it is NumPy on the graph's programs: nothing is
+compiled for it.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from udkjax.equations.code import code, scalars
+from udkjax.scene.mechanism import Mechanism
+
+# Relative to the largest singular value, with rows scaled to length one, at a closed position: redundant rows leave rounding
+# errors (1e-13 of positions closed to 1e-12), rows that are merely close to a singular configuration leave more.
+RANK_TOL = 1e-8
+CLOSED = 1e-11  # relative to the size of the coordinates: what closing attains in double precision
+SAMPLES = 24
+TURN = 0.35  # rad or m: the length of one step of the random motion, long enough to leave a singular configuration
+ORDINARY = 0.05  # a position counts as ordinary if its smallest singular value is this part of the largest
+
+
+class Position(NamedTuple):
+    """A closed position as the analysis sees it: the singular value decomposition of D with rows of length one."""
+
+    t: float
+    q: np.ndarray
+    u: np.ndarray
+    sigma: np.ndarray
+    vt: np.ndarray
+
+    @property
+    def rank(self) -> int:
+        return int(np.sum(self.sigma > RANK_TOL * self.sigma[0])) if len(self.sigma) else 0
+
+
+def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
+    """Return the rows of Psi to leave out, or None where the initial guess cannot be closed or numbers are traced."""
+    leaves = jax.tree.leaves(mechanism)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return None
+    rows = Rows(mechanism)
+    if not rows.count:
+        return ()
+    first = rows.close(0.0, np.asarray(mechanism.q0, float).ravel())
+    if first is None:
+        return None
+    found = [first]
+    random = np.random.default_rng(0)
+    heading = random.standard_normal(rows.size)
+    for k in range(SAMPLES):
+        if max(p.rank for p in found) == rows.count:
+            return ()
+        last = found[-1]
+        heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(rows.size) / np.sqrt(rows.size)
+        heading = last.vt[last.rank :].T @ (last.vt[last.rank :] @ heading)  # onward, so that the motion gets around
+        moved = last.q + TURN * rows.root * heading / max(np.abs(rows.root * heading).max(), 1e-300)
+        found.append(rows.close(0.05 * (k + 1), moved) or last)
+        heading = heading if np.any(heading) else random.standard_normal(rows.size)
+    rank = max(p.rank for p in found)
+    generic = [p for p in found if p.rank == rank]
+    ordinary = [p for p in generic if p.sigma[rank - 1] > ORDINARY * p.sigma[0]] or generic
+    return dispensable([p.u[:, rank:] for p in ordinary])
+
+
+def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
+    """Choose rows S, as many as each null space has columns, such that N[S] is as far from singular as it goes for every N.
+
+    Greedy: the row whose smallest length over all N is largest; then each N gives up the direction of that row. Of rows that do
+    equally well the last is left out, so that a copy goes and its original stays.
+    """
+    chosen: list[int] = []
+    while null_spaces[0].shape[1]:
+        length = np.min([np.linalg.norm(N, axis=1) for N in null_spaces], axis=0)
+        length[chosen] = -1.0
+        row = int(np.flatnonzero(length >= 0.999 * length.max())[-1])
+        chosen.append(row)
+        null_spaces = [N @ np.linalg.svd(N[row : row + 1])[2][1:].T for N in null_spaces]
+    return tuple(sorted(chosen))
+
+
+class Rows:
+    """Psi and D of a mechanism with known numbers, evaluated by NumPy."""
+
+    def __init__(self, mechanism: Mechanism):
+        self._code = code(mechanism, (), False, None)
+        self._constants = self._code.prologue([*map(float, scalars(jax.tree.map(np.asarray, jax.tree.leaves(mechanism)))), 0.0])
+        self.count, self.size = self._code.pattern.shape
+        self._closure: Callable = self._code.program("closure")
+        slots = self._code.pattern.slots
+        self._split = [slots, slots + self.count]
+        self.root = np.asarray(self._evaluate(0.0, np.zeros(self.size))[2])
+
+    def _evaluate(self, t: float, q: np.ndarray) -> list[np.ndarray]:
+        outputs = self._closure([*self._constants, float(t), *map(float, q), *[0.0] * self.size])
+        return np.split(np.array(outputs, float), self._split)
+
+    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Psi, and Psi and D scaled to rows of D of length one (which changes no solution of a consistent system)."""
+        values, psi, _ = self._evaluate(t, q)
+        D = self._code.pattern.dense(values, np)
+        length = np.linalg.norm(D, axis=1)
+        length[length == 0.0] = 1.0
+        return psi, psi / length, D / length[:, None]
+
+    def close(self, t: float, q: np.ndarray, iterations: int = 60) -> Position | None:
+        """Gauss-Newton in the mass metric, with steps of limited length; None where it does not close."""
+        for _ in range(iterations):
+            psi, scaled, D = self.at(t, q)
+            u, sigma, vt = np.linalg.svd(D)
+            position = Position(t, q, u, sigma, vt)
+            if not np.all(np.isfinite(psi)):
+                return None
+            size = CLOSED * (1.0 + np.abs(q).max())
+            if np.abs(psi).max() < size:
+                return position
+            kept = sigma > 1e-4 * sigma[0]
+            step = -self.root * (vt[: len(sigma)][kept].T @ ((u[:, : len(sigma)][:, kept].T @ scaled) / sigma[kept]))
+            q = q + step * min(1.0, TURN / max(np.abs(step).max(), 1e-300))
+        return None

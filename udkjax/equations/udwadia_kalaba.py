@@ -1,0 +1,195 @@
+"""The Udwadia-Kalaba equation (de Falco, Pennestri, Vita 2005, section 3).
+
+With D = Psi_q M^(-1/2), a_F = M^(-1) F and b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F,
+
+    a = a_F + M^(-1/2) D^+ b,        lambda = -(D^+)^T D^+ b        (M a + Psi_q^T lambda = F).
+
+It is written twice. The plain form is the equation as it stands, on arrays, for any pseudoinverse; every derivative is taken of
+it. The fast form is one straight-line program for elimination, with the plain form's derivatives.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from udkjax.equations.code import Code, code, scalars
+from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, SparseElimination
+from udkjax.scene.fields import number
+from udkjax.scene.mechanism import Mechanism
+
+# Far above rounding and drift, far below the singular values of a mechanism in ordinary positions: with the states returned to
+# the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
+RANK_TOL = 1e-4
+
+Vector = Float[Array, "n"]
+
+
+class Baumgarte(eqx.Module):
+    """Feed the violation back: Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0, alpha and beta in 1/s.
+
+    Gains of 2 to 5 hold what redundancy and rounding excite; the hundreds of the literature only make the problem stiff.
+    """
+
+    alpha: Float[Array, ""]
+    beta: Float[Array, ""]
+
+    def __init__(self, alpha: ArrayLike = 5.0, beta: ArrayLike = 5.0):
+        self.alpha, self.beta = number(alpha), number(beta)
+
+
+class Equations(eqx.Module):
+    """The equations of motion of one mechanism by one method: what an integrator needs, ready to be evaluated.
+
+    Coordinates and velocities are flat vectors (3 bodies,): x, y, angle of each body in turn.
+    """
+
+    constants: list[Array]  # the subexpressions of parameters alone that the programs use, computed once
+    method: Pseudoinverse
+    code: Code = eqx.field(static=True)
+
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+        """a = a_F + M^(-1/2) D^+ b."""
+        return _accelerations(self, t, q, v) if self.code.elimination else plain_accelerations(self, t, q, v)
+
+    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
+        return _project(self, t, q, v) if self.code.elimination else plain_project(self, t, q, v)
+
+    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+        """Psi and Psi_dot, of all rows: also of those that the method leaves out."""
+        return _stack(self.run("psi", t, q, v)), _stack(self.run("psi_dot", t, q, v))
+
+    def run(self, name: str, t: Any, q: Any, v: Any) -> list[Any]:
+        """Evaluate one of the programs."""
+        return self.code.program(name)([*self.constants, t, *scalars([q, v])])
+
+    def exact(self) -> "Equations":
+        """The same by singular values of all rows: what `Auto` turns to."""
+        return eqx.tree_at(lambda e: e.method, self, SVD(self.method.rank_tol, self.method.relative))
+
+
+def prepare(mechanism: Mechanism, method: Pseudoinverse | None = None, baumgarte: Baumgarte | None = None) -> Equations:
+    """Prepare a mechanism for a method (default `Auto`). Its numbers may be traced; its structure decides what is compiled.
+
+    A method without a `rank_tol` gets `RANK_TOL`. Without knowledge of which rows are redundant (a mechanism that was built from
+    traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
+    """
+    method = Auto() if method is None else method
+    if method.rank_tol is None:
+        method = eqx.tree_at(lambda m: m.rank_tol, method, number(RANK_TOL), is_leaf=lambda x: x is None)
+    left_out, elimination, drop = mechanism.left_out or (), None, number(0.0)
+    if isinstance(method, Elimination):
+        elimination, drop = "drop", method.rank_tol**2
+    elif isinstance(method, Auto) and mechanism.left_out is None:
+        method = SVD(method.rank_tol, method.relative)
+    elif isinstance(method, Auto):
+        elimination, drop = "check", method.branch_tol
+    programs = code(mechanism, left_out if elimination else (), baumgarte is not None, elimination)
+    gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
+    numbers = [*scalars(jax.tree.leaves(mechanism)), *gains, drop]
+    return Equations([jnp.asarray(c) for c in programs.prologue(numbers)], method, programs)
+
+
+# --- plain
+
+
+def plain_accelerations(equations: Equations, t: Any, q: Vector, v: Vector) -> Vector:
+    """a = a_F + M^(-1/2) D^+ b, on arrays."""
+
+    def solve(plus: Plus, name: str) -> Vector:
+        _, b, free, root = _arrays(equations, name, t, q, v)
+        return free + root * (plus @ b)
+
+    return _by_method(equations, solve, "rows", t, q, v)
+
+
+def plain_project(equations: Equations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    """Two Newton steps in position and one in velocity."""
+
+    def step(plus: Plus, name: str) -> Vector:
+        _, residual, root = _arrays(equations, name, t, q, v)
+        return -root * (plus @ residual)
+
+    q = q + _by_method(equations, step, "closure", t, q, v)
+    q = q + _by_method(equations, step, "closure", t, q, v)
+    return q, v + _by_method(equations, step, "rate", t, q, v)
+
+
+def _by_method(equations: Equations, use: Any, name: str, t: Any, q: Vector, v: Vector) -> Vector:
+    """Call `use` with D^+ by the equations' method, and the name of the program whose rows it is for."""
+    programs, method = equations.code, equations.method
+    if not programs.kept:
+        return use(_Unconstrained(), name)
+
+    def dense(method: Pseudoinverse) -> Vector:
+        return use(method.plus(programs.pattern.dense(_arrays(equations, name, t, q, v)[0])), name)
+
+    if not isinstance(method, Auto | Elimination):
+        return dense(method)
+    tol = method.branch_tol**0.5 if isinstance(method, Auto) else method.rank_tol
+    plus = SparseElimination(programs.kept_pattern, tol).plus(_arrays(equations, name + "_kept", t, q, v)[0])
+    if isinstance(method, Elimination):
+        return use(plus, name + "_kept")
+    safe = plus.rank == len(programs.kept)
+    return jax.lax.cond(safe, lambda: use(plus, name + "_kept"), lambda: dense(equations.exact().method))
+
+
+class _Unconstrained:
+    """D^+ of no rows at all."""
+
+    def __matmul__(self, b: Any) -> float:
+        return 0.0
+
+
+def _arrays(equations: Equations, name: str, t: Any, q: Vector, v: Vector) -> list[Array]:
+    """What a program returns, as arrays: the values of D, the right-hand side, and vectors over the coordinates."""
+    outputs = equations.run(name, t, q, v)
+    n, kept = len(q), equations.code.kept_pattern if name.endswith("_kept") else equations.code.pattern
+    bounds = [0, kept.slots, kept.slots + kept.shape[0]]
+    bounds += list(range(bounds[-1] + n, len(outputs) + 1, n))
+    return [_stack(outputs[i:j]) for i, j in zip(bounds, bounds[1:], strict=False)]
+
+
+def _stack(values: list[Any]) -> Array:
+    values = [jnp.asarray(x, jnp.result_type(float)) for x in values]
+    return jnp.stack(values) if values else jnp.zeros(0)
+
+
+# --- fast
+
+
+@jax.custom_jvp
+def _accelerations(equations: Equations, t: Any, q: Vector, v: Vector) -> Vector:
+    *a, safe = equations.run("accelerations", t, q, v)
+    return _checked(equations, safe, _stack(a), plain_accelerations, t, q, v)
+
+
+@jax.custom_jvp
+def _project(equations: Equations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    """As the plain form, but with the factors of the first position kept: they differ by the residual, and so does the result."""
+    *factors, safe = equations.run("factor", t, q, v)
+    step = equations.code.program("step")
+
+    def without(x: Vector, name: str, q: Vector) -> Vector:
+        residual = equations.run(name, t, q, x)
+        return x - _stack(step([*equations.constants, *factors, *residual]))
+
+    q1 = without(q, "psi_kept", q)
+    q2 = without(q1, "psi_kept", q1)
+    v1 = without(v, "psi_dot_kept", q2)
+    v2 = without(v1, "psi_dot_kept", q2)
+    return _checked(equations, safe, (q2, v2), plain_project, t, q, v)
+
+
+_accelerations.defjvp(lambda primals, tangents: jax.jvp(plain_accelerations, primals, tangents))
+_project.defjvp(lambda primals, tangents: jax.jvp(plain_project, primals, tangents))
+
+
+def _checked(equations: Equations, safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
+    """Take what elimination gave where its pivots are safe, or where it drops the others itself; else turn to singular values."""
+    if equations.code.elimination == "drop" or safe is True:
+        return fast
+    return jax.lax.cond(safe, lambda: fast, lambda: plain(equations.exact(), *state))

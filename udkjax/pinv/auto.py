@@ -1,0 +1,54 @@
+"""The default: elimination where it is safe, singular values where it is not."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.pinv.elimination import Elimination
+from udkjax.pinv.rule import Dense
+from udkjax.pinv.svd import SVD, Factors
+
+# A pivot relative to the diagonal entry of its row is the square of a distance from dependence, and elimination loses its digits
+# by the reciprocal: 1e-5 leaves eleven. Crossing singular configurations goes as well with 1e-3 and with 1e-7.
+BRANCH_TOL = 1e-5
+
+
+class Auto(Dense):
+    """`Elimination` while every pivot stays above `branch_tol` times its row's diagonal entry of D D^T, else the truncated `SVD`.
+
+    The branch is a real one in a single solve and under `lax.map`; under `vmap` both sides run.
+    """
+
+    branch_tol: Float[Array, ""]
+
+    def __init__(self, rank_tol: ArrayLike | None = None, relative: bool = True, branch_tol: ArrayLike = BRANCH_TOL):
+        super().__init__(rank_tol, relative)
+        self.branch_tol = jnp.asarray(branch_tol, dtype=jnp.result_type(float))
+
+    @property
+    def exact(self) -> SVD:
+        """The method of the careful side."""
+        return SVD(self.rank_tol, self.relative)
+
+    def factor(self, D: Float[Array, "m n"]) -> Factors:
+        wide = D.shape[0] <= D.shape[1]
+        fast = Elimination().factor(D if wide else D.T)
+        safe = (fast.rank == min(D.shape)) & (fast.smallest > self.branch_tol)
+
+        def eliminated() -> Factors:
+            # the same triple product as that of the singular values: D^+ = D^T ((L L^T)^-1), or its transpose
+            square = Elimination().apply(fast, jnp.eye(len(fast.D), dtype=D.dtype))
+            ones = jnp.ones(min(D.shape), D.dtype)
+            identity = jnp.eye(min(D.shape), dtype=D.dtype)
+            u, v = (identity, square) if wide else (square, identity)
+            return Factors(u, ones, v, fast.rank)
+
+        return jax.lax.cond(safe, eliminated, lambda: self.exact.factor(D))
+
+    def apply(self, factors: Any, b: Float[Array, "m"]) -> Float[Array, "n"]:
+        return self.exact.apply(factors, b)
+
+    def apply_transpose(self, factors: Any, c: Float[Array, "n"]) -> Float[Array, "m"]:
+        return self.exact.apply_transpose(factors, c)

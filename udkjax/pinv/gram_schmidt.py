@@ -1,0 +1,60 @@
+"""D^+ b by modified Gram-Schmidt."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.pinv.rule import beyond, dot
+from udkjax.pinv.triangular import Factors, PivotedQR, Triangular, leading
+
+
+class GramSchmidt(Triangular):
+    """D = Q R with column pivoting, then R^T = Z U: D^+ = Z U^(-T) Q^T, both by modified Gram-Schmidt.
+
+    With `twice` each column is made orthogonal to the previous ones a second time when its turn comes: the error then is of the order of
+    eps cond(D), as with Householder. Without it Q is orthogonal to eps cond(D) only, and the error can be of the order of eps cond(D)^2.
+    The threshold is on the diagonal of R, its scale the largest column norm.
+    """
+
+    twice: bool = eqx.field(static=True)
+
+    def __init__(self, rank_tol: ArrayLike | None = None, relative: bool = True, twice: bool = True):
+        super().__init__(rank_tol, relative)
+        self.twice = twice
+
+    def factor(self, D: Float[Array, "m n"]) -> Factors:
+        q, r, _, rank = gram_schmidt(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()), self.twice)
+        z, u, order, _ = gram_schmidt(r.T, jnp.zeros((), D.dtype), self.twice)  # the rank is decided: drop zero columns only
+        return Factors(z, leading(u[:, order], rank).T, q[:, order], rank, lower=True)
+
+
+def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: bool) -> PivotedQR:
+    """Modified Gram-Schmidt; each step takes the column with the largest rest, and stops where it is at most `threshold`."""
+    rows, columns = D.shape
+    steps = min(rows, columns)
+    column = jnp.arange(columns)
+
+    def orthogonalize(i, state):
+        rest, q, r, order, rank, used = state
+        pivot = jnp.argmax(jnp.where(used, -1, jnp.linalg.norm(rest, axis=0)))
+        a = rest[:, pivot]
+        above = r[:, pivot]
+        if twice:
+            again = dot(q.T, a)
+            a = a - dot(q, again)
+            above = above + again
+        norm = jnp.linalg.norm(a)
+        goes_on = (rank == i) & beyond(norm, threshold)
+
+        unit = jnp.where(goes_on, a / jnp.where(goes_on, norm, 1), 0)
+        used = used | (column == pivot)
+        along = jnp.where(used, 0, dot(unit, rest))
+        rest = rest - jnp.outer(unit, along)
+        r = jnp.where((column == pivot) & goes_on, above.at[i].set(norm)[:, None], r.at[i].set(along))
+        return rest, q.at[:, i].set(unit), r, order.at[i].set(pivot), rank + goes_on, used
+
+    q, r = jnp.zeros((rows, steps), D.dtype), jnp.zeros((steps, columns), D.dtype)
+    start = D, q, r, jnp.arange(steps), jnp.array(0), jnp.zeros(columns, bool)
+    _, q, r, order, rank, _ = jax.lax.fori_loop(0, steps, orthogonalize, start)
+    return PivotedQR(q, r, order, rank)

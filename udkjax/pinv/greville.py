@@ -1,0 +1,54 @@
+"""D^+ by Greville's recursion, one row at a time."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from udkjax.pinv.rule import Dense, beyond, dot
+
+
+class Factors(NamedTuple):
+    plus: Float[Array, "n m"]
+    rank: Int[Array, ""]
+
+
+class Greville(Dense):
+    """Given P = D_k^+ of the first k rows, the next row a^T makes it [P - p d^T, p] with d^T = a^T P, c^T = a^T - d^T D_k and
+
+        p = c / (c^T c)            if c is not zero: a is independent of the rows before it,
+        p = P d / (1 + d^T d)      if c is zero.
+
+    (T. N. E. Greville, SIAM Review 2 (1960) 15, for columns.) The threshold is on |c|, its scale the largest row norm.
+
+    Error of the order of eps cond(D)^2, because P is wrong by eps cond(D) |P|, and that enters c. So the residue of a dependent row
+    is of this order too, while an independent row may be as near as 1/cond(D). Hence the default `rank_tol` is eps^(1/3), where the two
+    meet; beyond cond(D) = eps^(-1/3) no threshold is right. One dependent row that passes for independent makes the result
+    wrong by any factor.
+    """
+
+    def factor(self, D: Float[Array, "m n"]) -> Factors:
+        rows, columns = D.shape
+        eps = float(jnp.finfo(D.dtype).eps)
+        threshold = self.threshold(D, jnp.linalg.norm(D, axis=1).max(), default=eps ** (1 / 3))
+
+        def append(state, row):
+            plus, rank = state
+            a, e = row  # the row of D, and its unit vector
+            d = dot(a, plus)
+            c = a - dot(d, D)  # d is zero from this row on, because the columns of plus still are
+            independent = beyond(jnp.linalg.norm(c), threshold)
+            cc = jnp.where(independent, dot(c, c), 1)
+            p = jnp.where(independent, c / cc, dot(plus, d) / (1 + dot(d, d)))
+            return (plus + jnp.outer(p, e - d), rank + independent), None
+
+        start = jnp.zeros((columns, rows), D.dtype), jnp.array(0)
+        (plus, rank), _ = jax.lax.scan(append, start, (D, jnp.eye(rows, dtype=D.dtype)))
+        return Factors(plus, rank)
+
+    def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+        return dot(factors.plus, b)
+
+    def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+        return dot(factors.plus.T, c)

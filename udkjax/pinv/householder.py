@@ -1,0 +1,66 @@
+"""D^+ b by Householder's QR: a basic solution, freed of its part in the null space."""
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+from udkjax.pinv.rule import beyond, dot
+from udkjax.pinv.triangular import Factors, PivotedQR, Triangular, leading
+
+
+class Householder(Triangular):
+    """Least squares by Householder's QR with column pivoting. With E the unit vectors of the r pivot columns,
+
+        D = Q T G,   T = R E (r, r) upper triangular,   G = T^(-1) R, which is [I S] in some order of the columns,
+
+    E T^(-1) Q^T b is one least-squares solution, the columns of I - E G are orthogonal to no row but span the null space
+    of D, and with V an orthonormal basis of them, by QR once more, x = (I - V V^T) E T^(-1) Q^T b is the shortest one
+    (Golub and Van Loan, Matrix Computations, 4th ed., section 5.5.6). The threshold is on the diagonal of T, its scale the largest column norm.
+
+    Error of the order of eps cond(D).
+    """
+
+    def factor(self, D: Float[Array, "m n"]) -> Factors:
+        columns = D.shape[1]
+        q, r, order, rank = pivoted_qr(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()))
+        t = leading(r[:, order], rank)
+        pivots = jax.nn.one_hot(order, columns, dtype=D.dtype) * (jnp.arange(len(order)) < rank)[:, None]  # E^T
+        is_pivot = pivots.any(axis=0)
+        null = jnp.eye(columns, dtype=D.dtype) - dot(pivots.T, solve_triangular(t, r))
+        free_first = jnp.argsort(is_pivot)
+        v, _ = jnp.linalg.qr(null[:, free_first])
+        v = jnp.where(jnp.arange(columns) < columns - rank, v, 0)
+        return Factors(pivots.T - dot(v, dot(v.T, pivots.T)), t, q, rank, lower=False)
+
+
+def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
+    """Householder's QR; each step takes the column with the largest remaining norm, and stops where it is at most `threshold`.
+
+    Columns stay in their place, only their order is noted. (Of what jax offers, jax.scipy's pivoted QR does not run on every accelerator.)
+    """
+    rows, columns = D.shape
+    steps = min(rows, columns)
+    row, column = jnp.arange(rows), jnp.arange(columns)
+
+    def reflect(i, state):
+        q, r, order, rank, used = state
+        below = jnp.where((row >= i)[:, None], r, 0)
+        norms = jnp.linalg.norm(below, axis=0)
+        pivot = jnp.argmax(jnp.where(used, -1, norms))
+        a, norm = below[:, pivot], norms[pivot]
+        goes_on = (rank == i) & beyond(norm, threshold)
+
+        diagonal = jnp.where(a[i] > 0, -norm, norm)  # away from a[i]: no cancellation
+        v = a.at[i].add(-diagonal)
+        tau = jnp.where(goes_on, 2 / jnp.where(goes_on, dot(v, v), 1), 0)
+        r = r - jnp.outer(tau * v, dot(v, r))
+        q = q - jnp.outer(dot(q, v), tau * v)
+        exact = jnp.where(row < i, r[:, pivot], jnp.where(row == i, diagonal, 0))
+        r = jnp.where((column == pivot) & goes_on, exact[:, None], r)
+        return q, r, order.at[i].set(pivot), rank + goes_on, used | (column == pivot)
+
+    start = jnp.eye(rows, dtype=D.dtype), D, jnp.arange(steps), jnp.array(0), jnp.zeros(columns, bool)
+    q, r, order, rank, _ = jax.lax.fori_loop(0, steps, reflect, start)
+    kept = jnp.arange(steps) < rank
+    return PivotedQR(jnp.where(kept, q[:, :steps], 0), jnp.where(kept[:, None], r[:steps], 0), order, rank)

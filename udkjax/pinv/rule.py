@@ -1,0 +1,239 @@
+"""The interface of all pseudoinverses, and the one derivative that they share.
+
+A method says how to factorize D, how to apply the factors, and where its rank threshold lies. That is all: D^+ b, D^+ itself
+and every derivative, forward or reverse and of any order, follow from here. No factorization is ever differentiated.
+"""
+
+from abc import abstractmethod
+from functools import partial
+from typing import Any, NamedTuple, Self
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+# Accelerators round float32 products to ten bits unless told otherwise.
+dot = partial(jnp.matmul, precision="highest")
+
+
+class LeastSquares(NamedTuple):
+    """The minimum-norm least-squares solution of D x = b, and the rank that was decided on the way."""
+
+    x: Float[Array, "n *k"]
+    rank: Int[Array, ""]
+
+
+class Pseudoinverse(eqx.Module):
+    """A way to apply the Moore-Penrose pseudoinverse D^+ of an (m, n) operator D, truncated at a numerical rank.
+
+    What counts as zero: with `relative=True` whatever is at most `rank_tol` times the method's scale of D (the largest singular
+    value, or its stand-in: a largest column or row norm); with `relative=False` whatever is at most `rank_tol`, in the units of D.
+    `rank_tol=None` stands for max(m, n) eps, eps the rounding unit of D: right for data that is exact up to rounding. (Greville: eps^(1/3).)
+    `rank_tol` is an array leaf: it may be traced and batched; its derivative is zero.
+
+    Methods for any operator: the matrix as a pytree, everything else as the six functions below. Derivatives assume that the
+    rank stays constant nearby; where it jumps no derivative exists.
+    """
+
+    rank_tol: Float[Array, ""] | None
+    relative: bool = eqx.field(static=True)
+
+    def __init__(self, rank_tol: ArrayLike | None = None, relative: bool = True):
+        if rank_tol is None and not relative:
+            raise ValueError("an absolute rank threshold has no default: give rank_tol, in the units of the matrix")
+        self.rank_tol = None if rank_tol is None else jnp.asarray(rank_tol, dtype=jnp.result_type(float))
+        self.relative = relative
+
+    @classmethod
+    def absolute(cls, rank_tol: ArrayLike, **choices: Any) -> Self:
+        """Threshold in the units of D, whatever its size. The paper's own rule takes the tolerance of the integration."""
+        return cls(rank_tol=rank_tol, relative=False, **choices)
+
+    # What a method writes. All functions of b, x, c and y are linear in them, in ordinary jax.numpy.
+
+    @abstractmethod
+    def admit(self, D: Any) -> Any:
+        """Check the operator at the door, by name; convert what is convertible."""
+
+    @abstractmethod
+    def shape(self, D: Any) -> tuple[int, int]:
+        """(m, n)."""
+
+    @abstractmethod
+    def matvec(self, D: Any, x: Float[Array, "n"]) -> Float[Array, "m"]:
+        """D x, bilinear in D and x."""
+
+    @abstractmethod
+    def rmatvec(self, D: Any, y: Float[Array, "m"]) -> Float[Array, "n"]:
+        """D^T y, bilinear in D and y."""
+
+    @abstractmethod
+    def factor(self, D: Any) -> Any:
+        """Whatever `apply` needs: a pytree with an integer leaf `.rank`. Never differentiated."""
+
+    @abstractmethod
+    def apply(self, factors: Any, b: Float[Array, "m"]) -> Float[Array, "n"]:
+        """D^+ b."""
+
+    @abstractmethod
+    def apply_transpose(self, factors: Any, c: Float[Array, "n"]) -> Float[Array, "m"]:
+        """(D^+)^T c."""
+
+    # What it gets for it.
+
+    def plus(self, D: Any) -> "Plus":
+        """D^+ as an operator, factorized once: `plus @ b`, `plus.T @ x`, `plus.rank`."""
+        D = self.admit(D)
+        method = jax.lax.stop_gradient(self)
+        return Plus(method, jax.lax.stop_gradient(method.factor(jax.lax.stop_gradient(D))), D)
+
+    def solve(self, D: Any, b: Float[ArrayLike, "m *k"]) -> LeastSquares:
+        """Minimum-norm least-squares solution x = D^+ b of D x = b, for one b (m,) or the columns of one (m, k); and rank(D)."""
+        plus = self.plus(D)
+        return LeastSquares(plus @ jnp.asarray(b), plus.rank)
+
+    def rank(self, D: Any) -> Int[Array, ""]:
+        """The numerical rank: how many directions lie above the threshold."""
+        return self.plus(D).rank
+
+    def __call__(self, D: Any) -> Float[Array, "n m"]:
+        """D^+ itself, as a matrix."""
+        plus = self.plus(D)
+        rows, _ = self.shape(plus.matrix)
+        dtype = jnp.result_type(*(leaf for leaf in jtu.tree_leaves(plus.matrix) if eqx.is_inexact_array(leaf)))
+        return plus @ jnp.eye(rows, dtype=dtype)
+
+
+class Dense(Pseudoinverse):
+    """A method whose operator is a real matrix."""
+
+    def admit(self, D: ArrayLike) -> Float[Array, "m n"]:
+        D = jnp.asarray(D)
+        if D.ndim != 2 or 0 in D.shape:
+            raise ValueError(f"{type(self).__name__} takes one matrix (m, n) with m, n > 0, not shape {D.shape}; batch it by jax.vmap")
+        if jnp.iscomplexobj(D):
+            raise TypeError(f"{type(self).__name__} takes a real matrix, not {D.dtype}")
+        return D.astype(jnp.result_type(D, jnp.float32) if jnp.issubdtype(D.dtype, jnp.floating) else jnp.result_type(float))
+
+    def shape(self, D: Float[Array, "m n"]) -> tuple[int, int]:
+        rows, columns = D.shape
+        return rows, columns
+
+    def matvec(self, D: Float[Array, "m n"], x: Float[Array, "n"]) -> Float[Array, "m"]:
+        return dot(D, x)
+
+    def rmatvec(self, D: Float[Array, "m n"], y: Float[Array, "m"]) -> Float[Array, "n"]:
+        return dot(D.T, y)
+
+    def threshold(
+        self, D: Float[Array, "m n"], scale: Float[Array, ""], default: float | None = None
+    ) -> Float[Array, ""]:
+        """At or below it a singular value, or what stands for one in this method, counts as zero.
+
+        Where no `rank_tol` is given: `default`, else max(m, n) eps, the rounding errors of a factorization relative to its matrix.
+        """
+        if self.rank_tol is None:
+            return scale * (max(D.shape) * float(jnp.finfo(D.dtype).eps) if default is None else default)
+        tol = self.rank_tol.astype(D.dtype)
+        return tol * scale if self.relative else tol
+
+
+def beyond(size: Float[Array, "*s"], threshold: Float[Array, ""]) -> Bool[Array, "*s"]:
+    """Whether a size counts. NaN counts, so that an invalid matrix gives NaN and not a rank of zero and a plausible answer."""
+    return ~(size <= threshold)
+
+
+class Plus(eqx.Module):
+    """D^+, or its transpose, as an operator: `plus @ b` for b (m,) or (m, k)."""
+
+    method: Pseudoinverse
+    factors: Any
+    matrix: Any
+    transposed: bool = eqx.field(static=True, default=False)
+
+    @property
+    def T(self) -> "Plus":
+        return Plus(self.method, self.factors, self.matrix, not self.transposed)
+
+    @property
+    def rank(self) -> Int[Array, ""]:
+        return self.factors.rank
+
+    def __matmul__(self, b: Float[Array, "m *k"]) -> Float[Array, "n *k"]:
+        size = self.method.shape(self.matrix)[1 if self.transposed else 0]
+        if b.ndim not in (1, 2) or b.shape[0] != size:
+            raise ValueError(f"D^+{'^T' if self.transposed else ''} applies to ({size},) or ({size}, k), not to shape {b.shape}")
+        dtypes = [leaf.dtype for leaf in jtu.tree_leaves(self.matrix) if eqx.is_inexact_array(leaf)]
+        b = b.astype(jnp.result_type(b, *dtypes))
+        if b.ndim == 2:
+            return jax.vmap(partial(_bind, self), in_axes=1, out_axes=1)(b)
+        return _bind(self, b)
+
+
+# The derivative, for x = D^+ b at constant rank. Write ' for a tangent. Differentiating the four Penrose conditions gives
+# (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413, theorem 4.3, and Stewart, SIAM Review 19 (1977) 634)
+#
+#     (D^+)' = -D^+ D' D^+ + D^+ D^+^T D'^T (I - D D^+) + (I - D^+ D) D'^T D^+^T D^+
+#
+# The first term is the derivative of an inverse. D^+ maps onto the row space of D, which turns with D: the third term; and it
+# ignores what is orthogonal to the column space, which turns too: the second. With y = D^+^T x, r = b - D x, w = D'^T y:
+#
+#     x' = D^+ b' + (D^+)' b = w + D^+ (b' - D' x - D w + D^+^T D'^T r)
+#
+# Only D^+ and its transpose are applied, by the factors at hand; no difference of singular values is ever divided by. Since
+# (D^+)^T = (D^T)^+, the same rule holds for the transpose, with D and D^T exchanged. And D^+ b is linear in b with the
+# transpose D^+^T: this is all that reverse mode wants to know. Both rules are written with D^+ applied, and so are
+# themselves differentiable: this gives all higher orders. It is a primitive of its own because a jax.custom_jvp is
+# forgotten in the linear part of a reverse pass, whose second derivative would then go through the factorization.
+
+
+def _apply(plus: Plus, b):
+    apply = plus.method.apply_transpose if plus.transposed else plus.method.apply
+    return apply(plus.factors, b)
+
+
+@eqxi.filter_primitive_def
+def _shape_of_apply(plus, b):
+    structs = jtu.tree_map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), (plus, b))
+    out = jax.eval_shape(_apply, *structs)
+    return jax.core.ShapedArray(out.shape, out.dtype)
+
+
+@eqxi.filter_primitive_jvp
+def _derivative(primals, tangents):
+    plus, b = primals
+    d_plus, db = tangents
+    dD = d_plus.matrix  # the factors and the method carry no tangent of their own: they are functions of D, and its tangent says all
+    x = _bind(plus, b)
+    s = eqxi.materialise_zeros(b, db)
+    if not jtu.tree_leaves(dD):
+        return x, _bind(plus, s)
+
+    forward, backward = plus.method.matvec, plus.method.rmatvec
+    if plus.transposed:
+        forward, backward = backward, forward
+
+    def along(product, v):
+        return eqx.filter_jvp(lambda D: product(D, v), (plus.matrix,), (dD,))
+
+    Dx, dD_x = along(forward, x)
+    w = along(backward, _bind(plus.T, x))[1]
+    g = along(backward, b - Dx)[1]
+    return x, w + _bind(plus, s - dD_x - forward(plus.matrix, w) + _bind(plus.T, g))
+
+
+@eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
+def _transpose(inputs, cotangent):
+    plus, _ = inputs
+    return jtu.tree_map(lambda _: None, plus), _bind(plus.T, cotangent)
+
+
+_apply_p = eqxi.create_vprim("pseudoinverse", eqxi.filter_primitive_def(_apply), _shape_of_apply, _derivative, _transpose)
+
+
+def _bind(plus: Plus, b: Float[Array, "m"]) -> Float[Array, "n"]:
+    return eqxi.filter_primitive_bind(_apply_p, plus, b)

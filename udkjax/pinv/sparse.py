@@ -1,0 +1,216 @@
+"""Sparse rows: which entries of a matrix can be nonzero, and the straight-line elimination that this fixes.
+
+For independent rows, D^+ = D^T (D D^T)^-1. D D^T is formed and factorized as L diag(p) L^T on scalars, in an order of least
+fill that is chosen once: no loop, no index and no structural zero is left in the program. A pivot that is small against the
+diagonal entry of its row (both are squares of lengths: p_i is what remains of row i when the rows before it are taken out)
+says that the row depends on them; it is dropped, and counted out of the rank.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from udkjax.straightline import Graph, Program, Scalar, frontier
+
+Row = dict[int, Scalar]
+
+
+class Entry(NamedTuple):
+    """A nonzero entry: `sign` times the value number `slot`. Entries that are equal share their slot."""
+
+    row: int
+    column: int
+    slot: int
+    sign: int
+
+
+class Pattern(NamedTuple):
+    """Where the entries of an (m, n) matrix lie; the matrix itself is the vector of its distinct values."""
+
+    shape: tuple[int, int]
+    entries: tuple[Entry, ...]
+
+    @property
+    def slots(self) -> int:
+        return 1 + max((e.slot for e in self.entries), default=-1)
+
+    def dense(self, values: Any, numpy: Any = jnp) -> Any:
+        """Return the matrix of the given values (slots,)."""
+        place, sign = np.full(self.shape, self.slots), np.zeros(self.shape)
+        for e in self.entries:
+            place[e.row, e.column], sign[e.row, e.column] = e.slot, e.sign
+        return numpy.append(values, 0.0)[place] * sign
+
+    def matvec(self, values: Any, x: Any) -> Any:
+        """D x."""
+        rows, columns, slots, signs = self._arrays
+        return jnp.zeros(self.shape[0], x.dtype).at[rows].add(signs * values[slots] * x[columns])
+
+    def rmatvec(self, values: Any, y: Any) -> Any:
+        """D^T y."""
+        rows, columns, slots, signs = self._arrays
+        return jnp.zeros(self.shape[1], y.dtype).at[columns].add(signs * values[slots] * y[rows])
+
+    @property
+    def _arrays(self):
+        entries = np.array(self.entries).reshape(-1, 4)
+        return entries[:, 0], entries[:, 1], entries[:, 2], entries[:, 3].astype(float)
+
+
+def pattern(rows: Sequence[Row], columns: int) -> tuple[Pattern, list[Scalar]]:
+    """Return the pattern of rows of scalars, and the scalars that its slots stand for."""
+    slots: dict[int, int] = {}
+    values: list[Scalar] = []
+    entries = []
+    for i, row in enumerate(rows):
+        for k, scalar in sorted(row.items()):
+            if scalar.index not in slots:
+                slots[scalar.index] = len(values)
+                values.append(Scalar(scalar.graph, scalar.index))
+            entries.append(Entry(i, k, slots[scalar.index], scalar.sign))
+    return Pattern((len(rows), columns), tuple(entries)), values
+
+
+def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
+    """Order rows so that eliminating D D^T fills little: always the row that meets the fewest others (ties: the first)."""
+    meets: dict[int, set[int]] = {}
+    for i, row in enumerate(rows):
+        for k in row:
+            meets.setdefault(k, set()).add(i)
+    near = [set().union(*(meets[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
+    left, order = set(range(len(rows))), []
+    while left:
+        i = min(left, key=lambda i: (len(near[i]), i))
+        left.remove(i)
+        order.append(i)
+        for k in near[i]:
+            near[k] = (near[k] | near[i]) - {i, k}
+    return order
+
+
+class Factors(NamedTuple):
+    """L diag(p) L^T, factorized in the given order."""
+
+    order: list[int]
+    lower: list[dict[int, Scalar]]  # by columns, without the unit diagonal
+    inverse_pivots: list[Scalar]
+    kept: list[Scalar]  # booleans, in the order of elimination
+
+
+def factorize(rows: Sequence[Row], drop: Scalar, replace: bool = True) -> Factors:
+    """D D^T = L diag(p) L^T. A pivot is kept if it exceeds `drop` times its row's diagonal entry.
+
+    With `replace` the others count as infinite, so that their rows drop out; without, the result is of use only if all are kept.
+    """
+    graph = drop.graph
+    order = minimum_degree([set(row) for row in rows])
+    place = {row: j for j, row in enumerate(order)}
+    meets: dict[int, list[int]] = {}
+    for i, row in enumerate(rows):
+        for k in row:
+            meets.setdefault(k, []).append(i)
+    zero, one = graph.constant(0.0), graph.constant(1.0)
+    column: list[dict[int, Scalar]] = [{} for _ in rows]  # the lower triangle of D D^T, by columns
+    for k in sorted(meets):
+        for i in meets[k]:
+            for j in meets[k]:
+                if place[j] <= place[i]:
+                    target = column[place[j]]
+                    target[place[i]] = target.get(place[i], zero) + rows[i][k] * rows[j][k]
+    diagonal = [column[j].get(j, zero) for j in range(len(rows))]
+    inverse, kept = [], []
+    for j in range(len(rows)):
+        d = column[j].get(j, zero)
+        keep = greater(d, drop * diagonal[j])
+        inverse.append(where(keep, one / d, zero) if replace else one / d)
+        kept.append(keep)
+        below = sorted(i for i in column[j] if i > j)
+        lower = {i: column[j][i] * inverse[j] for i in below}
+        for i in below:
+            for k in below:
+                if k <= i:
+                    column[k][i] = column[k].get(i, zero) - lower[i] * column[j][k]
+        column[j] = lower
+    return Factors(order, column, inverse, kept)
+
+
+def multipliers(factors: Factors, b: Sequence[Scalar]) -> list[Scalar]:
+    """y with D D^T y = b, zero where a row was dropped."""
+    m = len(b)
+    y = [b[i] for i in factors.order]
+    for j in range(m):
+        for i, entry in factors.lower[j].items():
+            y[i] = y[i] - entry * y[j]
+    for j in reversed(range(m)):
+        y[j] = y[j] * factors.inverse_pivots[j]
+        for i, entry in factors.lower[j].items():
+            y[j] = y[j] - entry * y[i]
+    result: list[Scalar] = [b[0]] * m
+    for j, i in enumerate(factors.order):
+        result[i] = y[j]
+    return result
+
+
+def transpose_times(rows: Sequence[Row], y: Sequence[Scalar], columns: int, zero: Scalar) -> list[Scalar]:
+    """D^T y."""
+    x = [zero] * columns
+    for row, multiplier in zip(rows, y, strict=True):
+        for k, entry in row.items():
+            x[k] = x[k] + entry * multiplier
+    return x
+
+
+def greater(a: Scalar, b: Scalar) -> Scalar:
+    return a.graph.apply(lax.gt_p, {}, (a, b), bool, np.greater)
+
+
+def where(condition: Scalar, yes: Scalar, no: Scalar) -> Scalar:
+    if condition.constant is not None:
+        return yes if condition.constant else no
+    return yes.graph.apply(lax.select_n_p, {}, (condition, no, yes), yes.node.dtype, lambda c, n, y: y if c else n)
+
+
+def all_of(conditions: Sequence[Scalar], graph: Graph) -> Scalar:
+    result = graph.constant(True, bool)
+    for c in conditions:
+        if c.constant is not True:
+            result = c if result.constant is True else result.graph.apply(lax.and_p, {}, (result, c), bool, np.logical_and)
+    return result
+
+
+class EliminationProgram:
+    """The straight-line code of one pattern, on arrays: `factor(values, tol)` and `solve(lower, b)`."""
+
+    def __init__(self, pattern: Pattern):
+        graph = Graph()
+        values = [graph.input(k, "value") for k in range(pattern.slots)]
+        tol = graph.input("tol", "value")
+        b = [graph.input(k, "right") for k in range(pattern.shape[0])]
+        rows: list[Row] = [{} for _ in b]
+        for e in pattern.entries:
+            rows[e.row][e.column] = values[e.slot] if e.sign > 0 else -values[e.slot]
+        factors = factorize(rows, tol * tol)
+        y = multipliers(factors, b)
+        lower = frontier(graph, y, lambda node: "right" not in node.depends)
+        self._factor = Program(graph, [*values, tol], [*lower, *factors.kept])
+        self._solve = Program(graph, [*lower, *b], y)
+        self._lower = len(lower)
+
+    def factor(self, values: Any, tol: Any) -> tuple[Any, Any]:
+        outputs = self._factor([*_scalars(values), tol])
+        lower, kept = outputs[: self._lower], outputs[self._lower :]
+        return jnp.stack([jnp.asarray(x, values.dtype) for x in lower]), jnp.stack([jnp.asarray(k) for k in kept])
+
+    def solve(self, lower: Any, b: Any) -> Any:
+        return jnp.stack(self._solve([*_scalars(lower), *_scalars(b)]))
+
+
+program = lru_cache(maxsize=64)(EliminationProgram)
+
+
+def _scalars(array: Any) -> list[Any]:
+    return [array[k] for k in range(len(array))]

@@ -1,0 +1,33 @@
+"""D^+ by the truncated singular value decomposition."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from udkjax.pinv.rule import Dense, beyond, dot
+
+
+class Factors(NamedTuple):
+    u: Float[Array, "m k"]
+    inverse: Float[Array, "k"]  # 1/sigma, zero for what is truncated
+    v: Float[Array, "n k"]
+    rank: Int[Array, ""]
+
+
+class SVD(Dense):
+    """D = U S V^T, D^+ = V S^+ U^T: the reference, and the only method whose threshold meets the singular values themselves.
+
+    Error of the order of eps cond(D), cond over the kept singular values.
+    """
+
+    def factor(self, D: Float[Array, "m n"]) -> Factors:
+        u, sigma, vt = jnp.linalg.svd(D, full_matrices=False)
+        kept = beyond(sigma, self.threshold(D, sigma[0]))
+        return Factors(u, jnp.where(kept, 1 / jnp.where(kept, sigma, 1), 0), vt.T, kept.sum())
+
+    def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+        return dot(factors.v, factors.inverse * dot(factors.u.T, b))
+
+    def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+        return dot(factors.u, factors.inverse * dot(factors.v.T, c))

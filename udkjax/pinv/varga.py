@@ -1,0 +1,23 @@
+"""D^+ by two QR factorizations: a complete orthogonal decomposition."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.pinv.householder import pivoted_qr
+from udkjax.pinv.triangular import Factors, Triangular, leading
+
+
+class Varga(Triangular):
+    """D = Q R with column pivoting, then R^T = Z U: D = Q U^T Z^T and D^+ = Z U^(-T) Q^T.
+
+    Without pivoting the small entries of R would not be last, and the rank could not be read from it. The threshold is on
+    the diagonal of R, its scale the largest column norm.
+
+    Error of the order of eps cond(D): orthogonal transformations only.
+    """
+
+    def factor(self, D: Float[Array, "m n"]) -> Factors:
+        q, r, _, rank = pivoted_qr(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()))
+        z, u = jnp.linalg.qr(r.T)
+        z = jnp.where(jnp.arange(z.shape[1]) < rank, z, 0)
+        return Factors(z, leading(u, rank).T, q, rank, lower=True)

@@ -1,0 +1,86 @@
+"""A rigid body, and the frame through which joints and forces see it."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.scene.fields import POSITIVE, number
+
+GROUND = "ground"
+
+
+class Body(eqx.Module):
+    """A rigid body in the plane; its frame has its origin at the centre of mass.
+
+    `position`, `angle`, `velocity` and `angular_velocity` are the initial guess that `assemble` closes.
+    """
+
+    mass: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)  # kg, > 0
+    inertia: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)  # kg m^2 about the centre of mass, > 0
+    position: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))  # m
+    angle: Float[Array, ""] = eqx.field(converter=number, default=0.0)  # rad, anticlockwise from the x axis
+    velocity: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))  # m/s
+    angular_velocity: Float[Array, ""] = eqx.field(converter=number, default=0.0)  # rad/s
+
+    def frame(self) -> "Frame":
+        """Return the body's frame at its initial guess."""
+        return Frame(self.position[0], self.position[1], self.angle, jnp.cos(self.angle), jnp.sin(self.angle))
+
+
+class Point(NamedTuple):
+    """A point, a vector or a velocity in ground coordinates."""
+
+    x: Any
+    y: Any
+
+    def dot(self, other: "Point") -> Any:
+        """Return the scalar product with another vector."""
+        return self.x * other.x + self.y * other.y
+
+    def norm(self) -> Any:
+        """Return the vector's length; at the zero vector, where it has a kink, the derivative is taken as zero."""
+        square = self.dot(self)
+        moved = square > 0
+        return jnp.where(moved, jnp.sqrt(jnp.where(moved, square, 1.0)), 0.0)
+
+
+class Frame(NamedTuple):
+    """Where a body is and how it moves, as scalars: what joints and force elements are written with.
+
+    Joints see `vx`, `vy` and `omega` as None: ideal joints hold positions. The ground is the frame with all zeros.
+    """
+
+    x: Any  # m
+    y: Any  # m
+    angle: Any  # rad
+    cos: Any
+    sin: Any
+    vx: Any = None  # m/s
+    vy: Any = None  # m/s
+    omega: Any = None  # rad/s
+
+    def vector(self, local) -> Point:
+        """Turn a vector of the body's own frame into ground coordinates."""
+        return Point(self.cos * local[0] - self.sin * local[1], self.sin * local[0] + self.cos * local[1])
+
+    def point(self, local) -> Point:
+        """Return where a point of the body's own frame is, in ground coordinates (m)."""
+        arm = self.vector(local)
+        return Point(self.x + arm.x, self.y + arm.y)
+
+    def velocity(self, local) -> Point:
+        """Return the velocity of a point of the body's own frame, in ground coordinates (m/s)."""
+        arm = self.vector(local)
+        return Point(self.vx - self.omega * arm.y, self.vy + self.omega * arm.x)
+
+    def local(self, vector) -> Point:
+        """Turn a vector in ground coordinates into the body's own frame: the inverse of `vector`."""
+        return Point(self.cos * vector[0] + self.sin * vector[1], self.cos * vector[1] - self.sin * vector[0])
+
+
+def between(points, one: Frame, two: Frame) -> Point:
+    """Return the vector from `points[0]` of body 1 to `points[1]` of body 2, in ground coordinates (m)."""
+    p, q = one.point(points[0]), two.point(points[1])
+    return Point(q.x - p.x, q.y - p.y)

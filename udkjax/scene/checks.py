@@ -1,0 +1,236 @@
+"""What can be wrong with a scene, found all at once, for files and for Python alike."""
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, get_args, get_origin
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.joints import Revolute
+from udkjax.scene.schema import PLAIN, TYPES, in_files, keys, table_of
+
+
+class SceneError(ValueError):
+    """A scene cannot be what it says. `problems` lists every mistake, each with the path of the offending entry."""
+
+    def __init__(self, problems: Sequence[str], source: str = ""):
+        self.problems = list(problems)
+        head = f"{source}: " if source else ""
+        count = f"{len(self.problems)} mistakes in the scene:\n  "
+        super().__init__(head + (self.problems[0] if len(self.problems) == 1 else count + "\n  ".join(self.problems)))
+
+
+class Entry(NamedTuple):
+    """One element to check: its section, its place there, its name, its class (None if unknown) and its table."""
+
+    section: str
+    index: int
+    name: Any
+    cls: type | None
+    table: Mapping[str, Any]
+
+    @property
+    def where(self) -> str:
+        """The path of the entry, as in error messages."""
+        place = f"{self.section}[{self.index}]"
+        return f"{self.section} {quoted(self.name)} ({place})" if isinstance(self.name, str) and self.name else place
+
+
+def problems_of(entries: Sequence[Entry], gravity: Any) -> list[str]:
+    """Return every mistake of a scene, in the order of its entries."""
+    found = list(_number("gravity", ["2"], gravity, {}, {}))
+    bodies = [entry for entry in entries if entry.section == "body"]
+    if not bodies:
+        found.append("body: a mechanism needs at least one body")
+    known: dict[str, dict[str, type | None]] = {
+        "body": {GROUND: None, **{e.name: e.cls for e in bodies if isinstance(e.name, str)}},
+        "revolute": {e.name: e.cls for e in entries if e.section == "joint" and isinstance(e.name, str)},
+    }
+    owner: dict[tuple[str, str], Entry] = {}
+    for entry in entries:
+        space = "joint" if entry.section == "driver" else entry.section
+        if not isinstance(entry.name, str) or not entry.name:
+            given = "missing" if entry.name is None else f"must be a non-empty string, is {shown(entry.name)}"
+            found.append(f"{entry.where}.name: {given}")
+        elif entry.section == "body" and entry.name == GROUND:
+            found.append(f'{entry.where}.name: "{GROUND}" is the fixed frame; choose another name')
+        elif (first := owner.setdefault((space, entry.name), entry)) is not entry:
+            found.append(f"{entry.where}.name: taken by {first.section}[{first.index}]; names must be unique")
+        if entry.cls is not None:
+            found.extend(check_table(entry.where, entry.cls, entry.table, known))
+    return found
+
+
+def check_table(where: str, cls: type, table: Mapping[str, Any], known: Mapping[str, Mapping[str, type | None]]) -> Iterator[str]:
+    """Iterate over the mistakes of one table, read as an element of class `cls`."""
+    expected, sizes = keys(cls), {}
+    for name in table:
+        if name not in expected:
+            yield f"{where}.{name}: unknown key{suggestion(name, expected)}"
+    for name, key in expected.items():
+        if name in table:
+            yield from _value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes)
+            yield from _references(f"{where}.{name}", key.metadata.get("names"), table[name], known)
+        elif key.required:
+            yield f"{where}.{name}: missing"
+    if "bodies" in expected:
+        yield from _bodies_differ(where, cls, table)
+
+
+def _value(path: str, annotation: Any, value: Any, metadata: Mapping[str, Any], sizes: dict[str, int]) -> Iterator[str]:
+    """Iterate over what is wrong with one value. `sizes` holds the lengths that the named dimensions of a table have so far."""
+    if hasattr(annotation, "dim_str"):
+        yield from _number(path, annotation.dim_str.split(), value, metadata, sizes)
+    elif get_origin(annotation) is Literal:
+        if value not in get_args(annotation):
+            choices = ", ".join(quoted(choice) for choice in get_args(annotation))
+            yield f"{path}: must be one of {choices}, is {shown(value)}{suggestion(value, get_args(annotation))}"
+    elif annotation in (str, bool):
+        if not isinstance(value, annotation):
+            yield f"{path}: must be {'a string' if annotation is str else 'true or false'}, is {shown(value)}"
+    elif get_origin(annotation) is tuple:
+        if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
+            yield f"{path}: must be a list of names, is {shown(value)}"
+    elif isinstance(annotation, type) and issubclass(annotation, eqx.Module):
+        yield from _nested(path, annotation, value)
+
+
+def _nested(path: str, annotation: type, value: Any) -> Iterator[str]:
+    """Iterate over the mistakes of a motion law or a profile: a module in Python, a table in a file."""
+    if isinstance(value, annotation):
+        yield from check_table(path, type(value), table_of(value), {})
+    elif not isinstance(value, dict):
+        yield f"{path}: must be a table, is {shown(value)}"
+    elif annotation in PLAIN.values():
+        yield from check_table(path, annotation, value, {})
+    else:
+        cls, problem = typed(path, TYPES["motion"], value)
+        if cls is None:
+            yield problem
+        else:
+            yield from check_table(path, cls, {name: v for name, v in value.items() if name != "type"}, {})
+
+
+def typed(path: str, choices: Mapping[str, type], table: Mapping[str, Any]) -> tuple[type | None, str]:
+    """Return the class that a table's `type` names, or None and what is wrong with it."""
+    kind = table.get("type")
+    if isinstance(kind, str) and kind in choices:
+        return choices[kind], ""
+    if kind is None:
+        return None, f"{path}.type: missing; one of {', '.join(choices)}"
+    return None, f"{path}.type: no type {shown(kind)}{suggestion(kind, choices) or '; one of ' + ', '.join(choices)}"
+
+
+def _number(path: str, dims: Sequence[str], value: Any, metadata: Mapping[str, Any], sizes: dict[str, int]) -> Iterator[str]:
+    """Iterate over what is wrong with a number: not one, wrong shape, not finite, out of its range (unknown while traced)."""
+    array = value if isinstance(value, Tracer) else _array(value)
+    fixed = all(dim.isdigit() for dim in dims)
+    if array is None or array.ndim != len(dims) or (fixed and array.shape != tuple(map(int, dims))):
+        expected = f"{' x '.join(dims)} numbers" if fixed else "numbers"
+        yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, is {shown(value)}"
+        return
+    for dim, size in zip(dims, array.shape, strict=True):
+        if not dim.isdigit() and sizes.setdefault(dim, size) != size:
+            yield f"{path}: must have {sizes[dim]} entries, as the list before it has, is {shown(value)}"
+            return
+    if array.ndim and len(array) < metadata.get("at_least", 0):
+        yield f"{path}: needs at least {metadata['at_least']} entries, is {shown(value)}"
+    if not isinstance(array, np.ndarray):
+        return
+    wrong = ~np.isfinite(array)
+    yield from _entries(path, array, wrong, "must be finite")
+    if array.size and not wrong.any():
+        for requirement in metadata.get("require", ()):
+            yield from _entries(path, array, ~requirement.holds(array), requirement.text)
+
+
+def _entries(path: str, array: np.ndarray, wrong: np.ndarray, text: str) -> Iterator[str]:
+    for index in map(tuple, np.argwhere(wrong)):
+        yield f"{path}{''.join(f'[{i}]' for i in index)}: {text}, is {shown(float(array[index]))}"
+
+
+def _array(value: Any) -> np.ndarray | None:
+    """Return a number, or nested lists of numbers, as an array; None if it is not one. Truth values and text are not numbers."""
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        array = np.asarray(value)
+        return array if array.dtype.kind in "iuf" else None
+    if isinstance(value, list | tuple):
+        items = [_array(item) for item in value]
+        ragged = any(item is None for item in items) or len({item.shape for item in items if item is not None}) > 1
+        return None if ragged else np.array(items, dtype=float)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return np.array(float(value) if abs(value) < 2**1024 else np.inf)
+    return None
+
+
+def _references(path: str, kind: str | None, value: Any, known: Mapping[str, Mapping[str, type | None]]) -> Iterator[str]:
+    """Iterate over the names in a value that name nothing."""
+    if kind is None:
+        return
+    named = known[kind]
+    single = isinstance(value, str)
+    for i, name in enumerate([value] if single else value if isinstance(value, list | tuple) else []):
+        place = path if single else f"{path}[{i}]"
+        if not isinstance(name, str):
+            continue
+        if name not in named:
+            what = "body" if kind == "body" else "revolute joint"
+            yield f"{place}: no {what} named {quoted(name)}{suggestion(name, named)}"
+        elif kind == "revolute" and not issubclass(named[name] or Revolute, Revolute):
+            yield f"{place}: {quoted(name)} must be a revolute joint"
+        elif single and name == GROUND and path.endswith(".body"):
+            yield f'{place}: "{GROUND}" does not move; name a body'
+
+
+def _bodies_differ(where: str, cls: type, table: Mapping[str, Any]) -> Iterator[str]:
+    """Iterate over mistakes in who is connected: two bodies for every type of the format, none of them twice."""
+    bodies = table.get("bodies")
+    if not isinstance(bodies, list | tuple):
+        return
+    if in_files(cls) and len(bodies) != 2:
+        yield f"{where}.bodies: must name 2 bodies, is {shown(bodies)}"
+    carrier = [table["carrier"]] if table.get("carrier", GROUND) != GROUND else []
+    attached = [*bodies, *carrier]
+    twice = {name: None for name in attached if isinstance(name, str) and attached.count(name) > 1}
+    yield from (f"{where}.{'carrier' if name in carrier else 'bodies'}: {quoted(name)} is connected to itself" for name in twice)
+
+
+def suggestion(name: Any, choices: Iterable[str]) -> str:
+    """Return '; did you mean "..."?' where one of the choices is close, else nothing."""
+    close = difflib.get_close_matches(name, list(choices), n=1, cutoff=0.6) if isinstance(name, str) else []
+    return f"; did you mean {quoted(close[0])}?" if close else ""
+
+
+def quoted(name: str) -> str:
+    """Return a name in double quotes."""
+    return '"' + name.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
+
+
+def shown(value: Any) -> str:
+    """Return a value for a message, shortened, as a TOML file would show it where it can."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return quoted(value)
+    if isinstance(value, list | tuple):
+        text = f"[{', '.join(map(shown, value))}]"
+    else:
+        text = f"shape {value.shape}" if isinstance(value, Tracer) else str(getattr(value, "tolist", lambda: value)())
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def not_numbers(element: eqx.Module) -> Iterator[str]:
+    """Iterate over the leaves of a user-written element that cannot be one: neither numbers nor declared static."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(element):
+        if not eqx.is_array(leaf):
+            yield f"{jax.tree_util.keystr(path)}: {shown(leaf)} is not a number: declare the field with eqx.field(static=True)"
+    try:
+        hash(jax.tree.structure(element))
+    except TypeError as error:
+        yield f": static fields must be hashable ({error}): write a tuple in place of a list"
+
+

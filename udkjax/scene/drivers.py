@@ -1,0 +1,79 @@
+"""Drivers prescribe a motion: the constraints that depend on time, and the motion laws that they follow."""
+
+from abc import abstractmethod
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.scene.bodies import between
+from udkjax.scene.fields import KNOTS, SOME, number, optional
+from udkjax.scene.joints import Constraint, filled
+from udkjax.scene.splines import natural
+
+
+class Motion(eqx.Module):
+    """A motion law. Subclass it to write one of your own: `__call__` maps the time (s) to a value (rad, m)."""
+
+    @abstractmethod
+    def __call__(self, t: Any) -> Any:
+        """Return the prescribed value at time t; it is differentiated twice."""
+
+
+class Polynomial(Motion):
+    """c0 + c1 t + c2 t^2 + ..."""
+
+    coefficients: Float[Array, "n"] = eqx.field(converter=number, metadata=SOME)
+
+    def __call__(self, t):
+        value = self.coefficients[-1]
+        for k in reversed(range(self.coefficients.size - 1)):
+            value = value * t + self.coefficients[k]
+        return value
+
+
+class Sine(Motion):
+    """offset + amplitude sin(frequency t + phase), frequency in rad/s."""
+
+    amplitude: Float[Array, ""] = eqx.field(converter=number)
+    frequency: Float[Array, ""] = eqx.field(converter=number)
+    phase: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    offset: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+
+    def __call__(self, t):
+        return self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase)
+
+
+class Spline(Motion):
+    """A natural cubic spline through (times, values), at least two; outside its times it goes on as a straight line."""
+
+    times: Float[Array, "n"] = eqx.field(converter=number, metadata=KNOTS)
+    values: Float[Array, "n"] = eqx.field(converter=number)
+
+    def __call__(self, t):
+        return natural(t, self.times, self.values)
+
+
+class Driver(Constraint):
+    """Prescribe one `coordinate` of body 2 relative to body 1. 1 row: the coordinate minus motion(t).
+
+    `angle`: theta2 - theta1 (rad). `x`, `y`: point 2 from point 1, along the axes of body 1's frame (m): with point 1 at the
+    origin, the default, the coordinates of point 2 in that frame. `distance`: between the points (m), which must not meet.
+    """
+
+    coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
+    motion: Motion
+    points: Float[Array, "2 2"] | None = eqx.field(converter=optional, default=None)
+
+    def residual(self, t, *frames):
+        one, two = frames
+        if self.coordinate == "angle":
+            return [two.angle - one.angle - self.motion(t)]
+        d = between(self.points, one, two)
+        if self.coordinate == "distance":
+            return [d.norm() - self.motion(t)]
+        return [getattr(one.local(d), self.coordinate) - self.motion(t)]
+
+    def resolved(self, *frames):
+        return self if self.coordinate == "angle" else filled(self, "points", ((0.0, 0.0), (0.0, 0.0)))

@@ -1,0 +1,51 @@
+"""How the classes of a scene declare their fields: converters at the door, and what a value must satisfy.
+
+A class of this folder is its own schema: its fields are the keys of the scene format, the annotation of a number states its
+shape, and the metadata below what else must hold. Files and Python are checked by the same declarations (`checks.py`).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+Numbers = ArrayLike | Sequence[Any]  # a number, an array, or nested lists of numbers
+
+
+def number(value: Numbers) -> Float[Array, "..."]:
+    """Make an array leaf of a number: a Python float as a field would be static, and each new value would compile anew."""
+    return jnp.asarray(value, dtype=jnp.result_type(float))
+
+
+def optional(value: Numbers | None) -> Float[Array, "..."] | None:
+    """Like `number`; None stays None: an absent number, for which nothing is computed."""
+    return None if value is None else number(value)
+
+
+def names(value: Sequence[str] | str) -> tuple[str, ...]:
+    """Make a hashable tuple of names."""
+    return (value,) if isinstance(value, str) else tuple(value)
+
+
+class Requirement(NamedTuple):
+    """What each entry of a number must satisfy: `holds` maps the array to a boolean array of the same shape."""
+
+    text: str
+    holds: Callable[[np.ndarray], np.ndarray]
+
+
+_POSITIVE = Requirement("must be > 0", lambda v: v > 0)
+_NOT_NEGATIVE = Requirement("must be >= 0", lambda v: v >= 0)
+_INCREASING = Requirement("must be greater than the entry before", lambda v: np.diff(v, prepend=-np.inf) > 0)
+_ONE_TURN = Requirement("must be less than a turn after the first (the profile closes by itself)", lambda v: v - v[0] < 2 * np.pi)
+
+POSITIVE = {"require": (_POSITIVE,)}
+NOT_NEGATIVE = {"require": (_NOT_NEGATIVE,)}
+KNOTS = {"require": (_INCREASING,), "at_least": 2}
+TURN = {"require": (_INCREASING, _ONE_TURN), "at_least": 3}
+RADII = {"require": (_POSITIVE,), "at_least": 3}
+SOME = {"at_least": 1}
+BODY = {"names": "body"}  # the field names one or several bodies
+REVOLUTE = {"names": "revolute"}  # the field names a revolute joint

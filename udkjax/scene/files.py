@@ -1,0 +1,164 @@
+"""The scene format: mechanisms as TOML files, version 1, read and written; reading gives back the numbers written, bit by bit."""
+
+import os
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from udkjax.scene.checks import Entry, SceneError, problems_of, shown, suggestion, typed
+from udkjax.scene.mechanism import Mechanism, numbered
+from udkjax.scene.schema import PLAIN, SECTIONS, TYPES, in_files, keys, table_of, type_name
+
+FORMAT = 1
+
+
+def load(path: str | os.PathLike[str]) -> Mechanism:
+    """Read a mechanism from a TOML file. Raises `SceneError`, which lists every mistake in it, or `OSError`."""
+    try:
+        return _read(Path(path).read_text(encoding="utf-8"), os.fspath(path))
+    except UnicodeDecodeError as error:
+        raise SceneError([f"not a text file in UTF-8 ({error})"], os.fspath(path)) from None
+
+
+def loads(text: str) -> Mechanism:
+    """Read a mechanism from the text of a TOML file, as `load` does."""
+    return _read(text, "")
+
+
+def save(mechanism: Mechanism, path: str | os.PathLike[str]) -> None:
+    """Write a mechanism to a TOML file, whole or not at all. Raises `SceneError` if the format cannot hold it (see `dumps`)."""
+    text, path = dumps(mechanism), Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def dumps(mechanism: Mechanism) -> str:
+    """Return the mechanism as the text of a TOML file.
+
+    Raises `SceneError` for what the format cannot hold: classes of the user's own, traced numbers, batches of numbers.
+    """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(mechanism)):
+        raise SceneError(["its numbers are traced: write it outside of jit, vmap and grad"], mechanism.name)
+    groups = {"body": mechanism.bodies, "joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
+    entries = [
+        Entry(section, index, name, type(element), table_of(element))
+        for section, elements in groups.items()
+        for index, (name, element) in enumerate(elements.items())
+    ]
+    problems = [problem for entry in entries for problem in _foreign(entry.where, entry.cls or object, entry.table)]
+    problems.extend(problems_of(entries, mechanism.gravity))
+    if problems:
+        raise SceneError(problems, mechanism.name)
+    title = {"name": mechanism.name} if mechanism.name else {}
+    lines = _lines({"format": FORMAT, **title, "gravity": mechanism.gravity})
+    for entry in entries:
+        lines += ["", f"[[{entry.section}]]", *_lines({"name": entry.name, **_type_of(entry.cls or object), **entry.table})]
+    return "\n".join(lines) + "\n"
+
+
+def _read(text: str, source: str) -> Mechanism:
+    try:
+        scene = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError([f"not valid TOML: {error}"], source) from None
+    entries, problems = [], list(_head(scene))
+    for section in SECTIONS:
+        entries.extend(_section(section, scene.get(section, []), problems))
+    gravity = scene.get("gravity", [0.0, -9.81])
+    problems.extend(problems_of(entries, gravity))
+    if problems:
+        raise SceneError(problems, source)
+    made: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
+    for entry in entries:
+        made[entry.section][entry.name] = _make(entry.cls, entry.table)
+    return Mechanism(made["body"], made["joint"], made["driver"], made["force"], gravity, scene.get("name", ""))
+
+
+def _head(scene: Mapping[str, Any]) -> Iterator[str]:
+    """Iterate over the mistakes at the top of a file."""
+    version = scene.get("format")
+    if version is None:
+        yield f"format: missing; write format = {FORMAT}"
+    elif version is True or version != FORMAT:
+        yield f"format: this version of udkjax reads format {FORMAT}, not {shown(version)}"
+    if not isinstance(scene.get("name", ""), str):
+        yield f"name: must be a string, is {shown(scene['name'])}"
+    expected = ("format", "name", "gravity", *SECTIONS)
+    yield from (f"{key}: unknown key{suggestion(key, expected)}" for key in scene if key not in expected)
+
+
+def _section(section: str, tables: Any, problems: list[str]) -> Iterator[Entry]:
+    """Iterate over the entries of one section, their types and names read; adds what is wrong with these to `problems`."""
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        problems.append(f"{section}: must be a list of tables; write [[{section}]] above each")
+        return
+    names: Sequence[Any] = [table.get("name") for table in tables]
+    if section == "force":
+        names = numbered([str(table.get("type")) for table in tables], names)
+    for index, (name, table) in enumerate(zip(names, tables, strict=True)):
+        entry = Entry(section, index, name, PLAIN.get(section), {key: value for key, value in table.items() if key != "name"})
+        if section in TYPES:
+            cls, problem = typed(entry.where, TYPES[section], table)
+            problems.extend([problem] if problem else [])
+            entry = entry._replace(cls=cls, table={key: value for key, value in entry.table.items() if key != "type"})
+        yield entry
+
+
+def _make(annotation: Any, value: Any) -> Any:
+    """Make an element, and the modules within it, of a table that has been checked."""
+    if not isinstance(value, dict):
+        return value
+    cls = annotation
+    if "type" in value:
+        cls = TYPES["motion"][value["type"]]
+    expected = keys(cls)
+    return cls(**{name: _make(expected[name].annotation, item) for name, item in value.items() if name != "type"})
+
+
+def _foreign(where: str, cls: type, table: Mapping[str, Any]) -> Iterator[str]:
+    """Iterate over the classes in an element that a file cannot name."""
+    if not in_files(cls):
+        yield f"{where}: a scene file has no type for the class {cls.__name__}; keep this scene in Python"
+    for name, value in table.items():
+        if isinstance(value, eqx.Module):
+            yield from _foreign(f"{where}.{name}", type(value), table_of(value))
+
+
+def _type_of(cls: type) -> dict[str, str]:
+    return {} if cls in PLAIN.values() else {"type": type_name(cls)}
+
+
+def _lines(table: Mapping[str, Any]) -> list[str]:
+    return [f"{key} = {_toml(value)}" for key, value in table.items()]
+
+
+def _toml(value: Any) -> str:
+    """Return a value as TOML; a float's shortest text that reads back as the same float."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return _string(value)
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_toml(item) for item in value)}]"
+    if isinstance(value, eqx.Module):
+        return f"{{{', '.join(_lines({**_type_of(type(value)), **table_of(value)}))}}}"
+    return _toml(np.asarray(value, dtype=float).tolist())
+
+
+def _string(text: str) -> str:
+    """Return a TOML basic string."""
+    escaped = re.sub(r'[\\"]', lambda match: "\\" + match[0], text)
+    return '"' + re.sub(r"[\x00-\x1f\x7f]", lambda match: f"\\u{ord(match[0]):04x}", escaped) + '"'

@@ -1,0 +1,128 @@
+"""Force elements. One writes its potential energy, or the loads that it puts on its bodies, or both: they add up."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.scene.bodies import Frame, Point, between
+from udkjax.scene.fields import BODY, NOT_NEGATIVE, POSITIVE, REVOLUTE, names, number, optional
+
+Load = tuple[Any, Any, Any]  # force x, force y (N), torque about the centre of mass (N m), in ground axes
+
+
+class ForceElement(eqx.Module):
+    """A force element. Subclass it and write `potential` or `loads`; the other one stays None, and costs nothing."""
+
+    bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
+
+    def potential(self, t: Any, *frames: Frame) -> Any:
+        """Return the potential energy V (J), or None; the load is -dV/dq."""
+        return None
+
+    def loads(self, t: Any, *frames: Frame) -> Sequence[Load] | None:
+        """Return (force x, force y, torque about the centre of mass) for each attached body, in ground axes (N, N m), or None."""
+        return None
+
+
+class Spring(ForceElement):
+    """V = 1/2 stiffness (|d| - length)^2 between two points, d from point 1 to point 2, and a damper beside it.
+
+    The damper's force on point 2 is -damping d|d|/dt along the line. Units: N/m, N s/m, m.
+    """
+
+    points: Float[Array, "2 2"] = eqx.field(converter=number)
+    stiffness: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
+    length: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
+    damping: Float[Array, ""] | None = eqx.field(converter=optional, default=None, metadata=NOT_NEGATIVE)
+
+    def potential(self, t, *frames):
+        return 0.5 * self.stiffness * (between(self.points, *frames).norm() - self.length) ** 2
+
+    def loads(self, t, *frames):
+        if self.damping is None:
+            return None
+        one, two = frames
+        d, v1, v2 = between(self.points, one, two), one.velocity(self.points[0]), two.velocity(self.points[1])
+        square, rate = d.dot(d), d.dot(Point(v2.x - v1.x, v2.y - v1.y))
+        pull = self.damping * rate / jnp.where(square > 0, square, 1.0)
+        force = Point(pull * d.x, pull * d.y)  # on point 1
+        return [_at(one, self.points[0], force), _at(two, self.points[1], Point(-force.x, -force.y))]
+
+
+class TorsionSpring(ForceElement):
+    """V = 1/2 stiffness (theta2 - theta1 - angle)^2, and a damper: the torque -damping (omega2 - omega1) on body 2.
+
+    Units: N m/rad, N m s/rad, rad.
+    """
+
+    stiffness: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
+    damping: Float[Array, ""] | None = eqx.field(converter=optional, default=None, metadata=NOT_NEGATIVE)
+    angle: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+
+    def potential(self, t, *frames):
+        one, two = frames
+        return 0.5 * self.stiffness * (two.angle - one.angle - self.angle) ** 2
+
+    def loads(self, t, *frames):
+        if self.damping is None:
+            return None
+        one, two = frames
+        return _couple(-self.damping * (two.omega - one.omega))
+
+
+class Force(ForceElement):
+    """A constant force `vector` (N) at a `point` of a body, in the axes of the ground, or of the body: it then turns with it."""
+
+    bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)
+    body: str = eqx.field(static=True, metadata=BODY)
+    vector: Float[Array, "2"] = eqx.field(converter=number)
+    point: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))
+    frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")
+
+    def __post_init__(self):
+        self.bodies = (self.body,)
+
+    def loads(self, t, *frames):
+        (body,) = frames
+        force = body.vector(self.vector) if self.frame == "body" else Point(self.vector[0], self.vector[1])
+        return [_at(body, self.point, force)]
+
+
+class Torque(ForceElement):
+    """A constant torque `value` (N m) on body 2, and its reaction on body 1."""
+
+    value: Float[Array, ""] = eqx.field(converter=number)
+
+    def loads(self, t, *frames):
+        return _couple(self.value)
+
+
+class Friction(ForceElement):
+    """Friction in a revolute joint: the torque -torque tanh(omega / velocity) on body 2, omega = omega2 - omega1.
+
+    Dry friction of `torque` (N m), smoothed over `velocity` (rad/s). Its bodies are those of its `joint`, which the mechanism
+    looks up (`Mechanism.frames_of`).
+    """
+
+    bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)
+    joint: str = eqx.field(static=True, metadata=REVOLUTE)
+    torque: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
+    velocity: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)
+
+    def loads(self, t, *frames):
+        one, two = frames
+        return _couple(-self.torque * jnp.tanh((two.omega - one.omega) / self.velocity))
+
+
+def _at(frame: Frame, point, force: Point) -> Load:
+    """Return a force at a point of a body as a load about its centre of mass."""
+    arm = frame.vector(point)
+    return force.x, force.y, arm.x * force.y - arm.y * force.x
+
+
+def _couple(torque) -> list[Load]:
+    """Return the loads of a torque on body 2 and its reaction on body 1."""
+    return [(0.0, 0.0, -torque), (0.0, 0.0, torque)]

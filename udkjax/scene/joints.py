@@ -1,0 +1,223 @@
+"""One class per joint. A joint writes only its position residual; everything else is derived from it.
+
+Conventions that hold throughout: `bodies` names the bodies that the joint connects, in the order in which `residual` gets
+their frames; `points` are the attachments, each in its body's own frame (m); `axis` is the direction of a line in body 1's
+frame (rad); angles are in rad, anticlockwise; rows come in the order in which `residual` returns them. A number that is None
+when a joint is made ("as in the initial guess") is filled in by the mechanism.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.scene.bodies import GROUND, Frame, Point, between
+from udkjax.scene.fields import BODY, POSITIVE, RADII, TURN, names, number, optional
+from udkjax.scene.splines import periodic
+
+
+class Constraint(eqx.Module):
+    """Anything that holds Psi(t, q) = 0: a joint or a driver. A subclass writes `residual`, nothing more."""
+
+    bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
+
+    @abstractmethod
+    def residual(self, t: Any, *frames: Frame) -> Sequence[Any]:
+        """Return Psi, one scalar a row, from the time (s) and the frames of the attached bodies."""
+
+    @property
+    def attached(self) -> tuple[str, ...]:
+        """The bodies whose frames `residual` gets, in that order."""
+        return self.bodies
+
+    def resolved(self, *frames: Frame) -> Self:
+        """Return the same with every number that the initial guess decides, given the attached bodies' frames there."""
+        return self
+
+
+class Joint(Constraint):
+    """A constraint that does not depend on time. Subclass it to write a joint of your own."""
+
+
+class Revolute(Joint):
+    """Two points coincide. 2 rows: the x and y components of point 2 minus point 1 (m)."""
+
+    points: Float[Array, "2 2"] = eqx.field(converter=number)
+
+    def residual(self, t, *frames):
+        one, two = frames
+        gap = between(self.points, one, two)
+        return [gap.x, gap.y]
+
+
+class Prismatic(Joint):
+    """Body 2 slides along a line of body 1 without turning on it.
+
+    2 rows: the distance of point 2 from the line through point 1 along `axis` (m, positive on its left), and
+    theta2 - theta1 - `angle` (rad; default: as in the initial guess).
+    """
+
+    points: Float[Array, "2 2"] = eqx.field(converter=number)
+    axis: Float[Array, ""] = eqx.field(converter=number)
+    angle: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
+
+    def residual(self, t, *frames):
+        one, two = frames
+        return [_beside(self.axis, self.points, one, two), two.angle - one.angle - self.angle]
+
+    def resolved(self, *frames):
+        return filled(self, "angle", frames[1].angle - frames[0].angle)
+
+
+class Slot(Joint):
+    """A pin of body 2 slides along a line of body 1, free to turn. 1 row: its distance from the line, as in `Prismatic`."""
+
+    points: Float[Array, "2 2"] = eqx.field(converter=number)
+    axis: Float[Array, ""] = eqx.field(converter=number)
+
+    def residual(self, t, *frames):
+        return [_beside(self.axis, self.points, *frames)]
+
+
+class Weld(Joint):
+    """No relative motion. 3 rows: those of `Revolute`, and theta2 - theta1 - `angle` (rad; default: as in the initial guess)."""
+
+    points: Float[Array, "2 2"] = eqx.field(converter=number)
+    angle: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
+
+    def residual(self, t, *frames):
+        one, two = frames
+        gap = between(self.points, one, two)
+        return [gap.x, gap.y, two.angle - one.angle - self.angle]
+
+    def resolved(self, *frames):
+        return filled(self, "angle", frames[1].angle - frames[0].angle)
+
+
+class Distance(Joint):
+    """A massless rod of `length` L joins two points. 1 row: (d.d - L^2) / (2 L) (m), d the vector from point 1 to point 2.
+
+    Its gradient at d.d = L^2 is the unit vector along the rod, so its multiplier is the rod's force (N), positive in compression.
+    """
+
+    points: Float[Array, "2 2"] = eqx.field(converter=number)
+    length: Float[Array, ""] | None = eqx.field(converter=optional, default=None, metadata=POSITIVE)
+
+    def residual(self, t, *frames):
+        one, two = frames
+        d = between(self.points, one, two)
+        return [0.5 * (d.dot(d) / self.length - self.length)]
+
+    def resolved(self, *frames):
+        return filled(self, "length", between(self.points, *frames).norm())
+
+
+class Angle(Joint):
+    """The relative angle is fixed. 1 row: theta2 - theta1 - `angle` (rad; default: as in the initial guess)."""
+
+    angle: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
+
+    def residual(self, t, *frames):
+        one, two = frames
+        return [two.angle - one.angle - self.angle]
+
+    def resolved(self, *frames):
+        return filled(self, "angle", frames[1].angle - frames[0].angle)
+
+
+class Gear(Joint):
+    """Two wheels mesh, their centres held by the `carrier` c (a body or the ground).
+
+    1 row (m): r1 (theta1 - theta_c) + r2 (theta2 - theta_c) - constant, with r2 negated where wheel 1 is an `internal` gear
+    (or wheel 2 is: the sign does not tell). The constant is the initial guess's.
+    """
+
+    radii: Float[Array, "2"] = eqx.field(converter=number, metadata=POSITIVE)
+    internal: bool = eqx.field(static=True, default=False)
+    carrier: str = eqx.field(static=True, default=GROUND, metadata=BODY)
+    constant: Float[Array, ""] | None = eqx.field(init=False, default_factory=lambda: None)
+
+    @property
+    def attached(self):
+        return self.bodies if self.carrier == GROUND else (*self.bodies, self.carrier)
+
+    def residual(self, t, *frames):
+        return [self._rolled(*frames) - self.constant]
+
+    def resolved(self, *frames):
+        return _with(self, "constant", self._rolled(*frames))
+
+    def _rolled(self, one, two, carrier=None):
+        first, second = (one.angle, two.angle) if carrier is None else (one.angle - carrier.angle, two.angle - carrier.angle)
+        rolled = self.radii[1] * second
+        return self.radii[0] * first - rolled if self.internal else self.radii[0] * first + rolled
+
+
+class Rack(Joint):
+    """Body 2, a pinion of `radius` r centred at its centre of mass, rolls on a rack along `axis` of body 1, on the rack's left.
+
+    1 row (m): s + r (theta2 - theta1) - constant, s the displacement of body 2's origin from body 1's along the axis. The
+    constant is the initial guess's. Only the rolling is held: what keeps the pinion at its height is another joint, a `Slot`.
+    """
+
+    radius: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)
+    axis: Float[Array, ""] = eqx.field(converter=number)
+    constant: Float[Array, ""] | None = eqx.field(init=False, default_factory=lambda: None)
+
+    def residual(self, t, *frames):
+        return [self._rolled(*frames) - self.constant]
+
+    def resolved(self, *frames):
+        return _with(self, "constant", self._rolled(*frames))
+
+    def _rolled(self, one, two):
+        along = one.vector((jnp.cos(self.axis), jnp.sin(self.axis)))
+        return along.dot(Point(two.x - one.x, two.y - one.y)) + self.radius * (two.angle - one.angle)
+
+
+class Profile(eqx.Module):
+    """A cam's outline: a closed curve, radius over polar angle, by a periodic cubic spline. The first point is not repeated."""
+
+    angle: Float[Array, "n"] = eqx.field(converter=number, metadata=TURN)  # rad, increasing, less than one turn
+    radius: Float[Array, "n"] = eqx.field(converter=number, metadata=RADII)  # m
+
+    def __call__(self, angle: Any) -> Any:
+        """Return the radius (m) at a polar angle (rad)."""
+        return periodic(angle, self.angle, self.radius, 2 * jnp.pi)
+
+
+def _profile(value) -> Profile:
+    return value if isinstance(value, Profile) else Profile(**value)
+
+
+class Cam(Joint):
+    """A follower, point 2, stays on body 1's closed `profile` around point 1.
+
+    1 row (m): |d| - radius(phi), with d the vector from point 1 to point 2 in body 1's frame, and phi its polar angle.
+    """
+
+    points: Float[Array, "2 2"] = eqx.field(converter=number)
+    profile: Profile = eqx.field(converter=_profile)
+
+    def residual(self, t, *frames):
+        one, two = frames
+        d = one.local(between(self.points, one, two))
+        return [d.norm() - self.profile(jnp.arctan2(d.y, d.x))]
+
+
+def _beside(axis, points, one, two):
+    """Return how far point 2 is to the left of the line through point 1 along `axis` of body 1 (m)."""
+    normal = one.vector((-jnp.sin(axis), jnp.cos(axis)))
+    return normal.dot(between(points, one, two))
+
+
+def _with(constraint, name, value):
+    return eqx.tree_at(lambda c: getattr(c, name), constraint, number(value), is_leaf=lambda leaf: leaf is None)
+
+
+def filled(constraint, name, value):
+    """Return the constraint with an absent number filled in."""
+    return constraint if getattr(constraint, name) is not None else _with(constraint, name, value)

@@ -1,0 +1,20 @@
+"""Mechanisms from the literature, ready to use: every number is an argument, and what is not driven starts free."""
+
+from udkjax.scene.library.linkages import elliptic_trammel, four_bar, n_four_bar, parallelogram, slider_crank
+from udkjax.scene.library.machines import peaucellier, planetary_gear, scissor_lift
+from udkjax.scene.library.pendulums import compound_pendulum, double_pendulum, driven_pendulum, simple_pendulum
+
+__all__ = [
+    "compound_pendulum",
+    "double_pendulum",
+    "driven_pendulum",
+    "elliptic_trammel",
+    "four_bar",
+    "n_four_bar",
+    "parallelogram",
+    "peaucellier",
+    "planetary_gear",
+    "scissor_lift",
+    "simple_pendulum",
+    "slider_crank",
+]

@@ -1,0 +1,166 @@
+"""Linkages with one degree of freedom, the paper's among them. SI units, radians."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.drivers import Driver, Polynomial
+from udkjax.scene.fields import number
+from udkjax.scene.joints import Prismatic, Revolute, Slot
+from udkjax.scene.library.poses import ORIGINS, apex, bar, down, moving, uniform_rod
+from udkjax.scene.mechanism import Mechanism
+
+
+def parallelogram(
+    angle: ArrayLike = -np.pi / 4,
+    angular_velocity: ArrayLike = 0.0,
+    length: ArrayLike = 1.0,
+    mass: ArrayLike = 1.0,
+    inertia: ArrayLike = 0.1,
+    coupler_mass: ArrayLike = 2.0,
+    coupler_inertia: ArrayLike = 0.2,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return the paper's five-bar parallelogram: three parallel links carry a coupler. 12 rows of rank 11, one degree of freedom.
+
+    Ground pivots at (0, 0), (1, 0), (2, 0); `angle` and `angular_velocity` are the links'. Bodies link1, link2, link3,
+    coupler; rows A1, A2, A3 (link minus ground), then B1, B2, B3 (link minus coupler). The paper does not print the initial
+    state: release from rest at -45 degrees is inferred from its tables.
+    """
+
+    def pose(s):
+        e = jnp.array([jnp.cos(s), jnp.sin(s)])
+        links = [(jnp.array([x, 0.0]) + 0.5 * length * e, s) for x in (0.0, 1.0, 2.0)]
+        return [*links, (jnp.array([1.0, 0.0]) + length * e, 0.0 * s)]
+
+    links = ("link1", "link2", "link3")
+    physics = [(mass, inertia)] * 3 + [(coupler_mass, coupler_inertia)]
+    half = 0.5 * number(length)
+    return Mechanism(
+        moving((*links, "coupler"), physics, pose, angle, angular_velocity),
+        {f"A{i + 1}": Revolute((GROUND, link), [(float(i), 0.0), (-half, 0.0)]) for i, link in enumerate(links)}
+        | {f"B{i + 1}": Revolute(("coupler", link), [(i - 1.0, 0.0), (half, 0.0)]) for i, link in enumerate(links)},
+        gravity=down(gravity),
+        name="five-bar parallelogram",
+    )
+
+
+def n_four_bar(n: int = 2, angle: ArrayLike = np.pi / 2, angular_velocity: ArrayLike = -1.0, gravity: ArrayLike = 9.81) -> Mechanism:
+    """Return the IFToMM benchmark A02: n square four-bars in a row, which pass through singular configurations twice a turn.
+
+    n + 1 links link0, ... on pivots (i, 0) at a common `angle`, n couplers coupler0, ...: uniform rods of 1 m and 1 kg. Rows:
+    A0, ... (links on the ground), then per coupler Bi (its left end on link i) and Ci (its right end on link i + 1).
+    """
+
+    def pose(s):
+        e = jnp.array([jnp.cos(s), jnp.sin(s)])
+        links = [(jnp.array([float(i), 0.0]) + 0.5 * e, s) for i in range(n + 1)]
+        return links + [(jnp.array([i + 0.5, 0.0]) + e, 0.0 * s) for i in range(n)]
+
+    names = [f"link{i}" for i in range(n + 1)] + [f"coupler{i}" for i in range(n)]
+    joints = {f"A{i}": Revolute((GROUND, f"link{i}"), [(float(i), 0.0), (-0.5, 0.0)]) for i in range(n + 1)}
+    for i in range(n):
+        joints[f"B{i}"] = Revolute((f"link{i}", f"coupler{i}"), [(0.5, 0.0), (-0.5, 0.0)])
+        joints[f"C{i}"] = Revolute((f"link{i + 1}", f"coupler{i}"), [(0.5, 0.0), (0.5, 0.0)])
+    bodies = moving(names, [uniform_rod(1.0, 1.0)] * len(names), pose, angle, angular_velocity)
+    return Mechanism(bodies, joints, gravity=down(gravity), name=f"{n}-four-bar")
+
+
+def four_bar(
+    angle: ArrayLike = np.pi / 3,
+    angular_velocity: ArrayLike = 0.0,
+    lengths: Sequence[ArrayLike] = (1.0, 2.5, 2.0),
+    ground: ArrayLike = 2.5,
+    density: ArrayLike = 1.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return a four-bar, by default a crank-rocker: crank, coupler and rocker of `lengths`, uniform, `density` in kg/m.
+
+    The crank turns on the origin at `angle`, the rocker on (`ground`, 0); the coupler's far pin is above their line.
+    """
+    a, b, c = map(number, lengths)
+
+    def pose(s):
+        start, end = a * jnp.array([jnp.cos(s), jnp.sin(s)]), jnp.stack([number(ground), number(0.0)])
+        pin = apex(start, end, b, c)
+        return [bar(number([0.0, 0.0]), start), bar(start, pin), bar(end, pin)]
+
+    return Mechanism(
+        moving(("crank", "coupler", "rocker"), [uniform_rod(density * k, k) for k in (a, b, c)], pose, angle, angular_velocity),
+        {
+            "A": Revolute((GROUND, "crank"), [(0.0, 0.0), (-a / 2, 0.0)]),
+            "B": Revolute(("crank", "coupler"), [(a / 2, 0.0), (-b / 2, 0.0)]),
+            "C": Revolute(("coupler", "rocker"), [(b / 2, 0.0), (c / 2, 0.0)]),
+            "D": Revolute((GROUND, "rocker"), [(ground, 0.0), (-c / 2, 0.0)]),
+        },
+        gravity=down(gravity),
+        name="four-bar",
+    )
+
+
+def slider_crank(
+    angle: ArrayLike = 0.0,
+    angular_velocity: ArrayLike = 4.0,
+    driven: bool = True,
+    crank: ArrayLike = 0.5,
+    rod: ArrayLike = 1.5,
+    masses: Sequence[ArrayLike] = (1.0, 1.5, 2.0),
+    slider_inertia: ArrayLike = 0.1,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return a slider-crank on the x axis: crank of length `crank` on the origin, connecting rod, slider in a guide.
+
+    `driven`: a motor turns the crank at constant `angular_velocity` from `angle`; otherwise these are its initial state.
+    `masses` are those of crank, rod (both uniform) and slider.
+    """
+
+    def pose(s):
+        e, tilt = jnp.array([jnp.cos(s), jnp.sin(s)]), -jnp.arcsin(crank * jnp.sin(s) / rod)
+        pin, along = crank * e, rod * jnp.array([jnp.cos(tilt), jnp.sin(tilt)])
+        return [(0.5 * pin, s), (pin + 0.5 * along, tilt), (pin + along, 0.0 * s)]
+
+    physics = [uniform_rod(masses[0], crank), uniform_rod(masses[1], rod), (masses[2], slider_inertia)]
+    motor = Driver((GROUND, "crank"), "angle", Polynomial([angle, angular_velocity]))
+    a, b = 0.5 * number(crank), 0.5 * number(rod)
+    return Mechanism(
+        moving(("crank", "rod", "slider"), physics, pose, angle, angular_velocity),
+        {
+            "O": Revolute((GROUND, "crank"), [(0.0, 0.0), (-a, 0.0)]),
+            "P": Revolute(("crank", "rod"), [(a, 0.0), (-b, 0.0)]),
+            "B": Revolute(("rod", "slider"), [(b, 0.0), (0.0, 0.0)]),
+            "guide": Prismatic((GROUND, "slider"), ORIGINS, axis=0.0, angle=0.0),
+        },
+        {"motor": motor} if driven else {},
+        gravity=down(gravity),
+        name="slider-crank",
+    )
+
+
+def elliptic_trammel(
+    angle: ArrayLike = np.pi / 4,
+    angular_velocity: ArrayLike = 0.0,
+    length: ArrayLike = 2.0,
+    mass: ArrayLike = 1.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return a uniform rod whose end A slides on the y axis and whose end B slides on the x axis.
+
+    The centre of mass is at length / 2 (cos `angle`, sin `angle`); the rod's own angle is minus that.
+    """
+    half = 0.5 * number(length)
+
+    def pose(s):
+        return [(half * jnp.array([jnp.cos(s), jnp.sin(s)]), -s)]
+
+    return Mechanism(
+        moving(("rod",), [uniform_rod(mass, length)], pose, angle, angular_velocity),
+        {
+            "A": Slot((GROUND, "rod"), [(0.0, 0.0), (-half, 0.0)], axis=np.pi / 2),
+            "B": Slot((GROUND, "rod"), [(0.0, 0.0), (half, 0.0)], axis=0.0),
+        },
+        gravity=down(gravity),
+        name="elliptic trammel",
+    )

@@ -1,0 +1,138 @@
+"""Larger mechanisms: a scissor lift, a straight-line linkage, a planetary gear. SI units, radians."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.fields import number
+from udkjax.scene.joints import Gear, Joint, Prismatic, Revolute, Slot
+from udkjax.scene.library.poses import ORIGINS, apex, bar, down, moving, uniform_disc, uniform_rod
+from udkjax.scene.mechanism import Mechanism
+
+
+def scissor_lift(
+    stages: int = 2,
+    angle: ArrayLike = np.pi / 6,
+    angular_velocity: ArrayLike = 0.0,
+    length: ArrayLike = 1.0,
+    mass: ArrayLike = 1.0,
+    platform_mass: ArrayLike = 5.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return a scissor lift: `stages` pairs of crossed bars and a platform, overconstrained by 2 rows by the platform's guide.
+
+    The bars rising0, falling0, ... cross at their middles, pinned, at `angle` to the horizontal; left ends stay on the y axis.
+    """
+    half = 0.5 * number(length)
+
+    def pose(s):
+        width, height = 2 * half * jnp.cos(s), 2 * half * jnp.sin(s)
+        bars = []
+        for i in range(stages):
+            middle = jnp.stack([0.5 * width, (i + 0.5) * height])
+            bars += [(middle, s), (middle, -s)]
+        return [*bars, (jnp.stack([half, stages * height]), 0.0 * s)]
+
+    names = [f"{kind}{i}" for i in range(stages) for kind in ("rising", "falling")]
+    left, right = (-half, 0.0), (half, 0.0)
+    joints = {
+        "foot": Revolute((GROUND, "rising0"), [(0.0, 0.0), left]),
+        "sliding foot": Slot((GROUND, "falling0"), [(0.0, 0.0), right], axis=0.0),
+    }
+    for i in range(stages):
+        joints[f"middle{i}"] = Revolute((f"rising{i}", f"falling{i}"), ORIGINS)
+    for i in range(stages - 1):
+        joints[f"left{i}"] = Revolute((f"falling{i}", f"rising{i + 1}"), [left, left])
+        joints[f"right{i}"] = Revolute((f"rising{i}", f"falling{i + 1}"), [right, right])
+    joints["head"] = Revolute((f"falling{stages - 1}", "platform"), [left, left])
+    joints["sliding head"] = Slot(("platform", f"rising{stages - 1}"), [left, right], axis=0.0)
+    joints["guide"] = Prismatic((GROUND, "platform"), [(0.0, 0.0), left], axis=np.pi / 2, angle=0.0)
+    physics = [uniform_rod(mass, length)] * len(names) + [uniform_rod(platform_mass, length)]
+    bodies = moving((*names, "platform"), physics, pose, angle, angular_velocity)
+    return Mechanism(bodies, joints, gravity=down(gravity), name="scissor lift")
+
+
+def peaucellier(
+    angle: ArrayLike = np.pi / 6,
+    angular_velocity: ArrayLike = 0.0,
+    crank: ArrayLike = 0.6,
+    arm: ArrayLike = 2.0,
+    side: ArrayLike = 1.2,
+    density: ArrayLike = 1.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return the Peaucellier-Lipkin linkage, which turns a rotation into an exact straight line.
+
+    Two arms from O = (0, 0) hold the corners A and B of a rhombus of `side`; the crank, pivoted at Q = (`crank`, 0), moves its
+    corner C on a circle through O; the opposite corner D then moves on the line x = (arm^2 - side^2) / (2 crank). Pins of three
+    bars are two revolutes. Uniform bars, `density` in kg/m; `gravity` pulls along +x, in which it hangs. Arms and sides fall
+    in line, a singular configuration, at |angle| = 2 acos((arm - side) / (2 crank)): 96 degrees by default.
+    """
+    r, a, b = number(crank), number(arm), number(side)
+
+    def pose(s):
+        o, q = number([0.0, 0.0]), jnp.stack([r, number(0.0)])
+        c = q + r * jnp.array([jnp.cos(s), jnp.sin(s)])
+        upper, lower = apex(o, c, a, b), apex(c, o, b, a)
+        d = upper + lower - c
+        return [bar(*ends) for ends in ((q, c), (o, upper), (o, lower), (c, upper), (c, lower), (upper, d), (lower, d))]
+
+    names = ("crank", "armA", "armB", "CA", "CB", "AD", "BD")
+    lengths = (r, a, a, b, b, b, b)
+    ends = {name: ((-0.5 * length, 0.0), (0.5 * length, 0.0)) for name, length in zip(names, lengths, strict=True)}
+
+    def pin(one, end, two, other):
+        return Revolute((one, two), [ends[one][end], ends[two][other]])
+
+    joints = {
+        "Q": Revolute((GROUND, "crank"), [(r, 0.0), ends["crank"][0]]),
+        "O1": Revolute((GROUND, "armA"), [(0.0, 0.0), ends["armA"][0]]),
+        "O2": Revolute((GROUND, "armB"), [(0.0, 0.0), ends["armB"][0]]),
+        "C1": pin("crank", 1, "CA", 0),
+        "C2": pin("crank", 1, "CB", 0),
+        "A1": pin("armA", 1, "CA", 1),
+        "A2": pin("armA", 1, "AD", 0),
+        "B1": pin("armB", 1, "CB", 1),
+        "B2": pin("armB", 1, "BD", 0),
+        "D": pin("AD", 1, "BD", 1),
+    }
+    bodies = moving(names, [uniform_rod(density * k, k) for k in lengths], pose, angle, angular_velocity)
+    return Mechanism(bodies, joints, gravity=jnp.stack([number(gravity), number(0.0)]), name="Peaucellier-Lipkin linkage")
+
+
+def planetary_gear(
+    planets: int = 3,
+    angular_velocity: ArrayLike = 1.0,
+    sun: ArrayLike = 0.2,
+    planet: ArrayLike = 0.1,
+    masses: Sequence[ArrayLike] = (4.0, 1.0, 2.0),
+    gravity: ArrayLike = 0.0,
+) -> Mechanism:
+    """Return a planetary gear with a fixed ring: `planets` planets on a carrier mesh with the sun and the ring.
+
+    `sun` and `planet` are radii; the ring's is sun + 2 planet. `angular_velocity` is the sun's; `masses` those of sun, planet
+    (discs) and carrier (a disc that reaches the planets' centres). One degree of freedom; rows: 4 + 4 planets, redundant by
+    planets - 1. Flat by default: no `gravity`.
+    """
+    r, p = number(sun), number(planet)
+    ring, reach = r + 2 * p, r + p
+    spots = [2 * np.pi * i / planets for i in range(planets)]
+
+    def pose(s):
+        turned = s * r / (r + ring)  # the carrier
+        spin = turned - (s - turned) * r / p
+        centres = [(reach * jnp.stack([jnp.cos(turned + spot), jnp.sin(turned + spot)]), spin) for spot in spots]
+        return [(number([0.0, 0.0]), s), *centres, (number([0.0, 0.0]), turned)]
+
+    joints: dict[str, Joint] = {"sun axle": Revolute((GROUND, "sun"), ORIGINS), "carrier axle": Revolute((GROUND, "carrier"), ORIGINS)}
+    for i, spot in enumerate(spots):
+        name = f"planet{i + 1}"
+        joints[f"axle{i + 1}"] = Revolute(("carrier", name), [(reach * np.cos(spot), reach * np.sin(spot)), (0.0, 0.0)])
+        joints[f"sun mesh{i + 1}"] = Gear(("sun", name), jnp.stack([r, p]), carrier="carrier")
+        joints[f"ring mesh{i + 1}"] = Gear((GROUND, name), jnp.stack([ring, p]), internal=True, carrier="carrier")
+    physics = [uniform_disc(masses[0], r), *[uniform_disc(masses[1], p)] * planets, uniform_disc(masses[2], reach)]
+    names = ("sun", *(f"planet{i + 1}" for i in range(planets)), "carrier")
+    return Mechanism(moving(names, physics, pose, 0.0, angular_velocity), joints, gravity=down(gravity), name="planetary gear")

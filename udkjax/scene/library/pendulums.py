@@ -1,0 +1,96 @@
+"""Pendulums. SI units, radians."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from udkjax.scene.bodies import GROUND, Body
+from udkjax.scene.drivers import Driver, Sine
+from udkjax.scene.fields import Numbers, number
+from udkjax.scene.joints import Distance, Revolute
+from udkjax.scene.library.poses import ORIGINS, down, hanging, moving, uniform_rod
+from udkjax.scene.mechanism import Mechanism
+
+
+def simple_pendulum(
+    position: Numbers = (-1.0, 0.0),
+    velocity: Numbers = (0.0, 0.0),
+    mass: ArrayLike = 1.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return the IFToMM benchmark A01: a point mass on a massless rod, as long as `position` is from the origin.
+
+    A body needs an inertia: 1 kg m^2, which nothing feels, since the rod holds the bob at its centre.
+    """
+    bodies = {"bob": Body(mass, 1.0, position, velocity=velocity)}
+    return Mechanism(bodies, {"rod": Distance((GROUND, "bob"), ORIGINS)}, gravity=down(gravity), name="simple pendulum")
+
+
+def compound_pendulum(
+    angle: ArrayLike = np.pi / 3,
+    angular_velocity: ArrayLike = 0.0,
+    length: ArrayLike = 1.5,
+    mass: ArrayLike = 2.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return a uniform rod pinned at one end; `angle` is measured from hanging straight down."""
+
+    def pose(s):
+        return [hanging(number([0.0, 0.0]), length, s)]
+
+    return Mechanism(
+        moving(("rod",), [uniform_rod(mass, length)], pose, angle, angular_velocity),
+        {"pin": Revolute((GROUND, "rod"), [(0.0, 0.0), (-0.5 * number(length), 0.0)])},
+        gravity=down(gravity),
+        name="compound pendulum",
+    )
+
+
+def double_pendulum(
+    angles: Sequence[ArrayLike] = (np.pi / 2, np.pi / 2),
+    angular_velocities: Sequence[ArrayLike] = (0.0, 0.0),
+    lengths: Sequence[ArrayLike] = (1.0, 1.0),
+    masses: Sequence[ArrayLike] = (1.0, 1.0),
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return two uniform rods in a chain, chaotic; `angles` are measured from hanging straight down."""
+    a, b = (0.5 * number(length) for length in lengths)
+
+    def pose(s):
+        tip = 2 * a * jnp.array([jnp.sin(s[0]), -jnp.cos(s[0])])
+        return [hanging(number([0.0, 0.0]), 2 * a, s[0]), hanging(tip, 2 * b, s[1])]
+
+    physics = [uniform_rod(mass, length) for mass, length in zip(masses, lengths, strict=True)]
+    return Mechanism(
+        moving(("upper", "lower"), physics, pose, angles, angular_velocities),
+        {
+            "shoulder": Revolute((GROUND, "upper"), [(0.0, 0.0), (-a, 0.0)]),
+            "elbow": Revolute(("upper", "lower"), [(a, 0.0), (-b, 0.0)]),
+        },
+        gravity=down(gravity),
+        name="double pendulum",
+    )
+
+
+def driven_pendulum(
+    amplitude: ArrayLike = 0.8,
+    frequency: ArrayLike = 3.0,
+    length: ArrayLike = 1.0,
+    mass: ArrayLike = 1.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return a uniform rod pinned at one end and driven to the angle `amplitude` sin(`frequency` t) from the x axis."""
+    half = 0.5 * number(length)
+
+    def pose(s):
+        return [(half * jnp.array([jnp.cos(s), jnp.sin(s)]), s)]
+
+    return Mechanism(
+        moving(("rod",), [uniform_rod(mass, length)], pose, 0.0, amplitude * number(frequency)),
+        {"pin": Revolute((GROUND, "rod"), [(0.0, 0.0), (-half, 0.0)])},
+        {"motor": Driver((GROUND, "rod"), "angle", Sine(amplitude, frequency))},
+        gravity=down(gravity),
+        name="driven pendulum",
+    )

@@ -1,0 +1,59 @@
+"""What the mechanisms of the library are made with: poses, and bodies that move with them.
+
+Each mechanism starts closed, with velocities that its constraints allow: its pose q(s) is written over one coordinate s, and
+the velocity is the pose's derivative times the rate of s.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.scene.bodies import Body
+from udkjax.scene.fields import number
+
+ORIGINS = ((0.0, 0.0), (0.0, 0.0))
+
+
+def moving(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: ArrayLike, rate: ArrayLike) -> dict[str, Body]:
+    """Make the bodies of the (mass, inertia)s, at the [(position, angle), ...] of pose(s), moving as s does at its rate."""
+    places, rates = jax.jvp(pose, (number(s),), (number(rate),))
+    motion = zip(names, physics, places, rates, strict=True)
+    return {name: Body(mass, inertia, *place, *speed) for name, (mass, inertia), place, speed in motion}
+
+
+def uniform_rod(mass: ArrayLike, length: ArrayLike) -> tuple:
+    """Return mass and inertia of a uniform rod."""
+    return number(mass), number(mass) * number(length) ** 2 / 12
+
+
+def uniform_disc(mass: ArrayLike, radius: ArrayLike) -> tuple:
+    """Return mass and inertia of a uniform disc."""
+    return number(mass), number(mass) * number(radius) ** 2 / 2
+
+
+def bar(start, end):
+    """Return position and angle of a bar between two points."""
+    along = end - start
+    return 0.5 * (start + end), jnp.arctan2(along[1], along[0])
+
+
+def hanging(pivot, length, angle):
+    """Return position and angle of a rod that hangs from a point, at an angle from straight down."""
+    return pivot + 0.5 * length * jnp.array([jnp.sin(angle), -jnp.cos(angle)]), angle - np.pi / 2
+
+
+def apex(start, end, a, b):
+    """Return the point at distances a from start and b from end, to the left of the way from start to end."""
+    along = end - start
+    square = along @ along
+    x = (square + a**2 - b**2) / (2 * square)
+    y = jnp.sqrt(a**2 / square - x**2)
+    return start + x * along + y * jnp.stack([-along[1], along[0]])
+
+
+def down(gravity: ArrayLike) -> Float[Array, "2"]:
+    """Return the acceleration of gravity along -y."""
+    return jnp.stack([number(0.0), 0.0 - number(gravity)])

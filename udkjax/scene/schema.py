@@ -1,0 +1,85 @@
+"""The classes of a scene read as its schema: types by their names in a file, and each element as a table of its keys.
+
+A table is what a TOML file holds: {key: value}, with nested tables for motion laws and profiles. It is the one form in which
+scenes are read, checked and written.
+"""
+
+import dataclasses
+import re
+import types
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, Union, get_args, get_origin
+
+import equinox as eqx
+import jax
+
+from udkjax.scene import drivers, forces, joints
+from udkjax.scene.bodies import Body
+
+SECTIONS = ("body", "joint", "driver", "force")
+
+
+def type_name(cls: type) -> str:
+    """Return the name of a class as a `type` in a file: `TorsionSpring` is "torsion_spring"."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+
+
+def _by_name(module, *names: str) -> dict[str, type]:
+    return {type_name(getattr(module, name)): getattr(module, name) for name in names}
+
+
+TYPES: dict[str, dict[str, type]] = {
+    "joint": _by_name(joints, "Revolute", "Prismatic", "Slot", "Weld", "Distance", "Angle", "Gear", "Rack", "Cam"),
+    "force": _by_name(forces, "Spring", "TorsionSpring", "Force", "Torque", "Friction"),
+    "motion": _by_name(drivers, "Polynomial", "Sine", "Spline"),
+}
+PLAIN: dict[str, type] = {"body": Body, "driver": drivers.Driver, "profile": joints.Profile}  # tables without a `type`
+
+
+def in_files(cls: type) -> bool:
+    """Tell whether the scene format knows the class."""
+    return cls in PLAIN.values() or any(cls in known.values() for known in TYPES.values())
+
+
+class Key(NamedTuple):
+    """One key of an element: a field of its class."""
+
+    annotation: Any  # without None
+    required: bool
+    metadata: Mapping[str, Any]
+
+
+def keys(cls: type) -> dict[str, Key]:
+    """Return the keys of a class: its fields, in their order, but those that are worked out."""
+    found = {}
+    for field in dataclasses.fields(cls):
+        if field.init:
+            annotation = field.type
+            if get_origin(annotation) in (Union, types.UnionType):
+                some = [kind for kind in get_args(annotation) if kind is not type(None)]
+                annotation = some[0] if len(some) == 1 else annotation
+            default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+            found[field.name] = Key(annotation, not default, field.metadata)
+    return found
+
+
+def table_of(element: eqx.Module) -> dict[str, Any]:
+    """Return an element as a table; what is absent (None) is left out, and nested modules stay modules."""
+    table = {name: getattr(element, name) for name in keys(type(element))}
+    return {name: value for name, value in table.items() if value is not None}
+
+
+def numbers_in(element: eqx.Module) -> Iterator[tuple[tuple[str, ...], jax.Array | None, tuple[int, ...] | None]]:
+    """Iterate over paths, values and shapes of an element's numbers.
+
+    A value is None where a number is absent but could be there; its shape is the annotation's, or None if that leaves it open.
+    """
+    for name, key in keys(type(element)).items():
+        value = getattr(element, name)
+        if isinstance(value, eqx.Module):
+            yield from (((name, *path), leaf, shape) for path, leaf, shape in numbers_in(value))
+        elif eqx.is_array(value):
+            yield (name,), value, value.shape
+        elif value is None and hasattr(key.annotation, "dim_str"):
+            dims = key.annotation.dim_str.split()
+            yield (name,), None, tuple(map(int, dims)) if all(dim.isdigit() for dim in dims) else None

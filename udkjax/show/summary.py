@@ -1,0 +1,75 @@
+"""What the command line says about a mechanism and about a run."""
+
+import numpy as np
+
+from udkjax.equations import energy, violation
+from udkjax.integrate import Solution
+from udkjax.scene import Mechanism
+from udkjax.show.plots import largest
+from udkjax.study import exact_coordinates
+
+
+def check_summary(mech: Mechanism, check) -> str:
+    """Describe what `udkjax.equations.assembly.check` found in a mechanism."""
+    lines = {
+        "bodies": f"{check.bodies}",
+        "coordinates": f"{check.coordinates}",
+        "constraint rows": f"{check.rows} in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}",
+        "rank": f"{check.rank}",
+        "degrees of freedom": f"{check.degrees_of_freedom}",
+        "redundant rows": ", ".join(row_name(mech, *row) for row in check.redundant) or "none",
+    }
+    if check.dependent:
+        lines["depend on each other"] = ", ".join(check.dependent)
+    lines["closure, as given"] = f"{float(check.residual_before):.2e}"
+    lines["closure, assembled"] = f"{float(check.residual_after):.2e}" + ("" if check.closed else ": it does not close")
+    return table(mech.name or "mechanism", lines)
+
+
+def run_summary(mech: Mechanism, sol: Solution, seconds: float, compiling: float) -> str:
+    """Describe how a run ended, what it took and how far it can be trusted."""
+    stats = {name: int(value) for name, value in sol.stats.items()}
+    lines = {
+        "result": result_name(sol),
+        "statistics": ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in stats.items()),
+        **accuracy(mech, sol),
+        "time": f"{seconds:.2f} s, {compiling:.2f} s of it to compile",
+    }
+    return table(f"{mech.name or 'mechanism'}, {float(sol.ts[0]):g} to {float(sol.ts[-1]):g} s, {len(sol.ts)} instants", lines)
+
+
+def accuracy(mech: Mechanism, sol: Solution) -> dict[str, str]:
+    """Describe the largest violation, the drift of the energy and, where one is known, the error against the exact solution."""
+    lines = {"violation": f"{np.nanmax(largest(violation(mech, sol))):.2e} m or rad at most"}
+    parts = energy(mech, sol)
+    total = np.asarray(parts.total)
+    scale = np.nanmax(np.asarray(parts.kinetic))
+    lines["energy"] = f"changes by {np.nanmax(np.abs(total - total[0])):.2e} J at most; kinetic up to {scale:.3g} J"
+    exact = exact_coordinates(mech, sol.ts, sol.q[0], sol.v[0])
+    if exact is not None:
+        error = np.nanmax(np.abs(np.asarray(sol.q) - exact))
+        lines["exact solution"] = f"missed by {error:.2e} m or rad at most"
+    return lines
+
+
+def result_name(sol: Solution) -> str:
+    """Return how a run ended, in words."""
+    return str(sol.result)
+
+
+def row_name(mech: Mechanism, constraint: str, row: int) -> str:
+    """Name one row of a constraint, such as `B2 (y)`."""
+    rows = {"Revolute": "xy", "Weld": ("x", "y", "angle"), "Prismatic": ("across", "angle")}
+    known = rows.get(type(mech.constraints[constraint]).__name__)
+    return f"{constraint} ({known[row]})" if known else f"{constraint} (row {row + 1})"
+
+
+def table(title: str, lines: dict[str, str]) -> str:
+    """Lay out names and values below a title."""
+    width = max(map(len, lines))
+    return "\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in lines.items())])
+
+
+def plural(count: int, noun: str) -> str:
+    """Say how many there are."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"

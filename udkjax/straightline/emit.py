@@ -1,0 +1,162 @@
+"""Emit a graph as a program: a function of scalars that computes the outputs asked for, and nothing else.
+
+On JAX scalars it is traced (under vmap each scalar becomes one vector over the batch, the layout that vectorizes); on Python
+floats it is evaluated at once, which is how a scene is analysed without compiling anything.
+
+XLA would fuse each output with a copy of everything before it. `cut_every` places an optimization barrier after that many
+operations; a barrier stops the duplication and changes no value.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from udkjax.straightline.graph import Details, Graph, Node, Scalar
+
+_FLOATS: dict[str, Callable] = {"sin": math.sin, "cos": math.cos, "tanh": math.tanh, "exp": math.exp}
+
+
+class Program:
+    """`program(values)` takes one value for each of `inputs` and returns one for each of `outputs`."""
+
+    def __init__(self, graph: Graph, inputs: Sequence[Scalar], outputs: Sequence[Scalar], cut_every: int | None = None):
+        self.graph, self.inputs, self.outputs, self.cut_every = graph, list(inputs), list(outputs), cut_every
+        self.order = _needed(graph, {s.index for s in inputs}, [s.index for s in outputs])
+        self.last_use = {a.index: k for k, i in enumerate(self.order) for a in graph.nodes[i].arguments}
+        self.last_use.update((s.index, len(self.order)) for s in outputs)
+
+    def uses(self, scalar: Scalar) -> bool:
+        """Whether the program needs this input at all."""
+        return scalar.index in self.last_use
+
+    def __call__(self, values: Sequence[Any]) -> list[Any]:
+        known: dict[int, Any] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
+        recent: list[int] = []
+        for k, index in enumerate(self.order):
+            node = self.graph.nodes[index]
+            known[index] = _evaluate(node, known)
+            if node.kind not in ("constant", "call"):
+                recent.append(index)
+            if self.cut_every and len(recent) >= self.cut_every:
+                self._cut(known, [i for i in recent if self.last_use[i] > k])
+                recent = []
+        return [_signed(known, s) for s in self.outputs]
+
+    def _cut(self, known: dict[int, Any], live: list[int]):
+        traced = [i for i in live if isinstance(known[i], jax.Array)]
+        if traced:
+            known.update(zip(traced, cut([known[i] for i in traced]), strict=True))
+
+    def count(self) -> dict[str, int]:
+        """How many operations of each kind the program holds."""
+        counts: dict[str, int] = {}
+        for index in self.order:
+            node = self.graph.nodes[index]
+            name = str(node.detail) if node.kind in ("apply", "call") else node.kind
+            if name not in ("constant", "pick", "input"):
+                counts[name] = counts.get(name, 0) + 1
+        return counts
+
+
+@jax.custom_jvp
+def cut(values: Any) -> Any:
+    """Keep XLA from fusing across this point. The identity, with the identity's derivative."""
+    return jax.lax.optimization_barrier(values)
+
+
+@cut.defjvp
+def _cut_jvp(primals, tangents):
+    return cut(*primals), tangents[0]
+
+
+def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:
+    """Return what an early program must hand to a later one: the early nodes that the outputs or later nodes use.
+
+    Where "early" means "depends on parameters alone", the early program runs once and the later one as often as the state changes.
+    """
+    order = _needed(graph, {i for i, n in enumerate(graph.nodes) if n.kind == "input"}, [s.index for s in outputs])
+    used = {s.index for s in outputs}
+    used.update(a.index for i in order if not early(graph.nodes[i]) for a in graph.nodes[i].arguments)
+    used = {i for i in used if early(graph.nodes[i]) and graph.nodes[i].kind not in ("constant", "call")}
+    return [Scalar(graph, i) for i in sorted(used)]
+
+
+def _needed(graph: Graph, given: set[int], wanted: Sequence[int]) -> list[int]:
+    needed, stack = set(), list(wanted)
+    while stack:
+        index = stack.pop()
+        if index not in needed and index not in given:
+            needed.add(index)
+            stack.extend(a.index for a in graph.nodes[index].arguments)
+    missing = [graph.nodes[i].detail for i in needed if graph.nodes[i].kind == "input"]
+    if missing:
+        raise ValueError(f"the outputs need inputs that are not given: {missing}")
+    return sorted(needed)
+
+
+def _signed(known: dict[int, Any], scalar: Scalar) -> Any:
+    value = known[scalar.index]
+    return value if scalar.sign > 0 else -value
+
+
+def _evaluate(node: Node, known: dict[int, Any]) -> Any:
+    if node.kind == "constant":
+        return node.detail
+    if node.kind == "pick":
+        output, flat = node.detail
+        array = known[node.arguments[0].index][output]
+        return array.reshape(-1)[flat]
+    values = [_signed(known, a) for a in node.arguments]
+    match node.kind:
+        case "add":
+            return values[0] + values[1]
+        case "sub":
+            return values[0] - values[1]
+        case "mul":
+            return values[0] * values[1]
+        case "div":
+            return values[0] / values[1]
+        case "sqrt":
+            return math.sqrt(values[0]) if isinstance(values[0], float) else jnp.sqrt(values[0])
+        case "apply":
+            return _apply(node, values)
+        case "call":
+            return _call(node.detail, node.arguments, values)
+    raise AssertionError(node.kind)
+
+
+def _apply(node: Node, values: list[Any]) -> Any:
+    name = node.detail.primitive.name
+    if name in _FLOATS and isinstance(values[0], float):
+        return _FLOATS[name](values[0])
+    floats = all(isinstance(v, float | int | bool | np.generic) for v in values)
+    primitive, parameters = node.detail.primitive, node.detail.parameters
+    if not floats:
+        return primitive.bind(*(jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)), **parameters)
+    with jax.ensure_compile_time_eval():
+        known = [jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)]
+        return np.asarray(primitive.bind(*known, **parameters)).item()
+
+
+def _call(details: Details, arguments: Sequence[Scalar], values: list[Any]) -> list[Any]:
+    primitive, parameters = details.primitive, details.parameters
+    if not all(isinstance(v, float | int | bool | np.generic) for v in values):
+        result = primitive.bind(*_arrays(details, arguments, values), **parameters)
+        return list(result) if primitive.multiple_results else [result]
+    with jax.ensure_compile_time_eval():
+        result = primitive.bind(*_arrays(details, arguments, values), **parameters)
+        return [np.asarray(r) for r in (result if primitive.multiple_results else [result])]
+
+
+def _arrays(details: Details, arguments: Sequence[Scalar], values: list[Any]) -> list[Any]:
+    arrays, start = [], 0
+    for shape in details.shapes:
+        size = int(np.prod(shape))
+        part = [jnp.asarray(v, a.node.dtype) for v, a in zip(values[start : start + size], arguments[start : start + size], strict=True)]
+        arrays.append(jnp.stack(part).reshape(shape) if part else jnp.zeros(shape))
+        start += size
+    return arrays

@@ -1,0 +1,210 @@
+"""A graph of scalar expressions.
+
+Equal expressions are one node, zeros and ones vanish while the graph is built, and a sign costs nothing: a `Scalar` is a
+signed reference to a node, so that a - b, b - a and -(a - b) share one subtraction. What is built but not asked for is
+never emitted (emit.py), so a caller builds freely and chooses later.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Node(NamedTuple):
+    """One operation. `arguments` are Scalars; `detail` is what else tells it apart (a name, a value, a primitive's parameters)."""
+
+    kind: str  # input, constant, add, sub, mul, div, sqrt, apply (a JAX primitive on scalars), call (on arrays), pick (from a call)
+    arguments: tuple["Scalar", ...]
+    detail: Any
+    dtype: np.dtype
+    depends: frozenset[str]  # the groups of inputs that it depends on
+
+
+class Scalar:
+    """A signed reference to a node, with arithmetic. Only floating-point scalars carry a sign."""
+
+    __slots__ = ("graph", "index", "sign")
+
+    def __init__(self, graph: "Graph", index: int, sign: int = 1):
+        self.graph, self.index, self.sign = graph, index, sign
+
+    @property
+    def node(self) -> Node:
+        return self.graph.nodes[self.index]
+
+    @property
+    def constant(self) -> Any:
+        """The value where it is known, else None."""
+        node = self.node
+        if node.kind != "constant":
+            return None
+        return node.detail if self.sign > 0 else -node.detail
+
+    @property
+    def is_zero(self) -> bool:
+        return self.constant == 0.0
+
+    @property
+    def is_float(self) -> bool:
+        return np.issubdtype(self.node.dtype, np.floating)
+
+    def __eq__(self, other):
+        return isinstance(other, Scalar) and (self.index, self.sign) == (other.index, other.sign) and self.graph is other.graph
+
+    def __hash__(self):
+        return hash((self.index, self.sign))
+
+    def __neg__(self):
+        return self.graph.negative(self)
+
+    def __add__(self, other):
+        return self.graph.add(self, self.graph.scalar(other))
+
+    def __sub__(self, other):
+        return self.graph.add(self, -self.graph.scalar(other))
+
+    def __mul__(self, other):
+        return self.graph.multiply(self, self.graph.scalar(other))
+
+    def __truediv__(self, other):
+        return self.graph.divide(self, self.graph.scalar(other))
+
+    def __radd__(self, other):
+        return self + other
+
+    def __rsub__(self, other):
+        return self.graph.scalar(other) - self
+
+    def __rmul__(self, other):
+        return self * other
+
+    def __rtruediv__(self, other):
+        return self.graph.scalar(other) / self
+
+    def __repr__(self):
+        node = self.node
+        return f"{'-' if self.sign < 0 else ''}%{self.index}:{node.kind}{'' if node.detail is None else f'[{node.detail}]'}"
+
+
+class Graph:
+    """Nodes in an order in which every argument comes before its use."""
+
+    def __init__(self, dtype=np.float64):
+        self.dtype = np.dtype(dtype)
+        self.nodes: list[Node] = []
+        self._known: dict[Any, int] = {}
+
+    # --- leaves
+
+    def input(self, name: Any, group: str, dtype=None) -> Scalar:
+        """Add an input; `group` says what kind of quantity it is, so that a program can be split by what depends on it."""
+        return Scalar(self, self._node("input", (), name, np.dtype(dtype or self.dtype), frozenset([group])))
+
+    def constant(self, value: Any, dtype=None) -> Scalar:
+        dtype = np.dtype(dtype or self.dtype)
+        value = dtype.type(value).item()
+        if np.issubdtype(dtype, np.floating) and math.copysign(1.0, value) < 0:
+            return Scalar(self, self._node("constant", (), -value, dtype, frozenset()), -1 if value != 0 else 1)
+        return Scalar(self, self._node("constant", (), value, dtype, frozenset()))
+
+    def scalar(self, value: Any) -> Scalar:
+        return value if isinstance(value, Scalar) else self.constant(value)
+
+    # --- arithmetic
+
+    def negative(self, a: Scalar) -> Scalar:
+        return a if a.is_zero else Scalar(self, a.index, -a.sign)
+
+    def add(self, a: Scalar, b: Scalar) -> Scalar:
+        if a.is_zero:
+            return b
+        if b.is_zero:
+            return a
+        if a.constant is not None and b.constant is not None:
+            return self.constant(a.constant + b.constant, a.node.dtype)
+        if a.index == b.index:
+            return self.constant(0.0, a.node.dtype) if a.sign != b.sign else a * self.constant(2.0, a.node.dtype)
+        if b.index < a.index:
+            a, b = b, a
+        kind = "add" if a.sign == b.sign else "sub"
+        return Scalar(self, self._operation(kind, (Scalar(self, a.index), Scalar(self, b.index))), a.sign)
+
+    def multiply(self, a: Scalar, b: Scalar) -> Scalar:
+        if a.constant is not None and b.constant is not None:
+            return self.constant(a.constant * b.constant, a.node.dtype)
+        for one, other in ((a, b), (b, a)):
+            if one.is_zero:
+                return one
+            if one.constant in (1.0, -1.0):
+                return other if one.constant > 0 else -other
+        if b.index < a.index:
+            a, b = b, a
+        return Scalar(self, self._operation("mul", (Scalar(self, a.index), Scalar(self, b.index))), a.sign * b.sign)
+
+    def divide(self, a: Scalar, b: Scalar) -> Scalar:
+        if a.is_zero:
+            return a
+        if b.constant in (1.0, -1.0):
+            return a if b.constant > 0 else -a
+        if a.constant is not None and b.constant not in (None, 0.0):
+            return self.constant(a.constant / b.constant, a.node.dtype)
+        if a.index == b.index:
+            return self.constant(float(a.sign * b.sign), a.node.dtype)
+        return Scalar(self, self._operation("div", (Scalar(self, a.index), Scalar(self, b.index))), a.sign * b.sign)
+
+    def sqrt(self, a: Scalar) -> Scalar:
+        if a.constant is not None:
+            return self.constant(math.sqrt(a.constant), a.node.dtype)
+        return Scalar(self, self._operation("sqrt", (a,)))
+
+    # --- everything else
+
+    def apply(self, primitive: Any, parameters: dict, arguments: tuple[Scalar, ...], dtype: Any, fold: Callable) -> Scalar:
+        """A JAX primitive on scalars; `fold` computes it where all arguments are known."""
+        if all(a.constant is not None for a in arguments):
+            return self.constant(np.asarray(fold(*(np.asarray(a.constant, a.node.dtype) for a in arguments))).item(), dtype)
+        detail = Details(primitive, parameters)
+        return Scalar(self, self._operation("apply", tuple(arguments), detail, np.dtype(dtype)))
+
+    def call(self, detail: "Details", arguments: tuple[Scalar, ...], outputs: list[tuple[tuple[int, ...], Any]]) -> list[np.ndarray]:
+        """A JAX primitive on whole arrays: an opaque node, and a pick for each element of what it returns."""
+        index = self._operation("call", arguments, detail, np.dtype(object))
+        arrays = []
+        for k, (shape, dtype) in enumerate(outputs):
+            array = np.empty(shape, object)
+            for place in np.ndindex(*shape):
+                flat = int(np.ravel_multi_index(place, shape)) if shape else 0
+                array[place] = Scalar(self, self._operation("pick", (Scalar(self, index),), (k, flat), np.dtype(dtype)))
+            arrays.append(array)
+        return arrays
+
+    def _operation(self, kind, arguments, detail=None, dtype=None) -> int:
+        depends = frozenset().union(*(a.node.depends for a in arguments)) if arguments else frozenset()
+        return self._node(kind, arguments, detail, dtype or arguments[0].node.dtype, depends)
+
+    def _node(self, kind, arguments, detail, dtype, depends) -> int:
+        key = (kind, tuple((a.index, a.sign) for a in arguments), detail, dtype)
+        index = self._known.get(key)
+        if index is None:
+            index = self._known[key] = len(self.nodes)
+            self.nodes.append(Node(kind, arguments, detail, dtype, depends))
+        return index
+
+
+class Details:
+    """A primitive with its parameters, and for arrays the shapes of its arguments; equal where the computation is."""
+
+    def __init__(self, primitive: Any, parameters: dict, shapes: tuple = ()):
+        self.primitive, self.parameters, self.shapes = primitive, parameters, shapes
+        self._key = (primitive.name, shapes, tuple(sorted((k, str(v)) for k, v in parameters.items())))
+
+    def __eq__(self, other):
+        return isinstance(other, Details) and self._key == other._key
+
+    def __hash__(self):
+        return hash(self._key)
+
+    def __repr__(self):
+        return self.primitive.name

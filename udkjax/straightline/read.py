@@ -1,0 +1,173 @@
+"""Read a jaxpr into a graph of scalars.
+
+An array is a NumPy array of Scalars, so that reshaping, slicing and broadcasting cost nothing and vanish, and whatever acts
+element by element becomes scalar operations that the graph can simplify. A primitive that does neither becomes one opaque
+node with the arrays it needs: anything that JAX can trace can be read.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from udkjax.straightline.graph import Details, Graph, Scalar
+
+_INLINED = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", "remat", "checkpoint")
+_ELEMENTWISE = frozenset(
+    """abs acos acosh and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma eq erf erf_inv
+    erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p logistic lt max min ne nextafter not or pow reduce_precision rem
+    round rsqrt select_n sign sin sinh tan tanh xor stop_gradient""".split()
+)  # fmt: skip
+
+
+def trace(function: Callable, *examples: Any) -> Callable[..., list[np.ndarray]]:
+    """Trace a function once; the result reads it into a graph, for arguments given as arrays of Scalars, as often as wanted."""
+    jaxpr = jax.make_jaxpr(function)(*examples)
+    return lambda graph, *arguments: read(graph, jaxpr, jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, np.ndarray)))
+
+
+def read(graph: Graph, closed: Any, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the outputs of a closed jaxpr as arrays of Scalars."""
+    constants = [_constants(graph, c) for c in closed.consts]
+    return _read(graph, closed.jaxpr, constants, arguments)
+
+
+def _constants(graph: Graph, value: Any) -> np.ndarray:
+    value = np.asarray(value)
+    array = np.empty(value.shape, object)
+    for place in np.ndindex(*value.shape):
+        array[place] = graph.constant(value[place], value.dtype)
+    return array
+
+
+def _read(graph: Graph, jaxpr: Any, constants: Sequence[np.ndarray], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+    known: dict[Any, np.ndarray] = {}
+    for variables, values in ((jaxpr.constvars, constants), (jaxpr.invars, arguments)):
+        known.update(zip(variables, (np.asarray(v, object) for v in values), strict=True))
+
+    def value(atom):
+        return _constants(graph, atom.val) if isinstance(atom, core.Literal) else known[atom]
+
+    for equation in jaxpr.eqns:
+        outputs = _equation(graph, equation, [value(a) for a in equation.invars])
+        known.update(zip(equation.outvars, outputs, strict=True))
+    return [value(a) for a in jaxpr.outvars]
+
+
+def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    name, parameters = equation.primitive.name, equation.params
+    if name in _INLINED:
+        inner = next(parameters[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in parameters)
+        return read(graph, inner, inputs) if hasattr(inner, "consts") else _read(graph, inner, [], inputs)
+    if name in _SHAPES:
+        return [np.asarray(_SHAPES[name](*inputs, **parameters), object)]
+    shape, dtype = equation.outvars[0].aval.shape, np.dtype(equation.outvars[0].aval.dtype)
+    if name in _ARITHMETIC and np.issubdtype(dtype, np.floating):
+        return [_elementwise(partial(_ARITHMETIC[name], **parameters), shape, inputs)]
+    if name == "convert_element_type" and all(s.node.dtype == dtype for s in inputs[0].flat):
+        return inputs
+    if name in _ELEMENTWISE:
+        return [_elementwise(partial(_apply, graph, equation, dtype), shape, inputs)]
+    if name == "reduce_sum" and np.issubdtype(dtype, np.floating):
+        return [np.asarray(np.sum(inputs[0], axis=parameters["axes"]), object)] if inputs[0].size else [_constants(graph, np.zeros(shape))]
+    if name == "dot_general" and np.issubdtype(dtype, np.floating):
+        return [_dot(graph, *inputs, parameters["dimension_numbers"], shape)]
+    if name in ("dynamic_slice", "gather") and all(s.constant is not None for i in inputs[1:] for s in i.flat):
+        return [_select(equation, inputs)]
+    if name == "iota":
+        return [_constants(graph, np.asarray(_fold(equation.primitive, parameters, [])))]
+    details = Details(equation.primitive, parameters, tuple(i.shape for i in inputs))
+    scalars = tuple(s for i in inputs for s in i.flat)
+    return graph.call(details, scalars, [(v.aval.shape, v.aval.dtype) for v in equation.outvars])
+
+
+def _elementwise(operation: Callable[..., Scalar], shape: tuple[int, ...], inputs: list[np.ndarray]) -> np.ndarray:
+    result = np.empty(shape, object)
+    inputs = [np.broadcast_to(i, shape) for i in inputs]
+    for place in np.ndindex(*shape):
+        result[place] = operation(*(i[place] for i in inputs))
+    return result
+
+
+def _apply(graph: Graph, equation: Any, dtype: np.dtype, *scalars: Scalar) -> Scalar:
+    primitive, parameters = equation.primitive, equation.params
+    if primitive.name == "select_n" and scalars[0].constant is not None:
+        return scalars[1 + int(scalars[0].constant)]
+    if primitive.name in ("stop_gradient",):
+        return scalars[0]
+    return graph.apply(primitive, parameters, scalars, dtype, lambda *values: _fold(primitive, parameters, values))
+
+
+def _fold(primitive: Any, parameters: dict, values: Sequence[Any]) -> Any:
+    with jax.ensure_compile_time_eval():
+        return np.asarray(primitive.bind(*map(jax.numpy.asarray, values), **parameters))
+
+
+def _select(equation: Any, inputs: list[np.ndarray]) -> np.ndarray:
+    """Which elements an indexing with known indices takes: let JAX take them from an array of their places."""
+    places = np.arange(inputs[0].size).reshape(inputs[0].shape)
+    indices = [np.array([s.constant for s in i.flat], i.flat[0].node.dtype).reshape(i.shape) for i in inputs[1:]]
+    parameters = {**equation.params, "fill_value": None} if "fill_value" in equation.params else equation.params
+    return inputs[0].reshape(-1)[_fold(equation.primitive, parameters, [places, *indices])]
+
+
+def _integer_power(x: Scalar, y: int) -> Scalar:
+    if y < 0:
+        return x.graph.constant(1.0, x.node.dtype) / _integer_power(x, -y)
+    result = x.graph.constant(1.0, x.node.dtype)
+    while y:
+        result, x, y = result * x if y & 1 else result, x * x if y > 1 else x, y >> 1
+    return result
+
+
+def _dot(graph: Graph, a: np.ndarray, b: np.ndarray, numbers: Any, shape: tuple[int, ...]) -> np.ndarray:
+    (contract_a, contract_b), (batch_a, batch_b) = numbers
+    free_a = [k for k in range(a.ndim) if k not in (*contract_a, *batch_a)]
+    free_b = [k for k in range(b.ndim) if k not in (*contract_b, *batch_b)]
+    batch, inner = [a.shape[k] for k in batch_a], [a.shape[k] for k in contract_a]
+    a = a.transpose(*batch_a, *free_a, *contract_a).reshape(int(np.prod(batch)), -1, int(np.prod(inner)))
+    b = b.transpose(*batch_b, *free_b, *contract_b).reshape(int(np.prod(batch)), -1, int(np.prod(inner)))
+    result = np.empty((len(a), a.shape[1], b.shape[1]), object)
+    for n, i, j in np.ndindex(*result.shape):
+        result[n, i, j] = sum((x * y for x, y in zip(a[n, i], b[n, j], strict=True)), graph.constant(0.0))
+    return result.reshape(shape)
+
+
+def _slice(a, start_indices, limit_indices, strides):
+    strides = strides or [1] * a.ndim
+    return a[tuple(slice(*s) for s in zip(start_indices, limit_indices, strides, strict=True))]
+
+
+def _broadcast(a, shape, broadcast_dimensions, **_):
+    source = [1] * len(shape)
+    for k, d in enumerate(broadcast_dimensions):
+        source[d] = a.shape[k]
+    return np.broadcast_to(a.reshape(source), shape)
+
+
+_ARITHMETIC: dict[str, Callable[..., Scalar]] = {
+    "add": lambda a, b, **_: a + b,
+    "add_any": lambda a, b, **_: a + b,
+    "sub": lambda a, b, **_: a - b,
+    "mul": lambda a, b, **_: a * b,
+    "div": lambda a, b, **_: a / b,
+    "neg": lambda a, **_: -a,
+    "square": lambda a, **_: a * a,
+    "sqrt": lambda a, **_: a.graph.sqrt(a),
+    "integer_pow": lambda a, y, **_: _integer_power(a, y),
+}
+_SHAPES: dict[str, Callable[..., Any]] = {
+    "reshape": lambda a, new_sizes, **_: a.reshape(new_sizes),
+    "squeeze": lambda a, dimensions: np.squeeze(a, tuple(dimensions)),
+    "expand_dims": lambda a, dimensions: np.expand_dims(a, dimensions),
+    "transpose": lambda a, permutation: np.transpose(a, permutation),
+    "rev": lambda a, dimensions: np.flip(a, dimensions),
+    "broadcast_in_dim": _broadcast,
+    "slice": _slice,
+    "concatenate": lambda *a, dimension: np.concatenate(a, dimension),
+    "stack": lambda *a, axis=0, **_: np.stack(a, axis),
+    "copy": lambda a, **_: a,
+}
