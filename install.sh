@@ -92,8 +92,8 @@ make_venv() {
         if "$other" -m pip --python "$venv/bin/python" install --quiet pip >/dev/null 2>&1 </dev/null; then break; fi
     done
     "$venv/bin/python" -m pip --version >/dev/null 2>&1 && return
-    "$venv/bin/python" -c 'import urllib.request as u; print(u.urlopen("https://bootstrap.pypa.io/get-pip.py").read().decode())' |
-        "$venv/bin/python" - --quiet
+    get='import urllib.request as u; print(u.urlopen("https://bootstrap.pypa.io/get-pip.py").read().decode())'
+    "$venv/bin/python" -c "$get" 2>/dev/null | "$venv/bin/python" - --quiet
     "$venv/bin/python" -m pip --version >/dev/null 2>&1
 }
 
@@ -108,6 +108,7 @@ case $wanted in
     ;;
 esac
 
+[ -n "$best" ] || [ -z "$wanted" ] || die 3 "found no Python $wanted in PATH, pyenv or uv that runs and will do"
 reuse=''
 if [ -e "$venv" ]; then
     minor=$(minor_of "$venv/bin/python") || minor=0
@@ -129,7 +130,7 @@ if [ -n "$reuse" ]; then
         say "this machine has Python 3.$newer too, which is faster: remove $venv and run this again to use it"
     fi
 else
-    [ -n "$best" ] || die 3 "found no Python ${wanted:-3.$oldest or newer} in PATH, pyenv or uv that runs; install one, or name it with --python"
+    [ -n "$best" ] || die 3 "found no Python 3.$oldest or newer in PATH, pyenv or uv that runs; install one, or name it with --python"
     rest=${best#* } minor=${rest%% *} python=${rest#* }
     say "Python 3.$minor: $python"
     make_venv || die 1 "could not make an environment with pip in $venv; on Debian: apt install python3.$minor-venv"
@@ -142,8 +143,8 @@ fi
 
 target=".${extras:+[$extras]}"
 say "installing udkjax and what it needs into $venv"
-if ! { works uv && uv pip install --quiet --python "$venv/bin/python" -c constraints.txt -e "$target"; }; then
-    "$venv/bin/python" -m pip install --quiet -c constraints.txt -e "$target" ||
+if ! { works uv && uv pip install --quiet --python "$venv/bin/python" -c constraints.txt -e "$target" 2>/dev/null; }; then
+    "$venv/bin/python" -m pip --disable-pip-version-check install --quiet -c constraints.txt -e "$target" ||
         die 1 "pip could not install; the reason stands above"
 fi
 "$venv/bin/udkjax" --help >/dev/null || die 1 "installed, but the command does not run"

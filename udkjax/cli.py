@@ -3,17 +3,18 @@
 Only the standard library and tyro are imported before a command is known, so that help comes at once.
 """
 
-import json
+import math
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
 if TYPE_CHECKING:
-    from udkjax import Mechanism, Solution
+    from udkjax import Mechanism
 
 BAD_RUN, BAD_INPUT = 1, 2  # exit codes
 
@@ -76,16 +77,15 @@ def simulate(
         max_steps: give up after so many steps.
         plot: picture to write; by default beside the NetCDF file.
     """
-    settings = {name: str(value) if isinstance(value, Path) else value for name, value in locals().items() if name != "scene"}
-    if not (t1 > t0 and dt > 0):
-        _refuse(f"--t1 {t1:g} must lie after --t0 {t0:g}, and --dt {dt:g} must be positive")
-    mech, text = _load(scene)
+    if not 0 < dt <= t1 - t0 < math.inf:
+        _refuse(f"from --t0 {t0:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
     plot = plot or out.with_suffix(".png")
     if plot == out:
         _refuse(f"--out {out} and --plot {plot} are the same file")
     for target in (out, plot):
         if not target.parent.is_dir():
             _refuse(f"there is no folder {target.parent} to write {target.name} to")
+    mech, text = _load(scene)
 
     import diffrax
     import numpy as np
@@ -94,21 +94,90 @@ def simulate(
     from udkjax.show.plots import trajectory
     from udkjax.show.summary import run_summary
 
-    ts = t0 + dt * np.arange(round((t1 - t0) / dt * (1 - 1e-12)) + 1)  # t1 itself, where dt divides the run
-    choices: dict[str, Any] = {} if max_steps is None else {"max_steps": max_steps}
     pseudoinverse = getattr(udk, METHODS[method])
-    choices["method"] = pseudoinverse() if rank_tol is None else pseudoinverse(rank_tol=rank_tol)
-    choices["solver"] = getattr(diffrax, SOLVERS[solver])()
-    choices["stabilization"] = {"projection": udk.Projection, "baumgarte": lambda: udk.Baumgarte(alpha, beta), "none": lambda: None}[
-        stabilization
-    ]()
-    with _compile_seconds() as compiling:
-        start = time.perf_counter()
-        sol = udk.simulate(mech, ts, rtol=rtol, atol=atol, throw=False, **choices)
-        float(np.asarray(sol.q)[-1, 0, 0])  # wait for it
-        seconds = time.perf_counter() - start
+    stabilizations = {"projection": udk.Projection, "baumgarte": lambda: udk.Baumgarte(alpha, beta), "none": lambda: None}
+    choices: dict[str, Any] = {
+        "rtol": rtol,
+        "atol": atol,
+        "method": pseudoinverse() if rank_tol is None else pseudoinverse(rank_tol=rank_tol),
+        "solver": getattr(diffrax, SOLVERS[solver])(),
+        "stabilization": stabilizations[stabilization](),
+        "throw": False,
+    }
+    if max_steps is not None:
+        choices["max_steps"] = max_steps
+    ts = t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # t1 itself too, where it is a multiple of dt up to rounding
+    with _stopwatch() as seconds:
+        sol = udk.simulate(mech, ts, **choices)
+        np.asarray(sol.q)  # JAX runs ahead: wait for it
 
-    _dataset(sol, settings, text).to_netcdf(out, engine="h5netcdf")
+    data = sol.to_xarray(mech)
+    data.attrs |= {"scene": text, "scene_file": scene.name}
+    data.to_netcdf(out, engine="h5netcdf")
     trajectory(mech, sol).savefig(plot, dpi=150)
-    print(run_summary(mech, sol, seconds, compiling[0]))
+    print(run_summary(mech, sol, seconds["all"], seconds["compiling"]))
     print(f"wrote {out} and {plot}")
+    if sol.result:
+        print(f"udkjax: {sol.cause}", file=sys.stderr)
+        sys.exit(BAD_RUN)
+
+
+def check(scene: Scene, /) -> None:
+    """Count what a scene is made of, name its redundant constraints, and try to close it; exit with 1 if it stays open.
+
+    Args:
+        scene: the mechanism.
+    """
+    mech, _ = _load(scene)
+    from udkjax.equations.assembly import check as checked
+    from udkjax.show.summary import check_summary
+
+    found = checked(mech)
+    print(check_summary(mech, found))
+    if not found.closed:
+        sys.exit(BAD_RUN)
+
+
+def doctor() -> None:
+    """Tell versions, devices and precision, ready to paste into a bug report."""
+    from udkjax.show import doctor as show
+
+    print(show.doctor())
+
+
+def _load(scene: Path) -> tuple["Mechanism", str]:
+    """Read a scene and its text, or say everything that is wrong with it and exit."""
+    import udkjax as udk
+
+    try:
+        return udk.load(scene), scene.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as problem:
+        _refuse(f"cannot read {scene}: {problem}")
+    except udk.SceneError as problem:
+        _refuse(str(problem))
+
+
+def _refuse(problem: str) -> NoReturn:
+    print(f"udkjax: {problem}", file=sys.stderr)
+    sys.exit(BAD_INPUT)
+
+
+@contextmanager
+def _stopwatch() -> Iterator[dict[str, float]]:
+    """Measure wall time (s), and how much of it went into tracing and compiling."""
+    import jax
+
+    seconds, spans = {"all": 0.0, "compiling": 0.0}, []
+
+    def listen(event: str, duration_secs: float, **_: Any) -> None:
+        if event.startswith("/jax/core/compile/"):
+            end = time.perf_counter()
+            while spans and spans[-1][0] > end - duration_secs:  # what is traced inside this is a part of it
+                spans.pop()
+            spans.append((end - duration_secs, end))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    start = time.perf_counter()
+    yield seconds
+    seconds["all"] = time.perf_counter() - start
+    seconds["compiling"] = sum(end - begin for begin, end in spans)

@@ -1,4 +1,4 @@
-"""The register of methods, and the matrices whose pseudoinverse is known exactly. A new method is one line, and meets every test."""
+"""The register of methods, where a new one is one line and meets every test; and matrices with exactly known pseudoinverses."""
 
 import json
 from collections.abc import Callable

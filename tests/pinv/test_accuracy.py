@@ -22,7 +22,7 @@ def bound(entry, matrix, dtype):
 
 
 def admitted(entry, matrix, dtype):
-    """Beyond, the method promises nothing, or the rank cannot be told from the rounded matrix (float32) or by this method (Greville)."""
+    """Else the method promises nothing, or the rank cannot be told, from a matrix in float32 or by this method."""
     if entry.power > 1 and bound(entry, matrix, dtype) >= 1:
         return False
     if entry.own_threshold:
@@ -31,7 +31,7 @@ def admitted(entry, matrix, dtype):
 
 
 def frame(matrix):
-    """A few shapes for all matrices: zero rows and columns add nothing to a pseudoinverse but zeros, and few shapes compile faster."""
+    """Few shapes for all matrices, to compile fast: zero rows and columns add nothing to a pseudoinverse but zeros."""
     m, n = matrix.a.shape
     return (12, 12) if m == n else (8, 5) if m > n else (m, n)
 
@@ -98,7 +98,7 @@ def test_the_checker_sees_what_is_wrong(exact):
     assert len(wrong(np.full((4, 4), np.nan), matrix, 1.0)) == 5
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1), (3, 7), (7, 3)], ids=str)
+@pytest.mark.parametrize("shape", [(1, 5), (5, 1), (3, 7), (7, 3)], ids=str)
 def test_shapes_and_degenerate_matrices(entry, shape):
     rng = np.random.default_rng(3)
     m, n = shape
@@ -108,7 +108,11 @@ def test_shapes_and_degenerate_matrices(entry, shape):
     stack = np.array([np.zeros(shape), equal_rows_and_columns, rank_one, general])
     b = rng.normal(size=(4, m))
     method = entry.make()
-    plus, (x, rank), columns = jax.jit(jax.vmap(lambda a, b: (method(a), method.solve(a, b), method.solve(a, b[:, None]).x)))(stack, b)
+
+    def everything(a, b):
+        return method(a), method.solve(a, b), method.solve(a, b[:, None]).x
+
+    plus, (x, rank), columns = jax.jit(jax.vmap(everything))(stack, b)
     expected = np.linalg.pinv(stack)
     np.testing.assert_allclose(plus, expected, atol=1e-12)
     np.testing.assert_allclose(x, np.einsum("snm,sm->sn", expected, b), atol=1e-12)

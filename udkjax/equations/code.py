@@ -1,5 +1,6 @@
 """The programs of one structure: what has to be computed for a method and a stabilization, and nothing else."""
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -8,12 +9,16 @@ import jax
 import numpy as np
 
 from udkjax.equations.expressions import Expressions, expressions
-from udkjax.pinv.sparse import Pattern, Row, all_of, factorize, multipliers, pattern, transpose_times
+from udkjax.pinv.sparse import Row, absolute, all_of, factorize, greater, multipliers, pattern, transpose_times
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Program, Scalar, frontier
 
 # Operations between two optimization barriers. Without barriers XLA repeats everything for each output; with too many it cannot fuse.
 CUT_EVERY = 48
+# What a row left out may disagree by, relative to its terms, and still count as satisfied: far above rounding, and above what
+# states carry that are closed to the tolerances of an integration.
+CONSISTENT = 1e-6
+TINY = 1e-12  # m/s^2: rows at rest have terms of no size at all
 
 
 class Code:
@@ -36,6 +41,7 @@ class Code:
         self.root = [graph.sqrt(graph.constant(1.0) / m) for m in equations.mass]
         everything = list(range(len(equations.psi)))
         self.kept = [i for i in everything if i not in left_out]
+        self.left_out = left_out
         self.D: list[Row] = [{k: entry * self.root[k] for k, entry in row.items()} for row in equations.psi_q]
         self.pattern, self.values = pattern(self.D, self.n)
         self.kept_pattern, self.kept_values = pattern([self.D[i] for i in self.kept], self.n)
@@ -70,7 +76,7 @@ class Code:
     def _eliminate(self):
         """The equation for rows D that are independent: x = D^T y with D D^T y = b."""
         graph, rows = self.graph, [self.D[i] for i in self.kept]
-        factors = factorize(rows, self.drop, replace=self.elimination == "drop")
+        factors = factorize(rows, self.drop, 0.0 if self.elimination == "drop" else math.nan)
         safe = all_of(factors.kept, graph)
 
         def scaled(b: list[Scalar]) -> list[Scalar]:
@@ -79,11 +85,20 @@ class Code:
 
         a = [f + s for f, s in zip(self.equations.free, scaled([self._b(i) for i in self.kept]), strict=True)]
         self.outputs["accelerations"] = [*a, safe]
+        self.outputs["accelerations_watched"] = [*a, all_of([safe, *(self._satisfied(i, a) for i in self.left_out)], graph)]
         self.residual = [graph.input(f"r{k}", "residual") for k in range(len(rows))]
         self.outputs["step"] = scaled(self.residual)
         early = frontier(graph, self.outputs["step"], lambda node: "residual" not in node.depends)
         self.factors = [s for s in early if not s.node.depends <= {"parameter"}]
         self.outputs["factor"] = [*self.factors, safe]
+
+    def _satisfied(self, i: int, a: list[Scalar]) -> Scalar:
+        """Whether the accelerations satisfy a row that was left out: if they do, they are those of all rows."""
+        zero = self.graph.constant(0.0)
+        terms = [entry * (a[k] - self.equations.free[k]) for k, entry in self.equations.psi_q[i].items()]
+        b = self._b(i)
+        size = sum((absolute(term) for term in terms), absolute(b))
+        return greater(size * CONSISTENT + TINY, absolute(sum(terms, zero) - b))
 
     def program(self, name: str) -> Program:
         if name not in self._programs:

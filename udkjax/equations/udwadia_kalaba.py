@@ -8,6 +8,8 @@ It is written twice. The plain form is the equation as it stands, on arrays, for
 it. The fast form is one straight-line program for elimination, with the plain form's derivatives.
 """
 
+import dataclasses
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -49,10 +51,21 @@ class Equations(eqx.Module):
     constants: list[Array]  # the subexpressions of parameters alone that the programs use, computed once
     method: Pseudoinverse
     code: Code = eqx.field(static=True)
+    branch: bool = eqx.field(static=True, default=True)  # whether `Auto` turns to singular values itself, or says NaN where it should
 
-    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
-        """a = a_F + M^(-1/2) D^+ b."""
-        return _accelerations(self, t, q, v) if self.code.elimination else plain_accelerations(self, t, q, v)
+    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+        """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out, which an integrator does once a step."""
+        if not self.code.elimination:
+            return plain_accelerations(self, t, q, v)
+        return _accelerations("accelerations_watched" if watch and isinstance(self.method, Auto) else "accelerations", self, t, q, v)
+
+    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
+        """lambda = -(D^+)^T D^+ b of all rows."""
+        equations = self.exact() if self.code.elimination else self
+        if not self.code.pattern.shape[0]:
+            return jnp.zeros(0)
+        plus, b, _ = equations.linearized("rows", t, q, v)
+        return -(plus.T @ (plus @ b))
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
@@ -62,13 +75,50 @@ class Equations(eqx.Module):
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""
         return _stack(self.run("psi", t, q, v)), _stack(self.run("psi_dot", t, q, v))
 
+    @property
+    def branches(self) -> bool:
+        """Whether evaluating them takes a branch to singular values."""
+        return self.branch and self.code.elimination == "check"
+
     def run(self, name: str, t: Any, q: Any, v: Any) -> list[Any]:
         """Evaluate one of the programs."""
         return self.code.program(name)([*self.constants, t, *scalars([q, v])])
 
+    def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Plus, Array, Vector]:
+        """D^+ of all rows by a dense method, the right-hand side of the program `name`, and M^(-1/2)."""
+        values, residual, *vectors = _arrays(self, name, t, q, v)
+        return self.method.plus(self.code.pattern.dense(values)), residual, vectors[-1]
+
+    @property
+    def quick(self) -> "Equations":
+        """The same without a branch: what `Auto` cannot solve by elimination is not a number. A loop of it is one small program."""
+        return dataclasses.replace(self, branch=False)
+
     def exact(self) -> "Equations":
         """The same by singular values of all rows: what `Auto` turns to."""
         return eqx.tree_at(lambda e: e.method, self, SVD(self.method.rank_tol, self.method.relative))
+
+
+def accelerations(
+    mechanism: Any,
+    t: ArrayLike,
+    q: Float[ArrayLike, "bodies 3"],
+    v: Float[ArrayLike, "bodies 3"],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
+    multipliers: bool = False,
+) -> Any:
+    """Return a (bodies, 3) at time t (s), coordinates q and velocities v; with `multipliers` also lambda, one a row of Psi.
+
+    a = a_F + M^(-1/2) D^+ b and lambda = -(D^+)^T D^+ b, of minimum norm where constraints are redundant (m/s^2, rad/s^2; N, N m,
+    in the rows' order and with the sign of M a + Psi_q^T lambda = F). The state need not be closed. `Auto` looks at the rows that
+    it leaves out, too: where they are not satisfied they were not redundant after all, and it takes singular values of all rows.
+    `Auto` and `Elimination` take lambda from singular values: a choice of rows has no minimum-norm multipliers.
+    """
+    equations = mechanism if isinstance(mechanism, Equations) else prepare(mechanism, method, stabilization)
+    q, v = jnp.asarray(q, jnp.result_type(float)), jnp.asarray(v, jnp.result_type(float))
+    a = equations.accelerations(t, q.ravel(), v.ravel(), watch=True).reshape(q.shape)
+    return (a, equations.multipliers(t, q.ravel(), v.ravel())) if multipliers else a
 
 
 def prepare(mechanism: Mechanism, method: Pseudoinverse | None = None, baumgarte: Baumgarte | None = None) -> Equations:
@@ -131,7 +181,7 @@ def _by_method(equations: Equations, use: Any, name: str, t: Any, q: Vector, v: 
         return dense(method)
     tol = method.branch_tol**0.5 if isinstance(method, Auto) else method.rank_tol
     plus = SparseElimination(programs.kept_pattern, tol).plus(_arrays(equations, name + "_kept", t, q, v)[0])
-    if isinstance(method, Elimination):
+    if isinstance(method, Elimination) or not equations.branch:
         return use(plus, name + "_kept")
     safe = plus.rank == len(programs.kept)
     return jax.lax.cond(safe, lambda: use(plus, name + "_kept"), lambda: dense(equations.exact().method))
@@ -161,9 +211,9 @@ def _stack(values: list[Any]) -> Array:
 # --- fast
 
 
-@jax.custom_jvp
-def _accelerations(equations: Equations, t: Any, q: Vector, v: Vector) -> Vector:
-    *a, safe = equations.run("accelerations", t, q, v)
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _accelerations(program: str, equations: Equations, t: Any, q: Vector, v: Vector) -> Vector:
+    *a, safe = equations.run(program, t, q, v)
     return _checked(equations, safe, _stack(a), plain_accelerations, t, q, v)
 
 
@@ -184,12 +234,12 @@ def _project(equations: Equations, t: Any, q: Vector, v: Vector) -> tuple[Vector
     return _checked(equations, safe, (q2, v2), plain_project, t, q, v)
 
 
-_accelerations.defjvp(lambda primals, tangents: jax.jvp(plain_accelerations, primals, tangents))
+_accelerations.defjvp(lambda program, primals, tangents: jax.jvp(plain_accelerations, primals, tangents))
 _project.defjvp(lambda primals, tangents: jax.jvp(plain_project, primals, tangents))
 
 
 def _checked(equations: Equations, safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
     """Take what elimination gave where its pivots are safe, or where it drops the others itself; else turn to singular values."""
-    if equations.code.elimination == "drop" or safe is True:
+    if not equations.branches or safe is True:
         return fast
     return jax.lax.cond(safe, lambda: fast, lambda: plain(equations.exact(), *state))

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from udkjax.pinv.rule import beyond, dot
 from udkjax.pinv.triangular import Factors, PivotedQR, Triangular, leading
@@ -12,16 +12,12 @@ from udkjax.pinv.triangular import Factors, PivotedQR, Triangular, leading
 class GramSchmidt(Triangular):
     """D = Q R with column pivoting, then R^T = Z U: D^+ = Z U^(-T) Q^T, both by modified Gram-Schmidt.
 
-    With `twice` each column is made orthogonal to the previous ones a second time when its turn comes: the error then is of the order of
-    eps cond(D), as with Householder. Without it Q is orthogonal to eps cond(D) only, and the error can be of the order of eps cond(D)^2.
-    The threshold is on the diagonal of R, its scale the largest column norm.
+    With `twice` each column is made orthogonal to the previous ones a second time when its turn comes: the error then is of the
+    order of eps cond(D), as with Householder. Without it Q is orthogonal to eps cond(D) only, and the error can be of the order
+    of eps cond(D)^2. The threshold is on the diagonal of R, its scale the largest column norm.
     """
 
-    twice: bool = eqx.field(static=True)
-
-    def __init__(self, rank_tol: ArrayLike | None = None, relative: bool = True, twice: bool = True):
-        super().__init__(rank_tol, relative)
-        self.twice = twice
+    twice: bool = eqx.field(static=True, default=True)
 
     def factor(self, D: Float[Array, "m n"]) -> Factors:
         q, r, _, rank = gram_schmidt(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()), self.twice)

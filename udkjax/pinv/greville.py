@@ -10,6 +10,8 @@ from udkjax.pinv.rule import Dense, beyond, dot
 
 
 class Factors(NamedTuple):
+    """D^+ itself."""
+
     plus: Float[Array, "n m"]
     rank: Int[Array, ""]
 
@@ -22,10 +24,10 @@ class Greville(Dense):
 
     (T. N. E. Greville, SIAM Review 2 (1960) 15, for columns.) The threshold is on |c|, its scale the largest row norm.
 
-    Error of the order of eps cond(D)^2, because P is wrong by eps cond(D) |P|, and that enters c. So the residue of a dependent row
-    is of this order too, while an independent row may be as near as 1/cond(D). Hence the default `rank_tol` is eps^(1/3), where the two
-    meet; beyond cond(D) = eps^(-1/3) no threshold is right. One dependent row that passes for independent makes the result
-    wrong by any factor.
+    Error of the order of eps cond(D)^2, because P is wrong by eps cond(D) |P|, and that enters c. So the residue of a dependent
+    row is of this order too, while an independent row may be as near as 1/cond(D). Hence the default `rank_tol` is eps^(1/3),
+    where the two meet; beyond cond(D) = eps^(-1/3) no threshold is right. One dependent row that passes for independent makes
+    the result wrong by any factor.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> Factors:

@@ -14,9 +14,9 @@ class Householder(Triangular):
 
         D = Q T G,   T = R E (r, r) upper triangular,   G = T^(-1) R, which is [I S] in some order of the columns,
 
-    E T^(-1) Q^T b is one least-squares solution, the columns of I - E G are orthogonal to no row but span the null space
-    of D, and with V an orthonormal basis of them, by QR once more, x = (I - V V^T) E T^(-1) Q^T b is the shortest one
-    (Golub and Van Loan, Matrix Computations, 4th ed., section 5.5.6). The threshold is on the diagonal of T, its scale the largest column norm.
+    E T^(-1) Q^T b is one least-squares solution. The columns of I - E G span the null space of D; with V an orthonormal basis of
+    them, by QR once more, x = (I - V V^T) E T^(-1) Q^T b is the shortest solution (Golub and Van Loan, Matrix Computations,
+    4th ed., section 5.5). The threshold is on the diagonal of T, its scale the largest column norm.
 
     Error of the order of eps cond(D).
     """
@@ -37,7 +37,7 @@ class Householder(Triangular):
 def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
     """Householder's QR; each step takes the column with the largest remaining norm, and stops where it is at most `threshold`.
 
-    Columns stay in their place, only their order is noted. (Of what jax offers, jax.scipy's pivoted QR does not run on every accelerator.)
+    Columns stay in their place, only their order is noted. (The pivoted QR of jax.scipy needs MAGMA on a GPU.)
     """
     rows, columns = D.shape
     steps = min(rows, columns)

@@ -27,26 +27,29 @@ class LeastSquares(NamedTuple):
     rank: Int[Array, ""]
 
 
+def number(value: ArrayLike | None) -> Float[Array, ""] | None:
+    """Make an array leaf of a number: a Python float as a field would be static, and each new value would compile anew."""
+    return None if value is None else jnp.asarray(value, dtype=jnp.result_type(float))
+
+
 class Pseudoinverse(eqx.Module):
     """A way to apply the Moore-Penrose pseudoinverse D^+ of an (m, n) operator D, truncated at a numerical rank.
 
     What counts as zero: with `relative=True` whatever is at most `rank_tol` times the method's scale of D (the largest singular
-    value, or its stand-in: a largest column or row norm); with `relative=False` whatever is at most `rank_tol`, in the units of D.
-    `rank_tol=None` stands for max(m, n) eps, eps the rounding unit of D: right for data that is exact up to rounding. (Greville: eps^(1/3).)
-    `rank_tol` is an array leaf: it may be traced and batched; its derivative is zero.
+    value, or its stand-in: the largest norm of a column or row); with `relative=False` whatever is at most `rank_tol`, in the
+    units of D. `rank_tol=None` stands for max(m, n) eps, eps the rounding unit of D: right for data that is exact up to rounding.
+    (For Greville it is eps^(1/3).) `rank_tol` is an array leaf: it may be traced and batched; its derivative is zero.
 
     Methods for any operator: the matrix as a pytree, everything else as the six functions below. Derivatives assume that the
     rank stays constant nearby; where it jumps no derivative exists.
     """
 
-    rank_tol: Float[Array, ""] | None
-    relative: bool = eqx.field(static=True)
+    rank_tol: Float[Array, ""] | None = eqx.field(converter=number, default=None)
+    relative: bool = eqx.field(static=True, default=True)
 
-    def __init__(self, rank_tol: ArrayLike | None = None, relative: bool = True):
-        if rank_tol is None and not relative:
+    def __check_init__(self):
+        if self.rank_tol is None and not self.relative:
             raise ValueError("an absolute rank threshold has no default: give rank_tol, in the units of the matrix")
-        self.rank_tol = None if rank_tol is None else jnp.asarray(rank_tol, dtype=jnp.result_type(float))
-        self.relative = relative
 
     @classmethod
     def absolute(cls, rank_tol: ArrayLike, **choices: Any) -> Self:
@@ -114,7 +117,8 @@ class Dense(Pseudoinverse):
     def admit(self, D: ArrayLike) -> Float[Array, "m n"]:
         D = jnp.asarray(D)
         if D.ndim != 2 or 0 in D.shape:
-            raise ValueError(f"{type(self).__name__} takes one matrix (m, n) with m, n > 0, not shape {D.shape}; batch it by jax.vmap")
+            name = type(self).__name__
+            raise ValueError(f"{name} takes one matrix (m, n) with m, n > 0, not shape {D.shape}; batch it by jax.vmap")
         if jnp.iscomplexobj(D):
             raise TypeError(f"{type(self).__name__} takes a real matrix, not {D.dtype}")
         return D.astype(jnp.result_type(D, jnp.float32) if jnp.issubdtype(D.dtype, jnp.floating) else jnp.result_type(float))
@@ -129,12 +133,10 @@ class Dense(Pseudoinverse):
     def rmatvec(self, D: Float[Array, "m n"], y: Float[Array, "m"]) -> Float[Array, "n"]:
         return dot(D.T, y)
 
-    def threshold(
-        self, D: Float[Array, "m n"], scale: Float[Array, ""], default: float | None = None
-    ) -> Float[Array, ""]:
+    def threshold(self, D: Float[Array, "m n"], scale: Float[Array, ""], default: float | None = None) -> Float[Array, ""]:
         """At or below it a singular value, or what stands for one in this method, counts as zero.
 
-        Where no `rank_tol` is given: `default`, else max(m, n) eps, the rounding errors of a factorization relative to its matrix.
+        Where no `rank_tol` is given: `default`, else max(m, n) eps: rounding errors of a factorization relative to its matrix.
         """
         if self.rank_tol is None:
             return scale * (max(D.shape) * float(jnp.finfo(D.dtype).eps) if default is None else default)
@@ -207,9 +209,9 @@ def _shape_of_apply(plus, b):
 def _derivative(primals, tangents):
     plus, b = primals
     d_plus, db = tangents
-    dD = d_plus.matrix  # the factors and the method carry no tangent of their own: they are functions of D, and its tangent says all
+    dD = d_plus.matrix  # factors and method carry no tangent: they are functions of D, and its tangent says all
     x = _bind(plus, b)
-    s = eqxi.materialise_zeros(b, db)
+    s = jnp.zeros_like(b) if db is None else db
     if not jtu.tree_leaves(dD):
         return x, _bind(plus, s)
 

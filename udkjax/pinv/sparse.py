@@ -101,10 +101,10 @@ class Factors(NamedTuple):
     kept: list[Scalar]  # booleans, in the order of elimination
 
 
-def factorize(rows: Sequence[Row], drop: Scalar, replace: bool = True) -> Factors:
+def factorize(rows: Sequence[Row], drop: Scalar, dropped: float = 0.0) -> Factors:
     """D D^T = L diag(p) L^T. A pivot is kept if it exceeds `drop` times its row's diagonal entry.
 
-    With `replace` the others count as infinite, so that their rows drop out; without, the result is of use only if all are kept.
+    `dropped` stands for the reciprocal of the others: zero takes their rows out, NaN marks whatever depends on them.
     """
     graph = drop.graph
     order = minimum_degree([set(row) for row in rows])
@@ -126,7 +126,7 @@ def factorize(rows: Sequence[Row], drop: Scalar, replace: bool = True) -> Factor
     for j in range(len(rows)):
         d = column[j].get(j, zero)
         keep = greater(d, drop * diagonal[j])
-        inverse.append(where(keep, one / d, zero) if replace else one / d)
+        inverse.append(where(keep, one / d, graph.constant(dropped)))
         kept.append(keep)
         below = sorted(i for i in column[j] if i > j)
         lower = {i: column[j][i] * inverse[j] for i in below}
@@ -162,6 +162,10 @@ def transpose_times(rows: Sequence[Row], y: Sequence[Scalar], columns: int, zero
         for k, entry in row.items():
             x[k] = x[k] + entry * multiplier
     return x
+
+
+def absolute(a: Scalar) -> Scalar:
+    return a.graph.apply(lax.abs_p, {}, (a,), a.node.dtype, np.abs)
 
 
 def greater(a: Scalar, b: Scalar) -> Scalar:

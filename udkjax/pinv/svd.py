@@ -9,6 +9,8 @@ from udkjax.pinv.rule import Dense, beyond, dot
 
 
 class Factors(NamedTuple):
+    """D^+ = V S^+ U^T."""
+
     u: Float[Array, "m k"]
     inverse: Float[Array, "k"]  # 1/sigma, zero for what is truncated
     v: Float[Array, "n k"]

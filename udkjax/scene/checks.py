@@ -18,10 +18,13 @@ class SceneError(ValueError):
     """A scene cannot be what it says. `problems` lists every mistake, each with the path of the offending entry."""
 
     def __init__(self, problems: Sequence[str], source: str = ""):
-        self.problems = list(problems)
+        self.problems, self.source = list(problems), source
         head = f"{source}: " if source else ""
         count = f"{len(self.problems)} mistakes in the scene:\n  "
         super().__init__(head + (self.problems[0] if len(self.problems) == 1 else count + "\n  ".join(self.problems)))
+
+    def __reduce__(self):
+        return type(self), (self.problems, self.source)
 
 
 class Entry(NamedTuple):
@@ -32,6 +35,7 @@ class Entry(NamedTuple):
     name: Any
     cls: type | None
     table: Mapping[str, Any]
+    problem: str = ""  # why the class is not known
 
     @property
     def where(self) -> str:
@@ -60,7 +64,10 @@ def problems_of(entries: Sequence[Entry], gravity: Any) -> list[str]:
             found.append(f'{entry.where}.name: "{GROUND}" is the fixed frame; choose another name')
         elif (first := owner.setdefault((space, entry.name), entry)) is not entry:
             found.append(f"{entry.where}.name: taken by {first.section}[{first.index}]; names must be unique")
-        if entry.cls is not None:
+        if entry.cls is None:
+            found.append(entry.problem)
+            found.extend(_references(f"{entry.where}.bodies", "body", entry.table.get("bodies"), known))
+        else:
             found.extend(check_table(entry.where, entry.cls, entry.table, known))
     return found
 
@@ -163,7 +170,7 @@ def _array(value: Any) -> np.ndarray | None:
         ragged = any(item is None for item in items) or len({item.shape for item in items if item is not None}) > 1
         return None if ragged else np.array(items, dtype=float)
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return np.array(float(value) if abs(value) < 2**1024 else np.inf)
+        return np.array(float(value) if isinstance(value, float) or abs(value) < 2**1023 else np.inf)
     return None
 
 
@@ -201,8 +208,11 @@ def _bodies_differ(where: str, cls: type, table: Mapping[str, Any]) -> Iterator[
 
 def suggestion(name: Any, choices: Iterable[str]) -> str:
     """Return '; did you mean "..."?' where one of the choices is close, else nothing."""
-    close = difflib.get_close_matches(name, list(choices), n=1, cutoff=0.6) if isinstance(name, str) else []
-    return f"; did you mean {quoted(close[0])}?" if close else ""
+    if not isinstance(name, str):
+        return ""
+    lowered = {choice.lower(): choice for choice in choices}
+    close = difflib.get_close_matches(name.lower(), lowered, n=1)
+    return f"; did you mean {quoted(lowered[close[0]])}?" if close else ""
 
 
 def quoted(name: str) -> str:
@@ -232,5 +242,3 @@ def not_numbers(element: eqx.Module) -> Iterator[str]:
         hash(jax.tree.structure(element))
     except TypeError as error:
         yield f": static fields must be hashable ({error}): write a tuple in place of a list"
-
-

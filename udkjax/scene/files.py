@@ -99,7 +99,7 @@ def _head(scene: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _section(section: str, tables: Any, problems: list[str]) -> Iterator[Entry]:
-    """Iterate over the entries of one section, their types and names read; adds what is wrong with these to `problems`."""
+    """Iterate over the entries of one section, their names and types read; adds to `problems` if it is not a section at all."""
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         problems.append(f"{section}: must be a list of tables; write [[{section}]] above each")
         return
@@ -110,8 +110,8 @@ def _section(section: str, tables: Any, problems: list[str]) -> Iterator[Entry]:
         entry = Entry(section, index, name, PLAIN.get(section), {key: value for key, value in table.items() if key != "name"})
         if section in TYPES:
             cls, problem = typed(entry.where, TYPES[section], table)
-            problems.extend([problem] if problem else [])
-            entry = entry._replace(cls=cls, table={key: value for key, value in entry.table.items() if key != "type"})
+            table = {key: value for key, value in entry.table.items() if key != "type"}
+            entry = entry._replace(cls=cls, problem=problem, table=table)
         yield entry
 
 

@@ -1,9 +1,8 @@
 """A mechanism: the pytree of everything that exists in a scene, checked, with named access to every number."""
 
-import re
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,12 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND, Body, Frame
-from udkjax.scene.checks import Entry, SceneError, not_numbers, problems_of, quoted, shown, suggestion
+from udkjax.scene.checks import Entry, SceneError, not_numbers, problems_of
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.joints import Constraint, Joint
-from udkjax.scene.schema import numbers_in, table_of, type_name
+from udkjax.scene.parameters import parameters_of, replaced
+from udkjax.scene.schema import table_of, type_name
 
 Element = TypeVar("Element", bound=eqx.Module)
 _FIXED = Frame(0.0, 0.0, 0.0, 1.0, 0.0)
@@ -63,24 +63,7 @@ class Mechanism(eqx.Module):
             "driver": list((drivers or {}).items()),
             "force": list(forces.items() if isinstance(forces, Mapping) else zip(numbered(forces), forces, strict=True)),
         }
-        kinds = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}
-        problems, entries, found = [], [], {}
-        for section, items in given.items():
-            found[section] = []
-            for index, (key, element) in enumerate(items):
-                if not isinstance(element, kinds[section]):
-                    entries.append(entry := Entry(section, index, key, None, {}))
-                    problems.append(f"{entry.where}: must be of class {kinds[section].__name__}, is a {type(element).__name__}")
-                    continue
-                element = jax.tree.map(_as_number, element)
-                entries.append(entry := Entry(section, index, key, type(element), table_of(element)))
-                problems.extend(f"{entry.where}{problem}" for problem in not_numbers(element))
-                if section == "force" and not _acts(type(element)):
-                    problems.append(f"{entry.where}: {type(element).__name__} must have a method `potential` or `loads`")
-                found[section].append((key, element))
-        problems.extend(problems_of(entries, gravity))
-        if problems:
-            raise SceneError(problems, name)
+        found = _checked(given, gravity, name)
         self.name, self.gravity, self.left_out = name, number(gravity), left_out
         self.body_names, self._bodies = _columns(found["body"])
         self.joint_names, self._joints = _columns([(key, self._resolved(c)) for key, c in found["joint"]])
@@ -93,8 +76,8 @@ class Mechanism(eqx.Module):
         return _named(self.body_names, self._bodies)
 
     @property
-    def joints(self) -> Mapping[str, Joint]:
-        """The joints by name."""
+    def joints(self) -> Mapping[str, Any]:
+        """The joints by name, each with the attributes of its own class."""
         return _named(self.joint_names, self._joints)
 
     @property
@@ -103,8 +86,8 @@ class Mechanism(eqx.Module):
         return _named(self.driver_names, self._drivers)
 
     @property
-    def forces(self) -> Mapping[str, ForceElement]:
-        """The force elements by name."""
+    def forces(self) -> Mapping[str, Any]:
+        """The force elements by name, each with the attributes of its own class."""
         return _named(self.force_names, self._forces)
 
     @property
@@ -128,53 +111,27 @@ class Mechanism(eqx.Module):
         """The initial guess of the velocities (m/s, rad/s)."""
         return jnp.stack([jnp.append(body.velocity, body.angular_velocity) for body in self._bodies])
 
+    def with_left_out(self, rows: tuple[int, ...] | None) -> "Mechanism":
+        """Return the mechanism with another choice of rows of Psi to leave out as redundant."""
+        copy = object.__new__(type(self))
+        for field, value in vars(self).items():
+            object.__setattr__(copy, field, value)
+        object.__setattr__(copy, "left_out", rows)
+        return copy
+
     def parameters(self) -> dict[str, Array]:
         """Return every number of the scene under its name, such as `body.link1.mass`; absent ones (a damping) are left out."""
-        return {name: known.value for name, known in self._parameters().items() if known.value is not None}
+        return {name: p.value for name, p in parameters_of(self).items() if p.value is not None}
 
     def with_parameters(self, values: Mapping[str, Numbers]) -> "Mechanism":
         """Return the mechanism with some of its numbers replaced; pure, and values may be traced.
 
         `values` maps names as in `parameters`, or those of one entry (`joint.A.points[1][0]`), to values of exactly the same
-        shape. A number that was absent is then there. Numbers that a joint once took from the initial guess stay as they are,
-        but the constants of gears and racks follow the initial guess. Raises `SceneError`.
+        shape: a batch of values belongs inside `vmap`. A number that was absent is then there. Numbers that a joint once took
+        from the initial guess stay as they are; the constants of gears and racks follow the guess. Raises `SceneError`.
         """
-        known, problems = self._parameters(), []
-        groups = {section: dict(getattr(self, plural)) for section, plural in _SECTIONS.items()}
-        gravity = self.gravity
-        # Whole arrays before their entries, whatever the order of the keys: jit sorts them.
-        for given in sorted(values, key=lambda name: name.count("[") if name not in known else 0):
-            name, index = _split(given, known)
-            if name not in known:
-                problems.append(f"no parameter {quoted(given)}{suggestion(name, known)}")
-                continue
-            section, owner, path, _, shape = known[name]
-            old, new = (_at(groups[section][owner], path) if path else gravity), _number(values[given])
-            if new is None:
-                problems.append(f"{given}: must be a number or an array, is {shown(values[given])}")
-            elif index and old is None:
-                problems.append(f"{given}: {name} is absent; set it as a whole")
-            elif shape is not None and (len(index) > len(shape) or any(i >= n for i, n in zip(index, shape, strict=False))):
-                problems.append(f"{given}: {name} has the shape {shape}")
-            elif shape is not None and new.shape != shape[len(index) :]:
-                problems.append(f"{given}: must have the shape {shape[len(index) :]}, has {new.shape}")
-            else:
-                new = old.at[index].set(new) if index else new
-                if path:
-                    groups[section][owner] = _set(groups[section][owner], path, new)
-                else:
-                    gravity = new
-        if problems:
-            raise SceneError(problems, self.name)
-        return Mechanism(groups["body"], groups["joint"], groups["driver"], groups["force"], gravity, self.name, self.left_out)
-
-    def _parameters(self) -> dict[str, "_Parameter"]:
-        found = {"gravity": _Parameter("", "", (), self.gravity, self.gravity.shape)}
-        for section, plural in _SECTIONS.items():
-            for owner, element in getattr(self, plural).items():
-                for path, value, shape in numbers_in(element):
-                    found[".".join((section, owner, *path))] = _Parameter(section, owner, path, value, shape)
-        return found
+        new, gravity = replaced(self, values)
+        return Mechanism(new["body"], new["joint"], new["driver"], new["force"], gravity, self.name, self.left_out)
 
     def _resolved(self, constraint):
         if type(constraint).resolved is Constraint.resolved:  # most joints: spares the sines and cosines of every body
@@ -183,15 +140,27 @@ class Mechanism(eqx.Module):
         return constraint.resolved(*(_FIXED if name == GROUND else bodies[name].frame() for name in constraint.attached))
 
 
-class _Parameter(NamedTuple):
-    section: str
-    owner: str
-    path: tuple[str, ...]  # of fields; none: gravity
-    value: Array | None  # None: absent
-    shape: tuple[int, ...] | None  # None: absent, any shape
-
-
-_SECTIONS = {"body": "bodies", "joint": "joints", "driver": "drivers", "force": "forces"}
+def _checked(given: Mapping[str, list], gravity: Any, name: str) -> dict[str, list[tuple[str, Any]]]:
+    """Return all elements with plain numbers made arrays; raise `SceneError` where anything is wrong with any of them."""
+    kinds = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}
+    problems, entries, found = [], [], {section: [] for section in given}
+    for section, items in given.items():
+        for index, (key, element) in enumerate(items):
+            if not isinstance(element, kinds[section]):
+                entry = Entry(section, index, key, None, {})
+                problem = f"{entry.where}: must be of class {kinds[section].__name__}, is a {type(element).__name__}"
+                entries.append(entry._replace(problem=problem))
+                continue
+            element = jax.tree.map(_as_number, element)
+            entries.append(entry := Entry(section, index, key, type(element), table_of(element)))
+            problems.extend(f"{entry.where}{problem}" for problem in not_numbers(element))
+            if section == "force" and not _acts(type(element)):
+                problems.append(f"{entry.where}: {type(element).__name__} must have a method `potential` or `loads`")
+            found[section].append((key, element))
+    problems.extend(problems_of(entries, gravity))
+    if problems:
+        raise SceneError(problems, name)
+    return found
 
 
 def numbered(elements: Sequence[Any], names: Sequence[str | None] = ()) -> list[str]:
@@ -213,32 +182,9 @@ def _as_number(leaf):
     return number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
 
 
-def _number(value: Any) -> Array | None:
-    try:
-        return None if isinstance(value, bool) else number(value)
-    except (TypeError, ValueError):
-        return None
-
-
 def _columns(items: Sequence[tuple[str, Element]]) -> tuple[tuple[str, ...], tuple[Element, ...]]:
     return tuple(key for key, _ in items), tuple(element for _, element in items)
 
 
 def _named(names: tuple[str, ...], elements: tuple[Element, ...]) -> Mapping[str, Element]:
     return MappingProxyType(dict(zip(names, elements, strict=True)))
-
-
-def _split(given: str, known: Mapping[str, Any]) -> tuple[str, tuple[int, ...]]:
-    """Split `joint.A.points[1][0]` into the parameter and the index of one of its entries."""
-    match = None if given in known else re.fullmatch(r"(.*?)((?:\[\d+\])+)", given)
-    return (given, ()) if match is None else (match[1], tuple(int(i) for i in re.findall(r"\d+", match[2])))
-
-
-def _at(element: Any, path: Sequence[str]) -> Any:
-    for name in path:
-        element = getattr(element, name)
-    return element
-
-
-def _set(element: Element, path: Sequence[str], value: Array) -> Element:
-    return eqx.tree_at(lambda e: _at(e, path), element, value, is_leaf=lambda leaf: leaf is None)

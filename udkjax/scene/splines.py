@@ -43,7 +43,7 @@ def periodic(x: Any, knots: Float[Array, " n"], values: Float[Array, " n"], peri
 
 def _cubic(x, knots, values, curvatures):
     """Return the spline's value and slope at x within the knots."""
-    i = jnp.clip(jnp.searchsorted(knots, x, side="right") - 1, 0, knots.size - 2)
+    i = jnp.sum(x >= knots[1:-1])  # the interval
     h, y0, y1, m0, m1 = knots[i + 1] - knots[i], values[i], values[i + 1], curvatures[i], curvatures[i + 1]
     a, b = (knots[i + 1] - x) / h, (x - knots[i]) / h
     value = a * y0 + b * y1 + ((a**3 - a) * m0 + (b**3 - b) * m1) * h**2 / 6

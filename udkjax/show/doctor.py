@@ -3,34 +3,22 @@
 import os
 import platform
 import sys
-from importlib.metadata import PackageNotFoundError, version
 
 import jax
 import jax.numpy as jnp
 
-PACKAGES = ("udkjax", "jax", "jaxlib", "equinox", "diffrax", "lineax", "optimistix", "numpy", "scipy", "xarray", "h5netcdf")
+from udkjax.integrate.solution import versions
+
 FLAGS = ("JAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 FAST_PYTHON = (3, 12)
-
-
-def versions(packages=PACKAGES) -> dict[str, str]:
-    """Return the installed version of each package."""
-    found = {}
-    for package in packages:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
 
 
 def doctor() -> str:
     """Describe versions, devices, precision and cores, and what could be better."""
     lines = {
-        "python": f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}",
+        **versions(),
         "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
         "cores": f"{_cores()} of {os.cpu_count()}",
-        **versions(),
         "devices": ", ".join(f"{device} ({device.device_kind})" for device in jax.devices()),
         "precision": f"{jnp.result_type(float)}",
         "environment": ", ".join(f"{key}={value}" for key, value in sorted(os.environ.items()) if key.startswith(FLAGS)) or "-",
@@ -43,8 +31,8 @@ def doctor() -> str:
 def _advice():
     if sys.version_info < FAST_PYTHON:
         yield (
-            f"Python {sys.version_info[0]}.{sys.version_info[1]} cannot have jax 0.12, on which single trajectories run several times "
-            "faster: install Python 3.12 or newer, remove .venv and run install.sh again"
+            f"Python {platform.python_version()} cannot have jax 0.12, on which single trajectories run several times faster: "
+            "install Python 3.12 or newer, remove .venv and run install.sh again"
         )
     elif jax.__version_info__ < (0, 12):
         yield f"jax {jax.__version__} runs single trajectories several times slower than jax 0.12: pip install --upgrade jax"

@@ -13,51 +13,67 @@ from udkjax.scene import GROUND, Mechanism
 
 # Okabe and Ito's colours, told apart by everyone; the yellow is left out, since thin lines of it vanish on white.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+WIDE = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
+ROUNDING = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
 SAME_ANGLE = 1e-6  # rad: curves closer than the width of a line share it
 
 
 def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
-    """Draw one simulation: the mechanism at its start and as `ghosts` later instants, and its angles, constraints and energy.
+    """Draw one simulation: the mechanism at its start and in `ghosts` later poses, and its angles, constraints and energy.
 
     Links are drawn through the points at which joints hold them; the fine lines are the paths of the centres of mass.
     """
-    figure = Figure(figsize=(10, 5.6), layout="constrained")
-    panels = figure.subplot_mosaic([["scene", "angles"], ["scene", "constraints"], ["scene", "energy"]], width_ratios=(1.15, 1))
-    ts = np.asarray(sol.ts)
-    alive = np.isfinite(np.asarray(sol.q)).all((1, 2))  # a run that failed has no values after its end
-    draw_motion(panels["scene"], mech, np.asarray(sol.q)[alive], ghosts)
-    draw_angles(panels["angles"], mech, ts, np.asarray(sol.q))
+    ts, q = np.asarray(sol.ts), np.asarray(sol.q)
+    alive = q[np.isfinite(q).all((1, 2))]  # a run that failed has no values after its end
+    if np.ptp(alive[..., 0]) > WIDE * np.ptp(alive[..., 1]):
+        figure = Figure(figsize=(10, 6.2), layout="constrained")
+        panels = figure.subplot_mosaic([["scene"] * 3, ["angles", "constraints", "energy"]], height_ratios=(1.5, 1))
+        lowest = ("angles", "constraints", "energy")
+    else:
+        figure = Figure(figsize=(10, 5.6), layout="constrained")
+        panels = figure.subplot_mosaic([["scene", "angles"], ["scene", "constraints"], ["scene", "energy"]])
+        lowest = ("energy",)
+    draw_motion(panels["scene"], mech, alive, ghosts)
+    draw_angles(panels["angles"], mech, ts, q)
     draw_violation(panels["constraints"], ts, violation(mech, sol))
     draw_energy(panels["energy"], ts, energy(mech, sol))
-    for name in ("angles", "constraints"):
-        panels[name].sharex(panels["energy"])
-        panels[name].tick_params(labelbottom=False)
-    panels["energy"].set_xlabel("time (s)")
-    figure.suptitle(mech.name or None)
+    for name in ("angles", "constraints", "energy"):
+        panels[name].set_xlim(ts[0], ts[-1])
+        panels[name].tick_params(labelbottom=name in lowest)
+        panels[name].set_xlabel("time (s)" if name in lowest else "")
+    figure.suptitle(mech.name)
     return figure
 
 
 def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"], ghosts: int) -> None:
-    """Draw the mechanism at the first of the configurations `q`, fainter at `ghosts` later ones, and the paths of its bodies."""
-    shapes = {body: outline(points) for body, points in attachments(mech).items()}
-    for place, body in enumerate(mech.bodies):
+    """Draw the mechanism in the first of the configurations `q`, fainter in `ghosts` others, and the paths of its bodies."""
+    held = attachments(mech)
+    for place in range(len(mech.bodies)):
         axes.plot(*q[:, place, :2].T, color=COLOURS[place % len(COLOURS)], lw=0.6, alpha=0.6, zorder=1)
-    for instant in np.linspace(0, len(q) - 1, ghosts + 1).astype(int)[::-1]:
+    for instant in reversed(apart(q, ghosts + 1)):
         strength = 1.0 if instant == 0 else 0.22
         for place, body in enumerate(mech.bodies):
             colour = COLOURS[place % len(COLOURS)]
-            x, y = placed(shapes[body], q[instant, place]).T
-            axes.fill(x, y, facecolor=colour, edgecolor=colour, alpha=0.25 * strength, lw=0, zorder=2)
+            x, y = placed(outline(held[body]), q[instant, place]).T
+            axes.fill(x, y, facecolor=colour, alpha=0.25 * strength, lw=0, zorder=2)
             axes.plot(x, y, color=colour, alpha=strength, lw=2.6, solid_capstyle="round", solid_joinstyle="round", zorder=3)
             if instant == 0:
-                axes.plot(x, y, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
-                axes.plot(*q[instant, place, :2], "o", ms=3, color=colour, zorder=4)
-    for point in attachments(mech)[GROUND]:
-        axes.plot(*point, "^", ms=9, color="0.45", zorder=1.5)
+                axes.plot(*placed(held[body], q[0, place]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
+                axes.plot(*q[0, place, :2], "o", ms=3, color=colour, zorder=4)
+    axes.plot(*held[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axes.set_adjustable("datalim")
     axes.grid(color="0.92", lw=0.6)
     axes.set_axisbelow(True)
+
+
+def apart(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[int]:
+    """Return up to `count` instants, from the first on, whose poses differ most: each is the farthest from those before it."""
+    poses = np.concatenate([q[..., :2], np.cos(q[..., 2:]), np.sin(q[..., 2:])], axis=-1).reshape(len(q), -1)
+    chosen, distance = [0], np.linalg.norm(poses - poses[0], axis=1)
+    while len(chosen) < count and distance.max() > 0:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(poses - poses[chosen[-1]], axis=1))
+    return chosen
 
 
 def draw_angles(axes: Axes, mech: Mechanism, ts, q: Float[np.ndarray, "T bodies 3"]) -> None:
@@ -75,12 +91,14 @@ def draw_angles(axes: Axes, mech: Mechanism, ts, q: Float[np.ndarray, "T bodies 
         axes.plot(ts, angle, color=colour, lw=1.2, label=", ".join(names) if len(names) < 5 else f"{names[0]} ... {names[-1]}")
     axes.set_ylabel("angle (rad)")
     if len(groups) <= len(COLOURS):
-        axes.legend(loc="upper right", fontsize="x-small", framealpha=0.85)
+        legend(axes)
 
 
 def draw_violation(axes: Axes, ts, violated) -> None:
     """Draw the largest violation of any constraint over time, in metres or radians."""
-    axes.semilogy(ts, np.maximum(largest(violated), np.finfo(float).tiny), color=COLOURS[1], lw=1)
+    size = largest(violated)
+    axes.semilogy(ts, np.maximum(size, ROUNDING), color=COLOURS[1], lw=1)
+    axes.set_ylim(ROUNDING, 1e3 * np.nanmax(size, initial=ROUNDING))
     axes.set_ylabel("violation (m, rad)")
 
 
@@ -91,7 +109,14 @@ def draw_energy(axes: Axes, ts, parts) -> None:
     axes.plot(ts, np.asarray(parts.potential) - start, color=COLOURS[2], lw=1, label="potential")
     axes.plot(ts, np.asarray(parts.total) - start, color="black", lw=1.4, label="total")
     axes.set_ylabel("energy (J)")
-    axes.legend(loc="upper right", fontsize="x-small", framealpha=0.85, ncols=3)
+    legend(axes)
+
+
+def legend(axes: Axes) -> None:
+    """Name the curves above their axes, where they cover nothing."""
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2, ncols=4, fontsize="small", frameon=False, handlelength=1.2
+    )
 
 
 def largest(violated) -> Float[np.ndarray, " T"]:
@@ -111,7 +136,7 @@ def attachments(mech: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:
 
 
 def outline(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
-    """Return a closed line through the points that hold a body, in turn around their middle; a single one is joined to its centre."""
+    """Return a line through the points that hold a body, closed where they span an area; a single one is joined to its centre."""
     if len(points) < 2:
         points = np.concatenate([points, np.zeros((1, 2))])
     spread = points - points.mean(axis=0)

@@ -28,14 +28,24 @@ def check_summary(mech: Mechanism, check) -> str:
 
 def run_summary(mech: Mechanism, sol: Solution, seconds: float, compiling: float) -> str:
     """Describe how a run ended, what it took and how far it can be trusted."""
-    stats = {name: int(value) for name, value in sol.stats.items()}
     lines = {
-        "result": result_name(sol),
-        "statistics": ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in stats.items()),
+        "result": sol.cause if sol.result else sol.result.name,
+        "work": work(sol),
         **accuracy(mech, sol),
         "time": f"{seconds:.2f} s, {compiling:.2f} s of it to compile",
     }
     return table(f"{mech.name or 'mechanism'}, {float(sol.ts[0]):g} to {float(sol.ts[-1]):g} s, {len(sol.ts)} instants", lines)
+
+
+def work(sol: Solution) -> str:
+    """Describe what a run took; a count of -1 is not known."""
+    named = {
+        "steps": "steps",
+        "rejected": "rejected",
+        "right_hand_sides": "right-hand sides",
+        "projections": "projections",
+    }
+    return ", ".join(f"{int(sol.stats[key])} {name}" for key, name in named.items() if int(sol.stats.get(key, -1)) >= 0)
 
 
 def accuracy(mech: Mechanism, sol: Solution) -> dict[str, str]:
@@ -50,11 +60,6 @@ def accuracy(mech: Mechanism, sol: Solution) -> dict[str, str]:
         error = np.nanmax(np.abs(np.asarray(sol.q) - exact))
         lines["exact solution"] = f"missed by {error:.2e} m or rad at most"
     return lines
-
-
-def result_name(sol: Solution) -> str:
-    """Return how a run ended, in words."""
-    return str(sol.result)
 
 
 def row_name(mech: Mechanism, constraint: str, row: int) -> str:

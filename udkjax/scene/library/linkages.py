@@ -48,7 +48,9 @@ def parallelogram(
     )
 
 
-def n_four_bar(n: int = 2, angle: ArrayLike = np.pi / 2, angular_velocity: ArrayLike = -1.0, gravity: ArrayLike = 9.81) -> Mechanism:
+def n_four_bar(
+    n: int = 2, angle: ArrayLike = np.pi / 2, angular_velocity: ArrayLike = -1.0, gravity: ArrayLike = 9.81
+) -> Mechanism:
     """Return the IFToMM benchmark A02: n square four-bars in a row, which pass through singular configurations twice a turn.
 
     n + 1 links link0, ... on pivots (i, 0) at a common `angle`, n couplers coupler0, ...: uniform rods of 1 m and 1 kg. Rows:

@@ -127,7 +127,10 @@ def planetary_gear(
         centres = [(reach * jnp.stack([jnp.cos(turned + spot), jnp.sin(turned + spot)]), spin) for spot in spots]
         return [(number([0.0, 0.0]), s), *centres, (number([0.0, 0.0]), turned)]
 
-    joints: dict[str, Joint] = {"sun axle": Revolute((GROUND, "sun"), ORIGINS), "carrier axle": Revolute((GROUND, "carrier"), ORIGINS)}
+    joints: dict[str, Joint] = {
+        "sun axle": Revolute((GROUND, "sun"), ORIGINS),
+        "carrier axle": Revolute((GROUND, "carrier"), ORIGINS),
+    }
     for i, spot in enumerate(spots):
         name = f"planet{i + 1}"
         joints[f"axle{i + 1}"] = Revolute(("carrier", name), [(reach * np.cos(spot), reach * np.sin(spot)), (0.0, 0.0)])

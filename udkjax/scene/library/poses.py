@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.scene.bodies import Body
-from udkjax.scene.fields import number
+from udkjax.scene.fields import Numbers, number
 
 ORIGINS = ((0.0, 0.0), (0.0, 0.0))
 
 
-def moving(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: ArrayLike, rate: ArrayLike) -> dict[str, Body]:
+def moving(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: Numbers, rate: Numbers) -> dict[str, Body]:
     """Make the bodies of the (mass, inertia)s, at the [(position, angle), ...] of pose(s), moving as s does at its rate."""
     places, rates = jax.jvp(pose, (number(s),), (number(rate),))
     motion = zip(names, physics, places, rates, strict=True)

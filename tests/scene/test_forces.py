@@ -1,0 +1,78 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax.scene as udk
+
+V = jnp.array([[0.3, -0.2, 1.1], [0.5, 0.4, -0.7], [0.0, 0.1, 0.2]])
+
+
+def total_loads(mechanism, name, at, q, v):
+    """The load on each attached body: what the element states, and -dV/dq of its potential."""
+    element = mechanism.forces[name]
+    attached = mechanism.frames_of(element)
+
+    def call(method, q):
+        return method(0.0, *(at(mechanism, q, v)[n] for n in attached))
+
+    stated = call(element.loads, q)
+    loads = dict.fromkeys(attached, jnp.zeros(3))
+    if stated is not None:
+        loads = {n: jnp.stack([jnp.asarray(x) for x in load]) for n, load in zip(attached, stated, strict=True)}
+    if call(element.potential, q) is not None:
+        slope = jax.grad(lambda q: call(element.potential, q))(q)
+        loads = {n: loads[n] - (slope[mechanism.body_names.index(n)] if n != "ground" else 0.0) for n in attached}
+    return loads
+
+
+@pytest.mark.parametrize("name", ["damped", "torsion", "torque"])
+def test_action_is_reaction(everything, at, name):
+    q = everything.q0
+    loads = total_loads(everything, name, at, q, V)
+    place = {n: q[everything.body_names.index(n)] for n in loads}
+    assert_allclose(sum(load[:2] for load in loads.values()), 0.0, atol=1e-14)
+    moment = sum(place[n][0] * load[1] - place[n][1] * load[0] + load[2] for n, load in loads.items())
+    assert_allclose(moment, 0.0, atol=1e-14)
+
+
+def test_a_damper_takes_power(everything, at):
+    damped, q = everything.forces["damped"], everything.q0
+
+    def stretch(q):
+        a, b = (at(everything, q)[n] for n in ("a", "b"))
+        return udk.between(damped.points, a, b).norm()
+
+    rate = jnp.sum(jax.grad(stretch)(q) * V)
+    loads = damped.loads(0.0, *(at(everything, q, V)[n] for n in ("a", "b")))
+    power = sum(jnp.dot(jnp.stack(load), V[everything.body_names.index(n)]) for n, load in zip("ab", loads, strict=True))
+    assert_allclose(power, -0.3 * rate**2, rtol=1e-13)
+
+
+def test_spring_pulls_with_stiffness_times_stretch():
+    spring = udk.Spring(["ground", "a"], [[0.0, 0.0], [0.0, 0.0]], stiffness=10.0, length=0.5)
+    ground = udk.Frame(0.0, 0.0, 0.0, 1.0, 0.0)
+
+    def energy(x):
+        return spring.potential(0.0, ground, udk.Frame(x, 0.0, 0.0, 1.0, 0.0))
+
+    assert_allclose([energy(2.0), jax.grad(energy)(2.0)], [0.5 * 10.0 * 1.5**2, 15.0])
+    assert spring.loads(0.0, ground, ground) is None  # no damping: nothing to compute
+    assert jnp.isfinite(jax.grad(energy)(0.0))  # its ends meet
+
+
+def test_torsion_spring_and_friction(everything, at):
+    loads = total_loads(everything, "torsion", at, everything.q0, V)
+    turned, omega = everything.q0[0, 2] - everything.q0[1, 2], V[0, 2] - V[1, 2]
+    assert_allclose(loads["b"], [0.0, 0.0, -3.0 * (turned - 0.1) - 0.2 * omega], rtol=1e-14)
+    assert everything.frames_of(everything.forces["rub"]) == ("ground", "b")
+    assert_allclose(total_loads(everything, "rub", at, everything.q0, V)["b"], [0.0, 0.0, -0.5 * np.tanh(1.1 / 0.01)])
+
+
+def test_forces_in_either_frame(everything, at):
+    angle = everything.q0[1, 2]
+    turned = [np.cos(angle) - 2.0 * np.sin(angle), np.sin(angle) + 2.0 * np.cos(angle)]
+    arm = 0.1 * np.array([np.cos(angle), np.sin(angle)])
+    assert_allclose(total_loads(everything, "follow", at, everything.q0, V)["a"], [*turned, 0.0], rtol=1e-14)
+    assert_allclose(total_loads(everything, "push", at, everything.q0, V)["a"], [1.0, 2.0, arm[0] * 2 - arm[1]], rtol=1e-14)

@@ -1,0 +1,125 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.interpolate import CubicSpline
+
+import udkjax.scene as udk
+from udkjax.scene import splines
+
+ROWS = {"revolute": 2, "prismatic": 2, "slot": 1, "weld": 3, "distance": 1, "angle": 1, "gear": 1, "rack": 1, "cam": 1} | {
+    "inner gear": 1
+}
+
+
+def evaluate(mechanism, name, at, q):
+    known = at(mechanism, q)
+    joint = mechanism.constraints[name]
+    return jnp.stack([jnp.asarray(r) for r in joint.residual(0.0, *(known[n] for n in mechanism.frames_of(joint)))])
+
+
+@pytest.mark.parametrize(("name", "rows"), ROWS.items())
+def test_rows_as_in_the_format(everything, at, name, rows):
+    assert evaluate(everything, name, at, everything.q0).shape == (rows,)
+
+
+@pytest.mark.parametrize("name", ["prismatic", "slot", "distance", "angle", "inner gear", "cam", "lift", "stretch"])
+def test_moving_everything_rigidly_changes_no_joint(everything, at, name):
+    q = everything.q0 + jnp.array([[0.1, 0.2, 0.3], [-0.2, 0.1, 0.1], [0.3, 0.1, -0.2]])
+    c, s = np.cos(0.7), np.sin(0.7)
+    turned = jnp.concatenate([q[:, :2] @ jnp.array([[c, s], [-s, c]]) + jnp.array([3.0, -2.0]), q[:, 2:] + 0.7], axis=1)
+    assert_allclose(evaluate(everything, name, at, turned), evaluate(everything, name, at, q), atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["prismatic", "weld", "distance", "angle", "gear", "inner gear", "rack"])
+def test_what_the_initial_guess_decides_holds_there(everything, at, name):
+    rows = evaluate(everything, name, at, everything.q0)
+    held = rows[-1] if name in ("prismatic", "weld") else rows
+    assert_allclose(held, 0.0, atol=1e-15)
+
+
+def test_revolute_is_point_2_minus_point_1(everything, at):
+    x, y, angle = everything.q0[0]
+    tip = [x - 0.5 * np.cos(angle) - 0.1 * np.sin(angle), y - 0.5 * np.sin(angle) + 0.1 * np.cos(angle)]
+    assert_allclose(evaluate(everything, "revolute", at, everything.q0), tip, rtol=1e-14)
+
+
+def test_slot_measures_to_the_left_of_the_line():
+    slot = udk.Slot(["ground", "b"], [[1.0, 0.0], [0.0, 0.0]], axis=np.pi / 4)
+    ground = udk.Frame(0.0, 0.0, 0.0, 1.0, 0.0)
+    assert_allclose(slot.residual(0.0, ground, udk.Frame(0.0, 1.0, 0.3, np.cos(0.3), np.sin(0.3)))[0], np.sqrt(2), rtol=1e-15)
+
+
+def test_gradient_of_distance_is_the_unit_vector(everything, at):
+    gradient = jax.jacfwd(lambda q: evaluate(everything, "distance", at, q)[0])(everything.q0)
+    d = everything.q0[0, :2] - everything.q0[1, :2]  # bodies = [a, b], and b comes first
+    assert_allclose(gradient[0, :2], d / jnp.linalg.norm(d), rtol=1e-14)
+    assert_allclose(gradient[1, :2], -d / jnp.linalg.norm(d), rtol=1e-14)
+
+
+@pytest.mark.parametrize("internal", [False, True])
+def test_wheels_in_mesh_have_one_velocity_at_the_pitch_point(internal):
+    gear = udk.Gear(["one", "two"], [0.3, 0.1], internal=internal)
+
+    def frame(angle):
+        return udk.Frame(0.0, 0.0, angle, jnp.cos(angle), jnp.sin(angle))
+
+    gradient = jax.jacfwd(lambda angles: gear._rolled(frame(angles[0]), frame(angles[1])))(jnp.zeros(2))
+    omega = jnp.array([1.0, -gradient[0] / gradient[1]])  # what the row allows
+    # Wheel 1 at the origin, wheel 2 on the x axis: the pitch point is at x = 0.3, centre 2 at 0.3 + 0.1, or at 0.3 - 0.1.
+    arm = 0.1 if internal else -0.1
+    assert_allclose(omega[0] * 0.3, omega[1] * arm, rtol=1e-14)
+
+
+def test_a_pinion_rolls_without_slipping(at):
+    axis, r = 0.4, 0.2
+    centre = r * np.array([-np.sin(axis), np.cos(axis)])  # on the left of the rack
+    mech = udk.Mechanism({"pinion": udk.Body(1.0, 1.0, centre)}, {"rack": udk.Rack(["ground", "pinion"], radius=r, axis=axis)})
+    gradient = jax.jacfwd(lambda q: evaluate(mech, "rack", at, q)[0])(mech.q0)[0]
+    along = np.array([np.cos(axis), np.sin(axis)])
+    omega = -(gradient[:2] @ along) / gradient[2]  # for the centre moving along the rack at 1 m/s
+    contact = along + omega * np.array([centre[1], -centre[0]])  # v + omega x (-centre)
+    assert_allclose(contact, 0.0, atol=1e-15)
+
+
+def test_profile_is_the_periodic_cubic_spline():
+    angles, radii = np.array([-1.0, 0.3, 1.0, 2.5, 4.0]), np.array([1.0, 1.3, 1.1, 0.9, 1.2])
+    exact = CubicSpline([*angles, angles[0] + 2 * np.pi], [*radii, radii[0]], bc_type="periodic")
+    profile = udk.Profile(angles, radii)
+    x = jnp.linspace(-7.0, 9.0, 101)
+    for order in range(3):
+        assert_allclose(jax.vmap(_derivative(profile, order))(x), exact(x, order), atol=1e-12)
+
+
+def test_natural_spline_goes_on_straight():
+    knots, values = np.array([0.0, 0.5, 2.0, 3.0]), np.array([0.0, 1.0, -1.0, 0.5])
+    exact = CubicSpline(knots, values, bc_type="natural")
+
+    def spline(x):
+        return splines.natural(x, jnp.asarray(knots), jnp.asarray(values))
+
+    x = jnp.linspace(0.0, 3.0, 61)
+    for order in range(3):
+        assert_allclose(jax.vmap(_derivative(spline, order))(x), exact(x, order), atol=1e-12)
+    assert_allclose(spline(5.0), values[-1] + 2.0 * exact(3.0, 1), rtol=1e-13)
+    assert_allclose(spline(-1.0), values[0] - 1.0 * exact(0.0, 1), rtol=1e-13)
+    assert_allclose(splines.natural(0.25, jnp.array([0.0, 1.0]), jnp.array([1.0, 3.0])), 1.5, rtol=1e-15)  # two knots: a line
+
+
+def test_cam_depends_smoothly_on_its_profile(everything, at):
+    def row(radius):
+        return evaluate(everything.with_parameters({"joint.cam.profile.radius": radius}), "cam", at, everything.q0)[0]
+
+    radius = everything.joints["cam"].profile.radius
+    gradient = jax.grad(row)(radius)
+    step = 1e-6 * jnp.eye(4)
+    assert_allclose(gradient, [(row(radius + h) - row(radius - h)) / 2e-6 for h in step], atol=1e-9)
+    assert_allclose(gradient.sum(), -1.0, rtol=1e-13)  # a larger cam is larger everywhere
+    assert jnp.isfinite(jax.hessian(row)(radius)).all()
+
+
+def _derivative(function, order):
+    for _ in range(order):
+        function = jax.grad(function)
+    return function

@@ -1,0 +1,89 @@
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax.scene as udk
+from udkjax.scene import library
+
+ROOT = Path(__file__).parents[2]
+# name: rows, rank of the Jacobian at the initial guess, what sets it in motion
+MECHANISMS = {
+    "parallelogram": (12, 11, {"angular_velocity": 1.3}),
+    "n_four_bar": (14, 14, {}),
+    "slider_crank": (9, 9, {"angle": 0.7}),
+    "four_bar": (8, 8, {"angular_velocity": 1.3}),
+    "simple_pendulum": (1, 1, {"velocity": (0.0, 1.0)}),
+    "compound_pendulum": (2, 2, {"angular_velocity": 1.3}),
+    "double_pendulum": (4, 4, {"angular_velocities": (1.0, -2.0)}),
+    "elliptic_trammel": (2, 2, {"angular_velocity": 1.3}),
+    "driven_pendulum": (3, 3, {}),
+    "scissor_lift": (16, 14, {"angular_velocity": 1.3}),
+    "peaucellier": (20, 20, {"angular_velocity": 1.3}),
+    "planetary_gear": (16, 14, {}),
+}
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_it_starts_closed_and_with_velocities_that_its_constraints_allow(name, psi):
+    rows, rank, moving = MECHANISMS[name]
+    mech = getattr(library, name)(**moving)
+    value, rate = jax.jvp(lambda q, t: psi(mech, q, t), (mech.q0, 0.0), (mech.v0, 1.0))
+    assert value.shape == (rows,)
+    assert_allclose(value, 0.0, atol=2e-15)
+    assert_allclose(rate, 0.0, atol=2e-15)
+    assert jnp.linalg.norm(mech.v0) > 0.1
+    jacobian = jax.jacfwd(lambda q: psi(mech, q))(mech.q0).reshape(rows, -1)
+    assert np.linalg.matrix_rank(jacobian, tol=1e-9) == rank
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_the_example_file_is_the_library_s(name):
+    mech, example = getattr(library, name)(), udk.load(ROOT / "examples" / f"{name}.toml")
+    assert jax.tree.structure(example) == jax.tree.structure(mech)
+    for key, value in mech.parameters().items():
+        assert_allclose(example.parameters()[key], value, rtol=1e-14, atol=1e-14, err_msg=key)
+
+
+def test_every_example_is_in_the_library():
+    assert {path.stem for path in (ROOT / "examples").glob("*.toml")} == set(library.__all__) == set(MECHANISMS)
+
+
+def test_numbers_may_be_traced():
+    start = jax.jit(lambda angle: library.parallelogram(angle=angle).q0)
+    assert_allclose(start(0.3), library.parallelogram(0.3).q0, atol=1e-15)
+    slope = jax.jacfwd(start)(0.3)
+    assert_allclose(slope[3], [-np.sin(0.3), np.cos(0.3), 0.0], atol=1e-15)
+
+
+def test_slider_crank_starts_as_in_the_reference():
+    data = json.loads((ROOT / "tests/data/slider_crank_constant_speed.json").read_text())["initial"]
+    mech = library.slider_crank()
+    assert_allclose(mech.q0.ravel(), data["q"], atol=1e-15)
+    assert_allclose(mech.v0.ravel(), data["v"], atol=1e-15)
+    assert not library.slider_crank(driven=False).drivers
+
+
+def test_n_four_bar_is_the_benchmark_s():
+    mech = library.n_four_bar(40)
+    assert len(mech.body_names) == 81
+    assert len(mech.joints) == 121
+    assert_allclose(mech.v0[0], [0.5, 0.0, -1.0], atol=1e-15)
+
+
+def test_peaucellier_s_pin_is_on_the_line():
+    for angle in (-1.2, 0.4, 1.5):
+        mech = library.peaucellier(angle)
+        side = mech.bodies["AD"]
+        tip = side.frame().point((0.6, 0.0))
+        assert_allclose(tip.x, (2.0**2 - 1.2**2) / (2 * 0.6), rtol=1e-13)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_planets_and_stages_can_be_counted(count, psi):
+    for mech in (library.planetary_gear(count), library.scissor_lift(count), library.n_four_bar(count)):
+        assert_allclose(psi(mech, mech.q0), 0.0, atol=5e-15)

@@ -1,0 +1,212 @@
+import pickle
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax.scene as udk
+
+
+def test_the_order_is_the_users(everything):
+    assert list(everything.bodies) == ["b", "a", "c"]
+    again = jax.tree.unflatten(jax.tree.structure(everything), jax.tree.leaves(everything))
+    assert list(again.bodies) == ["b", "a", "c"]
+    assert list(again.constraints) == [*everything.joints, *everything.drivers]
+    assert list(again.constraints)[-4:] == ["turn", "push", "lift", "stretch"]
+    assert hash(jax.tree.structure(again)) == hash(jax.tree.structure(everything))
+
+
+def test_all_numbers_are_leaves(everything):
+    leaves = jax.tree.leaves(everything)
+    assert all(isinstance(leaf, jax.Array) and leaf.dtype == jnp.float64 for leaf in leaves)
+    implied = 3  # the constants of two gears and a rack
+    assert len(leaves) == len(everything.parameters()) + implied
+
+
+def test_state_of_the_initial_guess(everything):
+    assert_allclose(everything.q0[0], [0.3, -0.2, 0.4])
+    assert_allclose(everything.v0, [[0.1, 0.2, -0.3], [0, 0, 0], [0, 0, 0]])
+
+
+def test_every_parameter_can_be_set_and_traced(everything):
+    parameters = everything.parameters()
+    changed = jax.jit(lambda p: everything.with_parameters({k: 1.5 * v for k, v in p.items()}).parameters())(parameters)
+    assert changed.keys() == parameters.keys()
+    for name, value in parameters.items():
+        assert_allclose(changed[name], 1.5 * value, err_msg=name)
+
+
+def test_same_numbers_same_mechanism(everything, same):
+    assert same(everything.with_parameters(everything.parameters()), everything)
+
+
+def test_one_entry_of_an_array(everything):
+    new = everything.with_parameters({"joint.revolute.points[1][0]": 7.0, "driver.turn.motion.coefficients[1]": 8.0})
+    assert_allclose(new.joints["revolute"].points, [[0.0, 0.0], [7.0, 0.1]])
+    assert_allclose(new.drivers["turn"].motion.coefficients, [0.0, 8.0])
+    both = everything.with_parameters({"gravity[0]": 1.0, "gravity": [2.0, 3.0]})  # the whole first, then its entry
+    assert_allclose(both.gravity, [1.0, 3.0])
+
+
+def test_under_vmap_and_grad(everything):
+    masses = jnp.array([1.0, 2.0, 3.0])
+    batch = jax.vmap(lambda m: everything.with_parameters({"body.b.mass": m}))(masses)
+    assert_allclose(batch.bodies["b"].mass, masses)
+    slope = jax.grad(lambda k: everything.with_parameters({"force.damped.damping": k}).forces["damped"].damping ** 2)(3.0)
+    assert_allclose(slope, 6.0)
+
+
+def test_it_can_be_made_of_traced_numbers():
+    @jax.jit
+    def length(mass, x):
+        mech = udk.Mechanism(
+            {"a": udk.Body(mass, 1.0, jnp.stack([x, 0.0]))}, {"rod": udk.Distance(["ground", "a"], jnp.zeros((2, 2)))}
+        )
+        return mech.joints["rod"].length
+
+    assert_allclose(length(-1.0, 3.0), 3.0)  # values that are traced are not looked at
+    assert_allclose(jax.grad(length, 1)(1.0, 3.0), 1.0)
+
+
+def test_an_absent_damping_can_be_set(everything):
+    assert "force.undamped.damping" not in everything.parameters()
+    assert everything.forces["undamped"].damping is None
+    assert_allclose(everything.with_parameters({"force.undamped.damping": 0.2}).forces["undamped"].damping, 0.2)
+
+
+def test_the_constants_of_gears_follow_the_initial_guess(everything, psi):
+    new = everything.with_parameters({"body.b.angle": 2.0, "joint.gear.radii": [0.3, 0.4]})
+    assert_allclose(new.joints["gear"].constant, 0.3 * new.bodies["a"].angle + 0.4 * 2.0)
+    assert_allclose(
+        new.joints["prismatic"].angle, everything.joints["prismatic"].angle
+    )  # an ordinary parameter since it was made
+
+
+def test_rows_left_out_are_kept(everything):
+    known = udk.Mechanism(everything.bodies, everything.joints, everything.drivers, everything.forces, left_out=(3, 5))
+    assert known.with_parameters({"gravity": [0.0, 0.0]}).left_out == (3, 5)
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ({"body.B.mass": 1.0}, 'no parameter "body.B.mass"; did you mean "body.b.mass"?'),
+        ({"body.b.mas": 1.0}, 'no parameter "body.b.mas"; did you mean "body.b.mass"?'),
+        ({"bodies": 1.0}, 'no parameter "bodies"'),
+        ({"gravity": 1.0}, "gravity: must have the shape (2,), has ()"),
+        ({"body.b.mass": [1.0]}, "body.b.mass: must have the shape (), has (1,)"),
+        ({"joint.revolute.points[2][0]": 1.0}, "joint.revolute.points[2][0]: joint.revolute.points has the shape (2, 2)"),
+        ({"driver.turn.points[0][0]": 1.0}, "driver.turn.points[0][0]: driver.turn.points is absent; set it as a whole"),
+        ({"driver.turn.points": 1.0}, "driver.turn.points: must have the shape (2, 2), has ()"),
+        ({"body.b.mass": "heavy"}, 'body.b.mass: must be a number or an array, is "heavy"'),
+        ({"body.b.mass": -1.0}, 'body "b" (body[0]).mass: must be > 0, is -1.0'),
+        ({"joint.gear.constant": 1.0}, 'no parameter "joint.gear.constant"'),
+    ],
+)
+def test_wrong_parameters_are_refused(everything, values, problem):
+    with pytest.raises(udk.SceneError) as caught:
+        everything.with_parameters(values)
+    assert [p for p in caught.value.problems if p.startswith(problem)] == caught.value.problems
+
+
+def test_all_mistakes_at_once():
+    o = [[0.0, 0.0], [0.0, 0.0]]
+    mistaken: Any = "weld"
+    misspelt: Any = "angel"
+    with pytest.raises(udk.SceneError) as caught:
+        udk.Mechanism(
+            bodies={"ground": udk.Body(1, 1), "b": udk.Body(-1.0, np.nan, [1.0, 2.0, 3.0])},
+            joints={"A": udk.Revolute(["grund", "b"], [[0.0, 0.0]]), "B": udk.Slot(["b", "b"], o, axis=0.0), "C": mistaken},
+            drivers={"A": udk.Driver(["ground", "b"], misspelt, udk.Spline([0.0, 1.0, 1.0], [0.0, 1.0]))},
+            forces={
+                "f": udk.Friction("B", torque=-1.0, velocity=1.0),
+                "g": udk.Friction("Q", torque=1.0, velocity=1.0),
+                "h": udk.Force("ground", [1.0, 2.0]),
+            },
+            gravity=[0.0, np.inf],
+        )
+    assert sorted(caught.value.problems) == sorted(
+        [
+            "gravity[1]: must be finite, is inf",
+            'body "ground" (body[0]).name: "ground" is the fixed frame; choose another name',
+            'body "b" (body[1]).mass: must be > 0, is -1.0',
+            'body "b" (body[1]).inertia: must be finite, is nan',
+            'body "b" (body[1]).position: must be a list of 2 numbers, is [1.0, 2.0, 3.0]',
+            'joint "A" (joint[0]).bodies[0]: no body named "grund"; did you mean "ground"?',
+            'joint "A" (joint[0]).points: must be a list of 2 x 2 numbers, is [[0.0, 0.0]]',
+            'joint "B" (joint[1]).bodies: "b" is connected to itself',
+            'joint "C" (joint[2]): must be of class Joint, is a str',
+            'driver "A" (driver[0]).name: taken by joint[0]; names must be unique',
+            'driver "A" (driver[0]).coordinate: must be one of "angle", "x", "y", "distance", is "angel"; did you mean "angle"?',
+            'driver "A" (driver[0]).motion.times[2]: must be greater than the entry before, is 1.0',
+            'driver "A" (driver[0]).motion.values: must have 3 entries, as the list before it has, is [0.0, 1.0]',
+            'force "f" (force[0]).joint: "B" must be a revolute joint',
+            'force "f" (force[0]).torque: must be >= 0, is -1.0',
+            'force "g" (force[1]).joint: no revolute joint named "Q"',
+            'force "h" (force[2]).body: "ground" does not move; name a body',
+        ]
+    )
+    assert all(problem in str(caught.value) for problem in caught.value.problems)
+
+
+def test_forces_without_names():
+    spring = udk.Spring(["ground", "a"], [[0, 0], [0, 0]], 1.0, 1.0)
+    mech = udk.Mechanism({"a": udk.Body(1, 1)}, forces=[spring, udk.Force("a", [0, 1]), spring])
+    assert list(mech.forces) == ["spring1", "force1", "spring2"]
+
+
+class Lever(udk.Joint):
+    ratio: float
+
+    def residual(self, t, one, two):
+        return [one.angle - self.ratio * two.angle]
+
+
+class Wind(udk.ForceElement):
+    drag: float
+    exponent: int = eqx.field(static=True, default=1)
+
+    def loads(self, t, body):
+        return [(-self.drag * body.vx**self.exponent, 0.0, 0.0)]
+
+
+def test_classes_of_ones_own(psi):
+    mech = udk.Mechanism(
+        {"a": udk.Body(1, 1, angle=0.6), "b": udk.Body(1, 1, angle=0.2)},
+        {"lever": Lever(["a", "b"], 3), "double": Lever(bodies=("a", "b"), ratio=2.0)},
+        forces={"wind": Wind("a", 0.5, exponent=3)},
+    )
+    assert_allclose(psi(mech, mech.q0), [0.0, 0.2], atol=1e-15)
+    assert_allclose(mech.with_parameters({"joint.lever.ratio": 4.0, "force.wind.drag": 2}).parameters()["joint.lever.ratio"], 4.0)
+    assert mech.frames_of(mech.forces["wind"]) == ("a",)
+    assert jax.jit(lambda m: m.forces["wind"].drag)(mech) == 0.5
+
+
+def test_classes_of_ones_own_that_cannot_work():
+    class Idle(udk.ForceElement):
+        pass
+
+    class Loose(udk.Joint):
+        kind: str
+
+        def residual(self, t, *frames):
+            return [0.0]
+
+    with pytest.raises(udk.SceneError) as caught:
+        udk.Mechanism({"a": udk.Body(1, 1)}, {"loose": Loose(["a", "c"], "x")}, forces={"idle": Idle(["a"])})
+    assert caught.value.problems == [
+        'joint "loose" (joint[0]).kind: "x" is not a number: declare the field with eqx.field(static=True)',
+        'force "idle" (force[0]): Idle must have a method `potential` or `loads`',
+        'joint "loose" (joint[0]).bodies[1]: no body named "c"',
+    ]
+
+
+def test_it_can_be_sent_to_another_process(everything, same):
+    assert same(pickle.loads(pickle.dumps(everything)), everything)
+    error = pickle.loads(pickle.dumps(udk.SceneError(["one", "two"], "scene.toml")))
+    assert error.problems == ["one", "two"]
+    assert str(error) == str(udk.SceneError(["one", "two"], "scene.toml"))

@@ -1,0 +1,149 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+
+from udkjax.cli import METHODS, SOLVERS, main
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PARALLELOGRAM = EXAMPLES / "parallelogram.toml"
+
+
+def udkjax(*arguments) -> int:
+    """Run the command line here, and return its exit code."""
+    try:
+        main([str(argument) for argument in arguments])
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 0 if end.code is None else 1
+    return 0
+
+
+@pytest.mark.parametrize("command", [[], ["simulate"], ["check"], ["doctor"]])
+def test_help_is_printed_without_importing_jax(command):
+    code = (
+        "import sys, atexit; from udkjax.cli import main\n"
+        "atexit.register(lambda: print('HEAVY', {'jax', 'numpy', 'diffrax', 'xarray', 'matplotlib'} & set(sys.modules)))\n"
+        f"main({[*command, '--help']})"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "usage: udkjax" in shown
+    assert "HEAVY set()" in shown
+
+
+def test_simulate_writes_a_file_that_can_be_trusted_and_a_picture(tmp_path, capsys):
+    out = tmp_path / "run.nc"
+    assert udkjax("simulate", PARALLELOGRAM, "--t1", 2, "--dt", 0.05, "--rtol", 1e-9, "--atol", 1e-9, "--out", out) == 0
+    shown = capsys.readouterr().out
+    for word in ("five-bar parallelogram", "successful", "violation", "energy", "exact solution", "compile", "run.nc", "run.png"):
+        assert word in shown
+    assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
+    with xarray.open_dataset(out, engine="h5netcdf") as data:
+        assert dict(data.sizes) == {"time": 41, "body": 4, "coordinate": 3}
+        assert list(data.coordinate.values) == ["x", "y", "angle"]
+        assert data.q.dims == data.v.dims == ("time", "body", "coordinate")
+        np.testing.assert_allclose(data.time, np.linspace(0, 2, 41))
+        assert data.attrs["scene"] == PARALLELOGRAM.read_text()
+        assert data.attrs["result"] == "successful"
+        assert {"version_udkjax", "version_jax", "setting_method", "stats_steps"} <= set(data.attrs)
+        assert [float(value) for name, value in data.attrs.items() if name.endswith("_rtol")] == [1e-9]
+        angle = data.q.sel(body="link1", coordinate="angle")
+        np.testing.assert_allclose(data.q.sel(body="link2", coordinate="x"), 1 + np.cos(angle) / 2, atol=1e-8)
+
+
+def test_what_a_run_prints_is_measured(tmp_path, capsys):
+    """Loose tolerances without stabilization: the error and the drift that are printed must be large, not the default's."""
+    arguments = ("simulate", PARALLELOGRAM, "--t1", 3, "--out", tmp_path / "run.nc")
+    errors = {}
+    for tol in (1e-3, 1e-10):
+        assert udkjax(*arguments, "--rtol", tol, "--atol", tol) == 0
+        (line,) = [line for line in capsys.readouterr().out.splitlines() if "exact solution" in line]
+        errors[tol] = float(line.split("missed by")[1].split()[0])
+    assert errors[1e-10] < 1e-8
+    assert errors[1e-3] > 1e3 * errors[1e-10]
+
+
+@pytest.mark.parametrize(
+    "choice", [["--method", "svd", "--rank-tol", 1e-4], ["--stabilization", "baumgarte", "--alpha", 2], ["--solver", "tsit5"]]
+)
+def test_choices_reach_the_simulation(tmp_path, choice):
+    out = tmp_path / "run.nc"
+    assert udkjax("simulate", EXAMPLES / "simple_pendulum.toml", "--t1", 1, "--out", out, *choice) == 0
+    with xarray.open_dataset(out, engine="h5netcdf") as data:
+        settings = " ".join(str(value) for name, value in data.attrs.items() if name.startswith("setting_")).lower()
+    assert choice[1] in settings
+
+
+def test_every_method_and_solver_exists():
+    import diffrax
+
+    import udkjax as udk
+
+    assert all(hasattr(udk, name) for name in METHODS.values())
+    assert all(hasattr(diffrax, name) for name in SOLVERS.values())
+
+
+def test_all_mistakes_of_a_scene_are_named_and_nothing_is_written(tmp_path, capsys):
+    scene = tmp_path / "bad.toml"
+    scene.write_text(PARALLELOGRAM.read_text().replace('"link1"]', '"lnik1"]').replace("mass = 2.0", "mass = -2.0"))
+    assert udkjax("simulate", scene, "--t1", 1, "--out", tmp_path / "run.nc") == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    for part in ("bad.toml", 'no body named "lnik1"', 'did you mean "link1"', "mass", "> 0"):
+        assert part in shown.err
+    assert "Traceback" not in shown.err
+    assert list(tmp_path.iterdir()) == [scene]
+    assert udkjax("check", scene) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "cause"),
+    [
+        (["nowhere.toml", "--t1", "1"], "nowhere.toml"),
+        ([PARALLELOGRAM, "--t1", "-1"], "--t1 -1"),
+        ([PARALLELOGRAM, "--t1", "1", "--dt", "0"], "--dt 0"),
+        ([PARALLELOGRAM, "--t1", "1", "--dt", "2"], "--dt 2"),
+        ([PARALLELOGRAM, "--t1", "1", "--plot", "run.nc"], "same file"),
+        ([PARALLELOGRAM, "--t1", "1", "--plot", "nowhere/run.png"], "no folder nowhere"),
+    ],
+)
+def test_wrong_input_is_refused_by_name(tmp_path, monkeypatch, capsys, arguments, cause):
+    monkeypatch.chdir(tmp_path)
+    assert udkjax("simulate", *arguments, "--out", "run.nc") == 2
+    assert cause in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_fails_says_why_and_keeps_what_it_got(tmp_path, capsys):
+    out = tmp_path / "run.nc"
+    assert udkjax("simulate", PARALLELOGRAM, "--t1", 20, "--out", out, "--max-steps", 20) == 1
+    shown = capsys.readouterr()
+    assert "step limit" in shown.err and "max_steps" in shown.err
+    with xarray.open_dataset(out, engine="h5netcdf") as data:
+        assert data.attrs["result"] == "step_limit"
+        assert np.isfinite(data.q[0]).all()
+    assert out.with_suffix(".png").exists()
+
+
+def test_check_names_the_redundant_row(capsys):
+    assert udkjax("check", PARALLELOGRAM) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for part in ("coordinates 12", "rank 11", "degrees of freedom 1", "12 in 6 joints and 0 drivers"):
+        assert part in shown
+    assert any(f"redundant rows {joint} ({axis})" in shown for joint in ("A1", "A2", "A3", "B1", "B2", "B3") for axis in "xy")
+
+
+def test_check_of_a_scene_that_cannot_close_fails(tmp_path, capsys):
+    scene = tmp_path / "open.toml"
+    scene.write_text(PARALLELOGRAM.read_text().replace("[[2.0, 0.0], [-0.5, 0.0]]", "[[9.0, 0.0], [-0.5, 0.0]]"))
+    assert udkjax("check", scene) == 1
+    assert "does not close" in capsys.readouterr().out
+
+
+def test_doctor_names_versions_and_devices(capsys):
+    assert udkjax("doctor") == 0
+    shown = capsys.readouterr().out
+    for word in ("udkjax", "jax", "jaxlib", "equinox", "diffrax", "numpy", "python", "devices", "float64", "cores"):
+        assert word in shown

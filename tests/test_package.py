@@ -1,0 +1,145 @@
+"""The house: floors import only from below, the public face is what it says, and importing it costs nothing."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import udkjax
+
+ROOT = Path(udkjax.__file__).parent
+
+BELOW = {
+    "straightline": set(),
+    "pinv": {"straightline"},
+    "scene": set(),
+    "equations": {"scene", "pinv", "straightline"},
+    "integrate": {"equations", "scene", "pinv", "straightline"},
+    "study": {"integrate", "equations", "scene", "pinv", "straightline"},
+    "show": {"study", "integrate", "equations", "scene", "pinv", "straightline"},
+}
+ONLY_IN = {"diffrax": {"integrate", "cli"}, "matplotlib": {"show"}, "tyro": {"cli"}, "msgspec": {"scene"}}
+
+
+def imports(file: Path, package: str) -> Iterator[str]:
+    """Every module that a file imports, by its full name, wherever in the file it does so. `package` is the one it is in."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            yield from (f"{base}.{name.name}" for name in node.names)
+
+
+def violations(root: Path) -> list[str]:
+    """What the package below `root` imports from above, sideways, or from a library that belongs to another floor."""
+    found = []
+    for file in sorted(root.rglob("*.py")):
+        place = file.relative_to(root)
+        floor = place.parts[0].removesuffix(".py")
+        if floor == "__init__":
+            continue
+        known = BELOW.get(floor, set(BELOW) | {"*"} if floor == "cli" else None)
+        if known is None:
+            found.append(f"{place}: no floor of this name")
+            continue
+        for module in imports(file, ".".join(["udkjax", *place.parts[:-1]])):
+            library, *rest = module.split(".")
+            if library != "udkjax":
+                allowed = floor in ONLY_IN.get(library, {floor})
+            else:
+                allowed = "*" in known or (rest and rest[0] in known | {floor})
+            if not allowed:
+                found.append(f"{place}: {module}")
+    return found
+
+
+def test_a_floor_imports_only_from_below():
+    assert violations(ROOT) == []
+
+
+@pytest.mark.parametrize(
+    ("place", "line"),
+    [
+        ("scene/joints.py", "from udkjax.equations import assembly"),
+        ("scene/joints.py", "from udkjax import equations"),
+        ("scene/joints.py", "import udkjax.pinv.svd as svd"),
+        ("scene/joints.py", "from ..equations import assembly"),
+        ("scene/library/pendulums.py", "from ...show import plots"),
+        ("scene/library/pendulums.py", "from .. import __init__, study\nfrom ... import study"),
+        ("pinv/rule.py", "def late():\n    from udkjax.scene import Body"),
+        ("equations/loads.py", "import udkjax"),
+        ("equations/loads.py", "import diffrax"),
+        ("integrate/simulate.py", "import matplotlib.figure"),
+        ("study/sweep.py", "from udkjax.cli import main"),
+        ("gadgets/new.py", "import math"),
+    ],
+)
+def test_an_import_from_above_is_caught(tmp_path, place, line):
+    file = tmp_path / place
+    file.parent.mkdir(parents=True)
+    file.write_text(line)
+    assert any(place in violation for violation in violations(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("place", "line"),
+    [
+        ("scene/joints.py", "from udkjax.scene.bodies import Frame\nfrom .bodies import Frame\nfrom . import bodies"),
+        ("scene/library/pendulums.py", "from ..joints import Revolute"),
+        ("equations/loads.py", "import jax\nfrom udkjax import scene\nfrom ..pinv import SVD"),
+        ("integrate/simulate.py", "import diffrax"),
+        ("cli.py", "import udkjax as udk\nimport diffrax"),
+        ("__init__.py", "from udkjax.show import plots"),
+    ],
+)
+def test_an_import_from_below_passes(tmp_path, place, line):
+    file = tmp_path / place
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(line)
+    assert violations(tmp_path) == []
+
+
+def test_the_public_names_are_there_and_type_checkers_know_them():
+    tree = ast.parse((ROOT / "__init__.py").read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    typed = {(node.module, name.name) for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names}
+    homes = {(module.rpartition(".")[0], name) for name, module in udkjax._MODULES.items()}
+    assert typed == homes | {(module, name) for name, module in udkjax._HOME.items()}
+    everything = {}
+    exec("from udkjax import *", everything)
+    assert set(udkjax.__all__) <= set(everything)
+    assert set(udkjax.__all__) <= set(dir(udkjax))
+    assert callable(udkjax.simulate) and callable(udkjax.assemble) and udkjax.library.__name__ == "udkjax.scene.library"
+    with pytest.raises(AttributeError, match="no attribute 'simulat'"):
+        udkjax.simulat  # noqa: B018
+
+
+def python(code: str, **environment: str) -> str:
+    clean = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu", **environment}
+    return subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_importing_the_package_imports_nothing_else():
+    assert python("import sys, udkjax; print({'jax', 'numpy', 'equinox', 'diffrax'} & set(sys.modules))") == "set()"
+
+
+FLOAT = "print(jnp.result_type(float))"
+
+
+@pytest.mark.parametrize("code", [f"import udkjax, jax.numpy as jnp; {FLOAT}", f"import jax.numpy as jnp, udkjax; {FLOAT}"])
+@pytest.mark.parametrize(
+    ("environment", "dtype"),
+    [
+        ({}, "float64"),
+        ({"JAX_ENABLE_X64": "1"}, "float64"),
+        ({"JAX_ENABLE_X64": "0"}, "float32"),
+        ({"JAX_ENABLE_X64": "False"}, "float32"),
+    ],
+)
+def test_float64_is_on_unless_the_environment_says_no(code, environment, dtype):
+    assert python(code, **environment) == dtype

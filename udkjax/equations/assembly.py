@@ -1,0 +1,175 @@
+"""Assembly: from the initial guess of a scene to positions and velocities that satisfy its constraints.
+
+Positions by damped Gauss-Newton in the mass metric, with Psi of all rows,
+
+    q <- q - s M^(-1/2) D^+ Psi,       D = Psi_q M^(-1/2),
+
+the smallest change that removes the linearized residual; s limits the length of a step, so that the branch of the guess is kept,
+and is halved until the residual falls: no step makes a state worse. Velocities by v - M^(-1/2) D^+ Psi_dot, which leaves the free
+motion of the guess as it is and satisfies the drivers. D^+ is truncated, so redundant rows do no harm, and its derivative is the
+one that all pseudoinverses share: gradients of the assembled state are right wherever the closed mechanism's rank is constant.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from udkjax.equations.udwadia_kalaba import Equations, prepare
+from udkjax.pinv import SVD
+from udkjax.scene.fields import number
+from udkjax.scene.mechanism import Mechanism
+
+STRIDE = 0.3  # rad and m: the longest change of a coordinate in one Gauss-Newton step
+ITERATIONS = 40
+HALVINGS = 12
+# Of the size of the coordinates (m, rad): what counts as closed. Rounding leaves 1e-15; a scene that cannot be closed leaves what
+# its lengths are wrong by.
+CLOSED = 1e-9
+
+
+class State(eqx.Module):
+    """Coordinates and velocities of all bodies: x, y (m) and angle (rad), and their rates, each (bodies, 3)."""
+
+    q: Float[Array, "bodies 3"]
+    v: Float[Array, "bodies 3"]
+
+
+class AssemblyError(ValueError):
+    """A mechanism cannot be closed, or not moved as its drivers ask. `state` is the best that was found."""
+
+    def __init__(self, message: str, state: State):
+        super().__init__(message)
+        self.state = state
+
+
+class Closure(NamedTuple):
+    """An assembled state, what is left of Psi (m, rad) and Psi_dot (m/s, rad/s), row by row, and the rank of D there."""
+
+    state: State
+    psi: Float[Array, "m"]
+    psi_dot: Float[Array, "m"]
+    rank: Int[Array, ""]
+
+
+def assemble(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None, throw: bool = True) -> State:
+    """Close a mechanism at time t (s), from `state` or from the initial guess of its bodies.
+
+    A state that satisfies all constraints is returned as it is, up to rounding. Differentiable to second order with respect to
+    every number of the mechanism and the guess, also where constraints are redundant. Raises `AssemblyError`, which names the
+    joints that stay open; with `throw=False`, or when numbers are traced, the best state found is returned instead.
+    """
+    closure = close(mechanism, t, state)
+    if throw:
+        require_closed(mechanism, closure)
+    return closure.state
+
+
+@eqx.filter_jit
+def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None) -> Closure:
+    """As `assemble`, with the residuals instead of an error."""
+    equations = prepare(mechanism, SVD())
+    t = number(t)
+    guess = State(mechanism.q0, mechanism.v0) if state is None else state
+    q, v = number(guess.q).ravel(), number(guess.v).ravel()
+    rank = jnp.array(0)
+    if equations.code.pattern.shape[0]:
+        q = _closed(equations, t, q)
+        for _ in range(2):  # the second removes the rounding errors of the first
+            plus, residual, root = equations.linearized("rate", t, q, v)
+            v, rank = v - root * (plus @ residual), plus.rank
+    psi, psi_dot = equations.violation(t, q, v)
+    return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, rank)
+
+
+def is_closed(closure: Closure) -> Any:
+    """Whether the residuals are rounding errors (see `CLOSED`)."""
+    q, v = jnp.abs(closure.state.q).max(initial=0.0), jnp.abs(closure.state.v).max(initial=0.0)
+    psi, psi_dot = (jnp.abs(r).max(initial=0.0) for r in (closure.psi, closure.psi_dot))
+    return (psi <= CLOSED * (1.0 + q)) & (psi_dot <= CLOSED * (1.0 + v))
+
+
+def require_closed(mechanism: Mechanism, closure: Closure) -> None:
+    """Raise an `AssemblyError` where a closure is not closed; traced values pass."""
+    closed = is_closed(closure)
+    if isinstance(closed, jax.core.Tracer) or closed:
+        return
+    equations = prepare(mechanism, SVD()).code.equations
+    worst: dict[str, float] = {}
+    open_position = bool(jnp.abs(closure.psi).max() > CLOSED * (1.0 + jnp.abs(closure.state.q).max()))
+    residual = closure.psi if open_position else closure.psi_dot
+    for (name, _), r in zip(equations.row_names, residual, strict=True):
+        worst[name] = max(worst.get(name, 0.0), abs(float(r)))
+    listed = sorted((n for n in worst if worst[n] > CLOSED), key=lambda n: -worst[n])
+    names = ", ".join(f'"{n}" ({worst[n]:.2g})' for n in listed[:8]) + (", ..." if len(listed) > 8 else "")
+    if open_position:
+        cause = f"the mechanism cannot be closed near its initial guess; open (m, rad): {names}"
+        cure = "check the points and lengths of these joints, or bring the initial positions and angles closer to a closed state"
+    else:
+        cause = f"no velocities satisfy all constraints in this position; left over (m/s, rad/s): {names}"
+        cure = "a driver asks for a motion that the joints forbid here: start elsewhere, or change the driver's motion"
+    raise AssemblyError(f"{cause}. {cure[0].upper()}{cure[1:]}.", closure.state)
+
+
+def _correction(equations: Equations, t: Any, q: Any) -> Any:
+    """-M^(-1/2) D^+ Psi."""
+    plus, psi, root = equations.linearized("closure", t, q, q)
+    return -root * (plus @ psi)
+
+
+def _size(equations: Equations, t: Any, q: Any) -> Any:
+    return jnp.linalg.norm(jnp.stack(equations.run("psi", t, q, q)))
+
+
+def _step(equations: Equations, t: Any, q: Any) -> tuple[Any, Any]:
+    """One damped step, and whether it made the residual smaller."""
+    step = _correction(equations, t, q)
+    longest = jnp.max(jnp.abs(step))
+    step = step * jnp.where(longest > STRIDE, STRIDE / jnp.where(longest > STRIDE, longest, 1.0), 1.0)
+    here, ahead = jax.lax.stop_gradient((q, step))
+    equations = jax.lax.stop_gradient(equations)
+    size = _size(equations, t, here)
+
+    def worse(trial):
+        scale, k = trial
+        return (k < HALVINGS) & ~(_size(equations, t, here + scale * ahead) < size)
+
+    scale, k = jax.lax.while_loop(worse, lambda trial: (0.5 * trial[0], trial[1] + 1), (jnp.ones(()), 0))
+    better = k < HALVINGS
+    return q + jnp.where(better, scale, 0.0) * step, better
+
+
+@jax.custom_jvp
+def _closed(equations: Equations, t: Any, q: Any) -> Any:
+    def unfinished(carry):
+        q, better, k = carry
+        return better & (k < ITERATIONS)
+
+    def body(carry):
+        q, _, k = carry
+        return *_step(equations, t, q), k + 1
+
+    return jax.lax.while_loop(unfinished, body, (q, jnp.array(True), 0))[0]
+
+
+def _closed_plain(equations: Equations, t: Any, q: Any) -> Any:
+    """The same steps as `_closed`, in a loop of fixed length that reverse mode can follow.
+
+    A step that no longer lowers the residual is taken in the derivative all the same: at a closed state it changes nothing but
+    the tangent, which it projects to the manifold.
+    """
+
+    def body(q, _):
+        ahead, better = _step(equations, t, q)
+        settled = q + _correction(equations, t, q)
+        return jnp.where(better, ahead, settled), None
+
+    return jax.lax.scan(body, q, None, length=ITERATIONS)[0]
+
+
+@_closed.defjvp
+def _(primals, tangents):
+    _, tangent = jax.jvp(_closed_plain, primals, tangents)
+    return _closed(*primals), tangent

@@ -1,0 +1,7 @@
+"""Trajectories: the only floor that knows diffrax."""
+
+from udkjax.integrate.projection import Projection as Projection
+from udkjax.integrate.simulate import simulate as simulate
+from udkjax.integrate.solution import Result as Result
+from udkjax.integrate.solution import SimulationError as SimulationError
+from udkjax.integrate.solution import Solution as Solution

@@ -1,0 +1,119 @@
+"""Return each step of a solver to the constraint manifold."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.equations.udwadia_kalaba import Equations
+
+
+class Projection(eqx.Module):
+    """Project positions and velocities after each step, by the smallest change in the mass metric (the default stabilization)."""
+
+
+class Constrained(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
+    """A diffrax solver for the motion of a mechanism: `args` are its equations, y is (q, v) in one vector.
+
+    Each step is taken by equations that do not branch, and taken again by those that do where a number came out that is not
+    finite: a branch a step instead of one a stage, and a real one under vmap too as long as no member needs it. With `projected`
+    the step ends on the constraint manifold. A derivative at its end that the solver would keep for the next step (FSAL) belongs
+    to the state before projection; told that the state has jumped, the solver takes a new one. Error estimate and interpolation
+    are the wrapped solver's own.
+    """
+
+    solver: diffrax.AbstractSolver
+    projected: bool
+
+    @property
+    def term_structure(self):
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.solver.interpolation_cls
+
+    @property
+    def term_compatible_contr_kwargs(self):
+        return self.solver.term_compatible_contr_kwargs
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def strong_order(self, terms):
+        return self.solver.strong_order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        made_jump = jnp.array(True) if self.projected else made_jump
+        if not args.branches:
+            return self._attempt(terms, t0, t1, y0, args, solver_state, made_jump)
+        state = (solver_state, made_jump)
+        quick = _in_a_loop(self, terms, t0, t1, y0, args.quick, *state)
+        doubt = ~jnp.all(jnp.isfinite(quick[0]))
+        careful = lambda: _arrays(self._attempt(terms, t0, t1, y0, args, *state))  # noqa: E731
+        return _second_thoughts(doubt, careful, quick)
+
+    def _attempt(self, terms, t0, t1, y0, equations, solver_state, made_jump):
+        y1, *rest = self.solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
+        return project(equations, t1, y1) if self.projected else y1, *rest
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+
+@eqx.filter_custom_jvp
+def _in_a_loop(solver: Constrained, terms, t0, t1, y0, equations, solver_state, made_jump):
+    """One attempt, as a loop of one round: on the CPU, XLA compiles a small loop into one function, and this one is hidden from it
+    in a larger loop with a branch. Each of its hundreds of operations would be a call of its own there (5 us a step instead of 1).
+    """
+    rounds = jnp.where(jnp.isnan(t0), 2, 1)  # one; unknown to the compiler, which removes a loop of one round
+    attempt = lambda y: _arrays(solver._attempt(terms, t0, t1, y, equations, solver_state, made_jump))  # noqa: E731
+    start = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(lambda: attempt(y0)[1:]))
+    loop = jax.lax.while_loop(lambda c: c[0] < rounds, lambda c: (c[0] + 1, attempt(c[1][0])), (0, (y0, *start)))
+    return loop[1]
+
+
+@_in_a_loop.def_jvp
+def _(primals, tangents):
+    return eqx.filter_jvp(lambda solver, *rest: _arrays(solver._attempt(*rest)), primals, tangents)
+
+
+def _arrays(tree: Any) -> Any:
+    return jax.tree.map(jnp.asarray, tree)
+
+
+def _second_thoughts(doubt: Any, careful: Any, quick: Any) -> Any:
+    """What was found without branching, or, where that is doubtful, what `careful` finds."""
+    where = lambda a, b: jnp.where(doubt, a, b)  # noqa: E731
+    return jax.lax.cond(eqxi.unvmap_any(doubt), lambda: jax.tree.map(where, careful(), quick), lambda: quick)
+
+
+def project(equations: Equations, t: Any, y: Float[Array, "2n"]) -> Float[Array, "2n"]:
+    """(q, v) on the manifold."""
+    q, v = jnp.split(y, 2)
+    return jnp.concatenate(equations.project(t, q, v))
+
+
+def project_all(equations: Equations, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:
+    """States at many times, each returned to the manifold. An interpolated state lies off it by the error of the interpolation: it
+    takes one projection more than a step."""
+
+    quick = jax.vmap(lambda t, y: _twice(equations.quick, t, y))(ts, ys)
+    if not equations.branches:
+        return quick
+    careful = lambda: jax.lax.map(lambda ty: _twice(equations, *ty), (ts, ys))  # noqa: E731
+    return _second_thoughts(~jnp.all(jnp.isfinite(quick)), careful, quick)
+
+
+def _twice(equations: Equations, t: Any, y: Any) -> Any:
+    return project(equations, t, project(equations, t, y))

@@ -1,0 +1,125 @@
+"""What a simulation returns."""
+
+import json
+import sys
+from enum import IntEnum
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from udkjax.scene.mechanism import Mechanism
+
+
+class Result(IntEnum):
+    """How a simulation ended."""
+
+    successful = 0
+    step_limit = 1
+    step_too_small = 2
+    not_finite = 3
+    drift = 4
+    could_not_assemble = 5
+
+
+CAUSES = {
+    Result.successful: "the end time was reached",
+    Result.step_limit: "the limit on steps was reached; raise `max_steps`, loosen the tolerances, or look for a stiff spring or gain",
+    Result.step_too_small: "the step fell to the rounding of time itself: the right-hand side jumps or grows without bound here, or the "
+    "tolerance is below what its rounding errors allow",
+    Result.not_finite: "a number that is not finite appeared; look at the loads and motions of the scene at this time",
+    Result.drift: "the constraints are violated by more than `drift_tol`: stabilize (`Projection()`), or, where the numbers of the scene "
+    "make rows independent that were found redundant when it was built, build it anew or take method=SVD()",
+    Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for the joints that stay open",
+}  # fmt: skip
+
+
+class SimulationError(RuntimeError):
+    """A simulation did not reach its end. `solution` is what it got."""
+
+    def __init__(self, message: str, solution: "Solution"):
+        super().__init__(message)
+        self.solution = solution
+
+
+class Solution(eqx.Module):
+    """States of a mechanism at the output times, how the run ended, and what it took.
+
+    `q` and `v` are (T, bodies, 3): x, y (m) and angle (rad) and their rates; not a number after the time of a failure. `code` is a
+    `Result`, `time` the time (s) that was reached, or at which the drift was first seen.
+    """
+
+    ts: Float[Array, "T"]
+    q: Float[Array, "T bodies 3"]
+    v: Float[Array, "T bodies 3"]
+    code: Int[Array, ""]
+    time: Float[Array, ""]
+    stats: dict[str, Array]
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    settings: tuple[tuple[str, str], ...] = eqx.field(static=True)
+
+    @property
+    def result(self) -> Any:
+        """The `Result`; in a batch, or while traced, the array of codes."""
+        if isinstance(self.code, jax.core.Tracer) or np.ndim(self.code):
+            return self.code
+        return Result(int(self.code))
+
+    @property
+    def cause(self) -> str:
+        """How the run ended, in words."""
+        return f"{self.result.name.replace('_', ' ')} at t = {float(self.time):.6g} s: {CAUSES[self.result]}"
+
+    def to_xarray(self, mechanism: Mechanism | None = None) -> Any:
+        """Return an xarray Dataset: q and v over time, body, coordinate, with units, versions, settings, result and statistics.
+
+        With the mechanism, its numbers (the attribute `parameters`, as JSON) and its text (`scene`, as TOML) are inside too.
+        """
+        import xarray
+
+        coordinates = ("x", "y", "angle")
+        dims = ("time", "body", "coordinate")
+        data = xarray.Dataset(
+            {"q": (dims, np.asarray(self.q)), "v": (dims, np.asarray(self.v))},
+            coords={"time": np.asarray(self.ts), "body": list(self.bodies), "coordinate": list(coordinates)},
+        )
+        data["time"].attrs = {"units": "s"}
+        data["q"].attrs = {"long_name": "coordinates: centre of mass and angle", "units": "m, m, rad"}
+        data["v"].attrs = {"long_name": "velocities", "units": "m/s, m/s, rad/s"}
+        data.attrs = {
+            "title": mechanism.name if mechanism is not None else "",
+            "result": self.result.name,
+            "cause": self.cause,
+            "end_time": float(self.time),
+            **{f"stats_{k}": int(v) for k, v in self.stats.items()},
+            **{f"setting_{k}": v for k, v in self.settings},
+            **{f"version_{k}": v for k, v in versions().items()},
+        }
+        if mechanism is not None:
+            data.attrs["parameters"] = json.dumps({k: np.asarray(v).tolist() for k, v in mechanism.parameters().items()})
+            data.attrs["scene"] = _text(mechanism)
+        return data
+
+
+def _text(mechanism: Mechanism) -> str:
+    from udkjax.scene import SceneError, dumps
+
+    try:
+        return dumps(mechanism)
+    except SceneError as error:  # classes of the user's own have no text
+        return f"# {error}"
+
+
+def versions() -> dict[str, str]:
+    """The versions that a result depends on."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": sys.version.split()[0]}
+    for package in ("udkjax", "jax", "jaxlib", "diffrax", "equinox", "numpy"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "unknown"
+    return found
