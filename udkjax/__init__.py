@@ -87,6 +87,7 @@ def __getattr__(name: str):
     if name in _MODULES:
         value = import_module(_MODULES[name])
     elif name in _HOME:
+        import_module("udkjax.equations")  # with it, mechanisms find their redundant rows when they are built
         value = getattr(import_module(_HOME[name]), name)
     else:
         raise AttributeError(f"module 'udkjax' has no attribute {name!r}")

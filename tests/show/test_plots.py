@@ -64,9 +64,9 @@ def test_trajectory_draws_the_mechanism_where_it_is(linkage, exact):
     tip = np.array([np.cos(-np.pi / 4), np.sin(-np.pi / 4)])
     for drawn, pivot in zip(strong, ([0, 0], [1, 0], [2, 0]), strict=False):
         ends = drawn[np.argsort(-drawn[:, 1])]
-        np.testing.assert_allclose(ends, [pivot, np.add(pivot, tip)], atol=1e-12)
+        np.testing.assert_allclose(ends, np.add(pivot, [0 * tip, tip]), atol=1e-12)
     assert angles.get_legend_handles_labels()[1] == ["link1, link2, link3", "coupler"]
-    assert constraints.get_yscale() == "log" and np.max(constraints.lines[0].get_ydata()) < 1e-14
+    assert constraints.get_yscale() == "log" and np.asarray(constraints.lines[0].get_ydata()).max() < 1e-14
     assert energy.get_xlabel() == "time (s)"
 
 

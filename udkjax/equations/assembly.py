@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from udkjax.equations.redundancy import dependent_constraints, redundant_rows
 from udkjax.equations.udwadia_kalaba import Equations, prepare
 from udkjax.pinv import SVD
 from udkjax.scene.fields import number
@@ -31,10 +32,16 @@ CLOSED = 1e-9
 
 
 class State(eqx.Module):
-    """Coordinates and velocities of all bodies: x, y (m) and angle (rad), and their rates, each (bodies, 3)."""
+    """Coordinates and velocities of all bodies: x, y (m) and angle (rad), and their rates, each (bodies, 3).
 
-    q: Float[Array, "bodies 3"]
-    v: Float[Array, "bodies 3"]
+    Of a `ConstrainedSystem`: (n,) each.
+    """
+
+    q: Float[Array, "bodies 3"] | Float[Array, "n"]
+    v: Float[Array, "bodies 3"] | Float[Array, "n"]
+
+    def __init__(self, q: ArrayLike, v: ArrayLike):
+        self.q, self.v = number(q), number(v)
 
 
 class AssemblyError(ValueError):
@@ -111,6 +118,44 @@ def require_closed(mechanism: Mechanism, closure: Closure) -> None:
         cause = f"no velocities satisfy all constraints in this position; left over (m/s, rad/s): {names}"
         cure = "a driver asks for a motion that the joints forbid here: start elsewhere, or change the driver's motion"
     raise AssemblyError(f"{cause}. {cure[0].upper()}{cure[1:]}.", closure.state)
+
+
+class Check(NamedTuple):
+    """What there is to know of a mechanism's constraints before it moves."""
+
+    bodies: int
+    coordinates: int
+    rows: int
+    rank: int  # in general: elsewhere than in a singular configuration
+    degrees_of_freedom: int
+    redundant: tuple[tuple[str, int], ...]  # rows that can be left out: the constraint and the row within it
+    dependent: tuple[str, ...]  # the constraints that depend on each other
+    residual_before: float  # the largest |Psi| (m, rad) as given, and assembled
+    residual_after: float
+    closed: bool
+
+
+def check(mechanism: Mechanism) -> Check:
+    """Count rows, rank and degrees of freedom, name redundant rows, and say how well the initial guess closes."""
+    closure = close(mechanism)
+    equations = prepare(mechanism, SVD())
+    before = equations.violation(0.0, mechanism.q0.ravel(), mechanism.v0.ravel())[0]
+    names, rows = equations.code.equations.row_names, len(before)
+    closed = bool(is_closed(closure))
+    left_out = redundant_rows(mechanism) if closed else None
+    rank = int(closure.rank) if left_out is None else rows - len(left_out)
+    return Check(
+        bodies=len(mechanism.body_names),
+        coordinates=3 * len(mechanism.body_names),
+        rows=rows,
+        rank=rank,
+        degrees_of_freedom=3 * len(mechanism.body_names) - rank,
+        redundant=tuple(names[i] for i in left_out or ()),
+        dependent=dependent_constraints(mechanism, closure.state.q) if closed else (),
+        residual_before=float(jnp.abs(before).max(initial=0.0)),
+        residual_after=float(jnp.abs(closure.psi).max(initial=0.0)),
+        closed=closed,
+    )
 
 
 def _correction(equations: Equations, t: Any, q: Any) -> Any:

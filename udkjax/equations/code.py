@@ -46,7 +46,7 @@ class Code:
         self.pattern, self.values = pattern(self.D, self.n)
         self.kept_pattern, self.kept_values = pattern([self.D[i] for i in self.kept], self.n)
 
-        self.outputs: dict[str, list[Scalar]] = {}
+        self.outputs: dict[str, list[Scalar]] = {"energy": [equations.kinetic_energy, equations.potential_energy]}
         self._describe("", everything, self.values)
         if elimination:
             self._describe("_kept", self.kept, self.kept_values)

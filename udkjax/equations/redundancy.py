@@ -69,6 +69,17 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     return dispensable([p.u[:, rank:] for p in ordinary])
 
 
+def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...]:
+    """Return the names of the constraints whose rows depend on each other at a closed position: those in the left null space."""
+    rows = Rows(mechanism)
+    position = rows.close(0.0, np.asarray(q, float).ravel()) if rows.count else None
+    if position is None:
+        return ()
+    involved = np.linalg.norm(position.u[:, position.rank :], axis=1) > 1e-6
+    names = [name for (name, _), part in zip(rows.names, involved, strict=True) if part]
+    return tuple(dict.fromkeys(names))
+
+
 def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
     """Choose rows S, as many as each null space has columns, such that N[S] is as far from singular as it goes for every N.
 
@@ -92,6 +103,7 @@ class Rows:
         self._code = code(mechanism, (), False, None)
         self._constants = self._code.prologue([*map(float, scalars(jax.tree.map(np.asarray, jax.tree.leaves(mechanism)))), 0.0])
         self.count, self.size = self._code.pattern.shape
+        self.names = self._code.equations.row_names
         self._closure: Callable = self._code.program("closure")
         slots = self._code.pattern.slots
         self._split = [slots, slots + self.count]

@@ -75,6 +75,21 @@ class Equations(eqx.Module):
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""
         return _stack(self.run("psi", t, q, v)), _stack(self.run("psi_dot", t, q, v))
 
+    def jacobian(self, t: Any, q: Vector) -> Float[Array, "m n"]:
+        """Psi_q of all rows."""
+        values, _, root = _arrays(self, "closure", t, q, q)
+        return self.code.pattern.dense(values) / root
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """The rows that the method does not see."""
+        return self.code.left_out
+
+    @property
+    def constrained(self) -> bool:
+        """Whether there are any constraints."""
+        return bool(self.code.pattern.shape[0])
+
     @property
     def branches(self) -> bool:
         """Whether evaluating them takes a branch to singular values."""
@@ -97,28 +112,6 @@ class Equations(eqx.Module):
     def exact(self) -> "Equations":
         """The same by singular values of all rows: what `Auto` turns to."""
         return eqx.tree_at(lambda e: e.method, self, SVD(self.method.rank_tol, self.method.relative))
-
-
-def accelerations(
-    mechanism: Any,
-    t: ArrayLike,
-    q: Float[ArrayLike, "bodies 3"],
-    v: Float[ArrayLike, "bodies 3"],
-    method: Pseudoinverse | None = None,
-    stabilization: Baumgarte | None = None,
-    multipliers: bool = False,
-) -> Any:
-    """Return a (bodies, 3) at time t (s), coordinates q and velocities v; with `multipliers` also lambda, one a row of Psi.
-
-    a = a_F + M^(-1/2) D^+ b and lambda = -(D^+)^T D^+ b, of minimum norm where constraints are redundant (m/s^2, rad/s^2; N, N m,
-    in the rows' order and with the sign of M a + Psi_q^T lambda = F). The state need not be closed. `Auto` looks at the rows that
-    it leaves out, too: where they are not satisfied they were not redundant after all, and it takes singular values of all rows.
-    `Auto` and `Elimination` take lambda from singular values: a choice of rows has no minimum-norm multipliers.
-    """
-    equations = mechanism if isinstance(mechanism, Equations) else prepare(mechanism, method, stabilization)
-    q, v = jnp.asarray(q, jnp.result_type(float)), jnp.asarray(v, jnp.result_type(float))
-    a = equations.accelerations(t, q.ravel(), v.ravel(), watch=True).reshape(q.shape)
-    return (a, equations.multipliers(t, q.ravel(), v.ravel())) if multipliers else a
 
 
 def prepare(mechanism: Mechanism, method: Pseudoinverse | None = None, baumgarte: Baumgarte | None = None) -> Equations:

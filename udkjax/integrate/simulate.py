@@ -10,8 +10,10 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.assembly import State, close, is_closed, require_closed
+from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.quantities import equations_of
 from udkjax.equations.redundancy import redundant_rows
-from udkjax.equations.udwadia_kalaba import Baumgarte, Equations, prepare
+from udkjax.equations.udwadia_kalaba import Baumgarte, Equations
 from udkjax.integrate.projection import Constrained, Projection, project_all
 from udkjax.integrate.solution import Result, SimulationError, Solution
 from udkjax.pinv import Auto, Pseudoinverse
@@ -26,7 +28,7 @@ SMALLEST_STEP = 100.0  # ulps of the end time: below it time does not advance
 
 
 def simulate(
-    mechanism: Mechanism,
+    mechanism: Mechanism | ConstrainedSystem,
     ts: ArrayLike,
     state: State | None = None,
     rtol: ArrayLike = 1e-8,
@@ -55,6 +57,8 @@ def simulate(
     solution there. A guess that cannot be closed raises `AssemblyError`.
     """
     ts = _times(ts)
+    if state is None and isinstance(mechanism, ConstrainedSystem):
+        raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
     arguments = (number(rtol), number(atol), Auto() if method is None else method, stabilization)
     tolerance = DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE
     choices = (solver or diffrax.Dopri8(), adjoint or diffrax.RecursiveCheckpointAdjoint(), max_steps, _meter(progress))
@@ -75,8 +79,8 @@ def simulate(
 @eqx.filter_jit
 def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol, solver, adjoint, max_steps, meter):
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
-    equations = prepare(mechanism, method, baumgarte)
-    projected = isinstance(stabilization, Projection) and bool(equations.code.kept)
+    equations = equations_of(mechanism, method, baumgarte)
+    projected = isinstance(stabilization, Projection) and equations.constrained
     closure = close(mechanism, ts[0]) if state is None else None
     start = state if closure is None else closure.state
     closed = jnp.array(True) if closure is None else is_closed(closure)
@@ -106,10 +110,10 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     q, v = jnp.split(ys, 2, axis=1)
     code, time, reached = _outcome(equations, run.result, ts, t_end, end, q, reached, closed, drift_tol)
     missed = jnp.array(False)
-    if closure is not None and equations.code.left_out:
-        missed = closed & (closure.rank > len(equations.code.kept))
+    if closure is not None and equations.left_out:
+        missed = closed & (closure.rank > len(closure.psi) - len(equations.left_out))
         code, time = jnp.where(missed, Result.drift, code), jnp.where(missed, ts[0], time)
-    q, v = (jnp.where(reached[:, None], x, jnp.nan).reshape(len(ts), -1, 3) for x in (q, v))
+    q, v = (jnp.where(reached[:, None], x, jnp.nan).reshape(len(ts), *start.q.shape) for x in (q, v))
     settings = (
         ("method", type(method).__name__),
         ("stabilization", type(stabilization).__name__),
@@ -118,7 +122,7 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     )
     stats = _stats(run.stats, solver, projected, len(ts))
     stats |= {"rtol": rtol, "atol": atol}
-    return Solution(ts, q, v, code, time, stats, mechanism.body_names, settings), closure, missed
+    return Solution(ts, q, v, code, time, stats, getattr(mechanism, "body_names", ()), settings), closure, missed
 
 
 def derivative(t: Any, y: Float[Array, "2n"], equations: Equations) -> Float[Array, "2n"]:
@@ -144,9 +148,9 @@ def _outcome(equations, result, ts, t_end, end, q, reached, closed, drift_tol):
     code = jnp.where(closed, code, Result.could_not_assemble)
     time = jnp.where(closed, t_end, ts[0])
     reached = reached & (closed | (jnp.arange(len(ts)) == 0))
-    if equations.code.pattern.shape[0]:
+    if equations.constrained:
         psi = jax.vmap(lambda t, q: equations.violation(t, q, q)[0])(ts, q)
-        lost = reached & closed & ~(jnp.max(jnp.abs(psi), axis=1) <= drift_tol)
+        lost = reached & closed & ~(jnp.max(jnp.abs(psi), axis=1, initial=0.0) <= drift_tol)
         first = jnp.argmax(lost)
         drifted = jnp.any(lost)
         code, time = jnp.where(drifted, Result.drift, code), jnp.where(drifted, ts[first], time)

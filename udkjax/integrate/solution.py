@@ -93,7 +93,7 @@ class Solution(eqx.Module):
             "result": self.result.name,
             "cause": self.cause,
             "end_time": float(self.time),
-            **{f"stats_{k}": int(v) for k, v in self.stats.items()},
+            **{f"stats_{k}": np.asarray(v).item() for k, v in self.stats.items()},
             **{f"setting_{k}": v for k, v in self.settings},
             **{f"version_{k}": v for k, v in versions().items()},
         }

@@ -11,8 +11,9 @@ from udkjax.pinv.rule import Dense
 from udkjax.pinv.svd import SVD, Factors
 
 # A pivot relative to the diagonal entry of its row is the square of a distance from dependence, and elimination loses its digits
-# by the reciprocal: 1e-5 leaves eleven. Crossing singular configurations goes as well with 1e-3 and with 1e-7.
-BRANCH_TOL = 1e-5
+# by the reciprocal: 1e-6 leaves ten. Crossing singular configurations goes as well with 1e-5 and with 1e-7; singular values are
+# needed the more often, the larger it is.
+BRANCH_TOL = 1e-6
 
 
 class Auto(Dense):

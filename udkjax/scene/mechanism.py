@@ -1,6 +1,6 @@
 """A mechanism: the pytree of everything that exists in a scene, checked, with named access to every number."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -21,6 +21,11 @@ from udkjax.scene.schema import table_of, type_name
 
 Element = TypeVar("Element", bound=eqx.Module)
 _FIXED = Frame(0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+# Which rows of Psi are redundant is a question to the equations, a floor above: imported, they put their answer here. It has to be
+# given when a mechanism is built, since its numbers may be traced ever after.
+find_redundant_rows: Callable[["Mechanism"], tuple[int, ...] | None] = lambda mechanism: None
 
 
 class Mechanism(eqx.Module):
@@ -69,6 +74,8 @@ class Mechanism(eqx.Module):
         self.joint_names, self._joints = _columns([(key, self._resolved(c)) for key, c in found["joint"]])
         self.driver_names, self._drivers = _columns([(key, self._resolved(c)) for key, c in found["driver"]])
         self.force_names, self._forces = _columns(found["force"])
+        if left_out is None:
+            self.left_out = find_redundant_rows(self)
 
     @property
     def bodies(self) -> Mapping[str, Body]:

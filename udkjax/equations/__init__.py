@@ -1,0 +1,21 @@
+"""What moves a mechanism: pure functions of its numbers, time, coordinates and velocities."""
+
+from udkjax.equations.assembly import AssemblyError as AssemblyError
+from udkjax.equations.assembly import Check as Check
+from udkjax.equations.assembly import State as State
+from udkjax.equations.assembly import assemble as assemble
+from udkjax.equations.assembly import check as check
+from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
+from udkjax.equations.quantities import Energy as Energy
+from udkjax.equations.quantities import accelerations as accelerations
+from udkjax.equations.quantities import energy as energy
+from udkjax.equations.quantities import equations_of as equations_of
+from udkjax.equations.quantities import reactions as reactions
+from udkjax.equations.quantities import violation as violation
+from udkjax.equations.redundancy import redundant_rows as redundant_rows
+from udkjax.equations.udwadia_kalaba import Baumgarte as Baumgarte
+from udkjax.equations.udwadia_kalaba import Equations as Equations
+from udkjax.equations.udwadia_kalaba import prepare as prepare
+from udkjax.scene import mechanism as _mechanism
+
+_mechanism.find_redundant_rows = redundant_rows

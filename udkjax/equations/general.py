@@ -1,0 +1,124 @@
+"""A constrained system of the user's own, by the same equation: any coordinates, any positive definite mass, nonholonomic rows too."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.equations.udwadia_kalaba import RANK_TOL, Baumgarte, Vector
+from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse
+from udkjax.scene.fields import number
+
+
+class ConstrainedSystem(eqx.Module):
+    """M(q) a = F(t, q, v) + constraint forces, subject to Psi(t, q) = 0 and phi(t, q, v) = 0.
+
+    `mass(q)` returns M (n, n), symmetric positive definite; `force(t, q, v)` returns F (n,); `constraint(t, q)` returns Psi (m,), or
+    is None; `velocity_constraint(t, q, v)` returns phi (k,), nonholonomic or not, or is None. All of them are differentiated:
+    write them in jax.numpy. Numbers that are to be traced or differentiated belong into an equinox module whose methods these are.
+    Simulate it from a `State` with q and v (n,).
+    """
+
+    mass: Callable[[Any], Any]
+    force: Callable[[Any, Any, Any], Any]
+    constraint: Callable[[Any, Any], Any] | None = None
+    velocity_constraint: Callable[[Any, Any, Any], Any] | None = None
+
+
+class GeneralEquations(eqx.Module):
+    """The equations of a `ConstrainedSystem` by one method, with the interface that the integrator knows from a mechanism's.
+
+    Rows of Psi come first, those of phi after them. With M = L L^T, D = A L^(-T) for the rows A = (Psi_q; phi_v):
+    a = a_F + L^(-T) D^+ b, which is a_F + M^(-1/2) D^+ b in other coordinates of the same metric.
+    """
+
+    system: ConstrainedSystem
+    method: Pseudoinverse
+    baumgarte: Baumgarte | None
+    left_out: tuple[int, ...] = eqx.field(static=True, default=())
+
+    @property
+    def branches(self) -> bool:
+        return False
+
+    @property
+    def quick(self) -> "GeneralEquations":
+        return self
+
+    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+        free, weight, plus, b = self._equation(t, q, v)
+        return free if plus is None else free + weight(plus @ b)
+
+    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
+        _, _, plus, b = self._equation(t, q, v)
+        return jnp.zeros(0) if plus is None else -(plus.T @ (plus @ b))
+
+    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """Two Newton steps in position and two in velocity, where phi need not be linear."""
+        for _ in range(2 if self.system.constraint is not None else 0):
+            plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
+            q = q - weight(plus @ self._psi(t, q))
+        for _ in range(2 if self.constrained else 0):
+            plus, weight = self._plus(q, self._slopes(t, q, v))
+            v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
+        return q, v
+
+    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+        return self._psi(t, q), jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)])
+
+    @property
+    def constrained(self) -> bool:
+        """Whether there are any constraints."""
+        return self.system.constraint is not None or self.system.velocity_constraint is not None
+
+    def _equation(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Any, Plus | None, Any]:
+        if not self.constrained:
+            return self._free(t, q, v), None, None, None
+        rate = lambda t, q: self._psi_dot(t, q, v)  # noqa: E731
+        gamma = -jax.jvp(rate, (t, q), (jnp.ones_like(t), v))[1]
+        bend = jax.jvp(lambda t, q: self._phi(t, q, v), (t, q), (jnp.ones_like(t), v))[1]
+        slopes, free = self._slopes(t, q, v), self._free(t, q, v)
+        b = jnp.concatenate([gamma, -bend]) - slopes @ free
+        if self.baumgarte is not None:
+            alpha, beta = self.baumgarte.alpha, self.baumgarte.beta
+            psi = self._psi(t, q)
+            b = b - 2 * alpha * jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)])
+            b = b.at[: len(psi)].add(-(beta**2) * psi)
+        plus, weight = self._plus(q, slopes)
+        return free, weight, plus, b
+
+    def _plus(self, q: Vector, slopes: Float[Array, "m n"]) -> tuple[Plus, Callable[[Vector], Vector]]:
+        """D^+ and x -> L^(-T) x."""
+        L = jnp.linalg.cholesky(jnp.asarray(self.system.mass(q)))
+        D = jax.scipy.linalg.solve_triangular(L, slopes.T, lower=True).T
+        return self.method.plus(D), lambda x: jax.scipy.linalg.solve_triangular(L, x, lower=True, trans=1)
+
+    def _free(self, t: Any, q: Vector, v: Vector) -> Vector:
+        factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.system.mass(q)), lower=True)
+        return jax.scipy.linalg.cho_solve(factor, jnp.asarray(self.system.force(t, q, v)))
+
+    def _slopes(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m n"]:
+        return jnp.concatenate([jax.jacfwd(self._psi, 1)(t, q), jax.jacfwd(self._phi, 2)(t, q, v)])
+
+    def _psi(self, t: Any, q: Vector) -> Array:
+        return jnp.zeros(0) if self.system.constraint is None else jnp.atleast_1d(jnp.asarray(self.system.constraint(t, q)))
+
+    def _phi(self, t: Any, q: Vector, v: Vector) -> Array:
+        constraint = self.system.velocity_constraint
+        return jnp.zeros(0) if constraint is None else jnp.atleast_1d(jnp.asarray(constraint(t, q, v)))
+
+    def _psi_dot(self, t: Any, q: Vector, v: Vector) -> Array:
+        return jax.jvp(self._psi, (t, q), (jnp.ones_like(t), v))[1]
+
+
+def prepare_general(system: ConstrainedSystem, method: Pseudoinverse | None, baumgarte: Baumgarte | None) -> GeneralEquations:
+    """Choose a method on dense rows: nothing is known of their structure, so `Auto` is by singular values."""
+    method = SVD() if method is None or type(method) is Auto else method
+    if isinstance(method, Elimination) and method.rank_tol is None:
+        return GeneralEquations(system, method, baumgarte)
+    if method.rank_tol is None:
+        method = eqx.tree_at(lambda m: m.rank_tol, method, number(RANK_TOL), is_leaf=lambda x: x is None)
+    return GeneralEquations(system, method, baumgarte)

@@ -1,0 +1,109 @@
+"""What one asks of a motion: accelerations, multipliers, reactions, energies, violations."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.equations.general import ConstrainedSystem, GeneralEquations, prepare_general
+from udkjax.equations.udwadia_kalaba import Baumgarte, Equations, prepare
+from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.mechanism import Mechanism
+
+
+class Energy(NamedTuple):
+    """Energies (J) at each time. Potential: of gravity, zero at the origin, and of the force elements that have one."""
+
+    kinetic: Float[Array, "T"]
+    potential: Float[Array, "T"]
+
+    @property
+    def total(self) -> Float[Array, "T"]:
+        return self.kinetic + self.potential
+
+
+def equations_of(
+    system: Mechanism | ConstrainedSystem, method: Pseudoinverse | None = None, baumgarte: Baumgarte | None = None
+) -> Equations | GeneralEquations:
+    """Prepare the equations of motion of whatever has some."""
+    if isinstance(system, ConstrainedSystem):
+        return prepare_general(system, method, baumgarte)
+    return prepare(system, method, baumgarte)
+
+
+def accelerations(
+    mechanism: Mechanism | ConstrainedSystem,
+    t: ArrayLike,
+    q: Float[ArrayLike, "bodies 3"],
+    v: Float[ArrayLike, "bodies 3"],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
+    multipliers: bool = False,
+) -> Any:
+    """Return a (bodies, 3) at time t (s), coordinates q and velocities v; with `multipliers` also lambda, one a row of Psi.
+
+    a = a_F + M^(-1/2) D^+ b and lambda = -(D^+)^T D^+ b, of minimum norm where constraints are redundant (m/s^2, rad/s^2; N, N m,
+    in the rows' order and with the sign of M a + Psi_q^T lambda = F). The state need not be closed. `Auto` looks at the rows that
+    it leaves out, too: where they are not satisfied they were not redundant after all, and it takes singular values of all rows.
+    `Auto` and `Elimination` take lambda from singular values: a choice of rows has no minimum-norm multipliers. For a
+    `ConstrainedSystem` q, v and a are (n,).
+    """
+    equations = equations_of(mechanism, method, stabilization)
+    t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
+    a = equations.accelerations(t, q.ravel(), v.ravel(), watch=True).reshape(q.shape)
+    return (a, equations.multipliers(t, q.ravel(), v.ravel())) if multipliers else a
+
+
+def violation(mechanism: Mechanism | ConstrainedSystem, solution: Any) -> Float[Array, "T m"]:
+    """Return Psi (m, rad) at each output time, one column a row: joints in their order, then drivers.
+
+    `solution` is anything with ts (T,), q and v (T, bodies, 3).
+    """
+    return _along(mechanism, solution, lambda equations, t, q, v: equations.violation(t, q, v)[0])
+
+
+def energy(mechanism: Mechanism, solution: Any) -> Energy:
+    """Return kinetic energy v^T M v / 2 and potential energy (J) at each output time."""
+    return _along(mechanism, solution, lambda equations, t, q, v: Energy(*equations.run("energy", t, q, v)))
+
+
+def reactions(
+    mechanism: Mechanism,
+    solution: Any,
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
+) -> dict[str, dict[str, Float[Array, "T 3"]]]:
+    """Return what each joint and driver does to each body that it holds, by their names: `reactions(mech, sol)["A"]["link1"]`.
+
+    The load (T, 3) is force x, force y (N, ground axes) and torque about the centre of mass (N m): -Psi_q^T lambda of the
+    constraint's rows. Of redundant constraints it is the share of minimum norm; the accelerations do not depend on it.
+    `method` (default `SVD`) decides the rank; give the run's `Baumgarte` to include what it adds.
+    """
+
+    def loads(equations, t, q, v):
+        multipliers = equations.multipliers(t, q, v)
+        return -jnp.asarray(equations.jacobian(t, q)) * multipliers[:, None]
+
+    by_row = _along(mechanism, solution, loads, SVD() if method is None else method, stabilization)
+    row_names = [name for name, _ in prepare(mechanism, SVD()).code.equations.row_names]
+    result: dict[str, dict[str, Array]] = {}
+    for name, element in mechanism.constraints.items():
+        load = by_row[:, [k for k, n in enumerate(row_names) if n == name]].sum(1)
+        places = {body: mechanism.body_names.index(body) for body in mechanism.frames_of(element) if body != GROUND}
+        result[name] = {body: load[:, 3 * k : 3 * k + 3] for body, k in places.items()}
+    return result
+
+
+def _along(mechanism: Any, solution: Any, quantity: Callable, method: Any = None, baumgarte: Any = None) -> Any:
+    return _evaluate(mechanism, solution.ts, solution.q, solution.v, quantity, SVD() if method is None else method, baumgarte)
+
+
+@eqx.filter_jit
+def _evaluate(mechanism, ts, q, v, quantity, method, baumgarte):
+    equations = equations_of(mechanism, method, baumgarte)
+    ts, q, v = jnp.asarray(ts), jnp.asarray(q).reshape(len(ts), -1), jnp.asarray(v).reshape(len(ts), -1)
+    return jax.vmap(lambda t, q, v: quantity(equations, t, q, v))(ts, q, v)
