@@ -15,12 +15,16 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.equations import Baumgarte as Baumgarte
     from udkjax.equations import ConstrainedSystem as ConstrainedSystem
     from udkjax.equations import accelerations as accelerations
+    from udkjax.equations import check as check
     from udkjax.equations import energy as energy
     from udkjax.equations import reactions as reactions
     from udkjax.equations import violation as violation
+    from udkjax.equations.assembly import AssemblyError as AssemblyError
     from udkjax.equations.assembly import State as State
     from udkjax.equations.assembly import assemble as assemble
     from udkjax.integrate import Projection as Projection
+    from udkjax.integrate import Result as Result
+    from udkjax.integrate import SimulationError as SimulationError
     from udkjax.integrate import Solution as Solution
     from udkjax.integrate import simulate as simulate
     from udkjax.pinv import SVD as SVD
@@ -48,6 +52,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import Point as Point
     from udkjax.scene import Polynomial as Polynomial
     from udkjax.scene import Prismatic as Prismatic
+    from udkjax.scene import Profile as Profile
     from udkjax.scene import Rack as Rack
     from udkjax.scene import Revolute as Revolute
     from udkjax.scene import SceneError as SceneError
@@ -70,12 +75,12 @@ _NAMES = {
         load loads save dumps SceneError
         Mechanism Body GROUND Frame Point Constraint Joint Driver Motion ForceElement
         Revolute Prismatic Slot Weld Distance Angle Gear Rack Cam
-        Polynomial Sine Spline
+        Polynomial Sine Spline Profile
         Spring TorsionSpring Force Torque Friction""",
     "udkjax.pinv": "SVD Varga Greville Householder GramSchmidt Elimination Auto",
-    "udkjax.equations.assembly": "State assemble",
-    "udkjax.equations": "ConstrainedSystem Baumgarte accelerations violation energy reactions",
-    "udkjax.integrate": "simulate Solution Projection",
+    "udkjax.equations.assembly": "AssemblyError State assemble",
+    "udkjax.equations": "ConstrainedSystem Baumgarte accelerations check violation energy reactions",
+    "udkjax.integrate": "simulate Solution Projection Result SimulationError",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
@@ -84,10 +89,11 @@ __all__ = [*_MODULES, *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str):
+    if name in _MODULES or name in _HOME:
+        import_module("udkjax.equations")  # with it, mechanisms find their redundant rows when they are built
     if name in _MODULES:
         value = import_module(_MODULES[name])
     elif name in _HOME:
-        import_module("udkjax.equations")  # with it, mechanisms find their redundant rows when they are built
         value = getattr(import_module(_HOME[name]), name)
     else:
         raise AttributeError(f"module 'udkjax' has no attribute {name!r}")

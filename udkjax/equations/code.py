@@ -13,8 +13,6 @@ from udkjax.pinv.sparse import Row, absolute, all_of, factorize, greater, multip
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Program, Scalar, frontier
 
-# Operations between two optimization barriers. Without barriers XLA repeats everything for each output; with too many it cannot fuse.
-CUT_EVERY = 48
 # What a row left out may disagree by, relative to its terms, and still count as satisfied: far above rounding, and above what
 # states carry that are closed to the tolerances of an integration.
 CONSISTENT = 1e-6
@@ -104,7 +102,7 @@ class Code:
         if name not in self._programs:
             e = self.equations
             state = [*self.factors, *self.residual] if name == "step" else [e.t, *e.q, *e.v]
-            self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name], CUT_EVERY)
+            self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name])
         return self._programs[name]
 
 

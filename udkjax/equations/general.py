@@ -66,6 +66,9 @@ class GeneralEquations(eqx.Module):
             v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
         return q, v
 
+    def is_finite(self, t: Any, q: Vector, v: Vector) -> Any:
+        return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
+
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         return self._psi(t, q), jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)])
 

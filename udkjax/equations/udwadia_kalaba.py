@@ -5,7 +5,8 @@ With D = Psi_q M^(-1/2), a_F = M^(-1) F and b = gamma - 2 alpha Psi_dot - beta^2
     a = a_F + M^(-1/2) D^+ b,        lambda = -(D^+)^T D^+ b        (M a + Psi_q^T lambda = F).
 
 It is written twice. The plain form is the equation as it stands, on arrays, for any pseudoinverse; every derivative is taken of
-it. The fast form is one straight-line program for elimination, with the plain form's derivatives.
+it. The fast form is one straight-line program for elimination, with the plain form's derivatives; where `Auto` may branch, those
+of singular values.
 """
 
 import dataclasses
@@ -69,11 +70,15 @@ class Equations(eqx.Module):
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
-        return _project(self, t, q, v) if self.code.elimination else plain_project(self, t, q, v)
+        return _project(self, t, q, v)
 
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""
         return _stack(self.run("psi", t, q, v)), _stack(self.run("psi_dot", t, q, v))
+
+    def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
+        """Whether everything that the equation is made of is a number."""
+        return jnp.all(jnp.isfinite(_stack(self.run("rows", t, q, v))))
 
     def jacobian(self, t: Any, q: Vector) -> Float[Array, "m n"]:
         """Psi_q of all rows."""
@@ -161,23 +166,33 @@ def plain_project(equations: Equations, t: Any, q: Vector, v: Vector) -> tuple[V
     return q, v + _by_method(equations, step, "rate", t, q, v)
 
 
-def _by_method(equations: Equations, use: Any, name: str, t: Any, q: Vector, v: Vector) -> Vector:
+def _plain_correction(equations: Equations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    """One Newton step in position and one in velocity, with one D^+: of a projected state it changes the tangents alone."""
+
+    def step(plus: Plus, name: str) -> tuple[Vector, Vector]:
+        _, psi, root = _arrays(equations, name, t, q, v)
+        closed = q - root * (plus @ psi)
+        rate = _stack(equations.run("psi_dot" + name.removeprefix("closure"), t, closed, v))
+        return closed, v - root * (plus @ rate)
+
+    return _by_method(equations, step, "closure", t, q, v)
+
+
+def _by_method(equations: Equations, use: Any, name: str, t: Any, q: Vector, v: Vector) -> Any:
     """Call `use` with D^+ by the equations' method, and the name of the program whose rows it is for."""
     programs, method = equations.code, equations.method
     if not programs.kept:
         return use(_Unconstrained(), name)
 
-    def dense(method: Pseudoinverse) -> Vector:
+    def dense(method: Pseudoinverse) -> Any:
         return use(method.plus(programs.pattern.dense(_arrays(equations, name, t, q, v)[0])), name)
 
     if not isinstance(method, Auto | Elimination):
         return dense(method)
+    if equations.branches:
+        return dense(equations.exact().method)
     tol = method.branch_tol**0.5 if isinstance(method, Auto) else method.rank_tol
-    plus = SparseElimination(programs.kept_pattern, tol).plus(_arrays(equations, name + "_kept", t, q, v)[0])
-    if isinstance(method, Elimination) or not equations.branch:
-        return use(plus, name + "_kept")
-    safe = plus.rank == len(programs.kept)
-    return jax.lax.cond(safe, lambda: use(plus, name + "_kept"), lambda: dense(equations.exact().method))
+    return use(SparseElimination(programs.kept_pattern, tol).plus(_arrays(equations, name + "_kept", t, q, v)[0]), name + "_kept")
 
 
 class _Unconstrained:
@@ -212,6 +227,18 @@ def _accelerations(program: str, equations: Equations, t: Any, q: Vector, v: Vec
 
 @jax.custom_jvp
 def _project(equations: Equations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    return _fast_project(equations, t, q, v) if equations.code.elimination else plain_project(equations, t, q, v)
+
+
+@_project.defjvp
+def _(primals, tangents):
+    """Where the residuals vanish the tangents of one Newton step are those of the projection."""
+    equations, t, q, v = primals
+    q, v = _project(equations, t, q, v)
+    return (q, v), jax.jvp(_plain_correction, (equations, t, q, v), tangents)[1]
+
+
+def _fast_project(equations: Equations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     """As the plain form, but with the factors of the first position kept: they differ by the residual, and so does the result."""
     *factors, safe = equations.run("factor", t, q, v)
     step = equations.code.program("step")
@@ -222,13 +249,10 @@ def _project(equations: Equations, t: Any, q: Vector, v: Vector) -> tuple[Vector
 
     q1 = without(q, "psi_kept", q)
     q2 = without(q1, "psi_kept", q1)
-    v1 = without(v, "psi_dot_kept", q2)
-    v2 = without(v1, "psi_dot_kept", q2)
-    return _checked(equations, safe, (q2, v2), plain_project, t, q, v)
+    return _checked(equations, safe, (q2, without(v, "psi_dot_kept", q2)), plain_project, t, q, v)
 
 
 _accelerations.defjvp(lambda program, primals, tangents: jax.jvp(plain_accelerations, primals, tangents))
-_project.defjvp(lambda primals, tangents: jax.jvp(plain_project, primals, tangents))
 
 
 def _checked(equations: Equations, safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:

@@ -1,6 +1,6 @@
 """Return each step of a solver to the constraint manifold."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -16,6 +16,14 @@ class Projection(eqx.Module):
     """Project positions and velocities after each step, by the smallest change in the mass metric (the default stabilization)."""
 
 
+def constrained(solver: diffrax.AbstractSolver, projected: bool, adjoint: diffrax.AbstractAdjoint) -> "Constrained":
+    """Wrap a solver, with the loop over its stages of the kind that the adjoint can differentiate."""
+    kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
+    if type(adjoint) in kinds and getattr(solver, "scan_kind", "") is None:
+        solver = eqx.tree_at(lambda s: s.scan_kind, solver, kinds[type(adjoint)], is_leaf=lambda x: x is None)
+    return Constrained(solver, projected)
+
+
 class Constrained(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     """A diffrax solver for the motion of a mechanism: `args` are its equations, y is (q, v) in one vector.
 
@@ -28,6 +36,7 @@ class Constrained(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver)
 
     solver: diffrax.AbstractSolver
     projected: bool
+    scan_kind: ClassVar[str] = "the wrapped solver's"  # an adjoint would replace None, here; `constrained` has done it
 
     @property
     def term_structure(self):
@@ -116,4 +125,4 @@ def project_all(equations: Equations, ts: Float[Array, "T"], ys: Float[Array, "T
 
 
 def _twice(equations: Equations, t: Any, y: Any) -> Any:
-    return project(equations, t, project(equations, t, y))
+    return jax.lax.scan(lambda y, _: (project(equations, t, y), None), y, None, length=2)[0]

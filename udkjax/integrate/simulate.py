@@ -14,7 +14,7 @@ from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.udwadia_kalaba import Baumgarte, Equations
-from udkjax.integrate.projection import Constrained, Projection, project_all
+from udkjax.integrate.projection import Projection, constrained, project_all
 from udkjax.integrate.solution import Result, SimulationError, Solution
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
@@ -24,6 +24,7 @@ MAX_STEPS = 100_000
 # m and rad. Projection leaves rounding errors, unless the rows that it does not see drift; without it drift is what one looks at,
 # and a run is lost when the parts visibly come apart.
 DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-2
+AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one looks for what is not finite
 SMALLEST_STEP = 100.0  # ulps of the end time: below it time does not advance
 
 
@@ -89,10 +90,10 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     rtol, atol = (jnp.where(closed, tol, 1e3) for tol in (rtol, atol))
     run = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
-        Constrained(solver, projected),
+        constrained(solver, projected, adjoint),
         t0=ts[0],
         t1=ts[-1],
-        dt0=None,
+        dt0=_first_step(equations, ts, y0, rtol, atol),
         y0=y0,
         args=equations,
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]),
@@ -108,7 +109,8 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     if projected:
         ys = jnp.concatenate([ys[:1], project_all(equations, ts[1:], ys[1:])])
     q, v = jnp.split(ys, 2, axis=1)
-    code, time, reached = _outcome(equations, run.result, ts, t_end, end, q, reached, closed, drift_tol)
+    state_of_play = jax.lax.stop_gradient((equations, ts, t_end, end, q, drift_tol))
+    code, time, reached = _outcome(run.result, reached, closed, *state_of_play)
     missed = jnp.array(False)
     if closure is not None and equations.left_out:
         missed = closed & (closure.rank > len(closure.psi) - len(equations.left_out))
@@ -125,6 +127,17 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     return Solution(ts, q, v, code, time, stats, getattr(mechanism, "body_names", ()), settings), closure, missed
 
 
+def _first_step(equations: Any, ts: Array, y0: Array, rtol: Any, atol: Any) -> Array:
+    """A step over which the state changes by a small part of itself (Hairer, Norsett, Wanner, II.4, without its second evaluation:
+    the controller corrects what is off)."""
+    equations, y0, rtol, atol = jax.lax.stop_gradient((equations.quick, y0, rtol, atol))
+    scale = atol + rtol * jnp.abs(y0)
+    size, slope = jnp.max(jnp.abs(y0) / scale), jnp.max(jnp.abs(derivative(ts[0], y0, equations)) / scale)
+    span = ts[-1] - ts[0]
+    ordinary = jnp.isfinite(slope) & (slope > 0) & (size > 0)
+    return jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, slope, 1.0), span), 1e-4 * span)
+
+
 def derivative(t: Any, y: Float[Array, "2n"], equations: Equations) -> Float[Array, "2n"]:
     """(v, a)."""
     q, v = jnp.split(y, 2)
@@ -137,11 +150,11 @@ def _controller(rtol: Any, atol: Any, ts: Array) -> diffrax.PIDController:
     return diffrax.PIDController(rtol=rtol, atol=atol, norm=optx.max_norm, dtmin=SMALLEST_STEP * ulp, force_dtmin=False)
 
 
-def _outcome(equations, result, ts, t_end, end, q, reached, closed, drift_tol):
+def _outcome(result, reached, closed, equations, ts, t_end, end, q, drift_tol):
     """The code, the time that belongs to it, and which output times count."""
-    slope = derivative(t_end, end, equations)
-    ahead = 1e-6 * (ts[-1] - ts[0])
-    finite = jnp.all(jnp.isfinite(slope)) & jnp.all(jnp.isfinite(derivative(t_end + ahead, end + ahead * slope, equations)))
+    q_end, v_end = jnp.split(end, 2)
+    times = t_end + jnp.array([0.0, AHEAD]) * (ts[-1] - ts[0])
+    finite = jnp.all(jax.vmap(lambda t: equations.is_finite(t, q_end + (t - t_end) * v_end, v_end))(times))
     stopped = jnp.where(finite, Result.step_too_small, Result.not_finite)
     stopped = jnp.where(result == diffrax.RESULTS.max_steps_reached, Result.step_limit, stopped)
     code = jnp.where(result == diffrax.RESULTS.successful, Result.successful, stopped)
@@ -164,8 +177,7 @@ def _stats(stats: dict[str, Any], solver: Any, projected: bool, outputs: int) ->
     counts["steps"], counts["accepted"], counts["rejected"] = steps, stats["num_accepted_steps"], stats["num_rejected_steps"]
     if isinstance(solver, diffrax.AbstractERK):
         stages, reused = solver.tableau.num_stages, solver.tableau.fsal and not projected
-        selection = 2  # the choice of the first step
-        counts["right_hand_sides"] = selection + (steps * (stages - 1) + 1 if reused else steps * stages)
+        counts["right_hand_sides"] = 1 + (steps * (stages - 1) + 1 if reused else steps * stages)  # 1: the first step's size
     else:
         counts["right_hand_sides"] = jnp.full_like(steps, -1)  # an implicit stage takes as many as its root finder needs: not known
     counts["projections"] = steps + 2 * (outputs - 1) if projected else jnp.zeros_like(steps)

@@ -2,12 +2,13 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from udkjax.pinv.elimination import Elimination
-from udkjax.pinv.rule import Dense
+from udkjax.pinv.rule import Dense, number
 from udkjax.pinv.svd import SVD, Factors
 
 # A pivot relative to the diagonal entry of its row is the square of a distance from dependence, and elimination loses its digits
@@ -22,11 +23,7 @@ class Auto(Dense):
     The branch is a real one in a single solve and under `lax.map`; under `vmap` both sides run.
     """
 
-    branch_tol: Float[Array, ""]
-
-    def __init__(self, rank_tol: ArrayLike | None = None, relative: bool = True, branch_tol: ArrayLike = BRANCH_TOL):
-        super().__init__(rank_tol, relative)
-        self.branch_tol = jnp.asarray(branch_tol, dtype=jnp.result_type(float))
+    branch_tol: Float[Array, ""] = eqx.field(converter=number, default=BRANCH_TOL)
 
     @property
     def exact(self) -> SVD:

@@ -5,14 +5,14 @@ D D^T = L L^T with as many columns in L as the rank, from which D^+ = D^T L (L^T
 A sparse matrix with independent rows takes straight-line code (sparse.py).
 """
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from udkjax.pinv.rule import Dense, Pseudoinverse, beyond, dot
+from udkjax.pinv.rule import Dense, Pseudoinverse, beyond, dot, number
 from udkjax.pinv.sparse import Pattern, program
 
 
@@ -82,12 +82,10 @@ class SparseElimination(Pseudoinverse):
     solves the rows kept, which is the pseudoinverse of all of them where they are consistent.
     """
 
-    pattern: Pattern = eqx.field(static=True)
-    default_tol: ClassVar[float] = 1e-8  # the square root of eps: a smaller remainder of a row is rounding error
+    pattern: Pattern = eqx.field(static=True, default=Pattern((0, 0), ()))
 
-    def __init__(self, pattern: Pattern, rank_tol: Any = None):
-        super().__init__(self.default_tol if rank_tol is None else rank_tol)
-        self.pattern = pattern
+    def __init__(self, pattern: Pattern, rank_tol: ArrayLike = 1e-8):  # the root of eps: a smaller remainder of a row is rounding
+        self.rank_tol, self.relative, self.pattern = number(rank_tol), True, pattern
 
     def admit(self, D: Any) -> Any:
         return jnp.asarray(D)

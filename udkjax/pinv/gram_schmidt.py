@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.pinv.orthogonal import Factors, Orthogonal, PivotedQR, divide
 from udkjax.pinv.rule import beyond, dot
-from udkjax.pinv.triangular import Factors, PivotedQR, Triangular, leading
 
 
-class GramSchmidt(Triangular):
+class GramSchmidt(Orthogonal):
     """D = Q R with column pivoting, then R^T = Z U: D^+ = Z U^(-T) Q^T, both by modified Gram-Schmidt.
 
     With `twice` each column is made orthogonal to the previous ones a second time when its turn comes: the error then is of the
@@ -21,8 +21,8 @@ class GramSchmidt(Triangular):
 
     def factor(self, D: Float[Array, "m n"]) -> Factors:
         q, r, _, rank = gram_schmidt(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()), self.twice)
-        z, u, order, _ = gram_schmidt(r.T, jnp.zeros((), D.dtype), self.twice)  # the rank is decided: drop zero columns only
-        return Factors(z, leading(u[:, order], rank).T, q[:, order], rank, lower=True)
+        z, u, order, _ = gram_schmidt(r.T, jnp.zeros((), D.dtype), self.twice)  # the rank is decided: leave out zero rows only
+        return Factors(divide(u[:, order], z.T, rank).T, q[:, order], rank)
 
 
 def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: bool) -> PivotedQR:

@@ -2,14 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from udkjax.pinv.orthogonal import Factors, Orthogonal, PivotedQR, divide
 from udkjax.pinv.rule import beyond, dot
-from udkjax.pinv.triangular import Factors, PivotedQR, Triangular, leading
 
 
-class Householder(Triangular):
+class Householder(Orthogonal):
     """Least squares by Householder's QR with column pivoting. With E the unit vectors of the r pivot columns,
 
         D = Q T G,   T = R E (r, r) upper triangular,   G = T^(-1) R, which is [I S] in some order of the columns,
@@ -24,14 +23,12 @@ class Householder(Triangular):
     def factor(self, D: Float[Array, "m n"]) -> Factors:
         columns = D.shape[1]
         q, r, order, rank = pivoted_qr(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()))
-        t = leading(r[:, order], rank)
-        pivots = jax.nn.one_hot(order, columns, dtype=D.dtype) * (jnp.arange(len(order)) < rank)[:, None]  # E^T
-        is_pivot = pivots.any(axis=0)
-        null = jnp.eye(columns, dtype=D.dtype) - dot(pivots.T, solve_triangular(t, r))
-        free_first = jnp.argsort(is_pivot)
-        v, _ = jnp.linalg.qr(null[:, free_first])
-        v = jnp.where(jnp.arange(columns) < columns - rank, v, 0)
-        return Factors(pivots.T - dot(v, dot(v.T, pivots.T)), t, q, rank, lower=False)
+        divided = divide(r[:, order], jnp.hstack([r, q.T]), rank)
+        g, basic = divided[:, :columns], divided[:, columns:]
+        pivots = jax.nn.one_hot(order, columns, dtype=D.dtype, axis=0) * (jnp.arange(len(order)) < rank)  # E
+        null = jnp.where(pivots.any(axis=1), 0, jnp.eye(columns, dtype=D.dtype) - dot(pivots, g))
+        v = pivoted_qr(null, jnp.zeros((), D.dtype)).q
+        return Factors(pivots - dot(v, dot(v.T, pivots)), basic.T, rank)
 
 
 def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:

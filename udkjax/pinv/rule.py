@@ -40,7 +40,7 @@ class Pseudoinverse(eqx.Module):
     units of D. `rank_tol=None` stands for max(m, n) eps, eps the rounding unit of D: right for data that is exact up to rounding.
     (For Greville it is eps^(1/3).) `rank_tol` is an array leaf: it may be traced and batched; its derivative is zero.
 
-    Methods for any operator: the matrix as a pytree, everything else as the six functions below. Derivatives assume that the
+    Methods for any operator: the matrix as a pytree, everything else as the seven functions below. Derivatives assume that the
     rank stays constant nearby; where it jumps no derivative exists.
     """
 

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.pinv.householder import pivoted_qr
-from udkjax.pinv.triangular import Factors, Triangular, leading
+from udkjax.pinv.orthogonal import Factors, Orthogonal, divide
 
 
-class Varga(Triangular):
+class Varga(Orthogonal):
     """D = Q R with column pivoting, then R^T = Z U: D = Q U^T Z^T and D^+ = Z U^(-T) Q^T.
 
     Without pivoting the small entries of R would not be last, and the rank could not be read from it. The threshold is on
@@ -18,6 +18,5 @@ class Varga(Triangular):
 
     def factor(self, D: Float[Array, "m n"]) -> Factors:
         q, r, _, rank = pivoted_qr(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()))
-        z, u = jnp.linalg.qr(r.T)
-        z = jnp.where(jnp.arange(z.shape[1]) < rank, z, 0)
-        return Factors(z, leading(u, rank).T, q, rank, lower=True)
+        z, u, order, _ = pivoted_qr(r.T, jnp.zeros((), D.dtype))  # the rank is decided: leave out zero rows only
+        return Factors(divide(u[:, order], z.T, rank).T, q[:, order], rank)

@@ -1,7 +1,6 @@
 """Straight-line programs: scalar expressions recorded once, with everything that is structurally zero or repeated left out."""
 
 from udkjax.straightline.emit import Program as Program
-from udkjax.straightline.emit import cut as cut
 from udkjax.straightline.emit import frontier as frontier
 from udkjax.straightline.graph import Graph as Graph
 from udkjax.straightline.graph import Scalar as Scalar

@@ -17,23 +17,32 @@ import numpy as np
 
 from udkjax.straightline.graph import Details, Graph, Node, Scalar
 
+# Operations between two optimization barriers. Without any, XLA repeats everything for each output; with too many it cannot fuse.
+CUT_EVERY = 48
+
 _FLOATS: dict[str, Callable] = {"sin": math.sin, "cos": math.cos, "tanh": math.tanh, "exp": math.exp}
 
 
 class Program:
     """`program(values)` takes one value for each of `inputs` and returns one for each of `outputs`."""
 
-    def __init__(self, graph: Graph, inputs: Sequence[Scalar], outputs: Sequence[Scalar], cut_every: int | None = None):
+    def __init__(self, graph: Graph, inputs: Sequence[Scalar], outputs: Sequence[Scalar], cut_every: int | None = CUT_EVERY):
         self.graph, self.inputs, self.outputs, self.cut_every = graph, list(inputs), list(outputs), cut_every
         self.order = _needed(graph, {s.index for s in inputs}, [s.index for s in outputs])
         self.last_use = {a.index: k for k, i in enumerate(self.order) for a in graph.nodes[i].arguments}
         self.last_use.update((s.index, len(self.order)) for s in outputs)
+        self._traced = jax.jit(self._run)  # traced once, wherever and however often it is called and differentiated
 
     def uses(self, scalar: Scalar) -> bool:
         """Whether the program needs this input at all."""
         return scalar.index in self.last_use
 
     def __call__(self, values: Sequence[Any]) -> list[Any]:
+        if all(isinstance(v, float | int) for v in values):
+            return self._run(values)
+        return self._traced([jnp.asarray(v, s.node.dtype) for v, s in zip(values, self.inputs, strict=True)])
+
+    def _run(self, values: Sequence[Any]) -> list[Any]:
         known: dict[int, Any] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
         recent: list[int] = []
         for k, index in enumerate(self.order):
@@ -49,7 +58,7 @@ class Program:
     def _cut(self, known: dict[int, Any], live: list[int]):
         traced = [i for i in live if isinstance(known[i], jax.Array)]
         if traced:
-            known.update(zip(traced, cut([known[i] for i in traced]), strict=True))
+            known.update(zip(traced, jax.lax.optimization_barrier([known[i] for i in traced]), strict=True))
 
     def count(self) -> dict[str, int]:
         """How many operations of each kind the program holds."""
@@ -60,17 +69,6 @@ class Program:
             if name not in ("constant", "pick", "input"):
                 counts[name] = counts.get(name, 0) + 1
         return counts
-
-
-@jax.custom_jvp
-def cut(values: Any) -> Any:
-    """Keep XLA from fusing across this point. The identity, with the identity's derivative."""
-    return jax.lax.optimization_barrier(values)
-
-
-@cut.defjvp
-def _cut_jvp(primals, tangents):
-    return cut(*primals), tangents[0]
 
 
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:

@@ -99,8 +99,9 @@ class Graph:
     # --- leaves
 
     def input(self, name: Any, group: str, dtype=None) -> Scalar:
-        """Add an input; `group` says what kind of quantity it is, so that a program can be split by what depends on it."""
-        return Scalar(self, self._node("input", (), name, np.dtype(dtype or self.dtype), frozenset([group])))
+        """Add an input; `group` says what kind of quantity it is, so that a program can be split by what depends on it. The two together
+        are the input's identity."""
+        return Scalar(self, self._node("input", (), (group, name), np.dtype(dtype or self.dtype), frozenset([group])))
 
     def constant(self, value: Any, dtype=None) -> Scalar:
         dtype = np.dtype(dtype or self.dtype)

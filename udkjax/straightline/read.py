@@ -15,7 +15,7 @@ from jax.extend import core
 
 from udkjax.straightline.graph import Details, Graph, Scalar
 
-_INLINED = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", "remat", "checkpoint")
+_INLINED = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", "remat", "remat2", "checkpoint")
 _ELEMENTWISE = frozenset(
     """abs acos acosh and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma eq erf erf_inv
     erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p logistic lt max min ne nextafter not or pow reduce_precision rem
@@ -77,8 +77,10 @@ def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
         return [_dot(graph, *inputs, parameters["dimension_numbers"], shape)]
     if name in ("dynamic_slice", "gather") and all(s.constant is not None for i in inputs[1:] for s in i.flat):
         return [_select(equation, inputs)]
-    if name == "iota":
-        return [_constants(graph, np.asarray(_fold(equation.primitive, parameters, [])))]
+    if name == "split":
+        return np.split(inputs[0], np.cumsum(parameters["sizes"])[:-1], parameters["axis"])
+    if all(s.constant is not None for i in inputs for s in i.flat) and not equation.effects:
+        return _known(graph, equation, inputs)
     details = Details(equation.primitive, parameters, tuple(i.shape for i in inputs))
     scalars = tuple(s for i in inputs for s in i.flat)
     return graph.call(details, scalars, [(v.aval.shape, v.aval.dtype) for v in equation.outvars])
@@ -106,10 +108,23 @@ def _fold(primitive: Any, parameters: dict, values: Sequence[Any]) -> Any:
         return np.asarray(primitive.bind(*map(jax.numpy.asarray, values), **parameters))
 
 
+def _known(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """What a primitive gives for known values, such as indices."""
+    values = [_values(i) for i in inputs]
+    with jax.ensure_compile_time_eval():
+        results = equation.primitive.bind(*map(jax.numpy.asarray, values), **equation.params)
+    return [_constants(graph, r) for r in (results if equation.primitive.multiple_results else [results])]
+
+
+def _values(array: np.ndarray) -> np.ndarray:
+    dtype = array.flat[0].node.dtype if array.size else float
+    return np.array([s.constant for s in array.flat], dtype).reshape(array.shape)
+
+
 def _select(equation: Any, inputs: list[np.ndarray]) -> np.ndarray:
     """Which elements an indexing with known indices takes: let JAX take them from an array of their places."""
     places = np.arange(inputs[0].size).reshape(inputs[0].shape)
-    indices = [np.array([s.constant for s in i.flat], i.flat[0].node.dtype).reshape(i.shape) for i in inputs[1:]]
+    indices = [_values(i) for i in inputs[1:]]
     parameters = {**equation.params, "fill_value": None} if "fill_value" in equation.params else equation.params
     return inputs[0].reshape(-1)[_fold(equation.primitive, parameters, [places, *indices])]
 

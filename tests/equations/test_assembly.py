@@ -1,0 +1,290 @@
+"""Closing a mechanism: that it closes, keeps its branch, says what stays open, and can be differentiated."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations import check, redundant_rows
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    return udk.library.parallelogram(np.deg2rad(-50))
+
+
+@pytest.fixture(scope="module")
+def crank():
+    return udk.library.slider_crank(angle=0.3)
+
+
+def violation(twin, mech, state, t=0.0):
+    q, v, t = state.q.ravel(), state.v.ravel(), jnp.asarray(t, float)
+    return jnp.abs(twin.psi(mech, t, q)).max(), jnp.abs(twin.psi_dot(mech, t, q, v)).max()
+
+
+# --- closing
+
+
+@pytest.mark.parametrize("size", [1e-6, 0.1, 0.3])
+def test_closes_from_a_rough_guess(linkage, twin, size):
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        guess = udk.State(linkage.q0 + size * random.uniform(-1, 1, (4, 3)), random.standard_normal((4, 3)))
+        state = udk.assemble(linkage, state=guess)
+        psi, psi_dot = violation(twin, linkage, state)
+        assert psi < 1e-14 and psi_dot < 1e-13
+        assert jnp.abs(state.q - guess.q).max() < 4 * size + 1e-14
+
+
+def test_what_is_closed_stays_as_it_is(linkage, placed):
+    q, v = placed(-0.8, 2.0)
+    state = udk.assemble(linkage, state=udk.State(q, v))
+    assert_allclose(state.q, q, atol=1e-14)
+    assert_allclose(state.v, v, atol=1e-13)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_keeps_the_branch_of_the_guess(side):
+    """A four-bar closes with its coupler above or below: as it was drawn."""
+    mech = udk.library.four_bar()
+    q = mech.q0.at[1:].add(0.15)
+    if side < 0:  # the mirror image about the line from the crank's tip to the rocker's pivot
+        tip, pivot = np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)]), np.array([2.5, 0.0])
+        along = (pivot - tip) / np.linalg.norm(pivot - tip)
+        mirror = 2 * np.outer(along, along) - np.eye(2)
+        turn = 2 * np.arctan2(along[1], along[0])
+        reflected = [[*(tip + mirror @ (np.asarray(b[:2]) - tip)), turn - b[2]] for b in mech.q0[1:]]
+        q = jnp.stack([mech.q0[0], *jnp.array(reflected)]).at[1:].add(0.1)
+    found = udk.assemble(mech, state=udk.State(q, jnp.zeros((3, 3)))).q
+    tip, pin = _end(found[0], 0.5), _end(found[1], 1.25)
+    across = np.cross([*(np.array([2.5, 0.0]) - tip), 0.0], [*(pin - tip), 0.0])[2]
+    assert np.sign(across) == side
+    assert jnp.abs(found - q).max() < 0.5
+
+
+def _end(pose, half):
+    x, y, angle = np.asarray(pose)
+    return np.array([x + half * np.cos(angle), y + half * np.sin(angle)])
+
+
+def test_velocities_follow_the_drivers(crank, twin):
+    """At any time the driver says what the velocities are, whatever the guess was."""
+    for t in (0.0, 0.9):
+        state = udk.assemble(crank, t, udk.State(udk.assemble(crank, 0.0).q.at[0, 2].add(4.0 * t), 5.0 * jnp.ones((3, 3))))
+        assert_allclose(state.q[0, 2], 0.3 + 4.0 * t, atol=1e-13)
+        assert_allclose(state.v[0], [-np.sin(0.3 + 4 * t), np.cos(0.3 + 4 * t), 4.0], atol=1e-12)
+        assert max(violation(twin, crank, state, t)) < 1e-12
+
+
+def test_velocities_keep_the_free_motion_of_the_guess(linkage, placed):
+    """The least change in the metric of the masses: momentum along the free motion stays as it was."""
+    q, direction = placed(-0.8, 1.0)
+    random = np.random.default_rng(1).standard_normal((4, 3))
+    state = udk.assemble(linkage, state=udk.State(q, random))
+    mass = np.array([[1, 1, 0.1]] * 3 + [[2, 2, 0.2]])
+    assert_allclose(state.v, direction * np.sum(mass * direction * random) / np.sum(mass * direction**2), atol=1e-13)
+
+
+# --- what cannot be closed
+
+
+def apart(mech, by):
+    """With its second ground pivot so far away that no coupler reaches it."""
+    return mech.with_parameters({"joint.D.points[0][0]": by})
+
+
+def test_names_what_stays_open_and_makes_nothing_worse(twin):
+    mech = apart(udk.library.four_bar(), 9.0)
+    before = jnp.linalg.norm(twin.psi(mech, 0.0, mech.q0.ravel()))
+    with pytest.raises(udk.AssemblyError, match=r'cannot be closed.*"[ABCD]" \([0-9.]+\).*closer') as caught:
+        udk.assemble(mech)
+    best = caught.value.state
+    assert jnp.linalg.norm(twin.psi(mech, 0.0, best.q.ravel())) < before
+    assert_allclose(udk.assemble(mech, throw=False).q, best.q)
+
+
+def test_a_joint_that_is_open_by_itself_is_named_alone():
+    """Two welds that contradict each other, beside a pendulum that closes."""
+    o = [[0.0, 0.0], [0.0, 0.0]]
+    bodies = {"block": udk.Body(1.0, 1.0), "rod": udk.Body(1.0, 1.0, [0.5, 0.0])}
+    joints = {
+        "one": udk.Weld(["ground", "block"], o, angle=0.0),
+        "other": udk.Weld(["ground", "block"], [[0.3, 0.0], [0.0, 0.0]], angle=0.0),
+        "pin": udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]]),
+    }
+    with pytest.raises(udk.AssemblyError) as caught:
+        udk.assemble(udk.Mechanism(bodies, joints))
+    assert '"one"' in str(caught.value) and '"other"' in str(caught.value) and '"pin"' not in str(caught.value)
+
+
+def test_a_driver_against_a_joint_leaves_velocities_open():
+    mech = udk.library.compound_pendulum()
+    driver = udk.Driver(["ground", "rod"], "distance", udk.Polynomial([0.75, 1.0]), [[0.0, 0.0], [0.0, 0.0]])
+    with pytest.raises(udk.AssemblyError, match=r'no velocities.*"(pin|pull)".*driver'):
+        udk.assemble(udk.Mechanism(mech.bodies, mech.joints, {"pull": driver}))
+
+
+def test_never_worse(linkage, twin):
+    """Also from guesses that are hopeless, and for a mechanism that cannot close at all."""
+    stuck = linkage.with_parameters({"joint.A3.points[1][0]": -0.4})
+    assemble = jax.jit(lambda q: udk.assemble(stuck, state=udk.State(q, jnp.zeros((4, 3)))).q)
+    for seed in range(8):
+        q = stuck.q0 + np.random.default_rng(seed).uniform(-2, 2, (4, 3))
+        before, after = (jnp.linalg.norm(twin.psi(stuck, 0.0, x.ravel())) for x in (q, assemble(q)))
+        assert after <= before
+
+
+def test_not_a_number_is_not_closed():
+    mech = udk.library.compound_pendulum()
+    with pytest.raises(udk.AssemblyError):
+        udk.assemble(mech, state=udk.State(jnp.full((1, 3), jnp.nan), jnp.zeros((1, 3))))
+
+
+def test_nothing_to_close():
+    mech = udk.Mechanism({"stone": udk.Body(1.0, 1.0, [1.0, 2.0], 0.3, [4.0, 5.0], 6.0)})
+    state = udk.assemble(mech)
+    assert_allclose(state.q, [[1.0, 2.0, 0.3]])
+    assert_allclose(state.v, [[4.0, 5.0, 6.0]])
+
+
+# --- derivatives
+
+
+def tied(mech, p):
+    """All three cranks of one length, two masses, the guess of one angle."""
+    lengths = {f"joint.A{k}.points[1][0]": -0.5 * p[0] for k in "123"} | {f"joint.B{k}.points[1][0]": 0.5 * p[0] for k in "123"}
+    masses = {"body.link1.mass": p[1], "body.coupler.inertia": p[2]}
+    return mech.with_parameters(lengths | masses | {"body.link2.angle": p[3], "body.coupler.angular_velocity": p[4]})
+
+
+STARTS = {"closed": [1.0, 1.0, 0.2, np.deg2rad(-50), 0.0], "rough": [1.15, 1.3, 0.25, -0.6, 0.4]}
+
+
+@pytest.fixture(scope="module")
+def assembled(linkage):
+    def outcome(p):
+        state = udk.assemble(tied(linkage, p))
+        return jnp.concatenate([state.q.ravel(), state.v.ravel()])
+
+    weights = jnp.asarray(np.random.default_rng(7).standard_normal(24))
+    return {
+        "value": jax.jit(outcome),
+        "forward": jax.jit(jax.jacfwd(outcome)),
+        "reverse": jax.jit(jax.grad(lambda p: weights @ outcome(p))),
+        "second": jax.jit(jax.hessian(lambda p: weights @ outcome(p))),
+        "weights": weights,
+    }
+
+
+def central(function, p, step):
+    return jnp.stack([(function(p + h) - function(p - h)) / (2 * step) for h in step * jnp.eye(len(p))], -1)
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_derivatives_of_the_assembled_state(assembled, start):
+    """With redundant rows, of tied lengths, masses and the guess: forward, reverse and second order."""
+    p = jnp.array(STARTS[start])
+    forward = assembled["forward"](p)
+    assert_allclose(forward, central(assembled["value"], p, 1e-5), atol=2e-9)
+    assert jnp.abs(forward).max(0).min() > 1e-2 if start == "rough" else jnp.abs(forward[:, 0]).max() > 0.1
+    assert_allclose(assembled["reverse"](p), assembled["weights"] @ forward, atol=1e-11)
+    second = assembled["second"](p)
+    assert_allclose(second, second.T, atol=1e-9)
+    assert_allclose(second, central(assembled["reverse"], p, 1e-5), atol=1e-7)
+
+
+def test_derivatives_with_respect_to_drivers(crank):
+    """q follows the first coefficient of the motor's polynomial, v the second; the chain's length changes both."""
+
+    def outcome(p):
+        mech = crank.with_parameters({"driver.motor.motion.coefficients": p[:2], "joint.B.points[0][0]": p[2]})
+        state = udk.assemble(mech)
+        return jnp.concatenate([state.q.ravel(), state.v.ravel()])
+
+    def exact(p):
+        """The slider: x = r cos + sqrt(l^2 - r^2 sin^2), the rod's length being 0.75 + p[2]."""
+        def x(a):
+            return 0.5 * jnp.cos(a) + jnp.sqrt((0.75 + p[2]) ** 2 - 0.25 * jnp.sin(a) ** 2)
+
+        return jnp.stack([p[0], x(p[0]), p[1], jax.grad(x)(p[0]) * p[1]])
+
+    chosen = jnp.array([2, 6, 9 + 2, 9 + 6])
+    for p in (jnp.array([0.3, 4.0, 0.75]), jnp.array([0.5, 3.0, 0.9])):
+        value, slope = jax.jit(lambda p: (outcome(p), jax.jacrev(outcome)(p)))(p)
+        assert_allclose(value[chosen], exact(p), atol=1e-12)
+        assert_allclose(slope[chosen], jax.jacfwd(exact)(p), atol=1e-11)
+
+
+# --- what there is to know of the constraints
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "rank", "freedom", "redundant"),
+    [
+        ("parallelogram", 12, 11, 1, 1),
+        ("scissor_lift", 16, 14, 1, 2),
+        ("planetary_gear", 16, 14, 1, 2),
+        ("peaucellier", 20, 20, 1, 0),
+        ("slider_crank", 9, 9, 0, 0),
+        ("double_pendulum", 4, 4, 2, 0),
+    ],
+)
+def test_check_counts(name, rows, rank, freedom, redundant):
+    found = check(getattr(udk.library, name)())
+    assert (found.rows, found.rank, found.degrees_of_freedom, len(found.redundant)) == (rows, rank, freedom, redundant)
+    assert found.closed and found.residual_after < 1e-13
+    assert bool(found.dependent) == bool(redundant)
+
+
+def test_check_names_what_depends_on_what(linkage):
+    found = check(linkage)
+    assert set(found.dependent) == {"A1", "A2", "A3", "B1", "B2", "B3"}
+    assert found.redundant[0][0] in found.dependent
+    assert check(udk.library.parallelogram(angle=0.0)).rank == 11  # also where it is singular
+    opened = check(apart(udk.library.four_bar(), 9.0))
+    assert not opened.closed and opened.residual_after > 1.0
+
+
+@pytest.mark.parametrize("copies", [2, 5])
+def test_copies_of_a_joint_are_redundant(copies):
+    plain = udk.library.double_pendulum()
+    mech = udk.Mechanism(plain.bodies, {**plain.joints, **{f"copy{k}": plain.joints["elbow"] for k in range(1, copies)}})
+    assert redundant_rows(mech) == tuple(range(4, 4 + 2 * (copies - 1)))  # the originals stay
+
+
+@pytest.mark.parametrize(
+    "mech",
+    [
+        udk.library.parallelogram(angle=0.0),
+        udk.library.parallelogram(angle=np.pi, angular_velocity=1.0),
+        udk.library.n_four_bar(3, angle=0.0),
+        udk.library.scissor_lift(3),
+        udk.library.planetary_gear(4),
+    ],
+    ids=["in line", "folded", "n-four-bar in line", "scissor lift", "planetary gear"],
+)
+def test_what_stays_has_full_rank_elsewhere(mech, twin):
+    """The rows that stay are as many as the rank, and independent, along the motion; also from a singular start."""
+    left_out = mech.left_out
+    state = mech.q0
+    drive = {"parallelogram": 0}.get(mech.name, 0)
+    assert left_out == redundant_rows(mech)
+    for step in (0.35, 0.7):
+        guess = state.at[drive, 2].add(step)
+        if "bar" in mech.name and "scissor" not in mech.name:  # keep to the branch where the links are parallel
+            angle = state[0, 2] + step
+            guess = (udk.library.parallelogram(angle) if "five" in mech.name else udk.library.n_four_bar(3, angle)).q0
+        q = udk.assemble(mech, state=udk.State(guess, jnp.zeros_like(guess))).q.ravel()
+        A = np.asarray(twin.psi_q(mech, jnp.array(0.0), q))
+        rank = np.linalg.matrix_rank(A, tol=1e-7)
+        kept = np.delete(A, left_out, axis=0)
+        assert len(kept) == rank
+        assert np.linalg.svd(kept, compute_uv=False)[-1] > 1e-3
+
+
+def test_independent_rows_all_stay():
+    for name in ("four_bar", "peaucellier", "slider_crank", "double_pendulum", "simple_pendulum", "elliptic_trammel"):
+        assert getattr(udk.library, name)().left_out == ()

@@ -1,0 +1,293 @@
+"""Every term of the equations against its definition: residuals of the elements, and JAX's own derivatives of them."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations import prepare
+from udkjax.pinv import SVD
+
+O = [[0.0, 0.0], [0.0, 0.0]]
+P = [[0.2, -0.1], [-0.3, 0.15]]
+
+
+class Ellipse(udk.Joint):
+    """A point of body 2 stays on an ellipse of body 1; written with arrays, and with an array as its answer."""
+
+    shape: jax.Array
+    point: jax.Array
+
+    def residual(self, t, *frames):
+        one, two = frames
+        turn = jnp.array([[one.cos, one.sin], [-one.sin, one.cos]])
+        p = two.point(self.point)
+        d = turn @ (jnp.stack([p.x, p.y]) - jnp.stack([one.x, one.y]))
+        return jnp.atleast_1d(d @ self.shape @ d - 1.0)
+
+
+class Table(udk.Joint):
+    """Height over x from a table, a soft step, a branch, a loop, a linear system: whatever JAX can trace."""
+
+    heights: tuple
+    slope: float = 0.3
+
+    def residual(self, t, *frames):
+        (one,) = frames
+        height = jnp.interp(one.x, jnp.linspace(-3.0, 3.0, len(self.heights)), jnp.stack([jnp.asarray(h) for h in self.heights]))
+        bend = jax.lax.cond(one.y > 0, lambda s: jnp.sin(s) ** 2, lambda s: s * self.slope, one.angle)
+        series = jax.lax.fori_loop(0, 3, lambda k, s: s * one.x / (k + 1.0) + 1.0, 1.0)
+        matrix = jnp.array([[2.0 + one.cos, one.sin], [0.3, 1.5]])
+        solved = jnp.linalg.solve(matrix, jnp.stack([one.x, one.y]))
+        return [one.y - height, jax.nn.softplus(one.x) + bend, series * jnp.sum(solved), jnp.polyval(jnp.array([0.2, -1.0, 0.5]), one.x)]
+
+
+class Belt(udk.Joint):
+    """Three bodies, the ground in the middle."""
+
+    radius: float
+
+    def residual(self, t, *frames):
+        one, ground, two = frames
+        spread = jnp.array([one.angle, two.angle - ground.angle]) * self.radius
+        return [jnp.sum(spread**3), jnp.cumsum(spread)[-1] * jnp.prod(jnp.stack([one.x, two.y]))]
+
+
+class Chirp(udk.Motion):
+    rate: float
+
+    def __call__(self, t):
+        return jnp.where(t > 0.5, jnp.sin(self.rate * t**2), jnp.exp(-t) * t)
+
+
+class Stop(udk.ForceElement):
+    """A one-sided spring against a wall."""
+
+    stiffness: float
+
+    def potential(self, t, *frames):
+        (one,) = frames
+        depth = jnp.where(one.x < 0.2, 0.2 - one.x, 0.0)
+        return 0.5 * self.stiffness * depth**2 * jnp.cosh(one.angle)
+
+
+class Drag(udk.ForceElement):
+    """Quadratic drag, a gust that comes with time, and a potential beside them."""
+
+    coefficient: jax.Array
+
+    def loads(self, t, *frames):
+        one, two = frames
+        velocity = jnp.stack([one.vx, one.vy]) - jnp.stack([two.vx, two.vy])
+        force = -(self.coefficient @ velocity) * jnp.linalg.norm(velocity) + jnp.where(t > 0.1, jnp.tanh(t), 0.0)
+        return [(*force, -one.omega**3), (*-force, jnp.max(jnp.stack([two.omega, one.omega])))]
+
+    def potential(self, t, *frames):
+        one, two = frames
+        return jnp.logaddexp(one.y, two.y) + jnp.arctan2(one.cos, 2.0 + two.sin) * jnp.cos(t)
+
+
+@pytest.fixture(scope="module")
+def mech():
+    """One of each, far from closed; it is not meant to move."""
+    return udk.Mechanism(
+        bodies={
+            "b": udk.Body(1.0, 0.1, [0.3, -0.2], 0.4, [0.1, 0.2], -0.3),
+            "a": udk.Body(2.0, 0.2, [1.0, 0.5], -1.1),
+            "c": udk.Body(0.7, 1.9, [-0.4, 0.1], 2.0),
+        },
+        joints={
+            "revolute": udk.Revolute(["ground", "b"], P),
+            "revolute of two": udk.Revolute(["c", "b"], P),
+            "to ground": udk.Revolute(["a", "ground"], P),
+            "prismatic": udk.Prismatic(["a", "b"], P, axis=0.3),
+            "slot": udk.Slot(["a", "c"], P, axis=0.3),
+            "weld": udk.Weld(["a", "ground"], P),
+            "distance": udk.Distance(["a", "b"], P),
+            "angle": udk.Angle(["c", "b"]),
+            "gear": udk.Gear(["a", "b"], [0.1, 0.2]),
+            "inner gear": udk.Gear(["a", "b"], [0.1, 0.2], internal=True, carrier="c"),
+            "rack": udk.Rack(["a", "b"], radius=0.2, axis=0.1),
+            "cam": udk.Cam(["a", "b"], P, udk.Profile([-1.0, 0.5, 2.0, 4.0], [1.0, 1.1, 1.2, 1.1])),
+            "ellipse": Ellipse(["a", "c"], jnp.array([[1.0, 0.2], [0.2, 0.5]]), jnp.array([0.1, 0.3])),
+            "ellipse on ground": Ellipse(["ground", "c"], jnp.array([[1.0, 0.2], [0.2, 0.5]]), jnp.array([0.1, 0.3])),
+            "table": Table("c", (0.1, 0.4, -0.3, 0.8)),
+            "belt": Belt(["a", "ground", "c"], 0.3),
+        },
+        drivers={
+            "turn": udk.Driver(["ground", "b"], "angle", udk.Polynomial([0.1, 2.0, -0.7, 0.2])),
+            "push": udk.Driver(["ground", "b"], "x", udk.Sine(1.0, 2.0, 0.3, -0.2)),
+            "lift": udk.Driver(["a", "b"], "y", udk.Spline([0.0, 1.0, 3.0], [0.0, 0.5, 0.1]), P),
+            "stretch": udk.Driver(["a", "b"], "distance", udk.Polynomial([1.0]), P),
+            "chirp": udk.Driver(["c", "ground"], "angle", Chirp(1.7)),
+        },
+        forces={
+            "damped": udk.Spring(["a", "b"], P, stiffness=10.0, length=0.4, damping=0.3),
+            "undamped": udk.Spring(["ground", "b"], P, stiffness=10.0, length=0.4),
+            "torsion": udk.TorsionSpring(["a", "b"], stiffness=3.0, damping=0.2, angle=0.1),
+            "push": udk.Force("a", [1.0, 2.0], point=[0.1, 0.4]),
+            "follow": udk.Force("c", [1.0, 2.0], point=[-0.3, 0.2], frame="body"),
+            "torque": udk.Torque(["a", "b"], value=0.7),
+            "motor": udk.Torque(["ground", "c"], value=0.7),
+            "rub": udk.Friction("revolute of two", torque=0.5, velocity=0.3),
+            "stop": Stop("b", 40.0),
+            "drag": Drag(["b", "c"], jnp.array([[0.4, 0.1], [0.0, 0.7]])),
+            "gust": Drag(["a", "ground"], jnp.array([[0.4, 0.1], [0.0, 0.7]])),
+        },
+        gravity=(0.3, -9.81),
+    )
+
+
+TIMES = np.array([0.0, 0.3, 0.7, 2.0, 3.5])
+
+
+@pytest.fixture(scope="module")
+def states(mech):
+    random = np.random.default_rng(1)
+    q, v = random.standard_normal((2, len(TIMES), 3 * len(mech.bodies)))
+    return jnp.asarray(TIMES), jnp.asarray(q), jnp.asarray(v)
+
+
+@pytest.fixture(scope="module")
+def terms(mech, states):
+    """What the compiled programs say."""
+
+    def at(mech, t, q, v):
+        equations = prepare(mech, SVD())
+        m, n = equations.code.pattern.shape
+        outputs = jnp.stack(equations.run("rows", t, q, v))
+        b, free, root = outputs[-2 * n - m : -2 * n], outputs[-2 * n : -n], outputs[-n:]
+        A = equations.jacobian(t, q)
+        psi, psi_dot = equations.violation(t, q, v)
+        kinetic, potential = equations.run("energy", t, q, v)
+        return {
+            "psi": psi,
+            "psi_dot": psi_dot,
+            "psi_q": A,
+            "gamma": b + A @ free,
+            "mass": root**-2,
+            "force": free / root**2,
+            "kinetic": kinetic,
+            "potential": potential,
+        }
+
+    return jax.vmap(at, (None, 0, 0, 0))(mech, *states)  # not jitted: compiling takes longer
+
+
+@pytest.fixture(scope="module")
+def expected(mech, states, twin):
+    """What the definitions say."""
+
+    def at(mech, t, q, v):
+        return {
+            "psi": twin.psi(mech, t, q),
+            "psi_dot": twin.psi_dot(mech, t, q, v),
+            "psi_q": twin.psi_q(mech, t, q),
+            "gamma": twin.gamma(mech, t, q, v),
+            "mass": twin.mass(mech),
+            "force": twin.force(mech, t, q, v),
+            "kinetic": twin.kinetic(mech, v),
+            "potential": twin.potential(mech, t, q, v),
+        }
+
+    return jax.vmap(at, (None, 0, 0, 0))(mech, *states)  # not jitted: compiling takes longer
+
+
+@pytest.fixture(scope="module")
+def owner(mech):
+    return np.array([name for name, _ in prepare(mech, SVD()).code.equations.row_names])
+
+
+NAMES = """revolute|revolute of two|to ground|prismatic|slot|weld|distance|angle|gear|inner gear|rack|cam|ellipse|ellipse on ground|
+    table|belt|turn|push|lift|stretch|chirp"""
+
+
+@pytest.mark.parametrize("term", ["psi", "psi_q", "psi_dot", "gamma"])
+@pytest.mark.parametrize("name", [n.strip() for n in NAMES.split("|")])
+def test_rows_are_the_derivatives_of_the_residual(terms, expected, owner, name, term):
+    rows = owner == name
+    assert rows.any()
+    assert_allclose(terms[term][:, rows], expected[term][:, rows], rtol=1e-12, atol=1e-12)
+
+
+def test_no_element_is_forgotten(mech, owner):
+    assert list(dict.fromkeys(owner)) == list(mech.constraints) == [n.strip() for n in NAMES.split("|")]
+
+
+@pytest.mark.parametrize("term", ["mass", "force", "kinetic", "potential"])
+def test_masses_loads_and_energies(terms, expected, term):
+    assert_allclose(terms[term], expected[term], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "name", ["damped", "undamped", "torsion", "push", "follow", "torque", "motor", "rub", "stop", "drag", "gust"]
+)
+def test_one_force_element_alone(mech, states, twin, name):
+    alone = udk.Mechanism(mech.bodies, {"revolute of two": mech.joints["revolute of two"]}, {}, {name: mech.forces[name]}, (0.0, 0.0))
+    t, q, v = (s[1] for s in states)
+    q = q.at[0].set(-0.5)  # at the stop
+    free = jnp.stack(prepare(alone, SVD()).run("rows", t, q, v)[-18:-9])
+    assert jnp.abs(free).max() > 1e-3
+    assert_allclose(free * twin.mass(alone), twin.force(alone, t, q, v), rtol=1e-12, atol=1e-12)
+
+
+def test_values_are_inputs_and_types_are_structure(mech):
+    other = jax.tree.map(lambda x: 1.1 * x, mech)
+    assert prepare(other, SVD()).code is prepare(mech, SVD()).code
+
+
+@pytest.fixture(scope="module")
+def machine():
+    """A slider-crank that is driven by a motor between crank and rod, with springs, dampers, friction and loads."""
+    plain = udk.library.slider_crank(angle=0.7, driven=False)
+    return udk.Mechanism(
+        plain.bodies,
+        plain.joints,
+        {"motor": udk.Driver(["crank", "rod"], "angle", udk.Sine(0.5, 3.0, 0.2))},
+        [
+            udk.Spring(["ground", "slider"], [[2.5, 0.3], [0.0, 0.1]], 30.0, 0.2, 4.0),
+            udk.TorsionSpring(["ground", "crank"], 3.0, 0.7, 0.3),
+            udk.Force("rod", [1.0, -2.0], [0.2, 0.1], "body"),
+            udk.Torque(["ground", "crank"], 2.0),
+            udk.Friction("P", 0.4, 0.1),
+            Drag(["slider", "ground"], jnp.eye(2)),
+        ],
+    )
+
+
+def test_energy_changes_by_the_power_of_loads_and_drivers(machine, twin):
+    """dE/dt = v F_nc + V_t + lambda Psi_t, where v satisfies the constraints; the reactions of joints do no work."""
+    random, t = np.random.default_rng(2), jnp.array(0.4)
+    q = machine.q0.ravel() + 0.1 * random.standard_normal(9)
+    A, v = twin.psi_q(machine, t, q), jnp.asarray(random.standard_normal(9))
+    v = v - jnp.linalg.pinv(A) @ twin.psi_dot(machine, t, q, v)
+    a, multipliers = udk.accelerations(machine, t, q.reshape(3, 3), v.reshape(3, 3), multipliers=True)
+
+    def energy(t, q, v):
+        return twin.kinetic(machine, v) + twin.potential(machine, t, q, v)
+
+    growth = jax.jvp(energy, (t, q, v), (1.0, v, a.ravel()))[1]
+    psi_t = jax.jacfwd(twin.psi, 1)(machine, t, q)
+    power = v @ twin.loads(machine, t, q, v) + multipliers @ psi_t + jax.grad(twin.potential, 1)(machine, t, q, v)
+    assert abs(multipliers @ psi_t) > 1.0  # the motor works
+    assert_allclose(growth, power, rtol=1e-11)
+
+    moment = SimpleNamespace(ts=t[None], q=q.reshape(1, 3, 3), v=v.reshape(1, 3, 3))
+    rates = dict(zip(machine.body_names, moment.v[0], strict=True))
+    work = {n: sum(load[0] @ rates[b] for b, load in loads.items()) for n, loads in udk.reactions(machine, moment).items()}
+    assert_allclose(work.pop("motor"), multipliers @ psi_t, rtol=1e-10)
+    assert_allclose(list(work.values()), 0.0, atol=1e-10)
+
+
+def test_energies_along_a_motion(machine, twin):
+    ts, qs, vs = jnp.array([0.0, 0.2]), jnp.stack([machine.q0, machine.q0 + 0.1]), jnp.stack([machine.v0, machine.v0 - 0.3])
+    found = udk.energy(machine, SimpleNamespace(ts=ts, q=qs, v=vs))
+    for k, t in enumerate(ts):
+        q, v = qs[k].ravel(), vs[k].ravel()
+        assert_allclose(found.kinetic[k], twin.kinetic(machine, v), rtol=1e-13)
+        assert_allclose(found.potential[k], twin.potential(machine, t, q, v), rtol=1e-13)
+    assert_allclose(found.total, found.kinetic + found.potential, rtol=1e-15)

@@ -1,0 +1,334 @@
+"""What a scene doesn't need is not computed: shown by what the lowered programs contain, not by their timing.
+
+A program is lowered to StableHLO, and its operations are counted, one for each number that an operation computes. `arithmetic`
+are the floating-point operations proper (add, subtract, multiply, divide, negate, absolute value, powers and roots); sines and
+cosines, comparisons and selections are counted apart. A program that holds a loop, a branch, a call or a routine of a library
+cannot be counted like this; `operations` refuses it, which says that there is none.
+"""
+
+import math
+import re
+from collections import Counter
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+
+import udkjax as udk
+from udkjax import GROUND
+from udkjax.equations import prepare
+
+ARITHMETIC = ("add", "subtract", "multiply", "divide", "negate", "abs", "sqrt", "rsqrt", "cbrt", "power", "maximum", "minimum")
+TRIGONOMETRY = ("sine", "cosine", "tan", "tanh", "atan2", "exponential", "log")
+CHOICES = ("compare", "select", "clamp", "and", "or", "not")
+MOVES = (
+    "constant reshape slice concatenate broadcast_in_dim convert optimization_barrier transpose iota dynamic_slice gather pad scatter"
+).split()
+ELIMINATION = udk.Elimination()
+
+
+def lowered(function, *arguments) -> str:
+    return jax.jit(lambda *a: function(*a)).lower(*arguments).as_text()
+
+
+def operations(text: str) -> Counter:
+    """How many numbers each kind of operation computes; what only moves numbers is left out."""
+    found = Counter()
+    for line in text.splitlines():
+        if match := re.match(r'\s*%\S+ = (?:"?(\w+)\.(\w+)|call)', line):
+            dialect, name = match.groups()
+            assert dialect in ("stablehlo", "chlo"), line
+            sizes = re.findall(r"tensor<((?:\d+x)*)\w+>", line.split("->")[-1] if "->" in line else line.rsplit(":", 1)[-1])
+            found[name] += math.prod(int(n) for n in sizes[-1].split("x") if n) if sizes else 1
+    known = {*ARITHMETIC, *TRIGONOMETRY, *CHOICES, *MOVES}
+    assert set(found) <= known, f"cannot be counted: {set(found) - known}"
+    return Counter({name: n for name, n in found.items() if name not in MOVES})
+
+
+def arithmetic(text: str) -> int:
+    return sum(operations(text)[name] for name in ARITHMETIC)
+
+
+def trigonometry(text: str) -> dict[str, int]:
+    return {name: n for name, n in operations(text).items() if name in TRIGONOMETRY}
+
+
+def right_hand_side(mechanism, method=ELIMINATION, baumgarte=None, **choices) -> str:
+    """a(t, q, v) with the mechanism's numbers known: what is left is what every evaluation computes."""
+    equations = prepare(mechanism, method, baumgarte)
+    q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
+    return lowered(lambda t, q, v: equations.accelerations(t, q, v, **choices), 0.1, q, v)
+
+
+def uses_time(text: str) -> bool:
+    """Whether the first argument appears anywhere but in the head of the function."""
+    return text.count("%arg0") > 1
+
+
+def joined(mechanism, *, joints=None, drivers=None, forces=None, name=""):
+    """The mechanism with further elements."""
+    return udk.Mechanism(
+        dict(mechanism.bodies),
+        {**mechanism.joints, **(joints or {})},
+        {**mechanism.drivers, **(drivers or {})},
+        {**mechanism.forces, **(forces or {})},
+        mechanism.gravity,
+        name,
+    )
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    return udk.library.parallelogram()
+
+
+@pytest.fixture(scope="module")
+def plain(linkage):
+    return right_hand_side(linkage)
+
+
+@pytest.fixture(scope="module")
+def rod():
+    """One pendulum rod, hung at its end."""
+    return udk.Mechanism({"rod": udk.Body(1.0, 0.1, [0.5, 0.0])}, {"A": udk.Revolute((GROUND, "rod"), [[0.0, 0.0], [-0.5, 0.0]])})
+
+
+# --- the counter itself
+
+
+def test_the_counter_counts_numbers_not_lines():
+    text = lowered(lambda x: (jnp.sin(x) * 2.0 + x, -x[0], jax.lax.select(x > 0, x, x)), jnp.ones(5))
+    found = operations(text)
+    assert {k: found[k] for k in ("sine", "multiply", "add", "negate", "select", "compare")} == {
+        "sine": 5, "multiply": 5, "add": 5, "negate": 1, "select": 5, "compare": 5,
+    }  # fmt: skip
+    assert arithmetic(text) == 11
+
+
+@pytest.mark.parametrize("function", [jnp.linalg.inv, jnp.sort, lambda x: x @ x, lambda x: jax.lax.fori_loop(0, 2, lambda i, y: y + x, x)])
+def test_the_counter_refuses_what_it_cannot_count(function):
+    with pytest.raises(AssertionError):
+        operations(lowered(function, jnp.ones((3, 3))))
+
+
+# --- the paper's linkage
+
+
+def test_the_papers_linkage_takes_fewer_than_a_thousand_operations(linkage):
+    """With all numbers traced: what parameters alone determine (12 roots and reciprocals) is included."""
+    a = lambda mech, t, q, v: udk.accelerations(mech, t, q, v, method=udk.Elimination())  # noqa: E731
+    text = lowered(a, linkage, 0.0, linkage.q0, linkage.v0)
+    assert arithmetic(text) <= 1000
+    assert trigonometry(text) == {"sine": 4, "cosine": 4}  # one pair a body
+
+
+def test_the_papers_linkage_pinned(linkage, plain):
+    """11 rows in 12 coordinates: a reciprocal a pivot, nothing else divides, no root is left to the run. A change is a decision."""
+    found = operations(plain)
+    assert found["divide"] == 11
+    assert found["sqrt"] == 0
+    assert found["compare"] == found["select"] == 11  # is the pivot small?
+    assert arithmetic(plain) <= 520
+
+
+def test_the_lowered_program_is_the_counted_one(linkage, plain):
+    program = prepare(linkage, ELIMINATION).code.program("accelerations").count()
+    found = operations(plain)
+    names = {"mul": "multiply", "sub": "subtract", "div": "divide", "sin": "sine", "cos": "cosine", "gt": "compare", "select_n": "select"}
+    for name, n in program.items():
+        # a negative output takes a sign and a zero output nothing: they are not operations of the graph
+        assert found[names.get(name, name)] == n, name
+    assert found["negate"] <= 12
+
+
+@pytest.mark.skipif(tuple(map(int, jax.__version__.split(".")[:2])) < (0, 12), reason="earlier versions ignore barriers on the CPU")
+def test_the_compiler_repeats_little_of_it(linkage, plain):
+    """Without barriers it computes everything before an output anew for each of them: ten times the operations."""
+    equations = prepare(linkage, ELIMINATION)
+    rhs = jax.jit(lambda t, q, v: equations.accelerations(t, q, v)).lower(0.0, linkage.q0.ravel(), linkage.v0.ravel())
+    cost = rhs.compile().cost_analysis()
+    assert cost["flops"] <= 1.5 * arithmetic(plain)
+
+
+# --- what a scene does not have
+
+
+def test_a_body_in_free_fall_takes_no_operation():
+    """a_F is a constant, its mass cancels, and there is nothing else."""
+    text = right_hand_side(udk.Mechanism({"stone": udk.Body(2.0, 0.1)}))
+    assert arithmetic(text) == 0 and trigonometry(text) == {}
+
+
+def test_gravity_alone_makes_a_constant_free_acceleration(linkage):
+    equations = prepare(linkage, ELIMINATION)
+    assert all(s.node.depends <= {"parameter"} for s in equations.code.equations.free)
+
+
+def test_without_drivers_time_is_not_used(linkage, plain):
+    assert not uses_time(plain)
+    driven = joined(linkage, drivers={"motor": udk.Driver((GROUND, "link1"), "angle", udk.Polynomial([0.0, 1.0, 0.5]))})
+    assert not uses_time(right_hand_side(driven))  # gamma of an angle that is quadratic in time is a number
+    turned = joined(linkage, drivers={"motor": udk.Driver((GROUND, "link1"), "angle", udk.Sine(1.0, 2.0))})
+    assert uses_time(right_hand_side(turned))
+
+
+def test_a_driver_costs_its_own_derivatives_only(rod):
+    """A motor that turns evenly has no second derivative: one row more to eliminate, no time, and no sine but the rod's."""
+    even = joined(rod, drivers={"motor": udk.Driver((GROUND, "rod"), "angle", udk.Polynomial([0.0, 1.0]))})
+    sine = joined(rod, drivers={"motor": udk.Driver((GROUND, "rod"), "angle", udk.Sine(1.0, 2.0))})
+    counts = [arithmetic(right_hand_side(m)) for m in (rod, even, sine)]
+    assert counts[0] < counts[1] < counts[2]
+    assert not uses_time(right_hand_side(even))
+    assert trigonometry(right_hand_side(even)) == trigonometry(right_hand_side(rod)) == {"sine": 1, "cosine": 1}
+    assert trigonometry(right_hand_side(sine)) == {"sine": 2, "cosine": 1}
+
+
+@pytest.mark.parametrize(
+    ("less", "more"),
+    [
+        (None, udk.TorsionSpring((GROUND, "rod"), 3.0)),
+        (udk.TorsionSpring((GROUND, "rod"), 3.0), udk.TorsionSpring((GROUND, "rod"), 3.0, 0.2)),
+        (None, udk.Force("rod", [0.0, 1.0], [0.1, 0.0])),
+        (udk.Force("rod", [0.0, 1.0]), udk.Force("rod", [0.0, 1.0], frame="body")),
+        (
+            udk.Spring((GROUND, "rod"), [[0.0, 1.0], [0.5, 0.0]], 3.0, 0.5),
+            udk.Spring((GROUND, "rod"), [[0.0, 1.0], [0.5, 0.0]], 3.0, 0.5, 0.2),
+        ),
+    ],
+    ids=["spring", "its damper", "force", "in the body's axes", "damper of a spring"],
+)
+def test_a_force_element_adds_operations_and_its_absence_none(rod, less, more):
+    counts = [arithmetic(right_hand_side(joined(rod, forces={"f": f} if f is not None else {}))) for f in (less, more)]
+    assert counts[0] < counts[1]
+    if less is None:
+        assert counts[0] == arithmetic(right_hand_side(rod))
+
+
+def test_a_body_without_dampers_is_not_asked_for_its_velocity():
+    spring = lambda *damping: {"s": udk.TorsionSpring((GROUND, "wheel"), 3.0, *damping)}  # noqa: E731
+    for forces, used in ((spring(), False), (spring(0.1), True)):
+        equations = prepare(udk.Mechanism({"wheel": udk.Body(1.0, 0.1)}, forces=forces), ELIMINATION)
+        program = equations.code.program("accelerations")
+        assert any(program.uses(v) for v in equations.code.equations.v) == used
+
+
+def test_without_stabilization_psi_and_its_rate_are_not_evaluated(linkage, plain):
+    """Of hinges, only Psi holds positions of centres of mass, and only Psi_dot holds their velocities."""
+    code = {b: prepare(linkage, ELIMINATION, udk.Baumgarte(5.0, 5.0) if b else None).code for b in (False, True)}
+    for baumgarte, used in ((False, False), (True, True)):
+        program, e = code[baumgarte].program("accelerations"), code[baumgarte].equations
+        assert any(program.uses(e.q[3 * k + i]) for k in range(4) for i in (0, 1)) == used
+        assert any(program.uses(e.v[3 * k + i]) for k in range(4) for i in (0, 1)) == used
+    stabilized = right_hand_side(linkage, baumgarte=udk.Baumgarte(5.0, 5.0))
+    assert arithmetic(stabilized) >= arithmetic(plain) + 4 * 11  # two products and two sums a row, and Psi and Psi_dot
+    assert trigonometry(stabilized) == trigonometry(plain)
+
+
+def test_multipliers_and_energies_only_where_asked_for(linkage):
+    """Multipliers of redundant constraints take singular values: a routine of a library, which `operations` refuses."""
+    q, v = linkage.q0, linkage.v0
+    without = lowered(lambda q, v: udk.accelerations(linkage, 0.0, q, v, ELIMINATION), q, v)
+    constants = prepare(linkage, ELIMINATION).code.prologue.count()
+    assert arithmetic(without) <= arithmetic(right_hand_side(linkage)) + sum(constants.values()) + 1
+    with pytest.raises(AssertionError):
+        operations(lowered(lambda q, v: udk.accelerations(linkage, 0.0, q, v, ELIMINATION, multipliers=True), q, v))
+    equations = prepare(linkage, ELIMINATION)
+    squares = equations.code.equations.kinetic_energy
+    assert squares.index in equations.code.program("energy").order
+    assert squares.index not in equations.code.program("accelerations").order
+
+
+# --- redundancy
+
+
+class Exponential(udk.Joint):
+    """Equal angles, written so that it shows."""
+
+    def residual(self, t, *frames):
+        one, two = frames
+        return [jnp.exp(two.angle - one.angle) - 1.0]
+
+
+def test_a_row_left_out_is_never_computed(rod):
+    """Both joints say that the angles are equal. The second is left out, and with it the exponential."""
+    two = joined(
+        udk.Mechanism({"rod": udk.Body(1.0, 0.1), "bar": udk.Body(1.0, 0.1, [1.0, 0.0])}),
+        joints={"A": udk.Revolute((GROUND, "rod"), [[0.0, 0.0], [0.0, 0.0]]), "same": udk.Angle(("rod", "bar"))},
+    )
+    three = joined(two, joints={"again": Exponential(("rod", "bar"))})
+    assert three.left_out == (3,)
+    assert operations(right_hand_side(three)) == operations(right_hand_side(two))
+    assert "exponential" in trigonometry(right_hand_side(three.with_left_out(())))
+
+
+@pytest.mark.parametrize("copies", [2, 3])
+@pytest.mark.parametrize("baumgarte", [None, udk.Baumgarte(2.0, 2.0)], ids=["", "Baumgarte"])
+def test_a_duplicated_joint_adds_no_operation(linkage, plain, copies, baumgarte):
+    more = {f"{name} {k}": joint for name, joint in linkage.joints.items() for k in range(1, copies)}
+    duplicated = right_hand_side(joined(linkage, joints=more), baumgarte=baumgarte)
+    assert operations(duplicated) == operations(plain if baumgarte is None else right_hand_side(linkage, baumgarte=baumgarte))
+
+
+def test_a_duplicated_joint_adds_no_operation_to_the_projection(linkage):
+    more = {f"{name} again": joint for name, joint in linkage.joints.items()}
+    for name in ("factor", "step", "psi_kept", "psi_dot_kept"):
+        counts = [prepare(m, ELIMINATION).code.program(name).count() for m in (linkage, joined(linkage, joints=more))]
+        assert counts[0] == counts[1], name
+
+
+def test_rows_left_out_are_watched_only_where_asked_for(linkage):
+    auto = prepare(linkage, udk.Auto()).code
+    watched, plain = (sum(auto.program(name).count().values()) for name in ("accelerations_watched", "accelerations"))
+    assert plain < watched < plain + 100
+    assert plain == sum(prepare(linkage, ELIMINATION).code.program("accelerations").count().values())
+
+
+def test_auto_is_elimination_and_a_branch(linkage, plain):
+    """What an integrator evaluates at its stages holds no branch and no singular values: the same operations as Elimination's."""
+    equations = prepare(linkage, udk.Auto())
+    q, v = linkage.q0.ravel(), linkage.v0.ravel()
+    quick = lowered(lambda t, q, v: equations.quick.accelerations(t, q, v), 0.0, q, v)
+    assert arithmetic(quick) == arithmetic(plain)
+    assert "stablehlo.case" not in quick
+    assert "stablehlo.case" in lowered(lambda t, q, v: equations.accelerations(t, q, v), 0.0, q, v)
+
+
+# --- structure
+
+
+def test_parts_that_do_not_touch_are_solved_apart(rod):
+    """Twice the operations, not eight times."""
+    pin = [[0.0, 0.0], [-0.5, 0.0]]
+    bodies = {name: udk.Body(1.0, 0.1, [0.5, 0.0]) for name in ("one", "two", "three")}
+    apart = udk.Mechanism(bodies, {name: udk.Revolute((GROUND, name), pin) for name in bodies})
+    assert arithmetic(right_hand_side(apart)) == 3 * arithmetic(right_hand_side(rod))
+
+
+def test_a_chain_of_loops_grows_linearly():
+    counts = [arithmetic(right_hand_side(udk.library.n_four_bar(n))) for n in (2, 4, 6)]
+    assert counts[2] - counts[1] < 1.2 * (counts[1] - counts[0])
+
+
+def test_a_projection_factorizes_once(linkage):
+    """Two steps in position and two in velocity by the factors of one position: 11 reciprocals, of the pivots."""
+    equations = prepare(linkage, ELIMINATION)
+    text = lowered(lambda t, q, v: equations.project(t, q, v), 0.0, linkage.q0.ravel(), linkage.v0.ravel())
+    assert operations(text)["divide"] == 11
+    assert arithmetic(text) <= 3 * arithmetic(right_hand_side(linkage))
+
+
+def test_numbers_that_change_do_not_compile_anew(linkage):
+    calls = 0
+
+    @eqx.filter_jit
+    def a(mechanism):
+        nonlocal calls
+        calls += 1
+        return udk.accelerations(mechanism, 0.0, mechanism.q0, mechanism.v0, ELIMINATION)
+
+    first = a(linkage)
+    heavier = linkage.with_parameters({"body.link1.mass": 1.5, "gravity": jnp.array([0.0, -3.0])})
+    assert not jnp.allclose(a(heavier), first)
+    assert calls == 1
+    assert prepare(heavier, ELIMINATION).code is prepare(linkage, ELIMINATION).code

@@ -1,0 +1,313 @@
+"""Accelerations and multipliers: against exact solutions, against other formulations, and the principles they obey."""
+
+from functools import partial
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations import prepare
+from udkjax.equations.udwadia_kalaba import plain_accelerations, plain_project
+
+METHODS = {m.__name__: m() for m in (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)}
+LIBRARY = """simple_pendulum compound_pendulum double_pendulum driven_pendulum parallelogram n_four_bar four_bar slider_crank
+    elliptic_trammel scissor_lift peaucellier planetary_gear""".split()
+every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    return udk.library.parallelogram(np.deg2rad(-50))
+
+
+@pytest.fixture(scope="module")
+def mechanisms():
+    return {name: getattr(udk.library, name)() for name in LIBRARY}
+
+
+# --- the paper's linkage
+
+
+@eqx.filter_jit
+def along(mechanism, q, v, method):
+    return jax.vmap(lambda q, v: udk.accelerations(mechanism, 0.0, q, v, method))(q, v)
+
+
+@every_method
+def test_the_linkage_moves_as_its_exact_equation_says(linkage, placed, method):
+    """3.05 theta'' = -3.5 g cos(theta), at any angle but the two where all links are in line, and at any angular velocity."""
+    angles = np.concatenate([np.linspace(-3.0, -0.15, 12), np.linspace(0.15, 3.0, 12)])
+    theta, rate = (x.ravel() for x in np.meshgrid(angles, [0.0, -1.0, 7.0]))
+    a = along(linkage, *jax.vmap(placed)(theta, rate), method)
+    exact = -3.5 * 9.81 * np.cos(theta) / 3.05
+    assert_allclose(a[:, :3, 2], np.stack([exact] * 3, 1), atol=1e-11)
+    assert_allclose(a[:, 3, 2], 0.0, atol=1e-11)
+    tip = np.stack([-np.sin(theta) * exact - np.cos(theta) * rate**2, np.cos(theta) * exact - np.sin(theta) * rate**2], 1)
+    assert_allclose(a[:, 3, :2], tip, atol=1e-11)
+    assert_allclose(a[:, 0, :2], tip / 2, atol=1e-11)
+
+
+@pytest.mark.parametrize("method", [m for n, m in METHODS.items() if n != "Elimination"], ids=[n for n in METHODS if n != "Elimination"])
+def test_in_line_too(linkage, placed, method):
+    """There the rank is 10, and the minimum-norm solution keeps to the parallelogram."""
+    theta, rate = np.array([0.0, 0.0, np.pi, np.pi, 1e-9]), np.array([0.0, 2.0, 0.0, -3.0, 1.0])
+    a = along(linkage, *jax.vmap(placed)(theta, rate), method)
+    assert_allclose(a[:, :3, 2], np.stack([-3.5 * 9.81 * np.cos(theta) / 3.05] * 3, 1), atol=1e-10)
+
+
+def reference(data, case):
+    rows = data("seed_fivebar_parallelogram")["cases"][case]["reference"].values()
+    return {key: np.array([np.asarray(row[key], float) for row in rows]) for key in next(iter(rows))}
+
+
+@pytest.mark.parametrize("case", ["rest_-50deg", "rest_-45deg", "rest_0deg_collinear", "rest_+45deg_crosses", "up_thd-1_rotates"])
+def test_reactions_of_minimum_norm(linkage, placed, data, case):
+    known = reference(data, case)
+    q, v = jax.vmap(placed)(known["theta"], known["thetad"])
+    loads = udk.reactions(linkage, SimpleNamespace(ts=jnp.zeros(len(q)), q=q, v=v))
+    for k in "123":
+        link = loads["B" + k]["link" + k]
+        assert_allclose(link[:, :2], known["coupler_joint_force_on_link"], atol=1e-11)
+        assert_allclose(loads["A" + k]["link" + k][:, :2], known["ground_joint_force_on_link"], atol=1e-11)
+        assert_allclose(loads["B" + k]["coupler"][:, :2], -link[:, :2], atol=1e-13)
+        arm = q[:, 0, :2]  # from the pivot of link 1 to its centre, and from there to the tip
+        assert_allclose(link[:, 2], arm[:, 0] * link[:, 1] - arm[:, 1] * link[:, 0], atol=1e-11)
+
+
+@every_method
+def test_multipliers_are_those_reactions_for_every_method(linkage, placed, data, method):
+    """lambda of a pin acts on the link, body 2, as -lambda, with M a + Psi_q^T lambda = F."""
+    known = reference(data, "rest_-50deg")
+    q, v = jax.vmap(placed)(known["theta"], known["thetad"])
+    multipliers = eqx.filter_jit(jax.vmap(lambda q, v: prepare(linkage, method).multipliers(0.0, q.ravel(), v.ravel())))(q, v)
+    expected = np.concatenate([known["ground_joint_force_on_link"]] * 3 + [known["coupler_joint_force_on_link"]] * 3, 1)
+    assert_allclose(-multipliers, expected, atol=1e-11)
+
+
+def test_accelerations_give_multipliers_when_asked(linkage, placed, data):
+    q, v = placed(np.deg2rad(-50), 0.0)
+    a, multipliers = udk.accelerations(linkage, 0.0, q, v, multipliers=True)
+    assert a.shape == (4, 3) and multipliers.shape == (12,)
+    assert_allclose(-multipliers[:2], reference(data, "rest_-50deg")["ground_joint_force_on_link"][0], atol=1e-11)
+    assert_allclose(multipliers @ data_null(np.deg2rad(-50)), 0.0, atol=1e-12)
+
+
+def data_null(theta):
+    """The state of self-stress of the linkage: what a multiplier of minimum norm has none of."""
+    axial = np.outer([1, -2, 1], [np.cos(theta), np.sin(theta)]).ravel()
+    return np.concatenate([axial, -axial]) / np.sqrt(12)
+
+
+# --- principles
+
+
+@pytest.mark.parametrize("name", LIBRARY)
+def test_agrees_with_the_augmented_equations(mechanisms, twin, closed, name):
+    """One large linear system in a and lambda, by NumPy."""
+    mech = mechanisms[name]
+    q, v = closed(mech)
+    a, multipliers = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3), multipliers=True)
+    expected, forces = twin.kkt(mech, jnp.array(0.0), q, v)
+    scale = 1 + np.abs(expected).max()
+    assert_allclose(a.ravel(), expected, atol=1e-10 * scale)
+    assert_allclose(multipliers, forces, atol=1e-9 * (1 + np.abs(forces).max()))
+    by_svd = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3), udk.SVD())
+    assert_allclose(a, by_svd, atol=1e-10 * scale)
+
+
+@pytest.mark.parametrize("name", ["parallelogram", "scissor_lift", "peaucellier", "planetary_gear", "slider_crank"])
+def test_gauss_principle(mechanisms, twin, closed, name):
+    """Among all accelerations that satisfy the constraints it is nearest to the free ones, in the metric of the masses."""
+    mech = mechanisms[name]
+    q, v = closed(mech, seed=3)
+    a = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3)).ravel()
+    t, mass = jnp.array(0.0), twin.mass(mech)
+    A = twin.psi_q(mech, t, q)
+    size = 1 + jnp.abs(a).max()
+    assert_allclose(A @ a, twin.gamma(mech, t, q, v), atol=1e-10 * size)
+    _, sigma, vt = np.linalg.svd(A)
+    allowed = vt[np.sum(sigma > 1e-8 * sigma[0]) :]
+    offset = a - twin.force(mech, t, q, v) / mass
+    assert len(allowed) == 3 * len(mech.bodies) - np.linalg.matrix_rank(A, tol=1e-8)
+    assert_allclose(allowed @ (mass * offset), 0.0, atol=1e-10 * size * mass.max())
+    effort = offset @ (mass * offset)
+    for z in np.random.default_rng(4).standard_normal((5, len(allowed))) @ allowed if len(allowed) else ():
+        assert (offset + 0.1 * z) @ (mass * (offset + 0.1 * z)) > effort
+
+
+def test_a_constraint_said_many_times_changes_nothing(data):
+    """Each copy of the pin carries its share."""
+    single = udk.library.compound_pendulum()
+    pin = single.joints["pin"]
+    triple = udk.Mechanism(single.bodies, {f"pin{k}": pin for k in range(3)})
+    one, three = (udk.accelerations(m, 0.0, m.q0, m.v0, multipliers=True) for m in (single, triple))
+    assert_allclose(three[0], one[0], atol=1e-13)
+    assert_allclose(three[1], jnp.tile(one[1] / 3, 3), atol=1e-13)
+    known = data("compound_pendulum")["reference"]["0"]
+    assert_allclose(-one[1], [float(known["Rx"]), float(known["Ry"])], rtol=1e-13)
+
+
+# --- stabilization
+
+
+@every_method
+def test_baumgarte_feeds_the_violation_back(mechanisms, twin, method):
+    """Psi_q a = gamma - 2 alpha Psi_dot - beta^2 Psi, away from the manifold, where rows are independent."""
+    mech, random = mechanisms["four_bar"], np.random.default_rng(5)
+    q, v = (x + 0.1 * random.standard_normal(x.shape) for x in (mech.q0, mech.v0))
+    t, state = jnp.array(0.0), (q.ravel(), v.ravel())
+    gains = udk.Baumgarte(3.0, 7.0)
+    a = udk.accelerations(mech, t, q, v, method, gains).ravel()
+    expected = twin.gamma(mech, t, *state) - 6.0 * twin.psi_dot(mech, t, *state) - 49.0 * twin.psi(mech, t, state[0])
+    assert_allclose(twin.psi_q(mech, t, state[0]) @ a, expected, atol=1e-10)
+    plain = udk.accelerations(mech, t, q, v, method)
+    assert_allclose(udk.accelerations(mech, t, q, v, method, udk.Baumgarte(0.0, 0.0)), plain, atol=1e-11)
+    assert jnp.abs(a - plain.ravel()).max() > 0.1
+
+
+# --- two forms of one equation
+
+
+@pytest.fixture(scope="module")
+def nearby(mechanisms):
+    """States almost closed, to 1e-7."""
+
+    def states(name, count=4):
+        mech, random = mechanisms[name], np.random.default_rng(6)
+        q, v = (np.asarray(x).ravel() + 1e-7 * random.standard_normal((count, x.size)) for x in (mech.q0, mech.v0))
+        return mech, jnp.asarray(q), jnp.asarray(v)
+
+    return states
+
+
+@pytest.mark.parametrize("method", [udk.Auto(), udk.Elimination()], ids=["Auto", "Elimination"])
+@pytest.mark.parametrize("name", ["parallelogram", "slider_crank"])
+def test_the_fast_form_is_the_plain_form(nearby, method, name):
+    """On rows that are left out they differ by the violation; `quick`, which does not branch, compares like with like."""
+    mech, qs, vs = nearby(name)
+
+    @eqx.filter_jit
+    def both(mech, qs, vs):
+        equations = prepare(mech, method, udk.Baumgarte(2.0, 3.0)).quick
+        forms = (equations.accelerations, lambda *s: plain_accelerations(equations, *s), equations.project,
+                 lambda *s: plain_project(equations, *s))  # fmt: skip
+        return [jax.lax.map(lambda s, form=form: form(0.0, *s), (qs, vs)) for form in forms]
+
+    fast, plain, projected, newton = both(mech, qs, vs)
+    size = 1 + jnp.abs(plain).max()
+    assert_allclose(fast, plain, atol=1e-11 * size)
+    for one, other, state in zip(projected, newton, (qs, vs), strict=True):
+        assert_allclose(one, other, atol=1e-12)
+        assert jnp.abs(one - state).max() > 1e-9  # it moved
+
+
+@pytest.mark.parametrize("name", ["parallelogram", "scissor_lift", "slider_crank"])
+def test_projection_is_the_smallest_change(nearby, twin, name):
+    mech, qs, vs = nearby(name)
+    equations, t = prepare(mech), jnp.array(0.0)
+    q, v = equations.project(t, qs[0], vs[0])
+    psi, psi_dot = equations.violation(t, q, v)
+    assert_allclose(psi, 0.0, atol=1e-15 * 40)
+    assert_allclose(psi_dot, 0.0, atol=1e-14 * 40)
+    A, mass = np.asarray(twin.psi_q(mech, t, q)), np.asarray(twin.mass(mech))
+    _, sigma, vt = np.linalg.svd(A)
+    for moved in (q - qs[0], v - vs[0]):
+        assert_allclose(vt[np.sum(sigma > 1e-6) :] @ (mass * moved), 0.0, atol=1e-11)
+
+
+# --- few constraints, and more than there seemed
+
+
+def test_bodies_without_constraints_fall_freely(twin):
+    bodies = {"one": udk.Body(2.0, 0.3, [0.1, 0.2], 0.3), "two": udk.Body(1.0, 0.1, [1.0, -0.5], 0.0, [1.0, 2.0], 3.0)}
+    forces = [udk.Spring(["one", "two"], [[0.1, 0.0], [0.0, 0.1]], 20.0, 0.5, 0.3), udk.Torque(["ground", "one"], 0.6)]
+    mech = udk.Mechanism(bodies, forces=forces)
+    assert mech.left_out == ()
+    for method in METHODS.values():
+        a, multipliers = udk.accelerations(mech, 0.0, mech.q0, mech.v0, method, multipliers=True)
+        force = twin.force(mech, 0.0, mech.q0.ravel(), mech.v0.ravel())
+        assert_allclose(a.ravel(), force / twin.mass(mech), atol=1e-13)
+        assert multipliers.shape == (0,)
+    empty = udk.Mechanism(bodies)
+    assert_allclose(udk.accelerations(empty, 0.0, empty.q0, empty.v0), [[0.0, -9.81, 0.0]] * 2, atol=1e-15)
+    still = SimpleNamespace(ts=jnp.zeros(1), q=empty.q0[None], v=empty.v0[None])
+    assert udk.reactions(empty, still) == {} and udk.violation(empty, still).shape == (1, 0)
+
+
+def test_a_body_that_nothing_holds_beside_a_linkage(linkage):
+    mech = udk.Mechanism({"stray": udk.Body(1.0, 1.0, [5.0, 5.0]), **linkage.bodies}, linkage.joints)
+    a = udk.accelerations(mech, 0.0, mech.q0, mech.v0)
+    assert_allclose(a[0], [0.0, -9.81, 0.0], atol=1e-14)
+    assert_allclose(a[1:], udk.accelerations(linkage, 0.0, linkage.q0, linkage.v0), atol=1e-12)
+
+
+def changed(mechanism, length):
+    """One crank of the linkage with another length: its twelve rows become independent, and it can no longer move."""
+    return mechanism.with_parameters({"joint.A3.points[1][0]": -0.5 * length, "joint.B3.points[1][0]": 0.5 * length})
+
+
+@pytest.mark.parametrize("length", [1.2, 1.4])
+def test_rows_left_out_that_become_independent_count_again(linkage, length):
+    mech = changed(linkage, length)
+    assert mech.left_out and mech.left_out == linkage.left_out
+    state = udk.assemble(mech)
+    a, expected = (udk.accelerations(mech, 0.0, state.q, state.v, method) for method in (udk.Auto(), udk.SVD()))
+    assert_allclose(a, expected, atol=1e-10)
+    assert jnp.abs(a).max() < 1e-9  # it cannot move
+    assert jnp.abs(udk.accelerations(mech, 0.0, state.q, state.v, udk.Elimination())).max() > 0.5  # which does not look
+
+
+def test_also_when_numbers_are_traced(linkage):
+    @jax.jit
+    def pair(length):
+        mech = changed(linkage, length)
+        state = udk.assemble(mech)
+        return [udk.accelerations(mech, 0.0, state.q, state.v, method) for method in (udk.Auto(), udk.SVD())]
+
+    for length in (1.2, 1.4):
+        a, expected = pair(length)
+        assert_allclose(a, expected, atol=1e-10)
+        assert jnp.abs(a).max() < 1e-9
+    a, expected = pair(1.0)
+    assert_allclose(a, expected, atol=1e-10)
+    assert jnp.abs(a).max() > 1.0
+
+
+def test_a_mechanism_made_of_traced_numbers():
+    """Nothing is known of its rows: singular values throughout."""
+
+    @jax.jit
+    def angular(angle):
+        mech = udk.library.parallelogram(angle)
+        assert mech.left_out is None
+        return udk.accelerations(mech, 0.0, mech.q0, mech.v0)[0, 2]
+
+    for angle in (-0.9, 0.7):
+        assert_allclose(angular(angle), -3.5 * 9.81 * np.cos(angle) / 3.05, atol=1e-11)
+
+
+# --- derivatives
+
+
+@pytest.mark.parametrize("method", [udk.Auto(), udk.SVD(), udk.Elimination()], ids=["Auto", "SVD", "Elimination"])
+def test_derivatives_of_accelerations(linkage, placed, method):
+    """d(theta'')/d(theta), with respect to a mass that the exact equation knows, and second derivatives."""
+
+    def angular(theta, mass):
+        mech = linkage.with_parameters({"body.coupler.mass": mass})
+        return udk.accelerations(mech, 0.0, *placed(theta, 1.3), method)[1, 2]
+
+    def exact(theta, mass):
+        return -(1.5 + mass) * 9.81 * jnp.cos(theta) / (1.05 + mass)
+
+    def derivatives(function, *at):
+        return jnp.stack(jax.grad(function, (0, 1))(*at)), jnp.array(jax.hessian(function, (0, 1))(*at))
+
+    at = (jnp.array(-0.8), jnp.array(2.0))
+    for found, known in zip(jax.jit(partial(derivatives, angular))(*at), derivatives(exact, *at), strict=True):
+        assert_allclose(found, known, atol=1e-9)

@@ -1,0 +1,259 @@
+"""Gradients: of accelerations against a closed form, of trajectories against elliptic functions; and joints given twice."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax import GROUND
+from udkjax.equations import prepare
+from udkjax.study.exact import pendulum
+
+DATA = json.loads((Path(__file__).parents[1] / "data" / "seed_fivebar_parallelogram.json").read_text())
+EXACT = {name: float(value) for name, value in DATA["sensitivities_rest_minus50"]["2"].items()}
+
+METHODS = {m.__name__: m() for m in (udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination, udk.Auto)}
+every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+
+
+def duplicated(mechanism, copies, joints=None):
+    """The mechanism with `copies` of each of its joints, or of those named."""
+    more = {f"{name} {k}": mechanism.joints[name] for name in joints or mechanism.joints for k in range(1, copies)}
+    return udk.Mechanism(dict(mechanism.bodies), {**mechanism.joints, **more}, gravity=mechanism.gravity)
+
+
+LINKAGE = udk.library.parallelogram(np.deg2rad(-50.0))
+
+
+# --- accelerations: p = (angle, mass of a link, length), the links turning at 1.3 rad/s
+
+RATE = 1.3
+
+
+def state(angle, length, rate=RATE):
+    """q and v (12,), and what they are made of: positions are q(angle), so that accelerations are q'(angle) theta'' + q'' rate^2."""
+
+    def q(s):
+        e = jnp.stack([jnp.cos(s), jnp.sin(s)])
+        links = [jnp.append(jnp.array([x, 0.0]) + length / 2 * e, s) for x in (0.0, 1.0, 2.0)]
+        return jnp.concatenate([*links, jnp.array([1.0, 0.0]) + length * e, jnp.zeros(1)])
+
+    position, slope = jax.jvp(q, (angle,), (jnp.ones_like(angle),))
+    curvature = jax.jvp(lambda s: jax.jvp(q, (s,), (jnp.ones_like(s),))[1], (angle,), (jnp.ones_like(angle),))[1]
+    return position, rate * slope, slope, curvature
+
+
+def closed_form(p):
+    """3.05 theta'' = -3.5 g cos(theta) of the linkage, for any mass and length of its links."""
+    angle, mass, length = p
+    inertia = 3 * (0.1 + mass * length**2 / 4) + 2.0 * length**2
+    turn = -9.81 * (1.5 * mass + 2.0) * length * jnp.cos(angle) / inertia
+    *_, slope, curvature = state(angle, length)
+    return slope * turn + curvature * RATE**2
+
+
+def accelerations(mechanism, method, p):
+    """The same by the equations, with the three links' numbers tied, so that the loop stays closed."""
+    angle, mass, length = p
+    half, zero = length / 2, jnp.zeros_like(length)
+    numbers = {f"body.link{i}.mass": mass for i in (1, 2, 3)}
+    for name in mechanism.joints:
+        side = -half if name[0] == "A" else half
+        numbers[f"joint.{name}.points[1]"] = jnp.stack([side, zero])
+    q, v, *_ = state(angle, length)
+    return prepare(mechanism.with_parameters(numbers), method).accelerations(0.0, q, v)
+
+
+def derivatives(f):
+    """Values, the Jacobian by forward and by reverse mode, and the Hessian of a sum with weights."""
+    total = lambda p: jnp.cos(jnp.arange(12.0)) @ f(p)  # noqa: E731
+    return jax.jit(jax.vmap(lambda p: (f(p), jax.jacfwd(f)(p), jax.jacrev(f)(p), jax.hessian(total)(p))))
+
+
+ANGLES = np.linspace(-np.pi, np.pi, 401)  # with the singular configurations -pi, 0 and pi
+POINTS = jnp.stack([jnp.asarray(ANGLES), jnp.full(401, 1.2), jnp.full(401, 0.9)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return derivatives(closed_form)(POINTS)
+
+
+@every_method
+def test_derivatives_of_accelerations(method, expected):
+    """Finite at all angles; equal to the closed form, and so among the methods, wherever the rank is constant nearby."""
+    found = derivatives(partial(accelerations, LINKAGE, method))(POINTS)
+    ordinary = np.abs(np.sin(ANGLES)) > 1e-2
+    assert ordinary.sum() >= 395
+    # The Hessian of a pseudoinverse holds its third power, 1 / sigma^3: 3e5 at the angles nearest to a singular one.
+    for name, f, e, tol in zip(("value", "forward", "reverse", "Hessian"), found, expected, (1e-9, 1e-9, 1e-9, 1e-7), strict=True):
+        assert np.all(np.isfinite(f)), name
+        scale = np.abs(e).max()
+        np.testing.assert_allclose(f[ordinary] / scale, e[ordinary] / scale, rtol=0, atol=tol, err_msg=name)
+
+
+def test_derivatives_agree_with_differences():
+    """The closed form itself, and one method off the closed form's reach: a load, gravity and a point."""
+    f = lambda x: udk.accelerations(  # noqa: E731
+        LINKAGE.with_parameters({"gravity": x[:2], "body.coupler.mass": x[2], "body.link2.inertia": x[3]}), 0.0, LINKAGE.q0, LINKAGE.v0
+    ).ravel()
+    x, h = jnp.array([0.4, -9.81, 2.1, 0.13]), 1e-5
+    differences = [(f(x + h * d) - f(x - h * d)) / (2 * h) for d in jnp.eye(4)]
+    for jacobian in (jax.jacfwd(f)(x), jax.jacrev(f)(x)):
+        np.testing.assert_allclose(jacobian, jnp.stack(differences, axis=1), rtol=1e-7, atol=1e-8)
+    p = jnp.array([0.7, 1.2, 0.9])
+    differences = jnp.stack([(closed_form(p + h * d) - closed_form(p - h * d)) / (2 * h) for d in jnp.eye(3)], axis=1)
+    np.testing.assert_allclose(jax.jacfwd(closed_form)(p), differences, rtol=1e-8, atol=1e-8)
+
+
+@every_method
+def test_projection_has_derivatives(method):
+    """A closed state stays; its change along the manifold stays too, and a change that opens the loop is taken back."""
+    equations = prepare(LINKAGE, method)
+    angle, length = jnp.array(-0.8), jnp.array(1.0)
+    project = lambda q, v: jnp.concatenate(equations.project(0.0, q, v))  # noqa: E731
+    q, v, *_ = state(angle, length)
+    along = jax.jvp(lambda a: jnp.concatenate(state(a, length)[:2]), (angle,), (jnp.ones(()),))[1]
+    value, tangent = jax.jvp(project, (q, v), tuple(jnp.split(along, 2)))
+    np.testing.assert_allclose(value, jnp.concatenate([q, v]), atol=1e-12)
+    np.testing.assert_allclose(tangent, along, atol=1e-10)
+    jacobian, opening = jax.jacfwd(project)(q, v), jnp.zeros(12).at[9].set(1.0)  # the coupler alone, along x
+    psi_q = equations.jacobian(0.0, q)
+    assert np.abs(psi_q @ opening).max() > 0.5
+    np.testing.assert_allclose(psi_q @ (jacobian[:12] @ opening), 0.0, atol=1e-10)
+    np.testing.assert_allclose(jax.jacrev(project)(q, v), jacobian, atol=1e-9)
+
+
+@every_method
+@pytest.mark.parametrize("copies", [2, 3])
+def test_a_duplicated_joint_changes_no_acceleration_and_no_gradient(method, copies):
+    p = jnp.array([[-0.8, 1.2, 0.9], [2.1, 0.7, 1.1]])
+    f = lambda mechanism: jax.jit(  # noqa: E731
+        jax.vmap(lambda p: (accelerations(mechanism, method, p), jax.jacfwd(partial(accelerations, mechanism, method))(p)))
+    )
+    found = f(duplicated(LINKAGE, copies, ["A1", "B2"]))(p)
+    for got, expected in zip(found, (jax.vmap(closed_form)(p), jax.vmap(jax.jacfwd(closed_form))(p)), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-10, atol=1e-10)
+
+
+# --- trajectories: p = (theta0, g, inertia of a link), from rest
+
+P = jnp.array([np.deg2rad(-50.0), 9.81, 0.1])
+GRADIENT = [EXACT["dtheta_dtheta0"], EXACT["dtheta_dg"], EXACT["dtheta_dI_link"]]
+TS = np.array([0.0, 1.0, 2.0])
+
+
+def theta(p, mechanism=LINKAGE, method=None, adjoint=None, stabilization=udk.Projection(), rtol=1e-11, assembled=False):
+    """theta(2 s)."""
+    angle, gravity, inertia = p
+    numbers = {"gravity": jnp.stack([0.0, -gravity]), **{f"body.link{i}.inertia": inertia for i in (1, 2, 3)}}
+    q, v, *_ = state(angle, jnp.ones(()), 0.0)
+    start = udk.State(q.reshape(4, 3), v.reshape(4, 3))
+    mechanism = mechanism.with_parameters(numbers)
+    if assembled:  # close a state that the first link alone determines
+        start = udk.assemble(mechanism, 0.0, udk.State(start.q.at[1:].set(jax.lax.stop_gradient(start.q[1:])), start.v), throw=False)
+    solution = udk.simulate(
+        mechanism, TS, start, rtol, rtol, method, stabilization, adjoint=adjoint, max_steps=4096, throw=False
+    )
+    return solution.q[-1, 0, 2]
+
+
+def forward(**choices):
+    f = lambda p: (theta(p, adjoint=diffrax.ForwardMode(), **choices),) * 2  # noqa: E731
+    gradient, value = jax.jit(jax.jacfwd(f, has_aux=True))(P)
+    return value, gradient
+
+
+def reverse(**choices):
+    return jax.jit(jax.value_and_grad(lambda p: theta(p, **choices)))(P)
+
+
+def check(value, gradient):
+    np.testing.assert_allclose(value, EXACT["theta"], rtol=1e-8)
+    np.testing.assert_allclose(gradient, GRADIENT, rtol=1e-7)
+
+
+def fast(*chosen):
+    """All methods, of which those not chosen are marked as slow: a gradient takes ten seconds to compile."""
+    return [pytest.param(m, id=name, marks=[] if name in chosen else pytest.mark.slow) for name, m in METHODS.items()]
+
+
+@pytest.mark.parametrize("method", fast("SVD", "Elimination"))
+def test_gradient_of_a_trajectory_forward(method):
+    check(*forward(method=method))
+
+
+@pytest.mark.parametrize("method", fast("Auto"))
+def test_gradient_of_a_trajectory_reverse(method):
+    check(*reverse(method=method))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [forward, reverse])
+@pytest.mark.parametrize("stabilization", [None, udk.Baumgarte(3.0, 3.0)], ids=["none", "Baumgarte"])
+@pytest.mark.parametrize("method", [udk.SVD(), udk.Auto()], ids=["SVD", "Auto"])
+def test_gradient_of_a_trajectory_with_other_stabilizations(method, stabilization, mode):
+    check(*mode(method=method, stabilization=stabilization))
+
+
+def test_gradient_of_a_trajectory_without_projection():
+    check(*forward(method=udk.SVD(), stabilization=None))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [forward, reverse])
+def test_gradient_of_a_trajectory_with_what_assembly_determines(mode):
+    value, gradient = mode(assembled=True)
+    check(value, np.append(GRADIENT[0], gradient[1:]))
+    assert np.isfinite(gradient[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [udk.Auto(), udk.Varga()], ids=["Auto", "Varga"])
+def test_second_derivative_of_a_trajectory(method):
+    """Against differences of the exact solution."""
+
+    def exact(p):
+        angle, gravity, inertia = p
+        omega = np.sqrt(gravity * 3.5 / (3 * (inertia + 0.25) + 2.0))
+        return angle + pendulum(np.array([2.0]), angle + np.pi / 2, 0.0, omega)[0]
+
+    f = lambda p: theta(p, method=method, adjoint=diffrax.ForwardMode())  # noqa: E731
+    along = jnp.array([1.0, 2.0, 0.1])
+    first = lambda p: jax.jvp(f, (p,), (along,))[1]  # noqa: E731
+    value, second = jax.jit(lambda p: jax.jvp(first, (p,), (along,)))(P)
+    p, d, h = np.asarray(P), np.asarray(along), 2e-3
+    samples = np.array([exact(p + k * h * d) for k in range(-3, 4)])
+    np.testing.assert_allclose(value, samples @ [-1, 9, -45, 0, 45, -9, 1] / (60 * h), rtol=1e-7)
+    np.testing.assert_allclose(second, samples @ [2, -27, 270, -490, 270, -27, 2] / (180 * h**2), rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", fast("Auto", "Greville"))
+def test_a_duplicated_joint_changes_no_trajectory(method):
+    ts = np.linspace(0.0, 1.0, 5)
+    run = lambda copies: udk.simulate(duplicated(LINKAGE, copies), ts, rtol=1e-12, atol=1e-12, method=method)  # noqa: E731
+    once, thrice = run(1), run(3)
+    np.testing.assert_allclose(thrice.q, once.q, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(thrice.v, once.v, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+@every_method
+def test_a_duplicated_joint_changes_no_gradient_of_a_trajectory(method):
+    check(*forward(method=method, mechanism=duplicated(LINKAGE, 3, ["A1", "B2"])))
+
+
+def test_a_duplicate_that_holds_a_body_on_the_ground_changes_nothing():
+    """Where nothing can move, too."""
+    body = {"plate": udk.Body(1.0, 0.1, [0.2, 0.1], 0.3)}
+    welds = {f"weld{k}": udk.Weld((GROUND, "plate"), [[0.0, 0.0], [0.0, 0.0]]) for k in range(3)}
+    for method in METHODS.values():
+        mechanism = udk.Mechanism(body, welds)
+        a = udk.accelerations(mechanism, 0.0, mechanism.q0, mechanism.v0, method)
+        np.testing.assert_allclose(a, 0.0, atol=1e-12)

@@ -1,0 +1,53 @@
+"""Functions as programs: traced, read into a graph, emitted."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from udkjax.straightline import Graph, Program, trace
+
+
+class Emitted(NamedTuple):
+    program: Program
+    shapes: list[tuple[int, ...]]
+
+    def __call__(self, *arguments: Any) -> tuple[Any, ...]:
+        """The program on arrays, as the function itself would be called."""
+        return self.shaped(self.program([a[place] for a in map(jnp.asarray, arguments) for place in np.ndindex(*a.shape)]))
+
+    def on_floats(self, *arguments: Any) -> tuple[Any, ...]:
+        """The program on Python numbers."""
+        return self.shaped(self.program([x.item() for a in arguments for x in np.asarray(a).flat]))
+
+    def shaped(self, outputs: list[Any]) -> tuple[Any, ...]:
+        results, start = [], 0
+        for shape in self.shapes:
+            size = int(np.prod(shape))
+            part = [jnp.asarray(x) for x in outputs[start : start + size]]
+            results.append(jnp.stack(part).reshape(shape) if part else jnp.zeros(shape))
+            start += size
+        return tuple(results)
+
+
+def emit_function(function: Callable, *examples: Any, cut_every: int | None = None) -> Emitted:
+    """Every element of the (array) arguments becomes one input, every element of the result one output."""
+    examples = tuple(jnp.asarray(e) for e in examples)
+    graph = Graph()
+    inputs = []
+    for k, example in enumerate(examples):
+        array = np.empty(example.shape, object)
+        for place in np.ndindex(*example.shape):
+            array[place] = graph.input((k, place), "argument", example.dtype)
+        inputs.append(array)
+    outputs = trace(lambda *a: jax.tree.leaves(function(*a)), *examples)(graph, *inputs)
+    program = Program(graph, [s for a in inputs for s in a.flat], [s for o in outputs for s in o.flat], cut_every)
+    return Emitted(program, [o.shape for o in outputs])
+
+
+@pytest.fixture
+def emit() -> Callable[..., Emitted]:
+    return emit_function

@@ -1,0 +1,115 @@
+"""Programs: optimization barriers, evaluation on floats, and the split into early and later."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from udkjax.straightline import Graph, Program, frontier, trace
+
+X = np.array([0.3, -0.7, 1.1])
+
+
+def test_barriers_have_derivatives_of_every_order(emit):
+    x, f = jnp.asarray(X), lambda x: jnp.sin(x[0] * x[1]) * x[2] / x[1]
+    program = emit(f, X, cut_every=2)
+    g = lambda x: program(x)[0]  # noqa: E731
+    for derivative in (jax.grad, jax.jacfwd, jax.hessian, lambda h: jax.jacrev(jax.jacrev(h))):
+        np.testing.assert_allclose(derivative(g)(x), derivative(f)(x), rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(jax.vmap(g)(jnp.stack([x, -x])), jax.vmap(f)(jnp.stack([x, -x])), rtol=1e-14)
+
+
+@pytest.mark.parametrize("every", [None, 1, 2, 5, 100])
+def test_barriers_change_nothing_but_their_number(emit, every):
+    f = lambda x: jnp.sin(x) * x - jnp.cos(x[::-1]) / (1.0 + x * x)  # noqa: E731
+    program = emit(f, X, cut_every=every)
+    operations = sum(program.program.count().values())
+    text = jax.jit(program.__call__).lower(jnp.asarray(X)).as_text()
+    assert text.count("optimization_barrier") <= (operations // every if every else 0)
+    assert ("optimization_barrier" in text) == (every is not None and every < operations)
+    np.testing.assert_allclose(program(jnp.asarray(X))[0], f(X), rtol=1e-14)
+
+
+def test_a_barrier_holds_only_what_is_used_later(emit):
+    """A chain: each operation uses the one before, so that no barrier needs more than one value."""
+    program = emit(lambda x: jnp.sin(jnp.cos(jnp.sin(jnp.cos(jnp.sin(x))))), 0.3, cut_every=1)
+    lines = [s for s in jax.jit(program.__call__).lower(0.3).as_text().splitlines() if "optimization_barrier" in s]
+    assert len(lines) == 5
+    assert all(line.count("tensor<f64>") == 1 for line in lines)
+
+
+def test_floats_are_evaluated_without_compiling():
+    graph = Graph()
+    x, y = (graph.input(name, "state") for name in "xy")
+    f = lambda x, y: jnp.sqrt(jnp.sin(x) ** 2 + jnp.exp(jnp.tanh(y))) / jnp.cos(x - y)  # noqa: E731
+    (result,) = trace(f, 0.1, 0.2)(graph, np.asarray(x, object), np.asarray(y, object))
+    program = Program(graph, [x, y], [result.item()], cut_every=1)
+    compiled, listening = [], True
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, duration, **_: compiled.append(event) if listening and "compile" in event else None
+    )
+    (found,) = program([0.4, 0.9])
+    assert type(found) is float
+    assert found == pytest.approx(math.sqrt(math.sin(0.4) ** 2 + math.exp(math.tanh(0.9))) / math.cos(-0.5), rel=1e-14)
+    assert compiled == []
+    jax.jit(lambda x: x * 3.25 + 1.125)(2.0)
+    listening = False
+    assert compiled, "the listener would not have noticed"
+
+
+def test_an_operation_is_traced_once_for_each_value_it_has(emit):
+    """What the jaxpr of a program holds is what the program counts."""
+    program = emit(lambda x: (x[0] - x[1]) * jnp.sin(x[2]) + (x[1] - x[0]) / x[2], X).program
+    jaxpr = jax.make_jaxpr(lambda values: program(values))([jnp.asarray(x) for x in X])
+    names = sorted(e.primitive.name for e in jaxpr.jaxpr.eqns)
+    assert names == sorted(name for name, n in program.count().items() for _ in range(n))
+
+
+@pytest.fixture
+def split():
+    """m and l are parameters, q the state: sqrt(m) l (q + 1 / m) + l^2, early by parameters alone."""
+    graph = Graph()
+    m, length = (graph.input(name, "parameter") for name in ("m", "l"))
+    q = graph.input("q", "state")
+    output = graph.sqrt(m) * length * (q + 1.0 / m) + length * length
+    early = frontier(graph, [output], lambda node: node.depends <= {"parameter"})
+    return Program(graph, [m, length], early), Program(graph, [*early, q], [output]), Program(graph, [m, length, q], [output])
+
+
+def test_what_depends_on_parameters_alone_is_computed_early(split):
+    prologue, later, whole = split
+    assert prologue.count() == {"sqrt": 1, "mul": 2, "div": 1}
+    assert later.count() == {"add": 2, "mul": 1}
+    assert whole.count() == {"sqrt": 1, "mul": 3, "div": 1, "add": 2}
+
+
+def test_the_frontier_holds_only_what_the_later_program_uses(split):
+    prologue, later, whole = split
+    assert len(prologue.outputs) == 3
+    assert all(later.uses(s) for s in prologue.outputs)
+    assert later([*prologue([4.0, 3.0]), 0.5]) == pytest.approx(whole([4.0, 3.0, 0.5]))
+
+
+def test_an_output_that_is_early_itself_goes_through_the_frontier():
+    graph = Graph()
+    m, q = graph.input("m", "parameter"), graph.input("q", "state")
+    outputs = [m * m, m * q, graph.constant(2.0)]
+    early = frontier(graph, outputs, lambda node: node.depends <= {"parameter"})
+    assert early == [m, m * m]
+    assert Program(graph, [*early, q], outputs)([3.0, 9.0, 2.0]) == [9.0, 6.0, 2.0]
+
+
+def test_an_early_opaque_node_hands_over_its_results():
+    graph = Graph()
+    m = np.array([graph.input(k, "parameter") for k in range(3)], object)
+    q = graph.input("q", "state")
+    (ordered,) = trace(jnp.sort, jnp.asarray(X))(graph, m)
+    outputs = [ordered[2] * q, ordered[0] + q]
+    early = frontier(graph, outputs, lambda node: node.depends <= {"parameter"})
+    prologue, later = Program(graph, list(m), early), Program(graph, [*early, q], outputs)
+    assert "sort" in prologue.count()
+    assert later.count() == {"mul": 1, "add": 1}
+    values = prologue([float(x) for x in X])
+    assert later([*map(float, values), 2.0]) == pytest.approx([2.2, 1.3])

@@ -1,0 +1,160 @@
+"""Whatever JAX can trace becomes a program that computes the same: on floats, under jit and vmap, and differentiated."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+
+@jax.custom_jvp
+def _doubled(x):
+    return 2.0 * x
+
+
+_doubled.defjvp(lambda primals, tangents: (_doubled(*primals), 7.0 * tangents[0]))  # wrong on purpose: it can be told
+
+
+def _switch(x, y):
+    return lax.switch(jnp.where(x[0] > 0, 1, 0), [lambda a: a * a, jnp.sin], y)
+
+
+def _scan(x, y):
+    return lax.scan(lambda c, a: (c * a + 1.0, c - a), y[0], x)
+
+
+FUNCTIONS = {
+    # written out: scalar operations only
+    "arithmetic": lambda x, y: (x[0] - y[0]) / (1.0 + x[1] ** 2) - (y[1] - x[0]) * -x[2],
+    "powers": lambda x, y: jnp.stack([x[0] ** 3, y[0] ** -2, x[1] ** 0, jnp.square(x[1])]),
+    "real power": lambda x, y: jnp.abs(y) ** 1.5,
+    "trigonometry": lambda x, y: jnp.sin(x) * jnp.cos(y) + jnp.arctan2(x, y) + jnp.tanh(x),
+    "roots": lambda x, y: jnp.sqrt(1.0 + x * x) + lax.rsqrt(1.0 + y * y) + jnp.cbrt(y),
+    "shapes": lambda x, y: jnp.concatenate([x[None], y.reshape(1, 3)], 0).T[::-1, 1:].ravel() * jnp.repeat(x[1:2], 3),
+    "broadcasting": lambda x, y: x[:, None] * y[None, :] + jnp.ones((3, 1)),
+    "constant indices": lambda x, y: x[jnp.array([2, 0, 0])] * y[np.array([1, 1, 2])],
+    "dot": lambda x, y: jnp.dot(x, y),
+    "matmul": lambda x, y: jnp.outer(x, y) @ jnp.outer(y, x),
+    "einsum": lambda x, y: jnp.einsum("ij,ik->ijk", jnp.outer(x[:2], x[:2]), y[:2, None]),
+    "where": lambda x, y: jnp.where(x > y, x * y, x - y),
+    "where of known": lambda x, y: jnp.where(jnp.array([True, False, True]), x, y),
+    "clip": lambda x, y: jnp.clip(x, -0.5, 0.5) + jnp.maximum(x, y) - jnp.minimum(x, 0.0),
+    "mean": lambda x, y: jnp.mean(x) + jnp.var(y),
+    "nested jit": lambda x, y: jax.jit(lambda a: jax.jit(jnp.sin)(a) * a)(x) + y,
+    "custom_jvp": lambda x, y: _doubled(x) + jax.nn.relu(y) + jax.nn.silu(x),
+    "checkpoint": lambda x, y: jax.checkpoint(lambda a: jnp.sin(a) * y)(x),
+    "derivative": lambda x, y: jax.jacfwd(lambda a: jnp.sin(a) * y[0])(x),
+    "stack": lambda x, y: jnp.stack([x, y], axis=1),
+    "iota": lambda x, y: x * jnp.arange(3.0),
+    "no argument at all": lambda x, y: jnp.ones(2),
+    # with opaque nodes
+    "cond": lambda x, y: lax.cond(x[0] > 0, lambda a, b: a * b, lambda a, b: a + b, x, y),
+    "switch": _switch,
+    "scan": _scan,
+    "fori_loop": lambda x, y: lax.fori_loop(0, 3, lambda k, a: jnp.sin(a) + k * y, x),
+    "gather": lambda x, y: x[jnp.where(y > 0, 2, 1)],
+    "dynamic slice": lambda x, y: lax.dynamic_slice(x, (jnp.where(y[0] > 0, 1, 0),), (2,)),
+    "interpolation": lambda x, y: jnp.interp(x[0], jnp.array([-2.0, 0.0, 3.0]), y),
+    "product and maximum": lambda x, y: jnp.prod(x) + jnp.max(y) + jnp.cumsum(x)[1],
+    "linear system": lambda x, y: jnp.linalg.solve(jnp.diag(2.0 + x * x) + 0.1 * jnp.outer(x, y), y),
+    "scatter": lambda x, y: x.at[1].set(y[0]).at[jnp.array([0, 2])].add(y[1]),
+    "pad": lambda x, y: jnp.pad(x, (1, 2)) * y[0],
+    "sort": lambda x, y: jnp.sort(x) * y,
+    "whole numbers": lambda x, y: x * jnp.sum(jnp.where(y > 0, 1, 2)),
+    "norm": lambda x, y: jnp.linalg.norm(x) * jnp.hypot(y[0], y[1]),
+}
+WRITTEN_OUT = list(FUNCTIONS)[: list(FUNCTIONS).index("cond")]
+X, Y = np.array([0.3, -0.7, 1.1]), np.array([0.5, 0.9, -0.4])
+XS, YS = np.stack([X, -X, X[::-1]]), np.stack([Y, Y + 0.2, -Y])
+
+
+def close(found, expected):
+    expected = jax.tree.leaves(expected)
+    assert len(found) == len(expected)
+    for f, e in zip(found, expected, strict=True):
+        assert np.shape(f) == np.shape(e)
+        np.testing.assert_allclose(f, e, rtol=1e-12, atol=1e-13)
+
+
+@pytest.fixture(params=FUNCTIONS, scope="module")
+def function(request):
+    return request.param, FUNCTIONS[request.param]
+
+
+def test_read(function, emit):
+    name, f = function
+    close(emit(f, X, Y).on_floats(X, Y), f(jnp.asarray(X), jnp.asarray(Y)))
+
+    def total(outputs):
+        return sum(jnp.sum(jnp.asarray(o, float) ** 2) for o in jax.tree.leaves(outputs))
+
+    def everything(g):  # values and derivatives of a batch, one compilation for both
+        point = lambda x, y: (g(x, y), jax.grad(lambda x, y: total(g(x, y)), argnums=(0, 1))(x, y))  # noqa: E731
+        return jax.vmap(point)
+
+    program = emit(f, X, Y, cut_every=3)
+    if name == "custom_jvp":  # the rule belongs to a derivative that is traced; of the program the body counts
+        f = lambda x, y: 2.0 * x + jax.nn.relu(y) + jax.nn.silu(x)  # noqa: E731
+    found, expected = jax.jit(lambda x, y: tuple(everything(g)(x, y) for g in (program, f)))(XS, YS)
+    close(jax.tree.leaves(found), expected)
+
+
+@pytest.mark.parametrize("name", WRITTEN_OUT)
+def test_what_acts_element_by_element_is_written_out(name, emit):
+    assert not [node for node in emit(FUNCTIONS[name], X, Y).program.graph.nodes if node.kind == "call"]
+
+
+@pytest.mark.parametrize("name", ["cond", "switch", "scan", "fori_loop", "gather", "sort"])
+def test_what_does_neither_is_opaque(name, emit):
+    """One node in place of a branch, a loop or an unknown index: not each of its outcomes."""
+    assert [node for node in emit(FUNCTIONS[name], X, Y).program.graph.nodes if node.kind == "call"]
+
+
+def test_a_traced_derivative_uses_its_own_rule(emit):
+    program = emit(lambda x: jax.jvp(_doubled, (x,), (jnp.ones(()),)), 3.0)
+    assert [float(o) for o in program(3.0)] == [6.0, 7.0]
+
+
+def test_structural_zeros_of_a_derivative_vanish(emit):
+    """d(x0 x1)/dx2 = 0 is known without a run, and so are the ones of the unit directions."""
+    jacobian = emit(jax.jacfwd(lambda x: jnp.stack([x[0] * x[1], x[2]])), X).program
+    assert [s.constant for s in jacobian.outputs] == [None, None, 0.0, 0.0, 0.0, 1.0]
+    assert jacobian.count() == {}
+
+
+def test_a_cosine_that_two_functions_use_is_one_node(emit):
+    program = emit(lambda x: (jnp.cos(x[0]) * x[1], jnp.cos(x[0]) + x[2], jnp.cos(jnp.sum(x[:1]))), X).program
+    assert program.count() == {"cos": 1, "mul": 1, "add": 1}
+
+
+def test_a_dot_product_with_known_zeros_is_short(emit):
+    program = emit(lambda x: jnp.array([[0.0, 1.0, 0.0], [2.0, 0.0, -1.0]]) @ x, X).program
+    assert program.count() == {"mul": 1, "sub": 1}
+
+
+def test_equal_opaque_nodes_are_one(emit):
+    f = lambda x, y: (jnp.linalg.inv(jnp.outer(x, x) + jnp.eye(3)), jnp.linalg.inv(jnp.outer(x, x) + jnp.eye(3))[0] * y)  # noqa: E731
+    once, twice = emit(lambda x, y: f(x, y)[0], X, Y).program, emit(f, X, Y).program
+    calls = lambda program: sum(program.graph.nodes[i].kind == "call" for i in program.order)  # noqa: E731
+    assert calls(once) == calls(twice) > 0
+
+
+def test_an_opaque_node_that_is_not_asked_for_is_not_emitted(emit):
+    program = emit(lambda x, y: (jnp.sort(x), y * 2.0), X, Y)
+    graph, outputs = program.program.graph, program.program.outputs
+    later = type(program.program)(graph, program.program.inputs, outputs[3:])
+    assert later.count() == {"mul": 3}
+
+
+def test_whole_number_and_logical_arguments(emit):
+    f = lambda x, k, flag: jnp.where(flag, x * k, x - k)  # noqa: E731
+    arguments = (1.5, np.int32(3), np.bool_(True))
+    (found,) = emit(f, *arguments)(*map(jnp.asarray, arguments))
+    assert float(found) == 4.5
+
+
+def test_single_precision_stays_single(emit):
+    x = jnp.asarray(X, jnp.float32)
+    (found,) = jax.jit(emit(lambda x: jnp.sin(x) * 2.0 + x @ x, x).__call__)(x)
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, jnp.sin(x) * 2.0 + x @ x, rtol=1e-6)

@@ -1,0 +1,52 @@
+"""What the methods by QR share: D^+ = Z Q^T with Z and Q of static shape, whatever the rank."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from udkjax.pinv.rule import Dense, dot
+
+
+class PivotedQR(NamedTuple):
+    """D = Q R with k = min(m, n): R[:, order] is upper triangular with a falling diagonal. From `rank` on, Q and R are zero."""
+
+    q: Float[Array, "m k"]
+    r: Float[Array, "k n"]
+    order: Int[Array, "k"]
+    rank: Int[Array, ""]
+
+
+class Factors(NamedTuple):
+    """D^+ = Z Q^T."""
+
+    z: Float[Array, "n k"]
+    q: Float[Array, "m k"]
+    rank: Int[Array, ""]
+
+
+class Orthogonal(Dense):
+    """A method whose factors are Z and Q, one of them with the triangle divided out."""
+
+    def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+        return dot(factors.z, dot(factors.q.T, b))
+
+    def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+        return dot(factors.q, dot(factors.z.T, c))
+
+
+def divide(t: Float[Array, "k k"], b: Float[Array, "k s"], rank: Int[Array, ""]) -> Float[Array, "k s"]:
+    """T^(-1) b for the leading triangle T of t of size `rank`, with zeros below.
+
+    (Not LAPACK: two of its batched calls at a time bring jax 0.10 to a standstill on a machine of two cores.)
+    """
+    size = len(t)
+
+    def substitute(step, x):
+        i = size - 1 - step
+        inside = i < rank
+        row = (b[i] - dot(t[i], x)) / jnp.where(inside, t[i, i], 1)  # x is still zero up to row i
+        return x.at[i].set(jnp.where(inside, row, 0))
+
+    return jax.lax.fori_loop(0, size, substitute, jnp.zeros_like(b))
