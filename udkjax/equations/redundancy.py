@@ -20,8 +20,12 @@ from udkjax.scene.mechanism import Mechanism
 # Relative to the largest singular value, with rows scaled to length one, at a closed position: redundant rows leave rounding
 # errors (1e-13 of positions closed to 1e-12), rows that are merely close to a singular configuration leave more.
 RANK_TOL = 1e-8
+CLEAR = 1e-4
 CLOSED = 1e-11  # relative to the size of the coordinates: what closing attains in double precision
 SAMPLES = 24
+TICK = 0.05  # s: drivers move on from one position to the next
+ITERATIONS = 100
+DAMPING = 1e-3  # of rows of length one
 TURN = 0.35  # rad or m: the length of one step of the random motion, long enough to leave a singular configuration
 ORDINARY = 0.05  # a position counts as ordinary if its smallest singular value is this part of the largest
 
@@ -37,11 +41,16 @@ class Position(NamedTuple):
 
     @property
     def rank(self) -> int:
-        return int(np.sum(self.sigma > RANK_TOL * self.sigma[0])) if len(self.sigma) else 0
+        return int(np.sum(self.sigma > RANK_TOL * self.sigma[0]))
+
+    @property
+    def clear(self) -> bool:
+        """Whether the rank is beyond doubt: near a singular configuration small residuals are large distances from closure."""
+        return bool(np.all((self.sigma <= RANK_TOL * self.sigma[0]) | (self.sigma > CLEAR * self.sigma[0])))
 
 
 def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
-    """Return the rows of Psi to leave out, or None where the initial guess cannot be closed or numbers are traced."""
+    """Return the rows of Psi to leave out, or None: the guess cannot be closed or moved, or numbers are traced."""
     leaves = jax.tree.leaves(mechanism)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         return None
@@ -55,14 +64,21 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     random = np.random.default_rng(0)
     heading = random.standard_normal(rows.size)
     for k in range(SAMPLES):
-        if max(p.rank for p in found) == rows.count:
+        if any(p.clear and p.rank == rows.count for p in found):
             return ()
         last = found[-1]
+        free = last.vt[last.rank :]
         heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(rows.size) / np.sqrt(rows.size)
-        heading = last.vt[last.rank :].T @ (last.vt[last.rank :] @ heading)  # onward, so that the motion gets around
+        heading = free.T @ (free @ heading)  # onward, so that the motion gets around
         moved = last.q + TURN * rows.root * heading / max(np.abs(rows.root * heading).max(), 1e-300)
-        found.append(rows.close(0.05 * (k + 1), moved) or last)
-        heading = heading if np.any(heading) else random.standard_normal(rows.size)
+        position = rows.close(TICK * (k + 1), moved)
+        if position is None or not position.clear or not np.any(heading):  # stuck: jump
+            heading = random.standard_normal(rows.size)
+            position = rows.close(TICK * (k + 1), first.q + TURN * random.uniform(-1.0, 1.0, rows.size))
+        found.extend([] if position is None else [position])
+    found = [p for p in found if p.clear]
+    if not found or (found == [first] and first.rank < rows.size):
+        return None
     rank = max(p.rank for p in found)
     generic = [p for p in found if p.rank == rank]
     ordinary = [p for p in generic if p.sigma[rank - 1] > ORDINARY * p.sigma[0]] or generic
@@ -121,18 +137,25 @@ class Rows:
         length[length == 0.0] = 1.0
         return psi, psi / length, D / length[:, None]
 
-    def close(self, t: float, q: np.ndarray, iterations: int = 60) -> Position | None:
-        """Gauss-Newton in the mass metric, with steps of limited length; None where it does not close."""
-        for _ in range(iterations):
-            psi, scaled, D = self.at(t, q)
+    def close(self, t: float, q: np.ndarray) -> Position | None:
+        """Levenberg-Marquardt in the mass metric, with steps of limited length; None where it does not close.
+
+        Damped, since a random motion out of a singular configuration ends far from any closed position in badly determined directions.
+        """
+        damping = DAMPING
+        psi, scaled, D = self.at(t, q)
+        for _ in range(ITERATIONS):
             u, sigma, vt = np.linalg.svd(D)
-            position = Position(t, q, u, sigma, vt)
-            if not np.all(np.isfinite(psi)):
+            if np.abs(psi).max() <= CLOSED * (1.0 + np.abs(q).max()):
+                return Position(t, q, u, sigma, vt)
+            gain = sigma / (sigma**2 + damping)
+            step = -self.root * (vt[: len(sigma)].T @ (gain * (u[:, : len(sigma)].T @ scaled)))
+            ahead = q + step * min(1.0, TURN / max(np.abs(step).max(), 1e-300))
+            trial = self.at(t, ahead)
+            if np.linalg.norm(trial[0]) < np.linalg.norm(psi):
+                q, (psi, scaled, D), damping = ahead, trial, 0.1 * damping
+            elif damping > 1e6 or not np.all(np.isfinite(psi)):
                 return None
-            size = CLOSED * (1.0 + np.abs(q).max())
-            if np.abs(psi).max() < size:
-                return position
-            kept = sigma > 1e-4 * sigma[0]
-            step = -self.root * (vt[: len(sigma)][kept].T @ ((u[:, : len(sigma)][:, kept].T @ scaled) / sigma[kept]))
-            q = q + step * min(1.0, TURN / max(np.abs(step).max(), 1e-300))
+            else:
+                damping = max(100.0 * damping, 1e-12)
         return None

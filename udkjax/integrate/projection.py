@@ -120,8 +120,13 @@ def project_all(equations: Equations, ts: Float[Array, "T"], ys: Float[Array, "T
     quick = jax.vmap(lambda t, y: _twice(equations.quick, t, y))(ts, ys)
     if not equations.branches:
         return quick
-    careful = lambda: jax.lax.map(lambda ty: _twice(equations, *ty), (ts, ys))  # noqa: E731
-    return _second_thoughts(~jnp.all(jnp.isfinite(quick)), careful, quick)
+    doubts = ~jnp.all(jnp.isfinite(quick), axis=1)
+
+    def one(member):
+        t, y, projected, doubt = member
+        return jax.lax.cond(doubt, lambda: _twice(equations, t, y), lambda: projected)
+
+    return jax.lax.cond(eqxi.unvmap_any(doubts), lambda: jax.lax.map(one, (ts, ys, quick, doubts)), lambda: quick)
 
 
 def _twice(equations: Equations, t: Any, y: Any) -> Any:

@@ -1,0 +1,228 @@
+"""Trajectories against exact solutions, with the settings that a user gets."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.study import exact_coordinates
+
+TS = np.linspace(0.0, 20.0, 401)
+COARSE = np.linspace(0.0, 20.0, 41)
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    return udk.library.parallelogram(np.deg2rad(-50))
+
+
+def error(mech, sol):
+    return np.abs(exact_coordinates(mech, sol.ts, sol.q[0], sol.v[0]) - sol.q).max()
+
+
+# --- the paper's linkage for 20 s
+
+
+STARTS = {  # angle, angular velocity, bound: the last four cross singular configurations
+    "-45": (-45, 0.0, 5e-9),
+    "-50": (-50, 0.0, 5e-9),
+    "+45": (45, 0.0, 5e-7),
+    "+60": (60, 0.0, 5e-7),
+    "in line at rest": (0, 0.0, 5e-7),
+    "up, turning": (90, -1.0, 5e-7),
+}
+
+
+@pytest.mark.parametrize(("angle", "rate", "bound"), STARTS.values(), ids=STARTS)
+def test_linkage(angle, rate, bound):
+    """All coordinates at all times, and all joints closed."""
+    mech = udk.library.parallelogram(np.deg2rad(angle), rate)
+    sol = udk.simulate(mech, TS, rtol=1e-9, atol=1e-9)
+    assert sol.result == udk.Result.successful
+    assert error(mech, sol) <= bound
+    assert jnp.abs(udk.violation(mech, sol)).max() <= 1e-11
+    assert sol.stats["steps"] < 600
+    energy = udk.energy(mech, sol).total
+    assert_allclose(energy, energy[0], atol=20 * bound)
+
+
+def test_many_starts_cross_singular_configurations(linkage, placed):
+    """One start flatters: 64 spread by 5 degrees about each of three, every one of which crosses."""
+
+    @jax.jit
+    def runs(angles):
+        def run(angle):
+            sol = udk.simulate(linkage, COARSE, udk.State(*placed(angle, 0.0)), rtol=1e-9, atol=1e-9)
+            return sol.q, sol.v, sol.code
+
+        return jax.lax.map(run, angles)
+
+    degrees = np.concatenate([np.linspace(c - 5, c + 5, 64) for c in (60, 45, 0)])
+    q, v, code = (np.asarray(x) for x in runs(jnp.deg2rad(degrees)))
+    assert (code == udk.Result.successful).all()
+    errors = np.array([np.abs(exact_coordinates(linkage, COARSE, a[0], b[0]) - a).max() for a, b in zip(q, v, strict=True)])
+    assert errors.max() < 2e-6, degrees[errors.argmax()]
+    assert np.median(errors) < 2e-7
+
+
+# --- what stabilization is worth
+
+
+@pytest.fixture(scope="module")
+def unstable(linkage):
+    """Run the linkage from -50 degrees in some way; return the solution, its error and its violation."""
+
+    def run(method, stabilization, angle=-50):
+        mech = udk.library.parallelogram(np.deg2rad(angle))
+        sol = udk.simulate(mech, COARSE, rtol=1e-9, atol=1e-9, method=method, stabilization=stabilization, throw=False)
+        return sol, np.nanmax(np.abs(exact_coordinates(mech, COARSE, sol.q[0], sol.v[0]) - sol.q)), udk.violation(mech, sol)
+
+    return run
+
+
+def test_truncated_and_not_stabilized_it_drifts(unstable):
+    """Redundancy makes the drift unstable: 1.59/s, so that rounding errors are large after 16 to 20 s."""
+    sol, _, psi = unstable(udk.SVD(), None)
+    size = np.abs(psi).max(axis=1)
+    lost = sol.result != udk.Result.successful
+    assert lost or np.nanmax(size) > 1e-7
+    assert size[4] < 1e-9  # at 2 s
+    early = slice(int(6 / 0.5), int(12 / 0.5))
+    rate = np.polyfit(COARSE[early], np.log(size[early]), 1)[0]
+    assert 1.2 < rate < 2.0
+
+
+def test_a_fixed_choice_of_rows_does_not(unstable):
+    sol, wrong, psi = unstable(udk.Elimination(), None)
+    assert sol.result == udk.Result.successful
+    assert wrong < 1e-7
+    assert np.abs(psi).max() < 1e-7
+
+
+@pytest.mark.parametrize("gain", [2.0, 5.0])
+def test_small_gains_hold_it(unstable, gain):
+    """Gains of 2 to 5 are above the rate at which the drift would grow."""
+    sol, wrong, psi = unstable(udk.SVD(), udk.Baumgarte(gain, gain))
+    assert sol.result == udk.Result.successful
+    assert wrong < 1e-7
+    assert np.abs(psi).max() < 1e-7
+
+
+# --- the IFToMM benchmark A02, which crosses twice a turn
+
+
+@pytest.mark.parametrize("n", [1, 2, pytest.param(10, marks=pytest.mark.slow)])
+def test_n_four_bar(data, table, n):
+    known = data("iftomm_A02_n_four_bar")["cases"][f"N={n}"]
+    ts, row = table({"0": {"B0x": 0, "B0y": 1, "B0vx": 1, "B0vy": 0}, **known["reference"]}, (0, 0.5, 1, 2, 4, 5, 10))
+    mech = udk.library.n_four_bar(n)
+    sol = udk.simulate(mech, ts, rtol=1e-9, atol=1e-9)
+    k = mech.body_names.index("coupler0")  # B0 is its left end; couplers do not turn
+    assert_allclose(sol.q[:, k, 0] - 0.5, row["B0x"], atol=1e-6)
+    assert_allclose(sol.q[:, k, 1], row["B0y"], atol=1e-6)
+    assert_allclose(sol.v[:, k, 0], row["B0vx"], atol=1e-5)
+    assert_allclose(sol.q[:, k:, 2], 0.0, atol=1e-6)
+    assert jnp.abs(udk.violation(mech, sol)).max() <= 1e-11
+
+
+# --- one body, and machines that a driver moves: rtol = atol = 1e-10, error 1e-8
+
+
+def run(mech, ts):
+    sol = udk.simulate(mech, ts, rtol=1e-10, atol=1e-10)
+    return sol, udk.reactions(mech, sol)
+
+
+def test_simple_pendulum(data, table):
+    """IFToMM A01; the rod's multiplier is its force."""
+    ts, row = table(data("iftomm_A01_simple_pendulum")["reference_exact"], (0.5, 1, 2, 5, 10, 20))
+    sol, loads = run(udk.library.simple_pendulum(), np.append(0.0, ts))
+    assert_allclose(sol.q[1:, 0, :2], np.stack([row["x"], row["y"]], 1), atol=1e-8)
+    pull = -loads["rod"]["bob"][1:, :2]  # along the rod, towards the pivot
+    assert_allclose(jnp.sum(pull * sol.q[1:, 0, :2], 1), row["rod_tension"], atol=2e-7)
+    assert_allclose(sol.q[:, 0, 2], 0.0, atol=1e-14)
+
+
+def test_compound_pendulum(data, table):
+    ts, row = table(data("compound_pendulum")["reference"])
+    sol, loads = run(udk.library.compound_pendulum(), ts)
+    assert_allclose(sol.q[:, 0, 2] + np.pi / 2, row["phi"], atol=1e-8)
+    assert_allclose(sol.v[:, 0, 2], row["phid"], atol=5e-8)
+    assert_allclose(loads["pin"]["rod"][:, :2], np.stack([row["Rx"], row["Ry"]], 1), atol=1e-6)
+
+
+def test_elliptic_trammel(data, table):
+    ts, row = table(data("elliptic_trammel")["reference"])
+    sol, loads = run(udk.library.elliptic_trammel(), ts)
+    turn = np.angle(np.exp(1j * (-sol.q[:, 0, 2] - row["theta"])))
+    assert_allclose(turn, 0.0, atol=1e-8)
+    assert_allclose(sol.q[:, 0, :2], np.stack([row["xc"], row["yc"]], 1), atol=1e-8)
+    assert_allclose(loads["A"]["rod"][:, 0], row["H_at_A"], atol=1e-6)
+    assert_allclose(loads["B"]["rod"][:, 1], row["V_at_B"], atol=1e-6)
+
+
+def test_driven_pendulum(data, table):
+    """No freedom is left: the motion is the driver's, and the torque is what inverse dynamics says."""
+    ts, row = table(data("driven_pendulum_rheonomic")["reference"])
+    sol, loads = run(udk.library.driven_pendulum(), ts)
+    assert_allclose(sol.q[:, 0, 2], row["theta"], atol=1e-12)
+    assert_allclose(sol.v[:, 0, 2], row["thetad"], atol=1e-12)
+    assert_allclose(loads["motor"]["rod"][:, 2], row["torque"], atol=1e-10)
+    assert_allclose(loads["motor"]["rod"][:, :2], 0.0, atol=1e-12)
+    assert_allclose(loads["pin"]["rod"][:, :2], np.stack([row["Rx"], row["Ry"]], 1), atol=1e-10)
+
+
+def test_slider_crank(data, table):
+    ts, row = table(data("slider_crank_constant_speed")["reference"])
+    sol, loads = run(udk.library.slider_crank(), ts)
+    assert_allclose(sol.q[:, 0, 2], row["theta"], atol=1e-11)
+    assert_allclose(sol.q[:, 1, 2], row["phi"], atol=1e-11)
+    assert_allclose(sol.q[:, 2, 0], row["x"], atol=1e-11)
+    assert_allclose(sol.v[:, 2, 0], row["xd"], atol=1e-11)
+    assert_allclose(loads["motor"]["crank"][:, 2], row["torque"], atol=1e-9)
+    assert_allclose(loads["guide"]["slider"][:, 1], row["guide_N"], atol=1e-9)
+    assert_allclose(loads["P"]["rod"][:, :2], np.stack([row["Px_on_rod"], row["Py_on_rod"]], 1), atol=1e-9)
+    assert_allclose(loads["O"]["crank"][:, :2], np.stack([row["Ox"], row["Oy"]], 1), atol=1e-9)
+
+
+# --- derivatives of a trajectory
+
+
+PARAMETERS = ("theta0", "g", "I_link")
+
+
+def angle_over(linkage, placed, ts, adjoint):
+    def angle(p):
+        inertias = {f"body.link{k}.inertia": p[2] for k in "123"}
+        mech = linkage.with_parameters({"gravity": jnp.stack([0.0, -p[1]]), **inertias})
+        sol = udk.simulate(mech, ts, udk.State(*placed(p[0], 0.0)), rtol=1e-10, atol=1e-10, adjoint=adjoint)
+        return jnp.stack([sol.q[1:, 0, 2], sol.v[1:, 0, 2]], 1)
+
+    return angle
+
+
+def sensitivities(data, table):
+    ts, row = table(data("seed_fivebar_parallelogram")["sensitivities_rest_minus50"])
+    expected = np.array([[row[f"d{x}_d{p}"] for p in PARAMETERS] for x in ("theta", "thetad")])
+    return np.append(0.0, ts), np.moveaxis(expected, -1, 0)
+
+
+AT = jnp.array([np.deg2rad(-50), 9.81, 0.1])
+
+
+def test_sensitivities_by_forward_mode(linkage, placed, data, table):
+    """Of a redundant mechanism, with respect to its start, gravity and three tied inertias."""
+    from diffrax import ForwardMode
+
+    ts, expected = sensitivities(data, table)
+    slopes = jax.jit(jax.jacfwd(angle_over(linkage, placed, ts, ForwardMode())))(AT)
+    assert_allclose(slopes, expected, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_sensitivities_by_reverse_mode(linkage, placed, data, table):
+    ts, expected = sensitivities(data, table)
+    slopes = jax.jit(jax.jacrev(angle_over(linkage, placed, ts, None)))(AT)
+    assert_allclose(slopes, expected, atol=1e-6)
