@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.equations.redundancy import dependent_constraints, redundant_rows
@@ -101,7 +103,7 @@ def is_closed(closure: Closure) -> Any:
 def require_closed(mechanism: Mechanism, closure: Closure) -> None:
     """Raise an `AssemblyError` where a closure is not closed; traced values pass."""
     closed = is_closed(closure)
-    if isinstance(closed, jax.core.Tracer) or closed:
+    if isinstance(closed, Tracer) or closed:
         return
     equations = prepare(mechanism, SVD()).code.equations
     worst: dict[str, float] = {}
@@ -151,7 +153,7 @@ def check(mechanism: Mechanism) -> Check:
         rank=rank,
         degrees_of_freedom=3 * len(mechanism.body_names) - rank,
         redundant=tuple(names[i] for i in left_out or ()),
-        dependent=dependent_constraints(mechanism, closure.state.q) if closed else (),
+        dependent=dependent_constraints(mechanism, np.asarray(closure.state.q)) if closed else (),
         residual_before=float(jnp.abs(before).max(initial=0.0)),
         residual_after=float(jnp.abs(closure.psi).max(initial=0.0)),
         closed=closed,
@@ -189,7 +191,7 @@ def _step(equations: Equations, t: Any, q: Any) -> tuple[Any, Any]:
 @jax.custom_jvp
 def _closed(equations: Equations, t: Any, q: Any) -> Any:
     def unfinished(carry):
-        q, better, k = carry
+        _, better, k = carry
         return better & (k < ITERATIONS)
 
     def body(carry):

@@ -78,7 +78,11 @@ class Code:
         safe = all_of(factors.kept, graph)
 
         def scaled(b: list[Scalar]) -> list[Scalar]:
-            x = transpose_times(rows, multipliers(factors, b), self.n, graph.constant(0.0)) if b else [graph.constant(0.0)] * self.n
+            x = (
+                transpose_times(rows, multipliers(factors, b), self.n, graph.constant(0.0))
+                if b
+                else [graph.constant(0.0)] * self.n
+            )
             return [r * s for r, s in zip(self.root, x, strict=True)]
 
         a = [f + s for f, s in zip(self.equations.free, scaled([self._b(i) for i in self.kept]), strict=True)]

@@ -123,7 +123,7 @@ class Expressions:
     def gravity(self) -> list[Scalar]:
         """The acceleration of free fall, coordinate by coordinate."""
         x, y = self.scene.gravity
-        return [x, y, self.graph.constant(0.0)] * len(self.mechanism.body_names)
+        return [_scalar(x), _scalar(y), self.graph.constant(0.0)] * len(self.mechanism.body_names)
 
     @cached_property
     def force(self) -> list[Scalar]:

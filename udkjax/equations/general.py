@@ -1,4 +1,4 @@
-"""A constrained system of the user's own, by the same equation: any coordinates, any positive definite mass, nonholonomic rows too."""
+"""A constrained system of the user's own, by the same equation: any coordinates and masses, nonholonomic rows too."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,16 +9,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.equations.udwadia_kalaba import RANK_TOL, Baumgarte, Vector
-from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse
+from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
 from udkjax.scene.fields import number
 
 
 class ConstrainedSystem(eqx.Module):
     """M(q) a = F(t, q, v) + constraint forces, subject to Psi(t, q) = 0 and phi(t, q, v) = 0.
 
-    `mass(q)` returns M (n, n), symmetric positive definite; `force(t, q, v)` returns F (n,); `constraint(t, q)` returns Psi (m,), or
-    is None; `velocity_constraint(t, q, v)` returns phi (k,), nonholonomic or not, or is None. All of them are differentiated:
-    write them in jax.numpy. Numbers that are to be traced or differentiated belong into an equinox module whose methods these are.
+    `mass(q)` returns M (n, n), symmetric positive definite; `force(t, q, v)` returns F (n,); `constraint(t, q)` returns Psi (m,),
+    or is None; `velocity_constraint(t, q, v)` returns phi (k,), nonholonomic or not, or is None. All of them are differentiated:
+    write them in jax.numpy. Numbers to be traced or differentiated belong into an equinox module whose methods these are.
     Simulate it from a `State` with q and v (n,).
     """
 
@@ -120,8 +120,5 @@ class GeneralEquations(eqx.Module):
 def prepare_general(system: ConstrainedSystem, method: Pseudoinverse | None, baumgarte: Baumgarte | None) -> GeneralEquations:
     """Choose a method on dense rows: nothing is known of their structure, so `Auto` is by singular values."""
     method = SVD() if method is None or type(method) is Auto else method
-    if isinstance(method, Elimination) and method.rank_tol is None:
-        return GeneralEquations(system, method, baumgarte)
-    if method.rank_tol is None:
-        method = eqx.tree_at(lambda m: m.rank_tol, method, number(RANK_TOL), is_leaf=lambda x: x is None)
-    return GeneralEquations(system, method, baumgarte)
+    tol = number(RANK_TOL) if method.rank_tol is None else method.rank_tol
+    return GeneralEquations(system, eqx.tree_at(lambda m: m.rank_tol, method, tol, is_leaf=lambda x: x is None), baumgarte)

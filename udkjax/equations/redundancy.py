@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from udkjax.equations.code import code, scalars
 from udkjax.scene.mechanism import Mechanism
@@ -52,7 +53,7 @@ class Position(NamedTuple):
 def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     """Return the rows of Psi to leave out, or None: the guess cannot be closed or moved, or numbers are traced."""
     leaves = jax.tree.leaves(mechanism)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+    if any(isinstance(leaf, Tracer) for leaf in leaves):
         return None
     rows = Rows(mechanism)
     if not rows.count:
@@ -140,7 +141,7 @@ class Rows:
     def close(self, t: float, q: np.ndarray) -> Position | None:
         """Levenberg-Marquardt in the mass metric, with steps of limited length; None where it does not close.
 
-        Damped, since a random motion out of a singular configuration ends far from any closed position in badly determined directions.
+        Damped: a random motion out of a singular configuration ends far from closure in badly determined directions.
         """
         damping = DAMPING
         psi, scaled, D = self.at(t, q)

@@ -11,6 +11,7 @@ of singular values.
 
 import dataclasses
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import equinox as eqx
@@ -52,13 +53,17 @@ class Equations(eqx.Module):
     constants: list[Array]  # the subexpressions of parameters alone that the programs use, computed once
     method: Pseudoinverse
     code: Code = eqx.field(static=True)
-    branch: bool = eqx.field(static=True, default=True)  # whether `Auto` turns to singular values itself, or says NaN where it should
+    branch: bool = eqx.field(
+        static=True, default=True
+    )  # whether `Auto` turns to singular values itself, or says NaN where it should
 
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
-        """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out, which an integrator does once a step."""
+        """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
         if not self.code.elimination:
             return plain_accelerations(self, t, q, v)
-        return _accelerations("accelerations_watched" if watch and isinstance(self.method, Auto) else "accelerations", self, t, q, v)
+        return _accelerations(
+            "accelerations_watched" if watch and isinstance(self.method, Auto) else "accelerations", self, t, q, v
+        )
 
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         """lambda = -(D^+)^T D^+ b of all rows."""
@@ -111,7 +116,7 @@ class Equations(eqx.Module):
 
     @property
     def quick(self) -> "Equations":
-        """The same without a branch: what `Auto` cannot solve by elimination is not a number. A loop of it is one small program."""
+        """The same without a branch: what `Auto` cannot solve by elimination is not a number."""
         return dataclasses.replace(self, branch=False)
 
     def exact(self) -> "Equations":
@@ -126,11 +131,13 @@ def prepare(mechanism: Mechanism, method: Pseudoinverse | None = None, baumgarte
     traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
     """
     method = Auto() if method is None else method
-    if method.rank_tol is None:
-        method = eqx.tree_at(lambda m: m.rank_tol, method, number(RANK_TOL), is_leaf=lambda x: x is None)
+    tol = number(RANK_TOL) if method.rank_tol is None else method.rank_tol
+    method: Any = eqx.tree_at(lambda m: m.rank_tol, method, tol, is_leaf=lambda x: x is None)
     left_out, elimination, drop = mechanism.left_out or (), None, number(0.0)
     if isinstance(method, Elimination):
-        elimination, drop = "drop", method.rank_tol**2
+        if not method.relative:
+            raise ValueError("Elimination compares each row with what remains of it: here its rank_tol must be relative")
+        elimination, drop = "drop", tol**2
     elif isinstance(method, Auto) and mechanism.left_out is None:
         method = SVD(method.rank_tol, method.relative)
     elif isinstance(method, Auto):
@@ -138,7 +145,8 @@ def prepare(mechanism: Mechanism, method: Pseudoinverse | None = None, baumgarte
     programs = code(mechanism, left_out if elimination else (), baumgarte is not None, elimination)
     gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
     numbers = [*scalars(jax.tree.leaves(mechanism)), *gains, drop]
-    return Equations([jnp.asarray(c) for c in programs.prologue(numbers)], method, programs)
+    constants = [jnp.asarray(c) for c in programs.prologue(numbers)]
+    return Equations(constants, method, programs)
 
 
 # --- plain
@@ -191,7 +199,7 @@ def _by_method(equations: Equations, use: Any, name: str, t: Any, q: Vector, v: 
         return dense(method)
     if equations.branches:
         return dense(equations.exact().method)
-    tol = method.branch_tol**0.5 if isinstance(method, Auto) else method.rank_tol
+    tol: Any = jnp.sqrt(jnp.asarray(method.branch_tol)) if isinstance(method, Auto) else method.rank_tol
     return use(SparseElimination(programs.kept_pattern, tol).plus(_arrays(equations, name + "_kept", t, q, v)[0]), name + "_kept")
 
 
@@ -208,7 +216,7 @@ def _arrays(equations: Equations, name: str, t: Any, q: Vector, v: Vector) -> li
     n, kept = len(q), equations.code.kept_pattern if name.endswith("_kept") else equations.code.pattern
     bounds = [0, kept.slots, kept.slots + kept.shape[0]]
     bounds += list(range(bounds[-1] + n, len(outputs) + 1, n))
-    return [_stack(outputs[i:j]) for i, j in zip(bounds, bounds[1:], strict=False)]
+    return [_stack(outputs[i:j]) for i, j in pairwise(bounds)]
 
 
 def _stack(values: list[Any]) -> Array:

@@ -82,8 +82,10 @@ class Constrained(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver)
 
 @eqx.filter_custom_jvp
 def _in_a_loop(solver: Constrained, terms, t0, t1, y0, equations, solver_state, made_jump):
-    """One attempt, as a loop of one round: on the CPU, XLA compiles a small loop into one function, and this one is hidden from it
-    in a larger loop with a branch. Each of its hundreds of operations would be a call of its own there (5 us a step instead of 1).
+    """One attempt, as a loop of one round.
+
+    On the CPU, XLA compiles a small loop into one function, but not the loop over the steps, which holds a branch: there each of
+    the attempt's hundreds of operations would be a call of its own (5 us a step instead of 1).
     """
     rounds = jnp.where(jnp.isnan(t0), 2, 1)  # one; unknown to the compiler, which removes a loop of one round
     attempt = lambda y: _arrays(solver._attempt(terms, t0, t1, y, equations, solver_state, made_jump))  # noqa: E731
@@ -113,9 +115,11 @@ def project(equations: Equations, t: Any, y: Float[Array, "2n"]) -> Float[Array,
     return jnp.concatenate(equations.project(t, q, v))
 
 
-def project_all(equations: Equations, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:
-    """States at many times, each returned to the manifold. An interpolated state lies off it by the error of the interpolation: it
-    takes one projection more than a step."""
+def project_all(equations: Any, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:
+    """States at many times, each returned to the manifold.
+
+    An interpolated state lies off it by the error of the interpolation: it takes one projection more than a step.
+    """
 
     quick = jax.vmap(lambda t, y: _twice(equations.quick, t, y))(ts, ys)
     if not equations.branches:

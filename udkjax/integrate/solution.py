@@ -6,8 +6,8 @@ from enum import IntEnum
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from udkjax.scene.mechanism import Mechanism
@@ -26,14 +26,14 @@ class Result(IntEnum):
 
 CAUSES = {
     Result.successful: "the end time was reached",
-    Result.step_limit: "the limit on steps was reached; raise `max_steps`, loosen the tolerances, or look for a stiff spring or gain",
-    Result.step_too_small: "the step fell to the rounding of time itself: the right-hand side jumps or grows without bound here, or the "
-    "tolerance is below what its rounding errors allow",
+    Result.step_limit: "the limit on steps was reached; raise `max_steps`, loosen the tolerances, or look for what is stiff",
+    Result.step_too_small: "the step fell to the rounding of time: the right-hand side jumps or grows without bound here, "
+    "or the tolerance is below what its rounding errors allow",
     Result.not_finite: "a number that is not finite appeared; look at the loads and motions of the scene at this time",
-    Result.drift: "the constraints are violated by more than `drift_tol`: stabilize (`Projection()`), or, where the numbers of the scene "
-    "make rows independent that were found redundant when it was built, build it anew or take method=SVD()",
+    Result.drift: "the constraints are violated by more than `drift_tol`: stabilize (`Projection()`), or, where the numbers "
+    "of the scene make rows independent that were found redundant when it was built, build it anew or take method=SVD()",
     Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for the joints that stay open",
-}  # fmt: skip
+}
 
 
 class SimulationError(RuntimeError):
@@ -47,8 +47,8 @@ class SimulationError(RuntimeError):
 class Solution(eqx.Module):
     """States of a mechanism at the output times, how the run ended, and what it took.
 
-    `q` and `v` are (T, bodies, 3): x, y (m) and angle (rad) and their rates; not a number after the time of a failure. `code` is a
-    `Result`, `time` the time (s) that was reached, or at which the drift was first seen.
+    `q` and `v` are (T, bodies, 3): x, y (m) and angle (rad) and their rates; not a number after the time of a failure. `code` is
+    a `Result`, `time` the time (s) that was reached, or at which the drift was first seen.
     """
 
     ts: Float[Array, "T"]
@@ -56,14 +56,16 @@ class Solution(eqx.Module):
     v: Float[Array, "T bodies 3"]
     code: Int[Array, ""]
     time: Float[Array, ""]
-    stats: dict[str, Array]
+    stats: dict[str, Int[Array, ""]]  # steps, accepted, rejected, right_hand_sides, projections
+    rtol: Float[Array, ""]
+    atol: Float[Array, ""]
     bodies: tuple[str, ...] = eqx.field(static=True)
     settings: tuple[tuple[str, str], ...] = eqx.field(static=True)
 
     @property
     def result(self) -> Any:
         """The `Result`; in a batch, or while traced, the array of codes."""
-        if isinstance(self.code, jax.core.Tracer) or np.ndim(self.code):
+        if isinstance(self.code, Tracer) or np.ndim(self.code):
             return self.code
         return Result(int(self.code))
 
@@ -93,7 +95,9 @@ class Solution(eqx.Module):
             "result": self.result.name,
             "cause": self.cause,
             "end_time": float(self.time),
-            **{f"stats_{k}": np.asarray(v).item() for k, v in self.stats.items()},
+            **{f"stats_{k}": int(v) for k, v in self.stats.items()},
+            "setting_rtol": float(self.rtol),
+            "setting_atol": float(self.atol),
             **{f"setting_{k}": v for k, v in self.settings},
             **{f"version_{k}": v for k, v in versions().items()},
         }

@@ -23,7 +23,7 @@ class Auto(Dense):
     The branch is a real one in a single solve and under `lax.map`; under `vmap` both sides run.
     """
 
-    branch_tol: Float[Array, ""] = eqx.field(converter=number, default=BRANCH_TOL)
+    branch_tol: Float[Array, ""] | None = eqx.field(converter=number, default=BRANCH_TOL)
 
     @property
     def exact(self) -> SVD:
@@ -33,7 +33,7 @@ class Auto(Dense):
     def factor(self, D: Float[Array, "m n"]) -> Factors:
         wide = D.shape[0] <= D.shape[1]
         fast = Elimination().factor(D if wide else D.T)
-        safe = (fast.rank == min(D.shape)) & (fast.smallest > self.branch_tol)
+        safe = (fast.rank == min(D.shape)) & (fast.smallest > jnp.asarray(self.branch_tol))
 
         def eliminated() -> Factors:
             # the same triple product as that of the singular values: D^+ = D^T ((L L^T)^-1), or its transpose

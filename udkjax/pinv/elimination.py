@@ -17,6 +17,8 @@ from udkjax.pinv.sparse import Pattern, program
 
 
 class Factors(NamedTuple):
+    """L, as Courrieu takes it, and what else D^+ is made of."""
+
     D: Float[Array, "m n"]
     columns: Float[Array, "m r"]  # L, with a zero column for each dropped pivot
     inverse: Float[Array, "r r"]  # (L^T L)^-1, with a one for each dropped pivot
@@ -70,6 +72,8 @@ def _square(factors: Factors, b: Float[Array, "m"]) -> Float[Array, "m"]:
 
 
 class SparseFactors(NamedTuple):
+    """The triangular factors of D D^T as the straight-line code wants them, and D."""
+
     values: Float[Array, "s"]
     lower: Float[Array, "l"]
     rank: Int[Array, ""]

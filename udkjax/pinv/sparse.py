@@ -165,20 +165,24 @@ def transpose_times(rows: Sequence[Row], y: Sequence[Scalar], columns: int, zero
 
 
 def absolute(a: Scalar) -> Scalar:
+    """|a|."""
     return a.graph.apply(lax.abs_p, {}, (a,), a.node.dtype, np.abs)
 
 
 def greater(a: Scalar, b: Scalar) -> Scalar:
+    """a > b."""
     return a.graph.apply(lax.gt_p, {}, (a, b), bool, np.greater)
 
 
 def where(condition: Scalar, yes: Scalar, no: Scalar) -> Scalar:
+    """One of two scalars."""
     if condition.constant is not None:
         return yes if condition.constant else no
     return yes.graph.apply(lax.select_n_p, {}, (condition, no, yes), yes.node.dtype, lambda c, n, y: y if c else n)
 
 
 def all_of(conditions: Sequence[Scalar], graph: Graph) -> Scalar:
+    """Whether all conditions hold."""
     result = graph.constant(True, bool)
     for c in conditions:
         if c.constant is not True:

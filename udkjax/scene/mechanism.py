@@ -23,9 +23,13 @@ Element = TypeVar("Element", bound=eqx.Module)
 _FIXED = Frame(0.0, 0.0, 0.0, 1.0, 0.0)
 
 
-# Which rows of Psi are redundant is a question to the equations, a floor above: imported, they put their answer here. It has to be
-# given when a mechanism is built, since its numbers may be traced ever after.
-find_redundant_rows: Callable[["Mechanism"], tuple[int, ...] | None] = lambda mechanism: None
+# Which rows of Psi are redundant is a question to the equations, a floor above: imported, they put their answer here. It has
+# to be given when a mechanism is built, since its numbers may be traced ever after.
+def _not_asked(mechanism: "Mechanism") -> tuple[int, ...] | None:
+    return None
+
+
+find_redundant_rows: Callable[["Mechanism"], tuple[int, ...] | None] = _not_asked
 
 
 class Mechanism(eqx.Module):

@@ -74,7 +74,7 @@ class Program:
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:
     """Return what an early program must hand to a later one: the early nodes that the outputs or later nodes use.
 
-    Where "early" means "depends on parameters alone", the early program runs once and the later one as often as the state changes.
+    Where early is what depends on parameters alone, that program runs once, the later one whenever the state changes.
     """
     order = _needed(graph, {i for i, n in enumerate(graph.nodes) if n.kind == "input"}, [s.index for s in outputs])
     used = {s.index for s in outputs}
@@ -154,7 +154,10 @@ def _arrays(details: Details, arguments: Sequence[Scalar], values: list[Any]) ->
     arrays, start = [], 0
     for shape in details.shapes:
         size = int(np.prod(shape))
-        part = [jnp.asarray(v, a.node.dtype) for v, a in zip(values[start : start + size], arguments[start : start + size], strict=True)]
+        part = [
+            jnp.asarray(v, a.node.dtype)
+            for v, a in zip(values[start : start + size], arguments[start : start + size], strict=True)
+        ]
         arrays.append(jnp.stack(part).reshape(shape) if part else jnp.zeros(shape))
         start += size
     return arrays

@@ -13,9 +13,11 @@ import numpy as np
 
 
 class Node(NamedTuple):
-    """One operation. `arguments` are Scalars; `detail` is what else tells it apart (a name, a value, a primitive's parameters)."""
+    """One operation; `detail` is what tells it apart besides its arguments: a name, a value, a primitive's parameters."""
 
-    kind: str  # input, constant, add, sub, mul, div, sqrt, apply (a JAX primitive on scalars), call (on arrays), pick (from a call)
+    kind: (
+        str  # input, constant, add, sub, mul, div, sqrt, apply (a JAX primitive on scalars), call (on arrays), pick (from a call)
+    )
     arguments: tuple["Scalar", ...]
     detail: Any
     dtype: np.dtype
@@ -91,7 +93,7 @@ class Scalar:
 class Graph:
     """Nodes in an order in which every argument comes before its use."""
 
-    def __init__(self, dtype=np.float64):
+    def __init__(self, dtype: Any = np.float64):
         self.dtype = np.dtype(dtype)
         self.nodes: list[Node] = []
         self._known: dict[Any, int] = {}
@@ -99,8 +101,10 @@ class Graph:
     # --- leaves
 
     def input(self, name: Any, group: str, dtype=None) -> Scalar:
-        """Add an input; `group` says what kind of quantity it is, so that a program can be split by what depends on it. The two together
-        are the input's identity."""
+        """Add an input, identified by its group and its name.
+
+        The group says what kind of quantity it is, so that a program can be split by what depends on it.
+        """
         return Scalar(self, self._node("input", (), (group, name), np.dtype(dtype or self.dtype), frozenset([group])))
 
     def constant(self, value: Any, dtype=None) -> Scalar:
@@ -169,7 +173,9 @@ class Graph:
         detail = Details(primitive, parameters)
         return Scalar(self, self._operation("apply", tuple(arguments), detail, np.dtype(dtype)))
 
-    def call(self, detail: "Details", arguments: tuple[Scalar, ...], outputs: list[tuple[tuple[int, ...], Any]]) -> list[np.ndarray]:
+    def call(
+        self, detail: "Details", arguments: tuple[Scalar, ...], outputs: list[tuple[tuple[int, ...], Any]]
+    ) -> list[np.ndarray]:
         """A JAX primitive on whole arrays: an opaque node, and a pick for each element of what it returns."""
         index = self._operation("call", arguments, detail, np.dtype(object))
         arrays = []

@@ -15,7 +15,18 @@ from jax.extend import core
 
 from udkjax.straightline.graph import Details, Graph, Scalar
 
-_INLINED = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", "remat", "remat2", "checkpoint")
+_INLINED = (
+    "jit",
+    "pjit",
+    "closed_call",
+    "core_call",
+    "custom_jvp_call",
+    "custom_vjp_call",
+    "custom_vjp_call_jaxpr",
+    "remat",
+    "remat2",
+    "checkpoint",
+)
 _ELEMENTWISE = frozenset(
     """abs acos acosh and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma eq erf erf_inv
     erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p logistic lt max min ne nextafter not or pow reduce_precision rem
@@ -72,9 +83,10 @@ def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
     if name in _ELEMENTWISE:
         return [_elementwise(partial(_apply, graph, equation, dtype), shape, inputs)]
     if name == "reduce_sum" and np.issubdtype(dtype, np.floating):
-        return [np.asarray(np.sum(inputs[0], axis=parameters["axes"]), object)] if inputs[0].size else [_constants(graph, np.zeros(shape))]
+        zero: Any = graph.constant(0.0, dtype)
+        return [np.asarray(np.sum(inputs[0], axis=parameters["axes"], initial=zero), object)]
     if name == "dot_general" and np.issubdtype(dtype, np.floating):
-        return [_dot(graph, *inputs, parameters["dimension_numbers"], shape)]
+        return [_dot(graph, inputs[0], inputs[1], parameters["dimension_numbers"], shape)]
     if name in ("dynamic_slice", "gather") and all(s.constant is not None for i in inputs[1:] for s in i.flat):
         return [_select(equation, inputs)]
     if name == "split":

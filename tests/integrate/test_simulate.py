@@ -1,0 +1,365 @@
+"""How a run ends, what it counts, what it returns, and what it compiles."""
+
+import json
+import subprocess
+import sys
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+
+TS = np.linspace(0.0, 1.0, 11)
+RESULTS = udk.Result
+
+
+class Until(udk.ForceElement):
+    """A torque that is not a number from some time on."""
+
+    end: jax.Array
+
+    def loads(self, t, *frames):
+        return [(0.0, 0.0, jnp.where(t < self.end, 0.0, jnp.nan))]
+
+
+class BlowUp(udk.ForceElement):
+    """A force that grows without bound towards some time."""
+
+    end: jax.Array
+
+    def loads(self, t, *frames):
+        return [(1.0 / (self.end - t) ** 2, 0.0, 0.0)]
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return udk.library.compound_pendulum()
+
+
+@pytest.fixture(scope="module")
+def motion(pendulum):
+    return udk.simulate(pendulum, TS)
+
+
+def with_force(pendulum, force):
+    return udk.Mechanism(pendulum.bodies, pendulum.joints, forces=[force])
+
+
+def ended(sol, result, time, tol):
+    """The run ended so, at about that time, and what lies beyond is not a number."""
+    assert sol.result == result
+    assert_allclose(sol.time, time, atol=tol)
+    reached = np.asarray(sol.ts <= sol.time)
+    assert np.isfinite(sol.q[reached]).all() and np.isfinite(sol.v[reached]).all()
+    assert np.isnan(sol.q[~reached]).all() and np.isnan(sol.v[~reached]).all()
+    assert reached[0]
+
+
+# --- how it ends
+
+
+def test_success(motion):
+    assert motion.result is RESULTS.successful
+    assert motion.time == 1.0
+    assert "end time" in motion.cause
+    assert motion.q.shape == motion.v.shape == (11, 1, 3)
+    assert_allclose(motion.ts, TS)
+
+
+def test_step_limit(pendulum):
+    with pytest.raises(udk.SimulationError, match=r"step limit at t = 0\.\d+ s.*max_steps") as caught:
+        udk.simulate(pendulum, TS, max_steps=4)
+    ended(caught.value.solution, RESULTS.step_limit, 0.5, 0.4)
+    assert caught.value.solution.stats["steps"] == 4
+    sol = udk.simulate(pendulum, TS, max_steps=4, throw=False)
+    assert_allclose(sol.q, caught.value.solution.q)
+
+
+def test_a_number_that_is_not_finite(pendulum):
+    mech = with_force(pendulum, Until("rod", 0.45))
+    sol = udk.simulate(mech, TS, throw=False)
+    ended(sol, RESULTS.not_finite, 0.45, 1e-3)
+    assert_allclose(sol.q[:5], udk.simulate(with_force(pendulum, Until("rod", 9.0)), TS).q[:5], atol=1e-7)
+    with pytest.raises(udk.SimulationError, match="not finite"):
+        udk.simulate(mech, TS)
+
+
+def test_not_finite_from_the_start(pendulum):
+    sol = udk.simulate(with_force(pendulum, Until("rod", -1.0)), TS, throw=False)
+    assert sol.result == RESULTS.not_finite
+    assert sol.time == 0.0
+    assert np.isnan(sol.q[1:]).all()
+
+
+def test_a_step_that_is_too_small():
+    mech = udk.Mechanism({"stone": udk.Body(1.0, 1.0)}, forces=[BlowUp("stone", 0.55)])
+    sol = udk.simulate(mech, TS, throw=False)
+    ended(sol, RESULTS.step_too_small, 0.55, 1e-6)
+    with pytest.raises(udk.SimulationError, match="step too small at t = 0.55"):
+        udk.simulate(mech, TS)
+
+
+def test_drift(pendulum):
+    """A violation above `drift_tol` ends the solution where it was first seen."""
+    sol = udk.simulate(pendulum, TS, rtol=1e-4, atol=1e-4, stabilization=None, drift_tol=1e-6, throw=False)
+    psi = np.abs(udk.violation(pendulum, sol)).max(1)
+    assert sol.result == RESULTS.drift
+    first = int(np.flatnonzero(np.asarray(sol.ts) == float(sol.time))[0])
+    assert (psi[:first] <= 1e-6).all() and psi[first] > 1e-6
+    assert np.isnan(psi[first + 1 :]).all() and first < 10
+    with pytest.raises(udk.SimulationError, match="drift at.*stabilize"):
+        udk.simulate(pendulum, TS, rtol=1e-4, atol=1e-4, stabilization=None, drift_tol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def four_bar():
+    return udk.library.four_bar(angular_velocity=1.0)
+
+
+def test_what_cannot_be_assembled(four_bar):
+    mech = four_bar.with_parameters({"joint.D.points[0][0]": 9.0})
+    with pytest.raises(udk.AssemblyError, match='"[ABCD]"'):
+        udk.simulate(mech, TS)
+    sol = udk.simulate(mech, TS, throw=False)
+    assert sol.result == RESULTS.could_not_assemble
+    assert sol.time == 0.0
+    assert np.isfinite(sol.q[0]).all() and np.isnan(sol.q[1:]).all()
+    assert sol.stats["steps"] < 30
+
+
+def test_rows_that_become_independent_are_seen():
+    """A linkage built with equal cranks, one of which is then longer: it cannot move, and does not move silently."""
+    mech = udk.library.parallelogram(np.deg2rad(-50))
+    stuck = mech.with_parameters({"joint.A3.points[1][0]": -0.6, "joint.B3.points[1][0]": 0.6})
+    assert stuck.left_out == mech.left_out
+    start = udk.assemble(stuck)
+    sol = udk.simulate(stuck, TS, throw=False)
+    assert_allclose(sol.q, jnp.broadcast_to(start.q, sol.q.shape), atol=1e-9)
+    assert sol.result == RESULTS.successful
+
+    @jax.jit
+    def traced(length):
+        half = 0.5 * length
+        return udk.simulate(mech.with_parameters({"joint.A3.points[1][0]": -half, "joint.B3.points[1][0]": half}), TS).code
+
+    assert traced(1.2) == RESULTS.drift
+    assert traced(1.0) == RESULTS.successful
+
+
+# --- what goes in
+
+
+@pytest.mark.parametrize("ts", [0.0, [0.0], [[0.0, 1.0]], [0.0, 1.0, 1.0], [1.0, 0.0]])
+def test_output_times_are_checked(pendulum, ts):
+    with pytest.raises(ValueError, match="ts must"):
+        udk.simulate(pendulum, ts)
+
+
+def test_it_may_start_at_any_time():
+    """The driver's clock is that of ts."""
+    mech = udk.library.driven_pendulum()
+    ts = np.array([0.7, 0.8, 1.9])
+    sol = udk.simulate(mech, ts)
+    assert_allclose(sol.q[:, 0, 2], 0.8 * np.sin(3 * ts), atol=1e-12)
+    assert_allclose(sol.v[:, 0, 2], 2.4 * np.cos(3 * ts), atol=1e-12)
+
+
+def test_a_given_state_is_taken_as_it_is(pendulum, motion):
+    rest = udk.simulate(pendulum, TS + 5.0, udk.State(motion.q[3], motion.v[3]))
+    assert_allclose(rest.q[:8], motion.q[3:], atol=1e-7)
+    assert_allclose(rest.q[0], motion.q[3], atol=0)
+
+
+# --- outputs between the steps
+
+
+SOLVERS = {
+    "Tsit5": diffrax.Tsit5(),
+    "Dopri5": diffrax.Dopri5(),
+    "Dopri8": diffrax.Dopri8(),
+    "Heun": diffrax.Heun(),
+    "Kvaerno5": diffrax.Kvaerno5(),
+}
+FINE = np.sort(np.append(np.linspace(0.0, 1.0, 38), [1 / np.pi, 0.333]))
+
+
+@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+def test_outputs_lie_on_the_manifold_with_every_solver(pendulum, motion, solver):
+    sol = udk.simulate(pendulum, FINE, rtol=1e-6, atol=1e-6, solver=solver)
+    assert jnp.abs(udk.violation(pendulum, sol)).max() < 1e-14
+    x, y, angle = jnp.moveaxis(sol.q[:, 0], -1, 0)
+    assert_allclose(sol.v[:, 0, 0], -sol.v[:, 0, 2] * y, atol=1e-14)  # the velocity of the centre, by the constraint
+    assert_allclose(sol.q[-1], motion.q[-1], atol=1e-4)
+    energy = udk.energy(pendulum, sol).total
+    assert_allclose(energy, energy[0], atol=2e-3)
+
+
+def test_output_times_do_not_change_the_motion(pendulum, motion):
+    """The steps are the solver's own; outputs are read off between them."""
+    sol = udk.simulate(pendulum, FINE)
+    assert sol.stats["steps"] == motion.stats["steps"]
+    assert_allclose(sol.q[-1], motion.q[-1], atol=1e-13)
+    few = udk.simulate(pendulum, [0.0, 1.0])
+    assert_allclose(few.q[-1], motion.q[-1], atol=1e-13)
+
+
+# --- what it counts
+
+
+class Count:
+    def __init__(self):
+        self.value = 0
+
+    def add(self):
+        self.value += 1
+
+
+def counted(held):
+    """A stone that counts how often its force is asked for; `held` on a circle."""
+    count = Count()
+
+    def force(t, q, v):
+        jax.debug.callback(count.add)
+        return jnp.stack([-q[0], -9.81 + 0.0 * t])
+
+    return udk.ConstrainedSystem(lambda q: jnp.eye(2), force, (lambda t, q: q @ q - 1.0) if held else None), count
+
+
+AFTER = 1  # the end of every run looks whether what follows is finite, once: under vmap
+
+
+@pytest.mark.parametrize("held", [True, False], ids=["projected", "free"])
+@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Heun()], ids=["Dopri8", "Tsit5", "Heun"])
+def test_right_hand_sides_are_counted(solver, held):
+    """A method that keeps its last stage for the next step takes one fewer, unless the step was projected away from it."""
+    system, count = counted(held)
+    sol = udk.simulate(system, TS, udk.State([0.6, 0.8], [0.0, 0.0]), rtol=1e-5, atol=1e-5, solver=solver)
+    jax.effects_barrier()
+    stats = {k: int(v) for k, v in sol.stats.items() if k not in ("rtol", "atol")}
+    assert stats["steps"] == stats["accepted"] + stats["rejected"] > 3
+    assert count.value - AFTER == stats["right_hand_sides"]
+    assert stats["projections"] == (stats["steps"] + 2 * (len(TS) - 1) if held else 0)
+
+
+# --- batches
+
+
+def test_a_batch_with_members_that_fail(four_bar):
+    """One cannot be closed, one gets a number that is not finite; the others are what they are alone, and nothing throws."""
+    mech = udk.Mechanism(four_bar.bodies, four_bar.joints, forces={"motor": Until("crank", 99.0)})
+
+    def run(pivot, end, mass):
+        values = {"joint.D.points[0][0]": pivot, "force.motor.end": end, "body.coupler.mass": mass}
+        return udk.simulate(mech.with_parameters(values), TS)
+
+    members = jnp.array([[2.5, 99.0, 2.5], [9.0, 99.0, 2.5], [2.6, 99.0, 2.5], [2.5, 0.35, 2.5], [2.5, 99.0, 4.0]])
+    batch = jax.jit(jax.vmap(run))(*members.T)
+    assert list(batch.result) == [RESULTS.successful, RESULTS.could_not_assemble, RESULTS.successful, RESULTS.not_finite, 0]
+    assert batch.q.shape == (5, 11, 3, 3) and batch.stats["steps"].shape == (5,)
+    single = eqx.filter_jit(run)
+    for k in (0, 2, 4):
+        alone = single(*members[k])
+        assert_allclose(batch.q[k], alone.q, atol=1e-11)
+        assert batch.stats["steps"][k] == alone.stats["steps"]
+    assert np.isnan(batch.q[1, 1:]).all() and np.isnan(batch.q[3, 4:]).all()
+    assert_allclose(batch.q[3, :4], batch.q[0, :4], atol=1e-7)
+    assert jnp.abs(batch.q[4, -1] - batch.q[0, -1]).max() > 1e-3
+
+
+def test_a_batch_of_mechanisms(pendulum):
+    """`eqx.filter_vmap` over whole mechanisms, tolerances and times."""
+    masses, tols = jnp.array([1.0, 2.0, 3.0]), jnp.array([1e-4, 1e-6, 1e-9])
+    mechs = eqx.filter_vmap(lambda m: pendulum.with_parameters({"body.rod.mass": m}))(masses)
+    batch = eqx.filter_vmap(lambda m, tol: udk.simulate(m, TS, rtol=tol, atol=tol))(mechs, tols)
+    assert (batch.result == 0).all()
+    assert (np.diff(batch.stats["steps"]) > 0).all()
+    assert_allclose(batch.stats["rtol"], tols)
+    # a heavier rod of the same inertia: a physical pendulum of its own frequency
+    early = batch.q[:, 1, 0, 2] - batch.q[:, 0, 0, 2]
+    acceleration = -9.81 * 0.75 * masses * np.sin(np.pi / 3) / (0.375 + 0.5625 * masses)
+    assert_allclose(early, acceleration * 0.005, rtol=0.02)
+
+
+# --- what is compiled
+
+
+def compilations(caplog, action):
+    """How often a whole simulation was compiled."""
+    caplog.clear()
+    with jax.log_compiles(True), caplog.at_level("WARNING"):
+        action()
+    return sum("Compiling" in r.getMessage() and "_simulate" in r.getMessage() for r in caplog.records)
+
+
+def test_one_compilation_serves_all_numbers(caplog, four_bar):
+    def first():
+        udk.simulate(four_bar, TS[:7], method=udk.Auto(1e-4), stabilization=udk.Baumgarte(1.0, 1.0))
+
+    def others():
+        changed = {"body.rocker.mass": 7.0, "joint.B.points[1][0]": -1.2, "gravity": [1.0, -3.0], "body.crank.angle": 1.2}
+        mech = four_bar.with_parameters(changed)
+        method, gains = udk.Auto(rank_tol=1e-3, branch_tol=1e-5), udk.Baumgarte(0.5, 0.1)
+        udk.simulate(mech, 2.0 * TS[:7] + 1.0, rtol=1e-5, atol=1e-3, method=method, stabilization=gains, drift_tol=0.5)
+
+    assert compilations(caplog, first) == 1
+    assert compilations(caplog, others) == 0
+
+
+# --- what comes out
+
+
+def test_progress_is_printed(pendulum, capfd):
+    udk.simulate(pendulum, [0.0, 0.5, 1.0], progress=True)
+    jax.effects_barrier()
+    assert "100" in capfd.readouterr().out
+
+
+def test_a_dataset(pendulum, motion):
+    data = motion.to_xarray(pendulum)
+    assert data["q"].dims == data["v"].dims == ("time", "body", "coordinate")
+    assert_allclose(data["q"].sel(body="rod", coordinate="angle"), motion.q[:, 0, 2])
+    assert list(data["coordinate"].values) == ["x", "y", "angle"]
+    assert data["time"].attrs["units"] == "s" and data["q"].attrs["units"] == "m, m, rad"
+    assert data.attrs["result"] == "successful" and data.attrs["end_time"] == 1.0
+    assert data.attrs["stats_steps"] == int(motion.stats["steps"])
+    assert data.attrs["stats_rtol"] == 1e-8
+    assert data.attrs["setting_solver"] == "Dopri8" and data.attrs["setting_method"] == "Auto"
+    assert data.attrs["setting_stabilization"] == "Projection"
+    assert data.attrs["version_jax"] == jax.__version__
+    assert json.loads(data.attrs["parameters"])["body.rod.mass"] == 2.0
+    again = udk.loads(data.attrs["scene"])
+    assert_allclose(udk.simulate(again, TS).q, motion.q, atol=1e-12)
+    assert "scene" not in motion.to_xarray().attrs
+
+
+def test_a_dataset_of_a_failure_and_of_own_classes(pendulum):
+    mech = with_force(pendulum, Until("rod", 0.45))
+    data = udk.simulate(mech, TS, throw=False).to_xarray(mech)
+    assert data.attrs["result"] == "not_finite" and "0.4" in data.attrs["cause"]
+    assert data.attrs["scene"].startswith("# ")
+
+
+def test_a_file_that_anyone_can_read(pendulum, motion, tmp_path):
+    path = tmp_path / "run.nc"
+    motion.to_xarray(pendulum).to_netcdf(path, engine="h5netcdf")
+    program = f"""if True:
+        import sys, xarray
+        with xarray.open_dataset({str(path)!r}, engine="h5netcdf") as data:
+            print(float(data.q.sel(body="rod", coordinate="x")[-1]), data.attrs["result"], data.attrs["stats_steps"])
+        assert not any(name.split(".")[0] in ("udkjax", "jax") for name in sys.modules)
+    """
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path, env={})
+    x, result, steps = found.stdout.split()
+    assert (float(x), result, int(steps)) == (float(motion.q[-1, 0, 0]), "successful", int(motion.stats["steps"]))
+
+
+def test_a_batch_says_how_each_ended(pendulum):
+    codes = jnp.array([0, 3])
+    sol = udk.simulate(pendulum, TS)
+    many = eqx.tree_at(lambda s: s.code, sol, codes)
+    assert_allclose(many.result, codes)
