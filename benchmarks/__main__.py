@@ -6,7 +6,7 @@ from pathlib import Path
 
 NAMES = ("right_hand_side", "simulate")
 
-parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure udkjax against what a user would write without it.")
+parser = argparse.ArgumentParser("python -m benchmarks", description="Measure udkjax against what a user would write without it.")
 parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; without one: all")
 parser.add_argument("--smoke", action="store_true", help="run everything once, to see that it runs; measures nothing")
 parser.add_argument("--out", type=Path, help="also write the figures to this JSON file (with several names: into this folder)")

@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 import statistics
 import time
 from collections.abc import Callable
@@ -61,7 +62,7 @@ def machine() -> dict[str, Any]:
     """Describe what the figures belong to."""
     cpu = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").exists():
-        models = [line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
+        models = re.findall(r"model name\s*:\s*(.*)", Path("/proc/cpuinfo").read_text())
         cpu = models[0] if models else cpu
     load = os.getloadavg() if hasattr(os, "getloadavg") else None
     packages = {name: version(name) for name in ("jax", "jaxlib", "equinox", "diffrax", "numpy")}

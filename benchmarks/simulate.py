@@ -4,7 +4,6 @@ import statistics
 from pathlib import Path
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -65,7 +64,7 @@ def main(smoke: bool = False, out: Path | None = None):
 
     about = machine()
     y0 = initial[STARTS[0]]
-    runs = {f"udkjax {name}": ours(mechanism, ts, solver) for name, solver in solvers.items()} 
+    runs = {f"udkjax {name}": ours(mechanism, ts, solver) for name, solver in solvers.items()}
     runs |= {f"script, {tikhonov:.0e}": script(ts, tikhonov) for tikhonov in REGULARIZATIONS}
     compiled = {name: Compiled(run, y0, jnp.asarray(TOLERANCES[0])) for name, run in runs.items()}
     figures = []

@@ -18,7 +18,8 @@ from udkjax.study.exact import pendulum
 DATA = json.loads((Path(__file__).parents[1] / "data" / "seed_fivebar_parallelogram.json").read_text())
 EXACT = {name: float(value) for name, value in DATA["sensitivities_rest_minus50"]["2"].items()}
 
-METHODS = {m.__name__: m() for m in (udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination, udk.Auto)}
+CLASSES = (udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination, udk.Auto)
+METHODS = {m.__name__: m() for m in CLASSES}
 every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 
 
@@ -42,7 +43,7 @@ RATE = 1.3
 
 
 def state(angle, length, rate=RATE):
-    """q and v (12,), and what they are made of: positions are q(angle), so that accelerations are q'(angle) theta'' + q'' rate^2."""
+    """q and v (12,), and q' and q'' along the angle: accelerations are q' theta'' + q'' rate^2."""
 
     def q(s):
         e = jnp.stack([jnp.cos(s), jnp.sin(s)])
@@ -97,7 +98,8 @@ def test_derivatives_of_accelerations(method, expected):
     ordinary = np.abs(np.sin(ANGLES)) > 1e-2
     assert ordinary.sum() >= 395
     # The Hessian of a pseudoinverse holds its third power, 1 / sigma^3: 2e5 at the angles nearest to a singular one.
-    for name, f, e, tol in zip(("value", "forward", "reverse", "Hessian"), found, expected, (1e-9, 1e-9, 1e-9, 1e-7), strict=True):
+    tolerances = {"value": 1e-9, "forward": 1e-9, "reverse": 1e-9, "Hessian": 1e-7}
+    for (name, tol), f, e in zip(tolerances.items(), found, expected, strict=True):
         assert np.all(np.isfinite(f)), name
         scale = np.abs(e).max()
         np.testing.assert_allclose(f[ordinary] / scale, e[ordinary] / scale, rtol=0, atol=tol, err_msg=name)
@@ -164,7 +166,8 @@ def theta(p, mechanism=LINKAGE, method=None, adjoint=None, stabilization=udk.Pro
     start = udk.State(q.reshape(4, 3), v.reshape(4, 3))
     mechanism = mechanism.with_parameters(numbers)
     if assembled:  # close a state that the first link alone determines
-        start = udk.assemble(mechanism, 0.0, udk.State(start.q.at[1:].set(jax.lax.stop_gradient(start.q[1:])), start.v), throw=False)
+        guess = udk.State(start.q.at[1:].set(jax.lax.stop_gradient(start.q[1:])), start.v)
+        start = udk.assemble(mechanism, 0.0, guess, throw=False)
     solution = udk.simulate(mechanism, TS, start, rtol, rtol, method, stabilization, adjoint=adjoint, max_steps=4096, throw=False)
     return solution.q[-1, 0, 2]
 

@@ -62,8 +62,8 @@ def test_floats_are_evaluated_without_compiling():
 def test_an_operation_is_traced_once_for_each_value_it_has(emit):
     """What the jaxpr of a program holds is what the program counts."""
     program = emit(lambda x: (x[0] - x[1]) * jnp.sin(x[2]) + (x[1] - x[0]) / x[2], X).program
-    jaxpr = jax.make_jaxpr(lambda values: program(values))([jnp.asarray(x) for x in X])
-    names = sorted(e.primitive.name for e in jaxpr.jaxpr.eqns)
+    (call,) = jax.make_jaxpr(lambda values: program(values))([jnp.asarray(x) for x in X]).jaxpr.eqns
+    names = sorted(e.primitive.name for e in call.params["jaxpr"].jaxpr.eqns)
     assert names == sorted(name for name, n in program.count().items() for _ in range(n))
 
 

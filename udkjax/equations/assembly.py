@@ -97,7 +97,8 @@ def is_closed(closure: Closure) -> Any:
     """Whether the residuals are rounding errors (see `CLOSED`)."""
     q, v = jnp.abs(closure.state.q).max(initial=0.0), jnp.abs(closure.state.v).max(initial=0.0)
     psi, psi_dot = (jnp.abs(r).max(initial=0.0) for r in (closure.psi, closure.psi_dot))
-    return (psi <= CLOSED * (1.0 + q)) & (psi_dot <= CLOSED * (1.0 + v))
+    tol = max(CLOSED, 64.0 * float(jnp.finfo(q.dtype).eps))
+    return (psi <= tol * (1.0 + q)) & (psi_dot <= tol * (1.0 + v))
 
 
 def require_closed(mechanism: Mechanism, closure: Closure) -> None:

@@ -130,23 +130,23 @@ def prepare(mechanism: Mechanism, method: Pseudoinverse | None = None, baumgarte
     A method without a `rank_tol` gets `RANK_TOL`. Without knowledge of which rows are redundant (a mechanism that was built from
     traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
     """
-    method = Auto() if method is None else method
-    tol = number(RANK_TOL) if method.rank_tol is None else method.rank_tol
-    method: Any = eqx.tree_at(lambda m: m.rank_tol, method, tol, is_leaf=lambda x: x is None)
+    chosen: Any = Auto() if method is None else method
+    tol = number(RANK_TOL) if chosen.rank_tol is None else chosen.rank_tol
+    chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)
     left_out, elimination, drop = mechanism.left_out or (), None, number(0.0)
-    if isinstance(method, Elimination):
-        if not method.relative:
+    if isinstance(chosen, Elimination):
+        if not chosen.relative:
             raise ValueError("Elimination compares each row with what remains of it: here its rank_tol must be relative")
         elimination, drop = "drop", tol**2
-    elif isinstance(method, Auto) and mechanism.left_out is None:
-        method = SVD(method.rank_tol, method.relative)
-    elif isinstance(method, Auto):
-        elimination, drop = "check", method.branch_tol
+    elif isinstance(chosen, Auto) and mechanism.left_out is None:
+        chosen = chosen.exact
+    elif isinstance(chosen, Auto):
+        elimination, drop = "check", chosen.branch_tol
     programs = code(mechanism, left_out if elimination else (), baumgarte is not None, elimination)
     gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
     numbers = [*scalars(jax.tree.leaves(mechanism)), *gains, drop]
     constants = [jnp.asarray(c) for c in programs.prologue(numbers)]
-    return Equations(constants, method, programs)
+    return Equations(constants, chosen, programs)
 
 
 # --- plain

@@ -58,7 +58,7 @@ class Program:
     def _cut(self, known: dict[int, Any], live: list[int]):
         traced = [i for i in live if isinstance(known[i], jax.Array)]
         if traced:
-            known.update(zip(traced, jax.lax.optimization_barrier([known[i] for i in traced]), strict=True))
+            known.update(zip(traced, cut([known[i] for i in traced]), strict=True))
 
     def count(self) -> dict[str, int]:
         """How many operations of each kind the program holds."""
@@ -69,6 +69,18 @@ class Program:
             if name not in ("constant", "pick", "input"):
                 counts[name] = counts.get(name, 0) + 1
         return counts
+
+
+@jax.custom_jvp
+def cut(values: list[Any]) -> list[Any]:
+    """Keep XLA from fusing across this point: the identity, with the identity's derivative."""
+    return jax.lax.optimization_barrier(values)
+
+
+@cut.defjvp
+def _(primals, tangents):
+    # One by one: a barrier of which only a part depends on what is differentiated has no transpose in jax 0.12.
+    return cut(*primals), [jax.lax.optimization_barrier(t) for t in tangents[0]]
 
 
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:
