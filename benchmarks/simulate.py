@@ -45,6 +45,7 @@ def script(ts, tikhonov):
             max_steps=100_000,
             throw=False,
         )
+        assert solution.ys is not None
         return solution.ys[:, :12], solution.stats["num_steps"]
 
     return run
@@ -60,7 +61,7 @@ def main(smoke: bool = False, out: Path | None = None):
     for start in STARTS:
         placed = udk.library.parallelogram(np.deg2rad(start))
         initial[start] = jnp.concatenate([placed.q0.ravel(), placed.v0.ravel()])
-        exact[start] = exact_coordinates(placed, ts, placed.q0, placed.v0).reshape(len(ts), 12)
+        exact[start] = np.reshape(exact_coordinates(placed, ts, placed.q0, placed.v0), (len(ts), 12))
 
     about = machine()
     y0 = initial[STARTS[0]]

@@ -185,12 +185,18 @@ def central(function, p, step):
 
 @pytest.mark.parametrize("start", STARTS)
 def test_derivatives_of_the_assembled_state(assembled, start):
-    """With redundant rows, of tied lengths, masses and the guess: forward, reverse and second order."""
+    """With redundant rows, of tied lengths, masses and the guess: forward and reverse."""
     p = jnp.array(STARTS[start])
     forward = assembled["forward"](p)
     assert_allclose(forward, central(assembled["value"], p, 1e-5), atol=1e-7)  # what differences are good for
-    assert jnp.abs(forward).max(0).min() > 1e-2 if start == "rough" else jnp.abs(forward[:, 0]).max() > 0.1
+    assert jnp.abs(forward[:, [0, 3]]).max(0).min() > 0.05
     assert_allclose(assembled["reverse"](p), assembled["weights"] @ forward, atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", STARTS)
+def test_second_derivatives_of_the_assembled_state(assembled, start):
+    p = jnp.array(STARTS[start])
     second = assembled["second"](p)
     assert_allclose(second, second.T, atol=1e-9)
     assert_allclose(second, central(assembled["reverse"], p, 1e-5), atol=1e-6)

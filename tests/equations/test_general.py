@@ -87,7 +87,7 @@ def test_every_method_and_redundancy(method):
     assert_allclose(forces, pull / 3, atol=1e-13)
 
 
-@pytest.mark.parametrize("method", [udk.SVD(), udk.Householder(), udk.GramSchmidt()], ids=["SVD", "Householder", "GramSchmidt"])
+@pytest.mark.parametrize("method", [udk.SVD(), udk.GramSchmidt()], ids=["SVD", "GramSchmidt"])
 def test_redundancy_along_a_motion(in_angles, method):
     sol = run(Ball(BALL.weight, BALL.radius, 3).system(), *BALL_START, method=method)
     assert_allclose(sol.q, in_angles, atol=1e-8)

@@ -113,7 +113,7 @@ def test_small_gains_hold_it(unstable, gain):
 # --- the IFToMM benchmark A02, which crosses twice a turn
 
 
-@pytest.mark.parametrize("n", [1, 2, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(10, marks=pytest.mark.slow)])
 def test_n_four_bar(data, table, n):
     known = data("iftomm_A02_n_four_bar")["cases"][f"N={n}"]
     ts, row = table({"0": {"B0x": 0, "B0y": 1, "B0vx": 1, "B0vy": 0}, **known["reference"]}, (0, 0.5, 1, 2, 4, 5, 10))
@@ -212,6 +212,7 @@ def sensitivities(data, table):
 AT = jnp.array([np.deg2rad(-50), 9.81, 0.1])
 
 
+@pytest.mark.slow
 def test_sensitivities_by_forward_mode(linkage, placed, data, table):
     """Of a redundant mechanism, with respect to its start, gravity and three tied inertias."""
     from diffrax import ForwardMode

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from udkjax.pinv import SVD, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
+from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
 
 
 class Entry(NamedTuple):
@@ -27,6 +27,8 @@ METHODS = [
     Entry("GramSchmidt", GramSchmidt),
     Entry("GramSchmidt once", partial(GramSchmidt, twice=False), power=2),
     Entry("Greville", Greville, power=2, own_threshold=True),
+    Entry("Elimination", Elimination, power=2, own_threshold=True),
+    Entry("Auto", Auto),
 ]
 
 

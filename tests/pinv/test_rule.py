@@ -100,8 +100,10 @@ def test_derivatives(entry, matrices, reference):
     actual = derivatives(make(entry))(matrices)
     close(actual[0], first, 1e-6)
     close(triangle(actual[1]), second, 1e-5)
+    # cond = 82 in the last matrix: cond^2 in each of the three applications that a second derivative takes
+    tol = 1e-10 if entry.power == 1 else 1e-8
     for a, b in zip(actual, reference):
-        close(a, b, 1e-10)
+        close(a, b, tol)
 
 
 def test_forward_and_reverse_are_transposes(matrices):

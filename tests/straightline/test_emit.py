@@ -47,9 +47,12 @@ def test_floats_are_evaluated_without_compiling():
     (result,) = trace(f, 0.1, 0.2)(graph, np.asarray(x, object), np.asarray(y, object))
     program = Program(graph, [x, y], [result.item()], cut_every=1)
     compiled, listening = [], True
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda event, duration, **_: compiled.append(event) if listening and "compile" in event else None
-    )
+
+    def listen(event: str, duration_secs: float, **_):
+        if listening and "compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
     (found,) = program([0.4, 0.9])
     assert type(found) is float
     assert found == pytest.approx(math.sqrt(math.sin(0.4) ** 2 + math.exp(math.tanh(0.9))) / math.cos(-0.5), rel=1e-14)

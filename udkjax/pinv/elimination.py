@@ -1,7 +1,10 @@
 """Elimination: D^+ from the triangular factors of D D^T. Fast, and as accurate as cond(D)^2 allows.
 
-For a matrix whose entries may all be nonzero the factors are those of Courrieu (Neural Information Processing 8 (2005) 25):
-D D^T = L L^T with as many columns in L as the rank, from which D^+ = D^T L (L^T L)^-1 (L^T L)^-1 L^T for any rank.
+Rows that depend on those before them show by a pivot of rounding errors and are dropped. With K the rows kept and L the factor,
+D = C D_K for C = L L_K^(-1), which holds a unit row for each row kept, so
+
+    D^+ = D_K^+ C^+ = D_K^T (L_K L_K^T)^(-1) (C^T C)^(-1) C^T.
+
 A sparse matrix with independent rows takes straight-line code (sparse.py).
 """
 
@@ -10,65 +13,78 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.pinv.rule import Dense, Pseudoinverse, beyond, dot, number
 from udkjax.pinv.sparse import Pattern, program
 
 
 class Factors(NamedTuple):
-    """L, as Courrieu takes it, and what else D^+ is made of."""
+    """D and S, with D^+ = D^T S."""
 
     D: Float[Array, "m n"]
-    columns: Float[Array, "m r"]  # L, with a zero column for each dropped pivot
-    inverse: Float[Array, "r r"]  # (L^T L)^-1, with a one for each dropped pivot
+    S: Float[Array, "m m"]
     rank: Int[Array, ""]
-    smallest: Float[Array, ""]  # the smallest pivot that was kept, relative to its diagonal entry
 
 
 class Elimination(Dense):
-    """Eliminate D D^T in the order of its rows; a pivot whose square root is below the threshold is dropped.
+    """Eliminate D D^T by its largest pivots; a pivot whose square root is at most the threshold is dropped.
 
-    Errors grow as eps cond(D)^2. The default threshold is therefore sqrt(max(m, n) eps): a smaller pivot is rounding error.
+    Errors grow as eps cond(D)^2. The default threshold is eps^(1/3) of the longest row, as Greville's: what rounding leaves of a
+    dependent row stays well below it, and what lies below it has lost most of its digits.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> Factors:
         gram = dot(D, D.T)
-        diagonal = jnp.diagonal(gram)
-        m = len(gram)
-        rows = jnp.arange(m)
+        largest = jnp.max(jnp.diagonal(gram))
         if self.rank_tol is None:
-            threshold = max(D.shape) * jnp.finfo(D.dtype).eps * jnp.max(diagonal)
+            threshold = float(jnp.finfo(D.dtype).eps) ** (2 / 3) * largest
         else:
-            threshold = self.threshold(D, jnp.sqrt(jnp.max(diagonal))) ** 2
-
-        def column(j, carry):
-            left, L, kept, smallest = carry
-            pivot = left[j, j]
-            keep = beyond(pivot, threshold)
-            root = jnp.sqrt(jnp.where(keep, pivot, 1.0))
-            entry = jnp.where(keep & (rows >= j), left[:, j] / root, 0.0)
-            ratio = jnp.where(keep, pivot / diagonal[j], smallest)
-            return left - entry[:, None] * entry, L.at[:, j].set(entry), kept.at[j].set(keep), jnp.minimum(smallest, ratio)
-
-        start = (gram, jnp.zeros_like(gram), jnp.zeros(m, bool), jnp.ones((), D.dtype))
-        _, L, kept, smallest = jax.lax.fori_loop(0, m, column, start)
-        inner = dot(L.T, L) + jnp.diag(jnp.where(kept, 0.0, 1.0).astype(D.dtype))
-        identity = jnp.eye(m, dtype=D.dtype)
-        inverse = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(inner), True), identity)
-        return Factors(D, L, inverse, jnp.sum(kept), smallest)
+            threshold = self.threshold(D, jnp.sqrt(largest)) ** 2
+        L, kept, order = _cholesky(gram, threshold)
+        L = L[order]
+        dropped = jnp.diag((~kept).astype(D.dtype))
+        inverse = _inverse(jnp.where(kept[:, None], L, 0.0) + dropped)  # of L_K
+        C = dot(L, inverse)
+        inner, _, again = _cholesky(dot(C.T, C) + dropped, 0.0)
+        inner = _inverse(inner[again])[:, jnp.argsort(again)]
+        both = jnp.where(kept[:, None], dot(inverse.T, dot(inverse, dot(inner.T, dot(inner, C.T)))), 0.0)
+        back = jnp.argsort(order)
+        return Factors(D, both[back][:, back], jnp.sum(kept))
 
     def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
-        return dot(factors.D.T, _square(factors, b))
+        return dot(factors.D.T, dot(factors.S, b))
 
     def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
-        return _square(factors, dot(factors.D, c))
+        return dot(factors.S.T, dot(factors.D, c))
 
 
-def _square(factors: Factors, b: Float[Array, "m"]) -> Float[Array, "m"]:
-    """(D D^T)^+ b."""
-    L, inverse = factors.columns, factors.inverse
-    return dot(L, dot(inverse, dot(inverse, dot(L.T, b))))
+def _cholesky(
+    gram: Float[Array, "m m"], threshold: Any
+) -> tuple[Float[Array, "m m"], Bool[Array, "m"], Int[Array, "m"]]:
+    """L with L L^T = gram, always by the largest pivot left; which pivots exceed the threshold; and the order of the rows.
+
+    L[order] is a lower triangle. A pivot that does not count leaves a zero column.
+    """
+    m = len(gram)
+
+    def column(k, carry):
+        left, L, kept, order, waiting = carry
+        j = jnp.argmax(jnp.where(waiting, jnp.diagonal(left), -jnp.inf))
+        keep = beyond(left[j, j], threshold)
+        root = jnp.sqrt(jnp.where(keep, left[j, j], 1.0))
+        entry = jnp.where(keep & waiting, left[:, j] / root, 0.0)
+        left = left - entry[:, None] * entry
+        return left, L.at[:, k].set(entry), kept.at[k].set(keep), order.at[k].set(j), waiting.at[j].set(False)
+
+    start = (gram, jnp.zeros_like(gram), jnp.zeros(m, bool), jnp.zeros(m, int), jnp.ones(m, bool))
+    return jax.lax.fori_loop(0, m, column, start)[1:4]
+
+
+def _inverse(T: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """T^(-1) of a lower triangle, by rows."""
+    identity = jnp.eye(len(T), dtype=T.dtype)
+    return jax.lax.fori_loop(0, len(T), lambda j, X: X.at[j].set((identity[j] - dot(T[j], X)) / T[j, j]), jnp.zeros_like(T))
 
 
 class SparseFactors(NamedTuple):
