@@ -39,6 +39,11 @@ class Constrained(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver)
     scan_kind: ClassVar[str] = "the wrapped solver's"  # an adjoint would replace None, here; `constrained` has done it
 
     @property
+    def root_finder(self):
+        """Of an implicit solver: diffrax gives it the tolerances of the step size controller."""
+        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
     def term_structure(self):
         return self.solver.term_structure
 

@@ -105,7 +105,7 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     saved: Any = (run.ys, run.ts)
     (ys, end), (_, t_end) = saved
     reached = ts <= t_end[0]
-    ys = jnp.where(reached[:, None], ys, y0)
+    ys = jnp.where(reached[:, None], ys, y0).at[0].set(y0)  # a run without any accepted step has saved nothing
     if projected:
         ys = jnp.concatenate([ys[:1], project_all(equations, ts[1:], ys[1:])])
     seen = _held(Run(equations, run.result, ts, ys, reached, t_end[0], end[0], closed, missed, drift_tol))

@@ -13,8 +13,10 @@ BRANCH_TOL = 1e-6
 
 
 class Auto(Dense):
-    """For a mechanism, straight-line elimination of rows known to be independent, and the truncated `SVD` of all rows wherever one
-    of its pivots falls to `branch_tol` times its row's diagonal entry of D D^T. That is for the equations to arrange, which know
+    """Elimination where the rows are known to be independent, else the truncated `SVD`.
+
+    In a mechanism these are rows found independent when it was built, by straight-line code, until one of the pivots falls to
+    `branch_tol` times its row's diagonal entry of D D^T: then it is the `SVD` of all rows. The equations arrange that, which know
     the rows. Of a matrix of which nothing is known it is the `SVD`.
     """
 
