@@ -86,12 +86,11 @@ def test_truncated_and_not_stabilized_it_drifts(unstable):
     """Redundancy makes the drift unstable: 1.59/s, so that rounding errors are large after 16 to 20 s."""
     sol, _, psi = unstable(udk.SVD(), None)
     size = np.abs(psi).max(axis=1)
-    lost = sol.result != udk.Result.successful
-    assert lost or np.nanmax(size) > 1e-7
+    assert sol.result != udk.Result.successful or np.nanmax(size) > 1e-5
     assert size[4] < 1e-8  # at 2 s
-    early = slice(int(6 / 0.5), int(12 / 0.5))
-    rate = np.polyfit(COARSE[early], np.log(size[early]), 1)[0]
-    assert 1.2 < rate < 2.0
+    growing = (size > 3e-8) & (size < 3e-5) & (COARSE > 8)  # above the errors of integration, below the threshold of the rank
+    rate = np.polyfit(COARSE[growing], np.log(size[growing]), 1)[0]
+    assert growing.sum() > 5 and 1.3 < rate < 1.9
 
 
 def test_a_fixed_choice_of_rows_does_not(unstable):

@@ -19,7 +19,8 @@ def solution(mech, q, v=None, code=Result.successful):
     q = jnp.asarray(q)
     ts = jnp.linspace(0.0, 1.0, len(q))
     v = jnp.zeros_like(q) if v is None else v
-    return Solution(ts, q, v, jnp.array(int(code)), ts[-1], {"steps": jnp.array(3)}, mech.body_names, ())
+    tol = jnp.array(1e-8)
+    return Solution(ts, q, v, jnp.array(int(code)), ts[-1], {"steps": jnp.array(3)}, tol, tol, mech.body_names, ())
 
 
 @pytest.fixture(scope="module")
