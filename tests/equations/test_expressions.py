@@ -12,7 +12,6 @@ import udkjax as udk
 from udkjax.equations import prepare
 from udkjax.pinv import SVD
 
-O = [[0.0, 0.0], [0.0, 0.0]]
 P = [[0.2, -0.1], [-0.3, 0.15]]
 
 
@@ -43,7 +42,12 @@ class Table(udk.Joint):
         series = jax.lax.fori_loop(0, 3, lambda k, s: s * one.x / (k + 1.0) + 1.0, 1.0)
         matrix = jnp.array([[2.0 + one.cos, one.sin], [0.3, 1.5]])
         solved = jnp.linalg.solve(matrix, jnp.stack([one.x, one.y]))
-        return [one.y - height, jax.nn.softplus(one.x) + bend, series * jnp.sum(solved), jnp.polyval(jnp.array([0.2, -1.0, 0.5]), one.x)]
+        return [
+            one.y - height,
+            jax.nn.softplus(one.x) + bend,
+            series * jnp.sum(solved),
+            jnp.polyval(jnp.array([0.2, -1.0, 0.5]), one.x),
+        ]
 
 
 class Belt(udk.Joint):
@@ -84,7 +88,7 @@ class Drag(udk.ForceElement):
         one, two = frames
         velocity = jnp.stack([one.vx, one.vy]) - jnp.stack([two.vx, two.vy])
         force = -(self.coefficient @ velocity) * jnp.linalg.norm(velocity) + jnp.where(t > 0.1, jnp.tanh(t), 0.0)
-        return [(*force, -one.omega**3), (*-force, jnp.max(jnp.stack([two.omega, one.omega])))]
+        return [(*force, -(one.omega**3)), (*-force, jnp.max(jnp.stack([two.omega, one.omega])))]
 
     def potential(self, t, *frames):
         one, two = frames
@@ -202,8 +206,8 @@ def owner(mech):
     return np.array([name for name, _ in prepare(mech, SVD()).code.equations.row_names])
 
 
-NAMES = """revolute|revolute of two|to ground|prismatic|slot|weld|distance|angle|gear|inner gear|rack|cam|ellipse|ellipse on ground|
-    table|belt|turn|push|lift|stretch|chirp"""
+NAMES = """revolute|revolute of two|to ground|prismatic|slot|weld|distance|angle|gear|inner gear|rack|cam|ellipse
+    |ellipse on ground|table|belt|turn|push|lift|stretch|chirp"""
 
 
 @pytest.mark.parametrize("term", ["psi", "psi_q", "psi_dot", "gamma"])
@@ -227,7 +231,8 @@ def test_masses_loads_and_energies(terms, expected, term):
     "name", ["damped", "undamped", "torsion", "push", "follow", "torque", "motor", "rub", "stop", "drag", "gust"]
 )
 def test_one_force_element_alone(mech, states, twin, name):
-    alone = udk.Mechanism(mech.bodies, {"revolute of two": mech.joints["revolute of two"]}, {}, {name: mech.forces[name]}, (0.0, 0.0))
+    pin = {"revolute of two": mech.joints["revolute of two"]}
+    alone = udk.Mechanism(mech.bodies, pin, forces={name: mech.forces[name]}, gravity=(0.0, 0.0))
     t, q, v = (s[1] for s in states)
     q = q.at[0].set(-0.5)  # at the stop
     free = jnp.stack(prepare(alone, SVD()).run("rows", t, q, v)[-18:-9])

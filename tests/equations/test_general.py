@@ -138,7 +138,7 @@ def test_a_blade_on_ice_runs_in_a_circle(stabilization):
 
 
 def test_a_blade_that_is_steered():
-    """With a constant torque the path is Cornu's spiral: the angle grows with the square of time, the speed along the blade stays."""
+    """With a constant torque the path is Cornu's spiral: the angle grows with the square of time, the speed stays."""
     sol = run(knife(0.8), [0.0, 0.0, 0.0], [2.0, 0.0, 0.0])
     assert_allclose(sol.q[:, 2], TS**2, atol=1e-8)
     s = np.linspace(0, 2, 4001)
@@ -179,7 +179,7 @@ def test_a_bead_on_a_turning_wire(stabilization):
 
 
 def double(redundant):
-    """A double pendulum of two unit point masses in its angles; `redundant` adds a coordinate for their sum, and says so twice."""
+    """A double pendulum of two unit point masses in its angles; `redundant` adds their sum as a coordinate, and says so twice."""
 
     def mass(q):
         c = jnp.cos(q[0] - q[1])
@@ -207,9 +207,7 @@ def test_a_mass_matrix_that_is_not_diagonal():
     for method in DENSE.values():
         a = udk.accelerations(double(True), 0.0, jnp.append(q, q.sum()), jnp.append(v, v.sum()), method)
         assert_allclose(a, jnp.append(expected, expected.sum()), atol=1e-11)
-    assert_allclose(
-        udk.accelerations(plain, 0.0, q, v), jnp.linalg.solve(plain.mass(q), plain.force(0.0, q, v)), atol=1e-13
-    )
+    assert_allclose(udk.accelerations(plain, 0.0, q, v), jnp.linalg.solve(plain.mass(q), plain.force(0.0, q, v)), atol=1e-13)
 
 
 def test_without_constraints_it_is_an_ordinary_equation():

@@ -14,8 +14,10 @@ import udkjax as udk
 from udkjax.equations import prepare
 from udkjax.equations.udwadia_kalaba import plain_accelerations, plain_project
 
-METHODS = {m.__name__: m() for m in (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)}
-SMALL = "simple_pendulum compound_pendulum double_pendulum driven_pendulum parallelogram four_bar slider_crank elliptic_trammel".split()
+CLASSES = (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)
+METHODS = {cls.__name__: cls() for cls in CLASSES}
+SMALL = """simple_pendulum compound_pendulum double_pendulum driven_pendulum parallelogram four_bar slider_crank
+    elliptic_trammel""".split()
 LARGE = "n_four_bar scissor_lift peaucellier planetary_gear".split()
 every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 
@@ -43,7 +45,8 @@ def test_the_linkage_moves_as_its_exact_equation_says(linkage, placed, method):
     """3.05 theta'' = -3.5 g cos(theta), at any angle but the two where all links are in line, and at any angular velocity."""
     angles = np.concatenate([np.linspace(-3.0, -0.15, 12), np.linspace(0.15, 3.0, 12)])
     theta, rate = (x.ravel() for x in np.meshgrid(angles, [0.0, -1.0, 7.0]))
-    a = along(linkage, *jax.vmap(placed)(theta, rate), method)
+    q, v = jax.vmap(placed)(theta, rate)
+    a = along(linkage, q, v, method)
     exact = -3.5 * 9.81 * np.cos(theta) / 3.05
     assert_allclose(a[:, :3, 2], np.stack([exact] * 3, 1), atol=1e-11)
     assert_allclose(a[:, 3, 2], 0.0, atol=1e-11)
@@ -52,11 +55,12 @@ def test_the_linkage_moves_as_its_exact_equation_says(linkage, placed, method):
     assert_allclose(a[:, 0, :2], tip / 2, atol=1e-11)
 
 
-@pytest.mark.parametrize("method", [m for n, m in METHODS.items() if n != "Elimination"], ids=[n for n in METHODS if n != "Elimination"])
+@pytest.mark.parametrize("method", list(METHODS.values())[:-1], ids=list(METHODS)[:-1])  # all but Elimination
 def test_in_line_too(linkage, placed, method):
     """There the rank is 10, and the minimum-norm solution keeps to the parallelogram."""
     theta, rate = np.array([0.0, 0.0, np.pi, np.pi, 1e-9]), np.array([0.0, 2.0, 0.0, -3.0, 1.0])
-    a = along(linkage, *jax.vmap(placed)(theta, rate), method)
+    q, v = jax.vmap(placed)(theta, rate)
+    a = along(linkage, q, v, method)
     assert_allclose(a[:, :3, 2], np.stack([-3.5 * 9.81 * np.cos(theta) / 3.05] * 3, 1), atol=1e-10)
 
 
@@ -113,9 +117,9 @@ def test_agrees_with_the_augmented_equations(mechanisms, twin, closed, name):
     q, v = closed(mech)
     a, multipliers = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3), multipliers=True)
     expected, forces = twin.kkt(mech, jnp.array(0.0), q, v)
-    scale = 1 + np.abs(expected).max()
+    scale = float(1 + np.abs(expected).max())
     assert_allclose(a.ravel(), expected, atol=1e-10 * scale)
-    assert_allclose(multipliers, forces, atol=1e-9 * (1 + np.abs(forces).max()))
+    assert_allclose(multipliers, forces, atol=1e-9 * float(1 + np.abs(forces).max()))
     by_svd = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3), udk.SVD())
     assert_allclose(a, by_svd, atol=1e-10 * scale)
 
@@ -128,13 +132,13 @@ def test_gauss_principle(mechanisms, twin, closed, name):
     a = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3)).ravel()
     t, mass = jnp.array(0.0), twin.mass(mech)
     A = twin.psi_q(mech, t, q)
-    size = 1 + jnp.abs(a).max()
+    size = float(1 + jnp.abs(a).max())
     assert_allclose(A @ a, twin.gamma(mech, t, q, v), atol=1e-10 * size)
     _, sigma, vt = np.linalg.svd(A)
     allowed = vt[np.sum(sigma > 1e-8 * sigma[0]) :]
     offset = a - twin.force(mech, t, q, v) / mass
     assert len(allowed) == 3 * len(mech.bodies) - np.linalg.matrix_rank(A, tol=1e-8)
-    assert_allclose(allowed @ (mass * offset), 0.0, atol=1e-10 * size * mass.max())
+    assert_allclose(allowed @ (mass * offset), 0.0, atol=1e-10 * size * float(mass.max()))
     effort = offset @ (mass * offset)
     for z in np.random.default_rng(4).standard_normal((5, len(allowed))) @ allowed if len(allowed) else ():
         assert (offset + 0.1 * z) @ (mass * (offset + 0.1 * z)) > effort
@@ -199,7 +203,7 @@ def test_the_fast_form_is_the_plain_form(nearby, method, name):
         return [jax.lax.map(lambda s, form=form: form(0.0, *s), (qs, vs)) for form in forms]
 
     fast, plain, projected, newton = both(mech, qs, vs)
-    size = 1 + jnp.abs(plain).max()
+    size = float(1 + jnp.abs(plain).max())
     assert_allclose(fast, plain, atol=1e-11 * size)
     for one, other, state in zip(projected, newton, (qs, vs), strict=True):
         assert_allclose(one, other, atol=1e-12)
@@ -300,7 +304,8 @@ def test_derivatives_of_accelerations(linkage, placed, method):
 
     def angular(theta, mass):
         mech = linkage.with_parameters({"body.coupler.mass": mass})
-        return udk.accelerations(mech, 0.0, *placed(theta, 1.3), method)[1, 2]
+        q, v = placed(theta, 1.3)
+        return udk.accelerations(mech, 0.0, q, v, method)[1, 2]
 
     def exact(theta, mass):
         return -(1.5 + mass) * 9.81 * jnp.cos(theta) / (1.05 + mass)

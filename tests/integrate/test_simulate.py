@@ -21,7 +21,7 @@ RESULTS = udk.Result
 class Until(udk.ForceElement):
     """A torque that is not a number from some time on."""
 
-    end: jax.Array
+    end: float
 
     def loads(self, t, *frames):
         return [(0.0, 0.0, jnp.where(t < self.end, 0.0, jnp.nan))]
@@ -30,7 +30,7 @@ class Until(udk.ForceElement):
 class BlowUp(udk.ForceElement):
     """A force that grows without bound towards some time."""
 
-    end: jax.Array
+    end: float
 
     def loads(self, t, *frames):
         return [(1.0 / (self.end - t) ** 2, 0.0, 0.0)]
@@ -100,7 +100,7 @@ def test_a_step_that_is_too_small():
     mech = udk.Mechanism({"stone": udk.Body(1.0, 1.0)}, forces=[BlowUp("stone", 0.55)])
     sol = udk.simulate(mech, TS, throw=False)
     ended(sol, RESULTS.step_too_small, 0.55, 1e-6)
-    with pytest.raises(udk.SimulationError, match="step too small at t = 0.55"):
+    with pytest.raises(udk.SimulationError, match=r"step too small at t = 0\.55"):
         udk.simulate(mech, TS)
 
 
@@ -112,13 +112,13 @@ def test_drift(pendulum):
     first = int(np.flatnonzero(np.asarray(sol.ts) == float(sol.time))[0])
     assert (psi[:first] <= 1e-6).all() and psi[first] > 1e-6
     assert np.isnan(psi[first + 1 :]).all() and first < 10
-    with pytest.raises(udk.SimulationError, match="drift at.*stabilize"):
+    with pytest.raises(udk.SimulationError, match=r"drift at.*stabilize"):
         udk.simulate(pendulum, TS, rtol=1e-4, atol=1e-4, stabilization=None, drift_tol=1e-6)
 
 
 @pytest.fixture(scope="module")
 def hung():
-    """A rod that swings from a pin, and the pin on a line through the origin, 1 m from a point above it: if it is not too high."""
+    """A rod that swings from a pin; the pin is on a line, 1 m from a point above it, if that is not too high."""
     bodies = {"rod": udk.Body(1.0, 0.2, [1.0, -0.5], -0.8, angular_velocity=1.0)}
     joints = {
         "line": udk.Slot(["ground", "rod"], [[0.0, 0.0], [-0.75, 0.0]], axis=0.0),
@@ -129,7 +129,7 @@ def hung():
 
 def test_what_cannot_be_assembled(hung):
     mech = hung.with_parameters({"joint.thread.points[0][1]": 2.0})
-    with pytest.raises(udk.AssemblyError, match='"(line|thread)"'):
+    with pytest.raises(udk.AssemblyError, match=r'"(line|thread)"'):
         udk.simulate(mech, TS)
     sol = udk.simulate(mech, TS, throw=False)
     assert sol.result == RESULTS.could_not_assemble
@@ -205,8 +205,7 @@ FINE = np.sort(np.append(np.linspace(0.0, 1.0, 38), [1 / np.pi, 0.333]))
 def test_outputs_lie_on_the_manifold_with_every_solver(pendulum, motion, solver):
     sol = udk.simulate(pendulum, FINE, rtol=1e-6, atol=1e-6, solver=solver)
     assert jnp.abs(udk.violation(pendulum, sol)).max() < 1e-14
-    x, y, angle = jnp.moveaxis(sol.q[:, 0], -1, 0)
-    assert_allclose(sol.v[:, 0, 0], -sol.v[:, 0, 2] * y, atol=1e-14)  # the velocity of the centre, by the constraint
+    assert_allclose(sol.v[:, 0, 0], -sol.v[:, 0, 2] * sol.q[:, 0, 1], atol=1e-14)  # the velocity of the centre, by the constraint
     assert_allclose(sol.q[-1], motion.q[-1], atol=1e-4)
     energy = udk.energy(pendulum, sol).total
     assert_allclose(energy, energy[0], atol=2e-3)
@@ -217,7 +216,7 @@ def test_output_times_do_not_change_the_motion(pendulum, motion):
     sol = udk.simulate(pendulum, FINE)
     assert sol.stats["steps"] == motion.stats["steps"]
     assert_allclose(sol.q[-1], motion.q[-1], atol=1e-13)
-    few = udk.simulate(pendulum, [0.0, 1.0])
+    few = udk.simulate(pendulum, np.array([0.0, 1.0]))
     assert_allclose(few.q[-1], motion.q[-1], atol=1e-13)
 
 
@@ -251,7 +250,7 @@ AFTER = 1  # the end of every run looks whether what follows is finite, once: un
 def test_right_hand_sides_are_counted(solver, held):
     """A method that keeps its last stage for the next step takes one fewer, unless the step was projected away from it."""
     system, count = counted(held)
-    sol = udk.simulate(system, TS, udk.State([0.6, 0.8], [0.0, 0.0]), rtol=1e-5, atol=1e-5, solver=solver)
+    sol = udk.simulate(system, TS, udk.State(np.array([0.6, 0.8]), np.zeros(2)), rtol=1e-5, atol=1e-5, solver=solver)
     jax.effects_barrier()
     stats = {k: int(v) for k, v in sol.stats.items()}
     assert stats["steps"] == stats["accepted"] + stats["rejected"] > 3
@@ -326,7 +325,7 @@ def test_one_compilation_serves_all_numbers(caplog, hung):
 
 
 def test_progress_is_printed(pendulum, capfd):
-    udk.simulate(pendulum, [0.0, 0.5, 1.0], progress=True)
+    udk.simulate(pendulum, np.array([0.0, 0.5, 1.0]), progress=True)
     jax.effects_barrier()
     assert "100" in capfd.readouterr().out
 

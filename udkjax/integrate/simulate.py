@@ -48,8 +48,9 @@ def simulate(
 
     Without `state` the scene's initial guess is assembled; a given state is taken as it is. `method` is any pseudoinverse
     (default `Auto`), `stabilization` is `Projection()`, a `Baumgarte` or None, `solver` any diffrax solver for ordinary
-    differential equations (default Dopri8: of those measured in benchmarks/ the fastest from errors of 1e-5 on). `rtol` and
-    `atol` hold for every coordinate and velocity. `progress=True` prints how far the run is.
+    differential equations (default Dopri8: of those measured in benchmarks/ the fastest at equal error, but for the tightest
+    tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity. `progress=True`
+    prints how far the run is.
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. For forward mode give `adjoint=diffrax.ForwardMode()`; reverse mode works as it is.
