@@ -59,9 +59,7 @@ class Elimination(Dense):
         return dot(factors.S.T, dot(factors.D, c))
 
 
-def _cholesky(
-    gram: Float[Array, "m m"], threshold: Any
-) -> tuple[Float[Array, "m m"], Bool[Array, "m"], Int[Array, "m"]]:
+def _cholesky(gram: Float[Array, "m m"], threshold: Any) -> tuple[Float[Array, "m m"], Bool[Array, "m"], Int[Array, "m"]]:
     """L with L L^T = gram, always by the largest pivot left; which pivots exceed the threshold; and the order of the rows.
 
     L[order] is a lower triangle. A pivot that does not count leaves a zero column.
