@@ -50,6 +50,7 @@ class Position(NamedTuple):
         return bool(np.all((self.sigma <= RANK_TOL * self.sigma[0]) | (self.sigma > CLEAR * self.sigma[0])))
 
 
+@np.errstate(all="ignore")  # what is not finite does not close
 def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     """Return the rows of Psi to leave out, or None: the guess cannot be closed or moved, or numbers are traced."""
     leaves = jax.tree.leaves(mechanism)
@@ -146,6 +147,8 @@ class Rows:
         damping = DAMPING
         psi, scaled, D = self.at(t, q)
         for _ in range(ITERATIONS):
+            if not (np.all(np.isfinite(psi)) and np.all(np.isfinite(D))):
+                return None
             u, sigma, vt = np.linalg.svd(D)
             if np.abs(psi).max() <= CLOSED * (1.0 + np.abs(q).max()):
                 return Position(t, q, u, sigma, vt)
@@ -155,7 +158,7 @@ class Rows:
             trial = self.at(t, ahead)
             if np.linalg.norm(trial[0]) < np.linalg.norm(psi):
                 q, (psi, scaled, D), damping = ahead, trial, 0.1 * damping
-            elif damping > 1e6 or not np.all(np.isfinite(psi)):
+            elif damping > 1e6:
                 return None
             else:
                 damping = max(100.0 * damping, 1e-12)

@@ -20,7 +20,7 @@ from udkjax.straightline.graph import Details, Graph, Node, Scalar
 # Operations between two optimization barriers. Without any, XLA repeats everything for each output; with too many it cannot fuse.
 CUT_EVERY = 48
 
-_FLOATS: dict[str, Callable] = {"sin": math.sin, "cos": math.cos, "tanh": math.tanh, "exp": math.exp}
+_FLOATS = ("sin", "cos", "tanh", "exp")  # of these names math and NumPy have functions, too
 
 
 class Program:
@@ -39,7 +39,11 @@ class Program:
 
     def __call__(self, values: Sequence[Any]) -> list[Any]:
         if all(isinstance(v, float | int) for v in values):
-            return self._run(values)
+            try:
+                return self._run(values)
+            except (ArithmeticError, ValueError):  # 1/0, an overflow, sin(inf): in JAX no errors, but values that are not finite
+                with np.errstate(all="ignore"):
+                    return self._run([np.float64(v) for v in values])
         return self._traced([jnp.asarray(v, s.node.dtype) for v, s in zip(values, self.inputs, strict=True)])
 
     def _run(self, values: Sequence[Any]) -> list[Any]:
@@ -131,7 +135,7 @@ def _evaluate(node: Node, known: dict[int, Any]) -> Any:
         case "div":
             return values[0] / values[1]
         case "sqrt":
-            return math.sqrt(values[0]) if isinstance(values[0], float) else jnp.sqrt(values[0])
+            return _library(values[0]).sqrt(values[0]) if isinstance(values[0], float) else jnp.sqrt(values[0])
         case "apply":
             return _apply(node, values)
         case "call":
@@ -139,10 +143,14 @@ def _evaluate(node: Node, known: dict[int, Any]) -> Any:
     raise AssertionError(node.kind)
 
 
+def _library(x: float) -> Any:
+    return np if isinstance(x, np.floating) else math
+
+
 def _apply(node: Node, values: list[Any]) -> Any:
     name = node.detail.primitive.name
     if name in _FLOATS and isinstance(values[0], float):
-        return _FLOATS[name](values[0])
+        return getattr(_library(values[0]), name)(values[0])
     floats = all(isinstance(v, float | int | bool | np.generic) for v in values)
     primitive, parameters = node.detail.primitive, node.detail.parameters
     if not floats:
