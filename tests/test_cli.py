@@ -53,6 +53,7 @@ def test_simulate_writes_a_file_that_can_be_trusted_and_a_picture(tmp_path, caps
         np.testing.assert_allclose(data.q.sel(body="link2", coordinate="x"), 1 + np.cos(angle) / 2, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_what_a_run_prints_is_measured(tmp_path, capsys):
     """Loose tolerances without stabilization: the error and the drift that are printed must be large, not the default's."""
     arguments = ("simulate", PARALLELOGRAM, "--t1", 3, "--out", tmp_path / "run.nc")
@@ -68,6 +69,7 @@ def test_what_a_run_prints_is_measured(tmp_path, capsys):
 @pytest.mark.parametrize(
     "choice", [["--method", "svd", "--rank-tol", 1e-4], ["--stabilization", "baumgarte", "--alpha", 2], ["--solver", "tsit5"]]
 )
+@pytest.mark.slow
 def test_choices_reach_the_simulation(tmp_path, choice):
     out = tmp_path / "run.nc"
     assert udkjax("simulate", EXAMPLES / "simple_pendulum.toml", "--t1", 1, "--out", out, *choice) == 0

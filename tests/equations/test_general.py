@@ -87,6 +87,7 @@ def test_every_method_and_redundancy(method):
     assert_allclose(forces, pull / 3, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [udk.SVD(), udk.GramSchmidt()], ids=["SVD", "GramSchmidt"])
 def test_redundancy_along_a_motion(in_angles, method):
     sol = run(Ball(BALL.weight, BALL.radius, 3).system(), *BALL_START, method=method)
@@ -235,6 +236,7 @@ def test_mass_redundancy_and_constraints_along_a_motion(stabilization):
 # --- the same linkage by either way
 
 
+@pytest.mark.slow
 def test_a_mechanism_written_by_hand_moves_alike(twin):
     mech = udk.library.parallelogram(np.deg2rad(-50))
     system = udk.ConstrainedSystem(

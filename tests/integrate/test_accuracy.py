@@ -106,6 +106,7 @@ def test_a_fixed_choice_of_rows_does_not(unstable):
     assert np.abs(psi).max() < 1e-7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [2.0, 5.0])
 def test_small_gains_hold_it(unstable, gain):
     """Gains of 2 to 5 are above the rate at which the drift would grow."""

@@ -205,6 +205,7 @@ def test_gradient_of_a_trajectory_with_other_stabilizations(method, stabilizatio
     check(*mode(method=method, stabilization=stabilization))
 
 
+@pytest.mark.slow
 def test_gradient_of_a_trajectory_without_projection():
     check(*forward(method=udk.SVD(), stabilization=None))
 
@@ -237,6 +238,7 @@ def test_second_derivative_of_a_trajectory(method):
     np.testing.assert_allclose(second, samples @ [2, -27, 270, -490, 270, -27, 2] / (180 * h**2), rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", fast("Auto"))
 def test_a_duplicated_joint_changes_no_trajectory(method):
     ts = np.linspace(0.0, 1.0, 5)

@@ -211,6 +211,7 @@ def test_outputs_lie_on_the_manifold_with_every_solver(pendulum, motion, solver)
     assert_allclose(energy, energy[0], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_output_times_do_not_change_the_motion(pendulum, motion):
     """The steps are the solver's own; outputs are read off between them."""
     sol = udk.simulate(pendulum, FINE)
