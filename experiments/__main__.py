@@ -1,0 +1,20 @@
+"""`python -m experiments NAME ... [--smoke] [--redraw] [--out DIR]`."""
+
+import argparse
+from pathlib import Path
+
+from experiments.common import NAMES, redraw, run
+
+parser = argparse.ArgumentParser("python -m experiments", description="Compute a claim's data, then draw its figure from them.")
+parser.add_argument("names", nargs="+", metavar="NAME", help=f"of {', '.join(NAMES)}; or all")
+parser.add_argument("--smoke", action="store_true", help="the same in small, in seconds; writes to a temporary folder")
+parser.add_argument("--redraw", action="store_true", help="compute nothing: draw the figure anew from the data file")
+parser.add_argument("--out", type=Path, metavar="DIR", help="write DIR/NAME.nc and DIR/NAME.png instead of the committed files")
+arguments = parser.parse_args()
+if unknown := set(arguments.names) - {*NAMES, "all"}:
+    parser.error(f"no study {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
+for name in NAMES if "all" in arguments.names else arguments.names:
+    if arguments.redraw:
+        redraw(name, arguments.out)
+    else:
+        run(name, arguments.smoke, arguments.out)

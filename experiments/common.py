@@ -1,0 +1,102 @@
+"""How every study runs: compute, write the data with all that it takes to repeat them, draw the figure from the file alone.
+
+A study is one module that says in its docstring what it claims and why, and has
+
+    study(smoke) -> xarray.Dataset     compute; in small if `smoke`; `described` adds what belongs to the data
+    holds(data) -> {part: bool}        the claim in parts, each held against the data, of the small run as well
+    headline(data) -> str              the claim in figures, in one line; the README quotes it
+    figure(data) -> Figure             from the data alone
+"""
+
+import inspect
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import xarray
+from matplotlib.figure import Figure
+
+from udkjax.integrate.solution import versions
+from udkjax.scene import Mechanism, dumps
+
+HERE = Path(__file__).parent
+NAMES = tuple(sorted(file.stem for file in HERE.glob("*.py") if file.stem not in ("__init__", "__main__", "common")))
+DPI = 110
+
+Item = TypeVar("Item")
+
+
+def run(name: str, smoke: bool = False, out: Path | None = None) -> xarray.Dataset:
+    """Compute a study, write its data, draw its figure from the file; return what was written."""
+    module: Any = import_module(f"experiments.{name}")
+    if smoke and out is None:
+        out = Path(tempfile.mkdtemp(prefix="experiments-"))
+    start = time.perf_counter()
+    data = module.study(smoke)
+    data.attrs |= {
+        "title": name,
+        "claim": inspect.cleandoc(module.__doc__),
+        "smoke": int(smoke),
+        "seconds": round(time.perf_counter() - start, 1),
+        **{f"version_{package}": version for package, version in (versions() | {"xarray": xarray.__version__}).items()},
+    }
+    file = data_file(name, out)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    packed = {variable: {"zlib": True} for variable in data.data_vars if data[variable].ndim}
+    data.to_netcdf(file, engine="h5netcdf", encoding=packed)
+    redraw(name, out)
+    return load(name, out)
+
+
+def redraw(name: str, out: Path | None = None) -> None:
+    """Draw a study's figure from its data file, and print its headline."""
+    module: Any = import_module(f"experiments.{name}")
+    data, file = load(name, out), (HERE / "figures" if out is None else out) / f"{name}.png"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    module.figure(data).savefig(file, dpi=DPI)
+    failed = [part for part, true in module.holds(data).items() if not true]
+    print(f"{name} ({data.attrs['seconds']} s): {module.headline(data)}")
+    print(f"  {data_file(name, out)}, {file}", *(f"\n  DOES NOT HOLD: {part}" for part in failed))
+
+
+def load(name: str, out: Path | None = None) -> xarray.Dataset:
+    """Return the data of a study, by default those that are committed."""
+    with xarray.open_dataset(data_file(name, out), engine="h5netcdf") as data:
+        return data.load()
+
+
+def data_file(name: str, out: Path | None = None) -> Path:
+    """Return where the data of a study are."""
+    return (HERE / "data" if out is None else out) / f"{name}.nc"
+
+
+def described(data: xarray.Dataset, scene: Mechanism | str, settings: Mapping[str, Any], seed: int | None = None):
+    """Return the data with what they were computed from: the scene's text, all settings (as JSON), the seed."""
+    text = scene if isinstance(scene, str) else dumps(scene)
+    numbers = {key: np.asarray(value).tolist() if not isinstance(value, str) else value for key, value in settings.items()}
+    return data.assign_attrs(scene=text, settings=json.dumps(numbers), seed="none" if seed is None else seed)
+
+
+def tracked(items: Sequence[Item] | Iterable[Item], what: str) -> Iterator[Item]:
+    """Iterate over the parts of a study; say on stderr which one is at work and how long it has been so far."""
+    items, start = list(items), time.perf_counter()
+    end = "\r" if sys.stderr.isatty() else "\n"
+    for number, item in enumerate(items, 1):
+        print(f"{what}: {number} of {len(items)}, {time.perf_counter() - start:.0f} s   ", end=end, file=sys.stderr, flush=True)
+        yield item
+
+
+def panels(rows: int, columns: int, width: float, height: float, **choices: Any) -> tuple[Figure, Any]:
+    """Return a figure (inches) that belongs to nobody else, and its axes as an array (rows, columns)."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **choices)
+    for one in axes.ravel():
+        one.grid(color="0.92", lw=0.6)
+        one.set_axisbelow(True)
+    return figure, axes
