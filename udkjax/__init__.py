@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.integrate import Result as Result
     from udkjax.integrate import SimulationError as SimulationError
     from udkjax.integrate import Solution as Solution
+    from udkjax.integrate import Verner65 as Verner65
     from udkjax.integrate import simulate as simulate
     from udkjax.pinv import SVD as SVD
     from udkjax.pinv import Auto as Auto
@@ -80,7 +81,7 @@ _NAMES = {
     "udkjax.pinv": "SVD Varga Greville Householder GramSchmidt Elimination Auto",
     "udkjax.equations.assembly": "AssemblyError State assemble",
     "udkjax.equations": "ConstrainedSystem Baumgarte accelerations check violation energy reactions",
-    "udkjax.integrate": "simulate Solution Projection Result SimulationError",
+    "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -5,3 +5,4 @@ from udkjax.integrate.simulate import simulate as simulate
 from udkjax.integrate.solution import Result as Result
 from udkjax.integrate.solution import SimulationError as SimulationError
 from udkjax.integrate.solution import Solution as Solution
+from udkjax.integrate.verner import Verner65 as Verner65

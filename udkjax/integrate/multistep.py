@@ -1,0 +1,60 @@
+"""What the multistep methods of variable order share: how they steer the step, and how they count.
+
+A method of variable order chooses its next order and step together. diffrax leaves the step to its controller, which sees an error
+estimate of one fixed order. So the methods here say what they want in the language of that controller: `steered` gives it an error
+from which `PIDController` draws the very factor that the method has chosen.
+"""
+
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+SAFETY = 0.9  # of diffrax.PIDController, by default
+ERROR_ORDER = 2  # that the controller is told: the order of the error of the first step, which is of order one
+
+
+class Tolerances(eqx.Module):
+    """What a step may err, and in which norm. It stands where diffrax, looking for a root finder, puts its controller's tolerances."""
+
+    rtol: Any
+    atol: Any
+    norm: Any = eqx.field(static=False)
+
+
+def from_controller() -> Any:
+    """Tolerances that `diffeqsolve` replaces by those of its step size controller."""
+    make: Any = diffrax.with_stepsize_controller_tols
+    return make(Tolerances)()
+
+
+def scale(tolerances: Tolerances, y0: Any, y1: Any) -> Any:
+    """atol + rtol max(|y0|, |y1|), as the controller has it."""
+    return jax.tree.map(lambda a, b: tolerances.atol + tolerances.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), y0, y1)
+
+
+def steered(tolerances: Tolerances, y0: Any, y1: Any, accept: Any, factor: Any) -> Any:
+    """An error estimate from which the controller accepts the step or not, and multiplies its size by `factor`.
+
+    The controller takes SAFETY / norm(error / scale)^(1 / ERROR_ORDER); it never shrinks a step after one that it accepted.
+    """
+    factor = jnp.where(accept, jnp.maximum(factor, 1.0), jnp.minimum(factor, SAFETY * (1 - 1e-3)))
+    size = (SAFETY / jax.lax.stop_gradient(factor)) ** ERROR_ORDER
+    ones = jax.tree.map(jnp.ones_like, y0)
+    return jax.tree.map(lambda s: size / tolerances.norm(ones) * s, scale(tolerances, y0, y1))
+
+
+class Multistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
+    """A multistep method of variable order and step.
+
+    Its solver state has a field `evaluations`: the calls of the vector field in `init` and in the steps that were accepted. A state
+    y0 that is not the last y1 (it was projected) is taken for the newest point of the history; `made_jump` begins a new history.
+    """
+
+    root_finder: eqx.AbstractVar[Any]
+    term_structure: ClassVar = diffrax.AbstractTerm
+
+    def error_order(self, terms):
+        return ERROR_ORDER
