@@ -60,16 +60,13 @@ def _drift(run: Run, code: Array) -> tuple[Array, Array, Bool[Array, "T"]]:
     return jnp.where(drifted, Result.drift, code), jnp.where(drifted, run.ts[first], run.t_end), reached
 
 
-def counts(stats: dict[str, Any], solver: diffrax.AbstractSolver, projected: bool, outputs: int) -> dict[str, Any]:
-    """Count steps and what follows from them; right-hand sides are -1 (not known) where stages are implicit."""
+def counts(stats: dict[str, Any], right_hand_sides: Array, projected: bool, outputs: int) -> dict[str, Any]:
+    """Count steps and what follows from them; right-hand sides are -1 where they are not known."""
     steps = stats["num_steps"]
-    found = {"steps": steps, "accepted": stats["num_accepted_steps"], "rejected": stats["num_rejected_steps"]}
-    if isinstance(solver, diffrax.AbstractERK):
-        tableau: Any = solver.tableau
-        # A projected step takes all of its stages anew. One evaluation more chooses the first step.
-        reused = tableau.fsal and not projected
-        found["right_hand_sides"] = 1 + (steps * (tableau.num_stages - 1) + 1 if reused else steps * tableau.num_stages)
-    else:
-        found["right_hand_sides"] = jnp.full_like(steps, -1)
-    found["projections"] = steps + 2 * (outputs - 1) if projected else jnp.zeros_like(steps)
-    return found
+    return {
+        "steps": steps,
+        "accepted": stats["num_accepted_steps"],
+        "rejected": stats["num_rejected_steps"],
+        "right_hand_sides": right_hand_sides,
+        "projections": steps + 2 * (outputs - 1) if projected else jnp.zeros_like(steps),
+    }

@@ -1,6 +1,6 @@
 """Return each step of a solver to the constraint manifold."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -10,79 +10,48 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.equations.udwadia_kalaba import Equations
+from udkjax.integrate.counting import again, tally
+from udkjax.integrate.multistep import Multistep
+from udkjax.integrate.wrapper import Wrapper
 
 
 class Projection(eqx.Module):
     """Project positions and velocities after each step, by the smallest change in the mass metric (the default stabilization)."""
 
 
-def constrained(solver: diffrax.AbstractSolver, projected: bool, adjoint: diffrax.AbstractAdjoint) -> "Constrained":
-    """Wrap a solver, with the loop over its stages of the kind that the adjoint can differentiate."""
-    kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
-    if type(adjoint) in kinds and getattr(solver, "scan_kind", "") is None:
-        solver = eqx.tree_at(lambda s: s.scan_kind, solver, kinds[type(adjoint)], is_leaf=lambda x: x is None)
-    return Constrained(solver, projected)
-
-
-class Constrained(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
+class Constrained(Wrapper):
     """A diffrax solver for the motion of a mechanism: `args` are its equations, y is (q, v) in one vector.
 
     Each step is taken by equations that do not branch, and taken again by those that do where a number came out that is not
     finite: a branch a step instead of one a stage, and a real one under vmap too as long as no member needs it. With `projected`
     the step ends on the constraint manifold. A derivative at its end that the solver would keep for the next step (FSAL) belongs
-    to the state before projection; told that the state has jumped, the solver takes a new one. Error estimate and interpolation
-    are the wrapped solver's own.
+    to the state before projection; told that the state has jumped, the solver takes a new one. (Not so a multistep method, which
+    would forget its whole history: it sees for itself that its newest point was moved.) Error estimates, counted, and
+    interpolation are the wrapped solver's own.
     """
 
     solver: diffrax.AbstractSolver
     projected: bool
-    scan_kind: ClassVar[str] = "the wrapped solver's"  # an adjoint would replace None, here; `constrained` has done it
-
-    @property
-    def root_finder(self):
-        """Of an implicit solver: diffrax gives it the tolerances of the step size controller."""
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def term_structure(self):
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.solver.interpolation_cls
-
-    @property
-    def term_compatible_contr_kwargs(self):
-        return self.solver.term_compatible_contr_kwargs
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def strong_order(self, terms):
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms):
-        return self.solver.error_order(terms)
-
-    def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        made_jump = jnp.array(True) if self.projected else made_jump
+        if self.projected and not isinstance(self.solver, Multistep):
+            made_jump = jnp.array(True)
         if not args.branches:
             return self._attempt(terms, t0, t1, y0, args, solver_state, made_jump)
         state = (solver_state, made_jump)
         quick = _in_a_loop(self, terms, t0, t1, y0, args.quick, *state)
         doubt = ~jnp.all(jnp.isfinite(quick[0]))
-        careful = lambda: _arrays(self._attempt(terms, t0, t1, y0, args, *state))  # noqa: E731
+
+        def careful():
+            y1, error, *rest = _arrays(self._attempt(terms, t0, t1, y0, args, *state))
+            return y1, again(quick[1], error), *rest
+
         return _second_thoughts(doubt, careful, quick)
 
     def _attempt(self, terms, t0, t1, y0, equations, solver_state, made_jump):
-        y1, *rest = self.solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
-        return project(equations, t1, y1) if self.projected else y1, *rest
-
-    def func(self, terms, t0, y0, args):
-        return self.solver.func(terms, t0, y0, args)
+        y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
+        y1 = project(equations, t1, y1) if self.projected else y1
+        return y1, tally(self.solver, error, solver_state, state, made_jump), dense, state, result
 
 
 @eqx.filter_custom_jvp

@@ -15,8 +15,9 @@ from udkjax.equations.general import ConstrainedSystem, GeneralEquations
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.udwadia_kalaba import Baumgarte, Equations
+from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.outcome import Run, counts, outcome
-from udkjax.integrate.projection import Projection, constrained, project_all
+from udkjax.integrate.projection import Constrained, Projection, project_all
 from udkjax.integrate.solution import Result, SimulationError, Solution
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
@@ -41,6 +42,7 @@ def simulate(
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int = MAX_STEPS,
     drift_tol: ArrayLike | None = None,
+    dt0: ArrayLike | None = None,
     throw: bool = True,
     progress: Any = None,
 ) -> Solution:
@@ -49,8 +51,8 @@ def simulate(
     Without `state` the scene's initial guess is assembled; a given state is taken as it is. `method` is any pseudoinverse
     (default `Auto`), `stabilization` is `Projection()`, a `Baumgarte` or None, `solver` any diffrax solver for ordinary
     differential equations (default Dopri8: of those measured in benchmarks/ the fastest at equal error, but for the tightest
-    tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity. `progress=True`
-    prints how far the run is.
+    tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity. `dt0` is the first
+    step that is tried, in s; by default it is chosen, which takes one right-hand side. `progress=True` prints how far the run is.
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. For forward mode give `adjoint=diffrax.ForwardMode()`; reverse mode works as it is.
@@ -63,7 +65,7 @@ def simulate(
     if state is None and isinstance(mechanism, ConstrainedSystem):
         raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
     drift = number((DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE) if drift_tol is None else drift_tol)
-    numbers = (state, number(rtol), number(atol), Auto() if method is None else method, stabilization, drift)
+    numbers = (state, number(rtol), number(atol), Auto() if method is None else method, stabilization, drift, _step(dt0))
     choices = (solver or diffrax.Dopri8(), adjoint or diffrax.RecursiveCheckpointAdjoint(), max_steps, _meter(progress))
 
     solution, closure, missed = _simulate(mechanism, ts, *numbers, *choices)
@@ -80,7 +82,7 @@ def simulate(
 
 
 @eqx.filter_jit
-def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol, solver, adjoint, max_steps, meter):
+def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol, dt0, solver, adjoint, max_steps, meter):
     """Return the solution, the closure that it starts from, and whether that closure needs rows which the method leaves out."""
     equations = equations_of(mechanism, method, stabilization if isinstance(stabilization, Baumgarte) else None)
     projected = isinstance(stabilization, Projection) and equations.constrained
@@ -90,14 +92,14 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     loose_rtol, loose_atol = (jnp.where(closed, tol, 1e3) for tol in (rtol, atol))
     run = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
-        constrained(solver, projected, adjoint),
+        Constrained(solver, projected),
         t0=ts[0],
         t1=ts[-1],
-        dt0=_first_step(equations, ts, y0, loose_rtol, loose_atol),
+        dt0=_first_step(equations, ts, y0, loose_rtol, loose_atol) if dt0 is None else dt0,
         y0=y0,
         args=equations,
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]),
-        stepsize_controller=_controller(loose_rtol, loose_atol, ts),
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], controller_state=True),
+        stepsize_controller=Counting(_controller(loose_rtol, loose_atol, ts)),
         adjoint=adjoint,
         max_steps=max_steps,
         progress_meter=meter,
@@ -113,7 +115,9 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     code, time, reached = outcome(seen)
     ys = jnp.where(reached[:, None], ys, jnp.nan)
     q, v = (y.reshape(len(ts), *start.q.shape) for y in jnp.split(ys, 2, axis=1))
-    stats = counts(run.stats, solver, projected, len(ts))
+    found = evaluations(run.controller_state)
+    right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (dt0 is None))  # one chooses the first step
+    stats = counts(run.stats, right_hand_sides, projected, len(ts))
     settings = (
         ("method", type(method).__name__),
         ("stabilization", type(stabilization).__name__),
@@ -170,6 +174,17 @@ def _times(ts: ArrayLike) -> Float[Array, "T"]:
     if not isinstance(ts, Tracer) and not bool(jnp.all(jnp.diff(ts) > 0)):
         raise ValueError("ts must increase from each output time to the next")
     return ts
+
+
+def _step(dt0: ArrayLike | None) -> Array | None:
+    if dt0 is None:
+        return None
+    dt0 = number(dt0)
+    if dt0.shape:
+        raise ValueError(f"dt0 is one time, in s; its shape is {dt0.shape}")
+    if not isinstance(dt0, Tracer) and not 0 < float(dt0) < jnp.inf:
+        raise ValueError(f"the first step dt0 must be positive, not {float(dt0)} s")
+    return dt0
 
 
 def _meter(progress: Any) -> diffrax.AbstractProgressMeter:

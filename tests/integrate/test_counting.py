@@ -1,0 +1,205 @@
+"""Right-hand sides are counted as they are called, one by one: by callbacks."""
+
+from functools import partial
+from typing import ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax.integrate.counting import NOT_KNOWN, Counting, count_evaluations, evaluations
+from udkjax.integrate.multistep import Multistep, from_controller
+from udkjax.integrate.projection import Constrained
+
+SAVE = diffrax.SaveAt(t1=True, controller_state=True)
+
+
+class Calls:
+    def __init__(self):
+        self.value = 0
+
+    def add(self):
+        self.value += 1
+
+
+@pytest.fixture
+def calls():
+    return Calls()
+
+
+def controller(tol=1e-5):
+    return diffrax.PIDController(rtol=tol, atol=tol)
+
+
+class Told(NamedTuple):
+    evaluations: jax.Array
+
+
+class Tells(diffrax.AbstractAdaptiveSolver):
+    """Heun's method, which says itself how often it calls: twice a step, and once before the first."""
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 2
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        terms.vf(t0, y0, args)
+        return Told(jnp.array(1))
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        first = terms.vf(t0, y0, args)
+        euler = y0 + (t1 - t0) * first
+        second = terms.vf(t1, euler, args)
+        y1 = y0 + (t1 - t0) * (first + second) / 2
+        return y1, y1 - euler, {"y0": y0, "y1": y1}, Told(solver_state.evaluations + 2), diffrax.RESULTS.successful
+
+
+def stiff(calls):
+    """A rate that jumps: steps are rejected there. Every call is counted."""
+
+    def rate(t, y, args):
+        jax.debug.callback(calls.add)
+        return jnp.where(t < 0.4, -1.0, 8.0) * y
+
+    return rate
+
+
+@pytest.mark.parametrize("dt0", [1e-3, 0.9], ids=["accepted", "rejected"])
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Heun(), Tells()], ids=["Tsit5", "Heun", "one that tells"])
+def test_every_call_is_counted(calls, solver, dt0):
+    """Also where the first step is rejected: nothing is kept from it, not even its first stage."""
+    counted = count_evaluations(solver, controller(1e-3))
+    term = diffrax.ODETerm(stiff(calls))
+    run = diffrax.diffeqsolve(term, counted[0], 0.0, 1.0, dt0, jnp.array([1.0]), saveat=SAVE, stepsize_controller=counted[1])
+    jax.effects_barrier()
+    assert run.stats["num_rejected_steps"] >= 1
+    assert evaluations(run.controller_state) == calls.value > 20
+
+
+def test_counting_changes_nothing():
+    """Steps, result and gradient are those of the solver alone."""
+
+    def run(choices, y0):
+        term = diffrax.ODETerm(lambda t, y, args: -(y**3))
+        run = diffrax.diffeqsolve(term, choices[0], 0.0, 2.0, 0.1, y0, stepsize_controller=choices[1], max_steps=64)
+        return jnp.asarray(run.ys)[0, 0], run.stats["num_steps"]
+
+    plain = (diffrax.Tsit5(), controller())
+    start = jnp.array([1.0])
+    alone, counted = (jax.value_and_grad(partial(run, c), has_aux=True)(start) for c in (plain, count_evaluations(*plain)))
+    assert alone == counted
+
+
+@pytest.mark.parametrize("solver", [diffrax.Kvaerno3(), diffrax.HalfSolver(diffrax.Heun())], ids=["implicit", "halved"])
+def test_what_is_not_known_is_not_counted(solver):
+    counted = count_evaluations(solver, controller())
+    term = diffrax.ODETerm(lambda t, y, args: -y)
+    run = diffrax.diffeqsolve(term, counted[0], 0.0, 1.0, 0.1, jnp.array([1.0]), saveat=SAVE, stepsize_controller=counted[1])
+    assert evaluations(run.controller_state) == NOT_KNOWN
+
+
+# --- as the motion of a mechanism is integrated
+
+
+class Branching(eqx.Module):
+    """An oscillator whose quick equations have no answer from t = 0.3 to 0.6."""
+
+    calls: Calls
+    branches: bool = eqx.field(static=True, default=True)
+
+    @property
+    def quick(self):
+        return Branching(self.calls, False)
+
+    def derivative(self, t, y):
+        jax.debug.callback(self.calls.add)
+        return jnp.where((t > 0.3) & (t < 0.6) & (not self.branches), jnp.nan, jnp.stack([y[1], -4 * y[0]]))
+
+    def project(self, t, q, v):
+        return q, v
+
+
+@pytest.mark.parametrize("projected", [True, False])
+def test_attempts_made_again_count_twice(calls, projected):
+    run = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, equations: equations.derivative(t, y)),
+        Constrained(diffrax.Tsit5(), projected),
+        0.0,
+        1.0,
+        0.05,
+        jnp.array([1.0, 0.0]),
+        Branching(calls),
+        saveat=SAVE,
+        stepsize_controller=Counting(controller(1e-3)),
+    )
+    jax.effects_barrier()
+    assert jnp.all(jnp.isfinite(jnp.asarray(run.ys)))
+    assert evaluations(run.controller_state) == calls.value
+    assert calls.value > (7 if projected else 6) * run.stats["num_steps"] + 1  # more than once around
+
+
+class Remembers(Multistep):
+    """Euler's method, which says what it is told of jumps."""
+
+    root_finder: object = eqx.field(default_factory=from_controller)
+    root_find_max_steps: int = 1
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def init(self, terms, t0, t1, y0, args):
+        return Told(jnp.array(0))
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1 = y0 + (t1 - t0) * terms.vf(t0, y0, args)
+        return y1, 0 * y0, {"y0": y0, "y1": y1, "jump": made_jump}, Told(solver_state.evaluations + 1), diffrax.RESULTS.successful
+
+
+@pytest.mark.parametrize("jumped", [False, True])
+def test_a_projection_is_no_jump_to_a_multistep_method(calls, jumped):
+    """It would forget its history. A Runge-Kutta method only forgets its last stage."""
+    solver = Constrained(Remembers(), True)
+    equations, y0 = Branching(calls).quick, jnp.array([1.0, 0.0])
+    terms = diffrax.ODETerm(lambda t, y, equations: equations.derivative(t, y))
+    *_, dense, state, _ = solver.step(terms, 0.0, 0.1, y0, equations, solver.init(terms, 0.0, 0.1, y0, equations), jumped)
+    assert dense["jump"] is jumped
+    assert state.evaluations == 1
+
+
+# --- the first step
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return udk.library.compound_pendulum()
+
+
+TS = np.linspace(0.0, 1.0, 11)
+
+
+def test_the_first_step_may_be_given(pendulum):
+    """No right-hand side is spent on choosing it, and one that is too long is rejected."""
+    stats = {dt0: udk.simulate(pendulum, TS, dt0=dt0).stats for dt0 in (0.01, 2.0, 1e-9)}
+    stages = diffrax.Dopri8.tableau.num_stages
+    for found in stats.values():
+        assert found["right_hand_sides"] == stages * found["steps"]
+    assert stats[2.0]["rejected"] > 0
+    assert stats[1e-9]["steps"] >= stats[0.01]["steps"] + 6  # steps grow by 10 at most
+    chosen = udk.simulate(pendulum, TS).stats
+    assert chosen["right_hand_sides"] == stages * chosen["steps"] + 1
+
+
+@pytest.mark.parametrize(("dt0", "problem"), [(0.0, "positive"), (-0.1, "positive"), (jnp.nan, "positive"), ([0.1], "one time")])
+def test_a_first_step_is_checked(pendulum, dt0, problem):
+    with pytest.raises(ValueError, match=problem):
+        udk.simulate(pendulum, TS, dt0=dt0)
