@@ -1,0 +1,89 @@
+"""What the report says it found: sentences whose numbers are read from the dataset."""
+
+import numpy as np
+
+from udkjax.show.report_figures import runs, tolerances
+from udkjax.show.report_tables import count, power, scientific
+
+
+def findings(data) -> str:
+    """Return the findings as an HTML list."""
+    return "<ul>\n" + "\n".join(f"<li>{text}</li>" for text in _sentences(data)) + "\n</ul>"
+
+
+def _sentences(data):
+    for stabilized, name in ((False, "without stabilization"), (True, "with the paper's gains")):
+        chosen = [run for run in runs(data, "paper") if (run.alpha > 0) == stabilized]
+        yield f"<b>The paper's runs {name}:</b> {_counted(chosen)}{_times_by_tolerance(data, chosen)}."
+    held = list(runs(data, "rank held"))
+    if held:
+        growth = [float(run.growth) for run in held if np.isfinite(run.growth)]
+        law = float(data.law_rate[int(np.argmin(np.abs(data.law_gain.values)))])
+        rates = f"; the drift grows at {min(growth):.2f} to {max(growth):.2f} 1/s" if growth else ""
+        yield (
+            f"<b>A threshold that is not tied to TOL does not save them:</b> with the rank held at 11, {_counted(held)}"
+            f"{_times_by_tolerance(data, held)}{rates}, by the law {law:.3f} 1/s. The cause is the redundancy itself."
+        )
+    gains = list(runs(data, "small gains"))
+    stiff = [run for run in runs(data, "paper") if run.alpha > 0]
+    if gains:
+        yield (
+            f"<b>Gains of {_span([float(run.alpha) for run in gains], 'g')} 1/s are enough:</b> {_counted(gains)}, largest error "
+            f"{_largest(gains)} rad, {_rate(gains)} right-hand sides a second of motion; the paper's gains take {_rate(stiff)}."
+        )
+    for group, name in (("fixed rows", "Eleven rows chosen once"), ("default", "The defaults of udkjax")):
+        chosen = list(runs(data, group))
+        if chosen:
+            ends = ", ".join(f"{scientific(float(run.error_end))} (TOL = {power(float(run.tol))})" for run in chosen)
+            yield f"<b>{name}:</b> {_counted(chosen)}; error at the end {ends} rad."
+
+
+def _counted(chosen) -> str:
+    """Say how many runs are correct, lost, or fail."""
+    kinds = [str(run.kind.item()) for run in chosen]
+    names = {"correct": "correct", "correct up to": "correct only for a while", "fails": "given up while still correct"}
+    parts = [f"{kinds.count(kind)} {text}" for kind, text in names.items() if kind in kinds]
+    return f"of {len(chosen)} runs " + ", ".join(parts)
+
+
+def _times_by_tolerance(data, chosen) -> str:
+    parts = []
+    for tol in tolerances(data):
+        times = [float(run.correct_to) for run in chosen if run.tol == tol and np.isfinite(run.correct_to)]
+        if times:
+            parts.append(f"{_span(times, '.1f')} s at TOL = {power(tol)}")
+    return ("; right until " + ", ".join(parts)) if parts else ""
+
+
+def _span(values, form: str) -> str:
+    low, high = format(min(values), form), format(max(values), form)
+    return low if low == high else f"{low} to {high}"
+
+
+def _largest(chosen) -> str:
+    return scientific(max(float(run.error_max) for run in chosen))
+
+
+def _rate(chosen) -> str:
+    rates = [float(run.right_hand_sides) / float(run.end) for run in chosen if run.right_hand_sides > 0 and run.end > 0]
+    return f"{count(min(rates))} to {count(max(rates))}" if rates else "an unknown number of"
+
+
+def repeat(data) -> str:
+    """Return how to get this page again."""
+    attrs = data.attrs
+    quick = " --quick" if attrs["setting_scope"] == "quick" else ""
+    command = f"udkjax report{quick} --start {attrs['setting_start']:g} --seed {attrs['setting_seed']}"
+    stiff = [float(run.t_end) for run in runs(data, "paper") if run.alpha > 0]
+    cut = (
+        f"This is the {attrs['setting_scope']} version: runs with the paper's gains are cut to {min(stiff):g} s, and the "
+        "work-precision diagram is thinner. "
+        if stiff and min(stiff) < float(data.t_end.max())
+        else ""
+    )
+    return (
+        f"<p><code>{command}</code> makes the data and this page again, here in {attrs['seconds']:.0f} s, "
+        f"{attrs['seconds_compiling']:.0f} s of it to compile. {cut}A run gives up after "
+        f"{count(attrs['setting_max_steps'])} steps. <code>udkjax report --from FILE.nc</code> draws the page from the "
+        "data alone.</p>"
+    )

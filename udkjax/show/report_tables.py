@@ -1,0 +1,182 @@
+"""The tables of the report, as HTML: every number in them is read from the dataset."""
+
+import json
+from collections.abc import Iterable, Sequence
+from html import escape
+from math import floor, isfinite, log10
+from string import ascii_lowercase
+
+from udkjax.show.report_figures import runs, tolerances
+
+NOTHING = "–"
+RULES = {
+    "SVD": "D = U S V<sup>T</sup>; singular values at or below TOL count as zero",
+    "Varga": "two QR factorizations by Householder reflections, the first with column pivoting; the rank is read from the "
+    "diagonal of R: entries at or below TOL count as zero",
+    "Greville": "row by row; a row counts as dependent when the norm of what is left of it, orthogonal to the rows before, is at "
+    "or below TOL",
+    "Householder": "least squares by QR with column pivoting, freed of its part in the null space; entries of the diagonal of R "
+    "at or below TOL count as zero",
+    "GramSchmidt": "modified Gram-Schmidt with column pivoting, each column made orthogonal twice, for D and again for R; the "
+    "rank is decided by the norm of what is left of a column: at or below TOL it counts as zero",
+}
+GROUPS = {
+    "rank held": "Rank held at 11: no stabilization, threshold {rank_held:g} of the largest singular value",
+    "small gains": "Small gains α = β, threshold TOL as in the paper",
+    "fixed rows": "Eleven independent rows, chosen once (sparse elimination), no stabilization",
+    "default": "What udkjax does by itself: Auto, projection of each step, Dopri8",
+}
+CAUSES = {
+    "step_limit": "step limit",
+    "step_too_small": "step too small",
+    "not_finite": "not finite",
+    "drift": "drift",
+    "could_not_assemble": "not closed",
+}
+
+
+def scientific(value: float | None, digits: int = 1) -> str:
+    """Write a number as 4.5·10⁻⁴."""
+    if value is None or not isfinite(value):
+        return NOTHING
+    if value == 0:
+        return "0"
+    exponent = floor(log10(abs(value)))
+    mantissa = f"{value / 10.0**exponent:.{digits}f}"
+    if mantissa.startswith("10"):
+        exponent, mantissa = exponent + 1, f"{1:.{digits}f}"
+    return f"{mantissa}·10<sup>{str(exponent).replace('-', '−')}</sup>"
+
+
+def power(value: float) -> str:
+    """Write a power of ten."""
+    return f"10<sup>{str(round(log10(value))).replace('-', '−')}</sup>"
+
+
+def count(value: float | None) -> str:
+    """Write an integer in groups of three digits."""
+    return NOTHING if value is None or value < 0 else f"{int(value):,}".replace(",", " ")
+
+
+def seconds(value: float | None) -> str:
+    """Write a time (s) with three significant digits."""
+    return NOTHING if value is None or not isfinite(value) else f"{value:.3g}"
+
+
+def result(run) -> str:
+    """Say how a run ended: its verdict, and the cause where the solver gave up."""
+    words = escape(str(run.verdict.item()))
+    cause = str(run.result.item())
+    return words if cause == "successful" else f"{words} ({CAUSES.get(cause, cause)})"
+
+
+def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], name: str) -> str:
+    """Return an HTML table; `head` is its rows of column heads, and the first cell of each row, all of it HTML, is its name.
+
+    A row of one cell is the title of those below it.
+    """
+    body, width = [], max(line.count("<th") for line in head)
+    for first, *rest in rows:
+        cells = "".join(f"<td>{cell}</td>" for cell in rest)
+        body.append(f'<th scope="row">{first}</th>{cells}' if rest else f'<th scope="rowgroup" colspan="{width}">{first}</th>')
+    parts = ("".join(f"<tr>{line}</tr>\n" for line in lines) for lines in (head, body))
+    return '<table class="{}">\n<caption>{}</caption>\n<thead>\n{}</thead>\n<tbody>\n{}</tbody>\n</table>'.format(
+        name, caption, *parts
+    )
+
+
+def columns(*names: str) -> str:
+    """Return the heads of columns."""
+    return "".join(f'<th scope="col">{name}</th>' for name in names)
+
+
+def rules(data) -> str:
+    """Return which rule decided the rank in each method."""
+    methods = json.loads(data.attrs["setting_methods"])
+    return table(
+        "What each method was told to count as zero, in the units of D.",
+        [columns("method", "rule")],
+        [(method, RULES[method]) for method in methods],
+        "words",
+    )
+
+
+def paper_tables(data) -> str:
+    """Return tables 2 to 7 of the paper with our figures beside."""
+    found = []
+    for published in json.loads(data.attrs["published"]):
+        stabilized = published["alpha"] > 0
+        ours = [run for run in runs(data, "paper", tol=published["tol"]) if (run.alpha > 0) == stabilized]
+        if ours:
+            found.append(_paper_table(published, {str(run.method.item()): run for run in ours}))
+    return "\n".join(found)
+
+
+def _paper_table(published: dict, ours: dict) -> str:
+    gains = f"Baumgarte α = {published['alpha']:g}, β = {published['beta']:g} 1/s" if published["alpha"] else "no stabilization"
+    end = float(next(iter(ours.values())).t_end)
+    misprints: list[str] = []
+    rows = []
+    for row in published["rows"]:
+        if row["method"] not in ours:
+            continue
+        run = ours[row["method"]]
+        star = ""
+        if row["misprint"]:
+            misprints.append(row["misprint"])
+            star = f"<sup>{len(misprints)}</sup>"
+        cells = [row["method"] + star, f"<i>{escape(row['result'])}</i>", result(run)]
+        cells += [f"<i>{scientific(row['psi2'])}</i>", scientific(float(run.psi2_end))]
+        cells += [f"<i>{count(row['nfunc'])}</i>", count(float(run.right_hand_sides))]
+        cells += [f"<i>{count(row['nsteps'])}</i>", count(float(run.accepted))]
+        cells += [f"<i>{seconds(row['cpu'])}</i>", seconds(float(run.cpu))]
+        rows.append([*cells, scientific(float(run.error_max)), str(run.remark.item())])
+    pairs = ("result", "Σψ² (m²)", "NFUNC", "NSTEPS", "CPU (s)")
+    head = ['<th scope="col" rowspan="2">method</th>']
+    head += [f'<th scope="colgroup" colspan="2">{pair}</th>' for pair in pairs]
+    head += ['<th scope="col" rowspan="2">exact error (rad)</th><th scope="col" rowspan="2">see</th>']
+    caption = f"<b>Table {published['number']}.</b> TOL = {power(published['tol'])}, {gains}, {end:g} s."
+    notes = "".join(f"<br><sup>{k + 1}</sup> Misprint in the paper: {escape(text)}." for k, text in enumerate(misprints))
+    second = columns(*(5 * ("paper", "here")))
+    return table(caption + notes, ["".join(head), second], rows, "paper")
+
+
+def remarks(data) -> str:
+    """Return what the letters in the tables stand for, those that occur."""
+    texts = json.loads(data.attrs["remarks"])
+    used = sorted(set(data.remark.values) & set(ascii_lowercase))
+    return "<dl>" + "".join(f"<dt>{letter}</dt><dd>{escape(texts[letter])}</dd>" for letter in used) + "</dl>"
+
+
+def better(data) -> str:
+    """Return what would have been better, one table a tolerance."""
+    head = columns("method", "result", "Σψ² (m²)", "NFUNC", "NSTEPS", "CPU (s)", "exact error (rad)", "at the end (rad)")
+    found = []
+    for tol in tolerances(data):
+        rows: list[Sequence[str]] = []
+        for group, title in GROUPS.items():
+            chosen = list(runs(data, group, tol=tol))
+            if chosen:
+                rows.append([title.format(rank_held=data.attrs["setting_rank_held"])])
+            rows += [_better_row(run) for run in chosen]
+        if rows:
+            found.append(table(f"TOL = {power(tol)}, {float(data.t_end.max()):g} s.", [head], rows, "better"))
+    return "\n".join(found)
+
+
+def _better_row(run) -> list[str]:
+    gain = f", α = β = {float(run.alpha):g}" if run.alpha > 0 else ""
+    errors = [scientific(float(run[name])) for name in ("error_max", "error_end")]
+    work = [count(float(run.right_hand_sides)), count(float(run.accepted)), seconds(float(run.cpu))]
+    return [f"{run.method.item()}{gain}", result(run), scientific(float(run.psi2_end)), *work, *errors]
+
+
+def settings(data) -> str:
+    """Return settings, versions and machine."""
+    rows = []
+    for name, value in data.attrs.items():
+        kind, _, rest = name.partition("_")
+        if kind in ("setting", "version"):
+            rows.append((f"{kind}: {rest.replace('_', ' ')}", escape(f"{value:g}" if isinstance(value, float) else f"{value}")))
+    rows += [(name, escape(str(data.attrs[name]))) for name in ("machine", "date")]
+    return table("Settings, versions and machine, as they stand in the data file.", [columns("name", "value")], rows, "words")

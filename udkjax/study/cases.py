@@ -1,0 +1,112 @@
+"""The runs of the paper's study, and what would have been better: which method, which integrator, which numbers.
+
+A `Case` is one run. Cases of one `Program` share a compilation: tolerances, thresholds, gains, times and the initial state are
+traced numbers, and no stabilization is Baumgarte's with gains of zero.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+METHODS = ("SVD", "Varga", "Greville", "Householder", "GramSchmidt")
+TOLERANCES = (1e-10, 1e-8, 1e-6)
+GAINS = (1000.0, 100.0)  # alpha, beta of the paper, 1/s
+FIRST_STEP = 0.66e-2  # s, of the paper
+END = 20.0  # s
+RANK_HELD = 1e-4  # of the largest singular value of D at the start: far above any drift that is small, far below sigma_11
+SMALL_GAINS = (2.0, 3.0, 5.0)  # alpha = beta, 1/s: above the rate at which a drift grows
+WORK_GAIN = 3.0  # alpha = beta of the work-precision runs: something must hold the constraints, or every run is lost
+WORK_TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
+
+
+class Program(NamedTuple):
+    """What is compiled."""
+
+    method: str
+    solver: str
+    projected: bool
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run of the study."""
+
+    group: str  # "paper", "rank held", "small gains", "fixed rows", "default", "start" or "work"
+    method: str
+    solver: str
+    tol: float
+    rank_tol: float | None = None  # absolute, in the units of D; None: as `RANK_HELD`, or the method's own
+    alpha: float = 0.0
+    beta: float = 0.0
+    projected: bool = False
+    end: float = END
+    start: int = 0  # 0: the exact initial state; else the number of one that differs from it by rounding
+
+    @property
+    def program(self) -> Program:
+        """What it runs on."""
+        return Program(self.method, self.solver, self.projected)
+
+    @property
+    def stiff(self) -> bool:
+        """Whether the gains dictate the step, not the motion."""
+        return self.alpha > 100
+
+    @property
+    def weight(self) -> float:
+        """Its share of the waiting, roughly."""
+        return 20.0 * self.end / END if self.stiff else 1.0
+
+
+@dataclass(frozen=True)
+class Scope:
+    """How much of the study is done."""
+
+    name: str
+    tolerances: tuple[float, ...] = TOLERANCES
+    stiff_end: float = END  # s, of the runs with the paper's gains
+    max_steps: int = 200_000
+    starts: int = 20
+    work: tuple[Program, ...] = ()
+    work_tolerances: tuple[float, ...] = WORK_TOLERANCES
+    repeats: int = 5  # of a run, for its time
+    patience: float = 3.0  # s: what took longer is timed once
+    gains_for: tuple[str, ...] = METHODS  # the methods that are run with small gains
+    better: bool = True  # whether what would have been better is done at all
+
+
+INTEGRATORS = ("Adams", "BDF", "Verner65", "Dopri8", "Tsit5")
+_WORK = tuple(Program(method, solver, False) for method, solver in product((*METHODS, "Elimination"), INTEGRATORS))
+FULL = Scope("full", work=(*_WORK, Program("Auto", "Dopri8", True)))
+QUICK = Scope(
+    "quick",
+    stiff_end=2.0,
+    max_steps=10_000,
+    starts=10,
+    work=(*(Program("SVD", solver, False) for solver in ("Adams", "Dopri8", "Tsit5")), Program("Auto", "Dopri8", True)),
+    work_tolerances=WORK_TOLERANCES[::2],
+    repeats=3,
+    patience=0.5,
+    gains_for=("SVD",),
+)
+SMOKE = Scope("smoke", tolerances=(1e-6,), stiff_end=0.1, max_steps=2_000, starts=0, repeats=1, gains_for=(), better=False)
+
+
+def plan(scope: Scope, solver: str = "Adams") -> list[Case]:
+    """Return all runs, the paper's first. `solver` is what stands for the paper's Adams-Moulton."""
+    alpha, beta = GAINS
+    cases = [Case("paper", method, solver, tol, tol) for tol, method in product(scope.tolerances, METHODS)]
+    cases += [
+        Case("paper", method, solver, tol, tol, alpha, beta, end=scope.stiff_end)
+        for tol, method in product(scope.tolerances, METHODS)
+    ]
+    if scope.better:
+        for tol in scope.tolerances:
+            cases += [Case("rank held", method, solver, tol) for method in METHODS]
+            cases += [Case("small gains", m, solver, tol, tol, gain, gain) for gain, m in product(SMALL_GAINS, scope.gains_for)]
+            cases += [Case("fixed rows", "Elimination", solver, tol), Case("default", "Auto", "Dopri8", tol, projected=True)]
+            cases += [Case("start", "SVD", solver, tol, start=k + 1) for k in range(scope.starts)]
+    for (method, integrator, projected), tol in product(scope.work, scope.work_tolerances):
+        gain = 0.0 if projected else WORK_GAIN
+        cases.append(Case("work", method, integrator, tol, None, gain, gain, projected))
+    return cases
