@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 import xarray
 from matplotlib.figure import Figure
+from PIL import Image
 
 from udkjax.integrate.solution import versions
 from udkjax.scene import Mechanism, dumps
@@ -28,6 +29,7 @@ from udkjax.scene import Mechanism, dumps
 HERE = Path(__file__).parent
 NAMES = tuple(sorted(file.stem for file in HERE.glob("*.py") if file.stem not in ("__init__", "__main__", "common")))
 DPI = 110
+COLOURS = 128  # of a figure: enough for lines and a colour map, and a third of the size
 
 Item = TypeVar("Item")
 
@@ -60,6 +62,7 @@ def redraw(name: str, out: Path | None = None) -> None:
     data, file = load(name, out), (HERE / "figures" if out is None else out) / f"{name}.png"
     file.parent.mkdir(parents=True, exist_ok=True)
     module.figure(data).savefig(file, dpi=DPI)
+    Image.open(file).convert("RGB").quantize(COLOURS).save(file, optimize=True)
     failed = [part for part, true in module.holds(data).items() if not true]
     print(f"{name} ({data.attrs['seconds']} s): {module.headline(data)}")
     print(f"  {data_file(name, out)}, {file}", *(f"\n  DOES NOT HOLD: {part}" for part in failed))

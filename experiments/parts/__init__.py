@@ -1,0 +1,1 @@
+"""What several studies, or one that is long, are made of."""
