@@ -21,7 +21,7 @@ def udkjax(*arguments) -> int:
     return 0
 
 
-@pytest.mark.parametrize("command", [[], ["simulate"], ["check"], ["doctor"]])
+@pytest.mark.parametrize("command", [[], ["report"], ["simulate"], ["check"], ["doctor"]])
 def test_help_is_printed_without_importing_jax(command):
     code = (
         "import sys, atexit; from udkjax.cli import main\n"
@@ -127,6 +127,41 @@ def test_a_run_that_fails_says_why_and_keeps_what_it_got(tmp_path, capsys):
         assert data.attrs["result"] == "step_limit"
         assert np.isfinite(data.q[0]).all()
     assert out.with_suffix(".png").exists()
+
+
+def test_a_report_is_drawn_from_its_data_alone(tmp_path, capsys, study_data):
+    from udkjax.study.record import save
+
+    save(study_data, tmp_path / "study.nc")
+    assert udkjax("report", "--from", tmp_path / "study.nc", "--out", tmp_path / "pages") == 0
+    assert "report.html" in capsys.readouterr().out
+    assert [file.name for file in (tmp_path / "pages").iterdir()] == ["report.html"]  # no data is made anew
+    assert (tmp_path / "pages" / "report.html").read_text().startswith("<!DOCTYPE html>")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "cause"),
+    [
+        (["--start", "10"], "--start 10"),
+        (["--start", "-90"], "at -90 they hang"),
+        (["--out", "report.pdf"], "neither a page"),
+        (["--out", "nowhere/report.html"], "no folder nowhere"),
+        (["--out", "nowhere/report"], "no folder nowhere"),
+        (["--from", "nowhere.nc"], "cannot read nowhere.nc"),
+    ],
+)
+def test_wrong_input_of_a_report_is_refused_before_anything_is_run(tmp_path, monkeypatch, capsys, arguments, cause):
+    monkeypatch.chdir(tmp_path)
+    assert udkjax("report", *arguments) == 2
+    assert cause in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_of_something_else_is_no_report(tmp_path, capsys):
+    xarray.Dataset({"q": ("time", [1.0])}).to_netcdf(tmp_path / "run.nc", engine="h5netcdf")
+    assert udkjax("report", "--from", tmp_path / "run.nc", "--out", tmp_path / "page.html") == 2
+    assert "no data of a report" in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
 
 
 def test_check_names_the_redundant_row(capsys):

@@ -12,7 +12,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from udkjax.show import report_figures, report_tables
-from udkjax.show.report_findings import findings, repeat
+from udkjax.show.report_findings import findings, psi2_note, repeat
 
 FIGURES: dict[str, tuple[Callable[[Any], Figure], str, str]] = {
     "linkage": (
@@ -35,8 +35,9 @@ FIGURES: dict[str, tuple[Callable[[Any], Figure], str, str]] = {
     ),
     "energies": (
         report_figures.energies,
-        "Change of the total energy over time, one panel a tolerance.",
-        "<b>Energy.</b> The change of the total energy. Dotted: with the paper's gains; black: the defaults of udkjax.",
+        "For each tolerance: the angle of a link over time, and the change of the total energy.",
+        "<b>Motion and energy.</b> Once the rank is 12 no degree of freedom is left, and a lost linkage comes to rest. Coloured: "
+        "without stabilization; dotted: with the paper's gains (energy only); black: the defaults of udkjax.",
     ),
     "growth": (
         report_figures.growth,
@@ -61,6 +62,7 @@ def page(data: Any) -> str:
         findings=findings(data),
         rules=report_tables.rules(data),
         paper_tables=report_tables.paper_tables(data),
+        psi2_note=psi2_note(data),
         remarks=report_tables.remarks(data),
         better=report_tables.better(data),
         settings=report_tables.settings(data),

@@ -13,6 +13,7 @@ WIDTH = 9.2  # inches, of the page's column
 LEAST_PSI2 = 1e-36  # m2: below the square of any rounding error; drawn in place of zero, which has no logarithm
 LEAST_ERROR = 1e-16  # rad
 LEAST_ENERGY = 1e-17  # J
+LEAST_SIGMA = 1e-18  # kg^(-1/2)
 MARKERS = "os^Dvph"
 GHOSTS = 4
 
@@ -57,17 +58,17 @@ def figure_2(data) -> Figure:
         without, gains, error = line
         for axes, stabilized in ((without, False), (gains, True)):
             for run in _paper(data, tol, stabilized):
-                _log(axes, run, "psi2", LEAST_PSI2, data)
+                _log(axes, run, "psi2", LEAST_PSI2, _colour(data, run))
             _threshold(axes, tol**2)
-            axes.set_ylim(1e-34, 1e3)
+            axes.set_ylim(1e-34, 1e-1)
             axes.set_ylabel("Σψ² (m²)" if axes is without else "")
         for stabilized, style in ((False, "-"), (True, ":")):
             for run in _paper(data, tol, stabilized):
-                _log(error, run, "angle_error", LEAST_ERROR, data, style)
+                _log(error, run, "angle_error", LEAST_ERROR, _colour(data, run), style)
         _threshold(error, float(data.attrs["setting_lost"]))
         error.set_ylim(1e-15, 10)
         error.set_ylabel("error of the angles (rad)")
-        without.text(0.04, 0.9, f"TOL = {tol:.0e}", transform=without.transAxes, weight="bold")
+        without.text(0.04, 0.88, _named(tol), transform=without.transAxes)
     alpha, beta = data.attrs["setting_alpha"], data.attrs["setting_beta"]
     titles = ("without stabilization", f"Baumgarte, {alpha:g} and {beta:g}", "error (dotted: Baumgarte)")
     for axes, title in zip(panels[0], titles, strict=True):
@@ -83,12 +84,12 @@ def singular_values(data) -> Figure:
     panels = figure.subplots(2, len(columns), sharex="col", sharey="row", squeeze=False, height_ratios=(3, 1))
     for tol, (values, rank) in zip(columns, panels.T, strict=True):
         for place, run in enumerate(_paper(data, tol, False)):
-            _log(values, run, "sigma_12", 1e-18, data)
+            _log(values, run, "sigma_12", LEAST_SIGMA, _colour(data, run))
             values.semilogy(run.time, run.sigma_11, color="0.6", lw=0.8)
             rank.step(run.time, run["rank"] + 0.06 * (2 - place), where="post", color=_colour(data, run), lw=1.2)
         _threshold(values, tol)
-        values.set_title(f"TOL = {tol:.0e}", fontsize="medium")
-        values.set_ylim(1e-18, 10)
+        values.set_title(_named(tol), fontsize="medium")
+        values.set_ylim(LEAST_SIGMA, 10)
         rank.set_yticks([10, 11, 12])
         rank.set_ylim(9.5, 12.5)
     panels[0, 0].set_ylabel("σ₁₁ (grey) and σ₁₂ (kg⁻½)")
@@ -98,22 +99,24 @@ def singular_values(data) -> Figure:
 
 
 def energies(data) -> Figure:
-    """Draw by how much the total energy changes."""
+    """Draw the angle of a link, and by how much the total energy changes."""
     columns = tolerances(data)
-    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
-    panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)
-    for tol, axes in zip(columns, panels[0], strict=True):
-        for stabilized, style in ((False, "-"), (True, ":")):
-            for run in _paper(data, tol, stabilized):
-                axes.semilogy(
-                    run.time, np.maximum(np.abs(run.energy), LEAST_ENERGY), style, color=_colour(data, run), lw=1, alpha=0.9
-                )
+    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
+    panels = figure.subplots(2, len(columns), sharex="col", sharey="row", squeeze=False)
+    for tol, (angle, energy) in zip(columns, panels.T, strict=True):
         for run in runs(data, "default", tol=tol):
-            axes.semilogy(run.time, np.maximum(np.abs(run.energy), LEAST_ENERGY), color="black", lw=1.2)
-        axes.set_title(f"TOL = {tol:.0e}", fontsize="medium")
-        axes.set_ylim(LEAST_ENERGY, 1e3)
-    panels[0, 0].set_ylabel("|E − E(0)| (J)")
-    _finish(figure, panels, data)
+            angle.plot(run.time, run.angle, color="black", lw=0.9, alpha=0.7)
+            _log(energy, run, "energy", LEAST_ENERGY, "black")
+        for run in _paper(data, tol, False):
+            angle.plot(run.time, run.angle, color=_colour(data, run), lw=1.1)
+            _log(energy, run, "energy", LEAST_ENERGY, _colour(data, run))
+        for run in _paper(data, tol, True):
+            _log(energy, run, "energy", LEAST_ENERGY, _colour(data, run), ":")
+        angle.set_title(_named(tol), fontsize="medium")
+        energy.set_ylim(LEAST_ENERGY, 1e3)
+    panels[0, 0].set_ylabel("angle of link1 (rad)")
+    panels[1, 0].set_ylabel("|E − E(0)| (J)")
+    _finish(figure, panels, data, [("defaults of udkjax", "black", "-")])
     return figure
 
 
@@ -126,18 +129,19 @@ def growth(data) -> Figure:
         drift.semilogy(run.time, run.sigma_12, color="0.8", lw=0.6, zorder=1)
     levels = []
     for run in runs(data, "rank held", tol=middle):
-        _log(drift, run, "sigma_12", 1e-18, data)
+        _log(drift, run, "sigma_12", LEAST_SIGMA, _colour(data, run))
         law = np.interp(run.time, data.law_time, data.law_drift)
-        grown = ((run.sigma_12 > 1e-12) & (run.sigma_12 < 1e-4)).values
+        low, high = data.attrs["setting_fitted"]
+        grown = ((run.sigma_12 > low) & (run.sigma_12 < high)).values
         if grown.any():
             levels.append(np.median((run.sigma_12.values / law)[grown]))
     if levels:
         drift.semilogy(data.law_time, np.median(levels) * data.law_drift, "--", color="black", lw=1.2, zorder=5)
-    drift.set_ylim(1e-18, 10)
-    drift.set(xlabel="time (s)", ylabel="σ₁₂ (kg⁻½), proportional to the drift", title=f"rank held at 11, TOL = {middle:.0e}")
+    drift.set_ylim(LEAST_SIGMA, 10)
+    drift.set(xlabel="time (s)", ylabel="σ₁₂ (kg⁻½), proportional to the drift", title=f"rank held at 11, {_named(middle)}")
     rates.plot(data.law_gain, data.law_rate, "-", color="black", lw=1.2)
-    measured = [float(run.growth) for run in runs(data, "rank held") if np.isfinite(run.growth)]
-    rates.plot([0.0] * len(measured), measured, "o", ms=5, mfc="none", color=COLOURS[1])
+    for run in [*runs(data, "rank held"), *runs(data, "law")]:
+        rates.plot(float(run.alpha), float(run.growth), "o", ms=5, mfc="none", color=COLOURS[1])
     rates.axhline(0, color="0.5", lw=0.8)
     rates.set(xlabel="gain α = β (1/s)", ylabel="rate of growth (1/s)", title="the law (line), measured (rings)")
     for axes in (drift, rates):
@@ -185,25 +189,29 @@ def _middle(data) -> float:
     return tolerances(data)[len(tolerances(data)) // 2]
 
 
+def _named(tol: float) -> str:
+    return f"TOL = $10^{{{round(np.log10(tol))}}}$"
+
+
 def _colour(data, run) -> str:
     return COLOURS[methods(data).index(str(run.method.item()))]
 
 
-def _log(axes: Axes, run, variable: str, least: float, data, style: str = "-") -> None:
-    axes.semilogy(run.time, np.maximum(run[variable], least), style, color=_colour(data, run), lw=1.1, alpha=0.9)
+def _log(axes: Axes, run, variable: str, least: float, colour: str, style: str = "-") -> None:
+    axes.semilogy(run.time, np.maximum(np.abs(run[variable]), least), style, color=colour, lw=1.1, alpha=0.9)
 
 
 def _threshold(axes: Axes, value: float) -> None:
     axes.axhline(value, color="black", lw=0.7, ls=(0, (6, 3)), zorder=0)
 
 
-def _finish(figure: Figure, panels, data) -> None:
+def _finish(figure: Figure, panels, data, more: list[tuple[str, str, str]] | None = None) -> None:
     for axes in panels.ravel():
         axes.grid(color="0.92", lw=0.6)
         axes.set_axisbelow(True)
     for axes in panels[-1]:
         axes.set_xlabel("time (s)")
-    _name_methods(figure, data)
+    _name_methods(figure, data, more)
 
 
 def _name_methods(figure: Figure, data, more: list[tuple[str, str, str]] | None = None) -> None:

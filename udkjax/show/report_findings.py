@@ -1,9 +1,13 @@
 """What the report says it found: sentences whose numbers are read from the dataset."""
 
+import json
+
 import numpy as np
 
 from udkjax.show.report_figures import runs, tolerances
 from udkjax.show.report_tables import count, power, scientific
+from udkjax.study.comparison import published_time
+from udkjax.study.published import Row
 
 
 def findings(data) -> str:
@@ -15,10 +19,11 @@ def _sentences(data):
     for stabilized, name in ((False, "without stabilization"), (True, "with the paper's gains")):
         chosen = [run for run in runs(data, "paper") if (run.alpha > 0) == stabilized]
         yield f"<b>The paper's runs {name}:</b> {_counted(chosen)}{_times_by_tolerance(data, chosen)}."
+    yield from _spacing(data)
     held = list(runs(data, "rank held"))
     if held:
         growth = [float(run.growth) for run in held if np.isfinite(run.growth)]
-        law = float(data.law_rate[int(np.argmin(np.abs(data.law_gain.values)))])
+        law = _law(data)
         rates = f"; the drift grows at {min(growth):.2f} to {max(growth):.2f} 1/s" if growth else ""
         yield (
             f"<b>A threshold that is not tied to TOL does not save them:</b> with the rank held at 11, {_counted(held)}"
@@ -36,6 +41,57 @@ def _sentences(data):
         if chosen:
             ends = ", ".join(f"{scientific(float(run.error_end))} (TOL = {power(float(run.tol))})" for run in chosen)
             yield f"<b>{name}:</b> {_counted(chosen)}; error at the end {ends} rad."
+
+
+def _spacing(data):
+    """How much sooner a run is lost for a smaller TOL, by the law, here, and in the paper."""
+    tols = tolerances(data)
+    free = [[run for run in runs(data, "paper", tol=tol) if not run.alpha and np.isfinite(run.correct_to)] for tol in tols]
+    if len(tols) < 2 or not all(free):
+        return
+    law = np.diff(np.log(tols)) / _law(data)
+    here = np.diff([np.median([float(run.correct_to) for run in chosen]) for chosen in free])
+    published = {
+        table["tol"]: published_time(Row(**row))
+        for table in json.loads(data.attrs["published"])
+        for row in table["rows"]
+        if row["method"] == "SVD" and not table["alpha"]
+    }
+    paper = np.diff([published[tol] for tol in tols])
+    yield (
+        "<b>A smaller TOL loses a run sooner,</b> because the threshold is tied to it: the drift must grow from rounding to "
+        f"TOL. From each TOL ({', '.join(map(power, tols))}) to the next the law says {_list(law)} s; here it is {_list(here)} s "
+        f"(medians of the methods), in the paper {_list(paper)} s (SVD, the one method that behaves so there)."
+    )
+
+
+def _list(values) -> str:
+    return " and ".join(f"{value:.2f}" for value in values)
+
+
+def _law(data) -> float:
+    """The law's rate of growth (1/s) without stabilization."""
+    return float(data.law_rate[int(np.argmin(np.abs(data.law_gain.values)))])
+
+
+def psi2_note(data) -> str:
+    """Say how far the paper's sums of squared violations are from ours."""
+    ratios: dict[bool, list[float]] = {False: [], True: []}
+    for table in json.loads(data.attrs["published"]):
+        printed = {row["method"]: row["psi2"] for row in table["rows"] if row["psi2"]}
+        for run in runs(data, "paper", tol=table["tol"]):
+            if (run.alpha > 0) == (table["alpha"] > 0) and run.method.item() in printed and run.psi2_end > 0:
+                ratios[table["alpha"] > 0].append(printed[run.method.item()] / float(run.psi2_end))
+    parts = [
+        f"{scientific(min(found), 0)} to {scientific(max(found), 0)} times ours {name}"
+        for name, found in (("without stabilization", ratios[False]), ("with it", ratios[True]))
+        if found
+    ]
+    return (
+        f"The paper’s Σψ² is {' and '.join(parts)}: unexplained. It does not say at which instants its sum is taken."
+        if parts
+        else ""
+    )
 
 
 def _counted(chosen) -> str:

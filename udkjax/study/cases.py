@@ -15,6 +15,7 @@ FIRST_STEP = 0.66e-2  # s, of the paper
 END = 20.0  # s
 RANK_HELD = 1e-4  # of the largest singular value of D at the start: far above any drift that is small, far below sigma_11
 SMALL_GAINS = (2.0, 3.0, 5.0)  # alpha = beta, 1/s: above the rate at which a drift grows
+LAW_GAINS = (0.5, 1.0)  # alpha = beta, 1/s: too small, so that the drift grows, at a rate that the law says
 WORK_GAIN = 3.0  # alpha = beta of the work-precision runs: something must hold the constraints, or every run is lost
 WORK_TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 
@@ -31,7 +32,7 @@ class Program(NamedTuple):
 class Case:
     """One run of the study."""
 
-    group: str  # "paper", "rank held", "small gains", "fixed rows", "default", "start" or "work"
+    group: str  # "paper", "rank held", "small gains", "fixed rows", "default", "law", "start" or "work"
     method: str
     solver: str
     tol: float
@@ -63,6 +64,7 @@ class Scope:
     """How much of the study is done."""
 
     name: str
+    methods: tuple[str, ...] = METHODS
     tolerances: tuple[float, ...] = TOLERANCES
     stiff_end: float = END  # s, of the runs with the paper's gains
     max_steps: int = 200_000
@@ -89,23 +91,25 @@ QUICK = Scope(
     patience=0.5,
     gains_for=("SVD",),
 )
-SMOKE = Scope("smoke", tolerances=(1e-6,), stiff_end=0.1, max_steps=2_000, starts=0, repeats=1, gains_for=(), better=False)
+SMOKE = Scope("smoke", ("Greville",), (1e-6,), stiff_end=0.1, max_steps=1_000, starts=0, repeats=1, gains_for=(), better=False)
 
 
 def plan(scope: Scope, solver: str = "Adams") -> list[Case]:
     """Return all runs, the paper's first. `solver` is what stands for the paper's Adams-Moulton."""
     alpha, beta = GAINS
-    cases = [Case("paper", method, solver, tol, tol) for tol, method in product(scope.tolerances, METHODS)]
+    methods, gains_for = scope.methods, scope.gains_for
+    cases = [Case("paper", method, solver, tol, tol) for tol, method in product(scope.tolerances, methods)]
     cases += [
         Case("paper", method, solver, tol, tol, alpha, beta, end=scope.stiff_end)
-        for tol, method in product(scope.tolerances, METHODS)
+        for tol, method in product(scope.tolerances, methods)
     ]
     if scope.better:
         for tol in scope.tolerances:
-            cases += [Case("rank held", method, solver, tol) for method in METHODS]
-            cases += [Case("small gains", m, solver, tol, tol, gain, gain) for gain, m in product(SMALL_GAINS, scope.gains_for)]
+            cases += [Case("rank held", method, solver, tol) for method in methods]
+            cases += [Case("small gains", m, solver, tol, tol, gain, gain) for gain, m in product(SMALL_GAINS, gains_for)]
             cases += [Case("fixed rows", "Elimination", solver, tol), Case("default", "Auto", "Dopri8", tol, projected=True)]
-            cases += [Case("start", "SVD", solver, tol, start=k + 1) for k in range(scope.starts)]
+            cases += [Case("law", scope.methods[0], solver, tol, None, gain, gain) for gain in LAW_GAINS]
+            cases += [Case("start", scope.methods[0], solver, tol, start=k + 1) for k in range(scope.starts)]
     for (method, integrator, projected), tol in product(scope.work, scope.work_tolerances):
         gain = 0.0 if projected else WORK_GAIN
         cases.append(Case("work", method, integrator, tol, None, gain, gain, projected))

@@ -26,7 +26,9 @@ REMARKS = {
     "h": "Unexplained. With Baumgarte's gains the constraints are held, the rank stays at 11, and nothing here stops the run.",
     "i": "Unexplained. The paper's run is right to the end, ours is lost by the drift, whose law does not know TOL.",
     "j": "Unexplained: the paper's run is right to the end, ours fails.",
-    "k": "The paper calls the run correct for a while; ours is right to the end.",
+    "k": "Unexplained: the paper's run is lost, ours is right to the end.",
+    "l": "Unexplained: the paper's run halts, ours is right to the end.",
+    "m": "Both runs are given up; ours for the cause that stands with it, the paper's for one that it does not name.",
 }
 
 
@@ -35,10 +37,10 @@ def remark(row: Row, table: Table, kind: str, correct_to: float) -> str:
     published = published_kind(row)
     if published == "fails":
         if table.alpha:
-            return "h" if kind == "correct" else "f"
+            return "h" if kind == "correct" else "m"
         if row.method == "Varga":
             return "g"
-        return {"fails": "f", "correct up to": "e", "correct": "h"}[kind]
+        return {"fails": "f", "correct up to": "e", "correct": "l"}[kind]
     if published == "correct":
         return {"correct": "a", "correct up to": "i", "fails": "j"}[kind]
     if kind == "correct":

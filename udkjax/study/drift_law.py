@@ -14,10 +14,14 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
+from udkjax.scene import Mechanism
+from udkjax.study.exact import as_pendulum, parallelogram
+
+ALIKE = 1e-8  # of a link's length: how equal and parallel links are that assembly has closed
 TOL = 1e-11  # of the law's own integration: ten digits of the rate
 
 
@@ -31,6 +35,15 @@ class Swing(NamedTuple):
     def period(self) -> float:
         """4 K(sin(amplitude / 2)) / omega, in s."""
         return float(4 * ellipk(np.sin(self.amplitude / 2) ** 2) / self.omega)
+
+
+def swing_of(mech: Mechanism, q: Float[ArrayLike, "bodies 3"]) -> Swing:
+    """Return the swing of a parallelogram linkage that is released from rest at `q`; ValueError where it is none."""
+    linkage = parallelogram(mech, np.asarray(q), ALIKE)
+    if linkage is None:
+        raise ValueError(f"{mech.name} is no parallelogram linkage that moves under gravity alone")
+    angle, omega = as_pendulum(mech, linkage)
+    return Swing(omega, angle)
 
 
 def growth_rate(swing: Swing, alpha: float = 0.0, beta: float = 0.0) -> float:

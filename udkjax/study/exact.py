@@ -41,16 +41,8 @@ def exact_coordinates(mech: Mechanism, ts, q0, v0, tol: float = 1e-8) -> Float[n
     if linkage is None:
         return None
     links, coupler, pivots, centres, arm = linkage
-    bodies = list(mech.bodies.values())
-    masses = np.array([float(bodies[link].mass) for link in links])
-    load = float(bodies[coupler].mass)
-    inertia = sum(float(bodies[link].inertia) for link in links) + masses @ (centres**2).sum(1) + load * arm @ arm
-    moment = masses @ centres + load * arm
-    gravity = np.asarray(mech.gravity, float)
-
-    hanging = np.arctan2(moment[1], moment[0]) - np.arctan2(gravity[1], gravity[0])
-    omega = np.sqrt(np.hypot(*gravity) * np.hypot(*moment) / inertia)
-    turn = pendulum(ts - ts[0], hanging, v0[links[0], 2], omega)
+    angle, omega = as_pendulum(mech, linkage)
+    turn = pendulum(ts - ts[0], angle, v0[links[0], 2], omega)
 
     q = np.repeat(q0[None], len(ts), axis=0)
     for link, pivot, centre in zip(links, pivots, centres, strict=True):
@@ -58,6 +50,18 @@ def exact_coordinates(mech: Mechanism, ts, q0, v0, tol: float = 1e-8) -> Float[n
         q[:, link, 2] += turn
     q[:, coupler, :2] += _turned(arm, turn) - arm
     return q
+
+
+def as_pendulum(mech: Mechanism, linkage: Parallelogram) -> tuple[float, float]:
+    """Return phi (rad) of a linkage as it stands, its angle from hanging, and omega (1/s) of its small oscillations."""
+    bodies, gravity = list(mech.bodies.values()), np.asarray(mech.gravity, float)
+    masses = np.array([float(bodies[link].mass) for link in linkage.links])
+    load, arm = float(bodies[linkage.coupler].mass), linkage.arm
+    inertia = sum(float(bodies[link].inertia) for link in linkage.links)
+    inertia += masses @ (linkage.centres**2).sum(1) + load * arm @ arm
+    moment = masses @ linkage.centres + load * arm
+    angle = np.arctan2(moment[1], moment[0]) - np.arctan2(gravity[1], gravity[0])
+    return float(np.remainder(angle + np.pi, 2 * np.pi) - np.pi), float(np.sqrt(np.hypot(*gravity) * np.hypot(*moment) / inertia))
 
 
 def pendulum(ts, angle: float, rate: float, omega: float) -> Float[np.ndarray, " T"]:

@@ -12,8 +12,7 @@ from udkjax.integrate.solution import versions
 from udkjax.scene import Mechanism, dumps
 from udkjax.study.cases import FIRST_STEP, GAINS, METHODS, RANK_HELD, SMALL_GAINS, Case
 from udkjax.study.comparison import REMARKS, published_row, remark
-from udkjax.study.drift_law import Swing, drift, growth_rate
-from udkjax.study.exact import parallelogram
+from udkjax.study.drift_law import drift, growth_rate, swing_of
 from udkjax.study.machine import machine
 from udkjax.study.published import CITATION, TABLES
 from udkjax.study.verdict import LOST, LOST_EARLY, LOST_LATE, Verdict, classify, lost_at
@@ -21,6 +20,7 @@ from udkjax.study.verdict import LOST, LOST_EARLY, LOST_LATE, Verdict, classify,
 FORMAT = "udkjax report 1"
 # Between these sizes of sigma_12, above rounding and below what is no longer small, growth is held against the law.
 FITTED = 1e-12, 1e-4
+GROWN = 30.0  # by how much it must have grown for a rate to be read from it
 
 HISTORIES = {
     "time": ("s", "instants at which the run was looked at"),
@@ -119,6 +119,7 @@ def _thresholds() -> dict[str, Any]:
         "beta": GAINS[1],
         "rank_held": RANK_HELD,
         "small_gains": list(SMALL_GAINS),
+        "fitted": list(FITTED),
         "methods": json.dumps(METHODS),
     }
 
@@ -162,21 +163,13 @@ def _growth(row: dict[str, Any]) -> float:
     stop = late[0] if len(late) else len(sigma)
     early = np.flatnonzero(sigma[:stop] < low)
     window = slice(early[-1] + 1 if len(early) else 0, stop)
-    grown = len(ts[window]) > 2 and ts[window][-1] - ts[window][0] > 2.0 and sigma[window][-1] > 1e3 * low
+    grown = len(ts[window]) > 2 and ts[window][-1] - ts[window][0] > 2.0 and sigma[window][-1] > GROWN * low
     return float(np.polyfit(ts[window], np.log(sigma[window]), 1)[0]) if grown else float("nan")
 
 
 def _add_law(data: Any, mech: Mechanism, state: State) -> None:
     """The law of the drift for this start: its growth over time without stabilization, and its rates by gain."""
-    linkage = parallelogram(mech, np.asarray(state.q), 1e-8)
-    assert linkage is not None
-    masses, inertias = (np.array([float(getattr(body, name)) for body in mech.bodies.values()]) for name in ("mass", "inertia"))
-    links, coupler = linkage.links, linkage.coupler
-    moment = masses[links] @ linkage.centres + masses[coupler] * linkage.arm
-    gravity = np.asarray(mech.gravity, float)
-    inertia = inertias[links].sum() + masses[links] @ (linkage.centres**2).sum(1) + masses[coupler] * linkage.arm @ linkage.arm
-    across, along = gravity[0] * moment[1] - gravity[1] * moment[0], gravity @ moment
-    swing = Swing(float(np.sqrt(np.hypot(*gravity) * np.hypot(*moment) / inertia)), float(np.arctan2(across, along)))
+    swing = swing_of(mech, state.q)
     ts = np.linspace(0.0, float(data["t_end"].max()), 401)
     data["law_time"] = ("law_instant", ts, {"units": "s"})
     data["law_drift"] = ("law_instant", drift(swing, ts), {"units": "1", "long_name": "drift by its law, from 1 at the start"})
