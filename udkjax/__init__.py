@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.equations.assembly import AssemblyError as AssemblyError
     from udkjax.equations.assembly import State as State
     from udkjax.equations.assembly import assemble as assemble
+    from udkjax.integrate import BDF as BDF
     from udkjax.integrate import Adams as Adams
     from udkjax.integrate import Projection as Projection
     from udkjax.integrate import Result as Result
@@ -82,7 +83,7 @@ _NAMES = {
     "udkjax.pinv": "SVD Varga Greville Householder GramSchmidt Elimination Auto",
     "udkjax.equations.assembly": "AssemblyError State assemble",
     "udkjax.equations": "ConstrainedSystem Baumgarte accelerations check violation energy reactions",
-    "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams",
+    "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 

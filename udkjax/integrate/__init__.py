@@ -1,6 +1,7 @@
 """Trajectories: the only floor that knows diffrax."""
 
 from udkjax.integrate.adams import Adams as Adams
+from udkjax.integrate.bdf import BDF as BDF
 from udkjax.integrate.projection import Projection as Projection
 from udkjax.integrate.simulate import simulate as simulate
 from udkjax.integrate.solution import Result as Result
