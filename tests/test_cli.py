@@ -129,14 +129,18 @@ def test_a_run_that_fails_says_why_and_keeps_what_it_got(tmp_path, capsys):
     assert out.with_suffix(".png").exists()
 
 
-def test_a_report_is_drawn_from_its_data_alone(tmp_path, capsys, study_data):
+def test_a_report_is_drawn_from_its_data_alone(tmp_path, monkeypatch, capsys, study_data):
+    from udkjax.show import report
     from udkjax.study.record import save
+
+    monkeypatch.setattr(report, "figure", lambda data, name: f"<p>{name}</p>")  # tests/show draws them
 
     save(study_data, tmp_path / "study.nc")
     assert udkjax("report", "--from", tmp_path / "study.nc", "--out", tmp_path / "pages") == 0
     assert "report.html" in capsys.readouterr().out
     assert [file.name for file in (tmp_path / "pages").iterdir()] == ["report.html"]  # no data is made anew
-    assert (tmp_path / "pages" / "report.html").read_text().startswith("<!DOCTYPE html>")
+    page = (tmp_path / "pages" / "report.html").read_text()
+    assert page.startswith("<!DOCTYPE html>") and "<p>figure_2</p>" in page
 
 
 @pytest.mark.parametrize(

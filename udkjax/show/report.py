@@ -12,7 +12,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from udkjax.show import report_figures, report_tables
-from udkjax.show.report_findings import findings, psi2_note, repeat
+from udkjax.show.report_findings import findings, growth_time, psi2_note, repeat
 
 FIGURES: dict[str, tuple[Callable[[Any], Figure], str, str]] = {
     "linkage": (
@@ -67,6 +67,7 @@ def page(data: Any) -> str:
         better=report_tables.better(data),
         settings=report_tables.settings(data),
         repeat=repeat(data),
+        growth_time=growth_time(data),
         citation=data.attrs["citation"],
         start=f"{data.attrs['setting_start']:g}°".replace("-", "−"),
         inferred="inferred: the paper does not print it" if data.attrs["setting_start"] in (-45.0, -50.0) else "chosen here",

@@ -9,6 +9,8 @@ from udkjax.show.report_tables import count, power, scientific
 from udkjax.study.comparison import published_time
 from udkjax.study.published import Row
 
+ROUNDING = 1e-16  # m: of a coordinate
+
 
 def findings(data) -> str:
     """Return the findings as an HTML list."""
@@ -72,6 +74,16 @@ def _list(values) -> str:
 def _law(data) -> float:
     """The law's rate of growth (1/s) without stabilization."""
     return float(data.law_rate[int(np.argmin(np.abs(data.law_gain.values)))])
+
+
+def growth_time(data) -> str:
+    """Say how long the drift takes from rounding to a lost run, by its law."""
+    decades = np.log10(float(data.attrs["setting_lost"]) / ROUNDING)
+    rate = _law(data)
+    took = f"about {decades * np.log(10) / rate:.0f} s" if rate > 0 else "for ever"
+    return (
+        f"Its rate of growth is {rate:.3f} 1/s: from {power(ROUNDING)} m to {power(data.attrs['setting_lost'])} it takes {took},"
+    )
 
 
 def psi2_note(data) -> str:

@@ -158,17 +158,18 @@ def better(data) -> str:
             chosen = list(runs(data, group, tol=tol))
             if chosen:
                 rows.append([title.format(rank_held=data.attrs["setting_rank_held"])])
-            rows += [_better_row(run) for run in chosen]
+            rows += [_better_row(run, data.attrs["setting_solver"]) for run in chosen]
         if rows:
             found.append(table(f"TOL = {power(tol)}, {float(data.t_end.max()):g} s.", [head], rows, "better"))
     return "\n".join(found)
 
 
-def _better_row(run) -> list[str]:
+def _better_row(run, usual: str) -> list[str]:
     gain = f", α = β = {float(run.alpha):g}" if run.alpha > 0 else ""
+    by = f", {run.solver.item()}" if run.solver != usual else ""
     errors = [scientific(float(run[name])) for name in ("error_max", "error_end")]
     work = [count(float(run.right_hand_sides)), count(float(run.accepted)), seconds(float(run.cpu))]
-    return [f"{run.method.item()}{gain}", result(run), scientific(float(run.psi2_end)), *work, *errors]
+    return [f"{run.method.item()}{gain}{by}", result(run), scientific(float(run.psi2_end)), *work, *errors]
 
 
 def settings(data) -> str:

@@ -73,13 +73,18 @@ class Scope:
     work_tolerances: tuple[float, ...] = WORK_TOLERANCES
     repeats: int = 5  # of a run, for its time
     patience: float = 3.0  # s: what took longer is timed once
+    also_held: tuple[tuple[str, str], ...] = ()  # methods by other integrators, which are run with the rank held
     gains_for: tuple[str, ...] = METHODS  # the methods that are run with small gains
     better: bool = True  # whether what would have been better is done at all
 
 
 INTEGRATORS = ("Adams", "BDF", "Verner65", "Dopri8", "Tsit5")
 _WORK = tuple(Program(method, solver, False) for method, solver in product((*METHODS, "Elimination"), INTEGRATORS))
-FULL = Scope("full", work=(*_WORK, Program("Auto", "Dopri8", True)))
+FULL = Scope(
+    "full",
+    work=(*_WORK, Program("Auto", "Dopri8", True)),
+    also_held=tuple(("SVD", solver) for solver in INTEGRATORS[1:]),
+)
 QUICK = Scope(
     "quick",
     stiff_end=2.0,
@@ -87,6 +92,7 @@ QUICK = Scope(
     starts=10,
     work=(*(Program("SVD", solver, False) for solver in ("Adams", "Dopri8", "Tsit5")), Program("Auto", "Dopri8", True)),
     work_tolerances=WORK_TOLERANCES[::2],
+    also_held=(("SVD", "Dopri8"),),
     repeats=3,
     patience=0.5,
     gains_for=("SVD",),
@@ -106,6 +112,7 @@ def plan(scope: Scope, solver: str = "Adams") -> list[Case]:
     if scope.better:
         for tol in scope.tolerances:
             cases += [Case("rank held", method, solver, tol) for method in methods]
+            cases += [Case("rank held", m, integrator, tol) for m, integrator in scope.also_held]
             cases += [Case("small gains", m, solver, tol, tol, gain, gain) for gain, m in product(SMALL_GAINS, gains_for)]
             cases += [Case("fixed rows", "Elimination", solver, tol), Case("default", "Auto", "Dopri8", tol, projected=True)]
             cases += [Case("law", scope.methods[0], solver, tol, None, gain, gain) for gain in LAW_GAINS]

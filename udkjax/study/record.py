@@ -157,9 +157,9 @@ def _remark(case: Case, verdict: Verdict) -> str:
 
 def _growth(row: dict[str, Any]) -> float:
     """The slope of log(sigma_12) over time, from where it last leaves the rounding errors to where it is no longer small."""
-    low, high = FITTED[0], np.fmin(FITTED[1], row["rank_tol"])  # above the threshold the rank is 12, and the law another
+    low, high = FITTED
     sigma, ts = np.nan_to_num(row["sigma_12"], nan=0.0), row["time"]
-    late = np.flatnonzero(sigma > high)
+    late = np.flatnonzero((sigma > high) | (row["rank"] > 11))  # of rank 12, where another law holds
     stop = late[0] if len(late) else len(sigma)
     early = np.flatnonzero(sigma[:stop] < low)
     window = slice(early[-1] + 1 if len(early) else 0, stop)
