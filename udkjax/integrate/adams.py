@@ -1,43 +1,29 @@
-"""Adams methods of variable order and step.
-
-The history of f at the times t_n > t_{n-1} > ... is kept as the modified divided differences of Krogh,
-
-    phi_i(n) = psi_1(n) ... psi_{i-1}(n) f[t_n, ..., t_{n-i+1}],        psi_i(n) = t_n - t_{n-i},
-
-which stay of the size of f. For the step from t_n to t_{n+1} = t_n + h, with psi_i(n+1) = h + psi_{i-1}(n),
-
-    phi*_i = beta_i phi_i(n),       beta_i = prod_{j<i} psi_j(n+1) / psi_j(n),
-    f(t_n + s h) ~ P(s) = sum_{i<=k} c_i(s) phi*_i,      c_i(s) = prod_{j<i} (s h + psi_{j-1}(n)) / psi_j(n+1),
-
-P interpolates the k newest values. Its integral predicts p; with f at p one point more is known, and the polynomial of degree k through
-it, P(s) + c_{k+1}(s) (f(t_{n+1}, p) - P(1)), is integrated to y_{n+1}. The integrals of c_i are sums over Gauss's points: exact, and of
-positive terms. L. F. Shampine, M. K. Gordon, Computer Solution of Ordinary Differential Equations (1975), chapters 5 to 7.
-"""
+"""Adams methods of variable order and step."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from udkjax.integrate.differences import HIGHEST, DifferenceInterpolation, Formula, formula
 from udkjax.integrate.multistep import Multistep, from_controller, scale, steered
 
-HIGHEST = 12
+SHARE = 0.25  # of the tolerance: the error that the next step is chosen for
+RUNGS = 4.0  # a step changes by powers of 2^(1/4): the factor does not follow the rounding errors in an estimate
+SMALLEST, LARGEST = 0.25, 2.0  # factors of a step
+NEGLIGIBLE = 1e-4  # relative to the tolerance: estimates below are of rounding errors, and say nothing about the order
+ROUNDING = 1e-14  # relative: a compiler may compute the same state twice, and not quite the same
+EVEN = 1e-2  # relative: two steps that differ by less count as of one size
 LOST = 0.05  # a step that so small a part of the one planned has to replace begins again with order one
-NODES, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.leggauss(HIGHEST // 2 + 1), (1.0, 0.0)))
-
-
-def _constant_steps(count: int) -> np.ndarray:
-    """|gamma*_i|, i = 0, 1, ...: what the i-th difference adds to a corrected step, all steps being equal."""
-    gamma = np.zeros(count)
-    for i in range(count):
-        gamma[i] = (i == 0) - sum(gamma[j] / (i + 1 - j) for j in range(i))
-    return np.abs(gamma)
+ITERATIONS = 3
+ITERATION_SHARE = 0.1  # of the tolerance, that may be left to an iteration that stops
+RATE_MEMORY = 0.3  # of the rate of convergence: a single fast iteration does not count for all
+TINY = 1e-300  # in the place of zero, where an error divides
 
 
 class History(eqx.Module):
@@ -46,57 +32,54 @@ class History(eqx.Module):
     ages: Float[Array, "N"]  # t_n - t_{n-j}, j = 0, 1, ...
     phi: Float[Array, "N y"]
     y: Float[Array, "y"]  # to which phi belongs
+    exact: Bool[Array, ""]  # whether phi_1 is f(t_n, y), not a value that the corrector has used
     points: Int[Array, ""]  # that are known: so many rows of phi count
     order: Int[Array, ""]  # of the next step
     planned: Float[Array, ""]  # size of the next step
-    even: Int[Array, ""]  # so many steps of equal size have been made
-    starting: Bool[Array, ""]  # order and step rise with each step
-    exact: Bool[Array, ""]  # whether phi_1 is f(t_n, y), not f at the predicted state
+    even: Int[Array, ""]  # steps of equal size that were made up to here
+    starting: Bool[Array, ""]  # order and step rise with every step
+    rate: Float[Array, ""]  # at which the iteration converges, over the step made
     evaluations: Int[Array, ""]
 
 
-def _integrals(s: Any, h: Any, ages: Float[Array, "N"]) -> Float[Array, "N"]:
-    """The integrals of c_1, ..., c_N from 0 to s."""
-    at = s * NODES[:, None]
-    factors = (at * h + ages[:-1]) / (h + ages[:-1])
-    c = jnp.concatenate([jnp.ones_like(at), jnp.cumprod(factors, axis=1)], axis=1)
-    return s * (WEIGHTS @ c)
+class Errors(eqx.Module):
+    """Estimated local errors of orders k - 2 to k + 1, relative to the tolerance, were all steps of one size."""
 
-
-class AdamsInterpolation(diffrax.AbstractLocalInterpolation):
-    """The polynomial that the step itself has integrated."""
-
-    t0: Any
-    t1: Any
-    y0: Any
-    ages: Any
-    terms: Any  # phi*_1, ..., phi*_k, f(t1, p) - P(1), 0, ...
-
-    def __init__(self, *, t0, t1, y0, ages, terms):
-        self.t0, self.t1, self.y0, self.ages, self.terms = t0, t1, y0, ages, terms
-
-    def evaluate(self, t0, t1=None, left=True):
-        if t1 is not None:
-            return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
-        h = self.t1 - self.t0
-        y0, unravel = ravel_pytree(self.y0)
-        s = (t0 - self.t0) / jnp.where(h == 0, 1.0, h)
-        return unravel(y0 + h * _integrals(s, h, self.ages) @ self.terms)
+    lowest: Any
+    lower: Any
+    same: Any
+    higher: Any
 
 
 class Adams(Multistep):
-    """Adams-Bashforth-Moulton."""
+    """Adams-Bashforth-Moulton methods of orders 1 to 12: the order and the step vary.
 
-    corrector: str = eqx.field(static=True)
-    min_order: int = eqx.field(static=True)
-    max_order: int = eqx.field(static=True)
-    root_finder: Any
-    root_find_max_steps: int = 3
-    interpolation_cls: ClassVar[Callable[..., AdamsInterpolation]] = AdamsInterpolation
+    The integral of the polynomial through the k newest values of f predicts the next state, that of the polynomial through one
+    value more corrects it. With `corrector="pece"` the value is f at the predicted state, and f at the corrected state goes into
+    the history: two calls of f a step, one where the error is too large. With `corrector="iteration"` f is called again until the
+    state has converged: mostly once or twice, but with less stability. Order and step follow from the estimated errors of orders
+    k - 2 to k + 1.
 
-    def __init__(self, corrector="pece", min_order=1, max_order=HIGHEST, rtol=None, atol=None):
-        self.corrector, self.min_order, self.max_order = corrector, min_order, max_order
-        self.root_finder, self.root_find_max_steps = from_controller(), 3
+    Use it as any diffrax solver, with a `PIDController` of default factors, which tells it the tolerances; for a given sequence
+    of steps, give them as `root_finder=Tolerances(rtol, atol)`. Its solver state counts `evaluations`.
+
+    Source: L. F. Shampine, M. K. Gordon, Computer Solution of Ordinary Differential Equations, 1975 (the code STEP), with
+    formulas for steps that all differ, and a step that follows the error more closely. The iteration is stopped as in VODE.
+    """
+
+    corrector: Literal["pece", "iteration"] = eqx.field(default="pece", static=True)
+    min_order: int = eqx.field(default=1, static=True)
+    max_order: int = eqx.field(default=HIGHEST, static=True)
+    root_finder: Any = eqx.field(default_factory=from_controller)
+    root_find_max_steps: int = eqx.field(default=ITERATIONS, static=True)
+
+    interpolation_cls: ClassVar[Callable[..., DifferenceInterpolation]] = DifferenceInterpolation
+
+    def __check_init__(self):
+        if not 1 <= self.min_order <= self.max_order <= HIGHEST:
+            raise ValueError(f"1 <= min_order <= max_order <= {HIGHEST}; they are {self.min_order} and {self.max_order}")
+        if self.corrector not in ("pece", "iteration"):
+            raise ValueError(f'corrector is "pece" or "iteration", not {self.corrector!r}')
 
     def order(self, terms):
         return self.max_order
@@ -104,101 +87,128 @@ class Adams(Multistep):
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
 
-    def _field(self, terms, args, unravel):
-        def f(t, y):
-            one = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))
-            return ravel_pytree(terms.vf_prod(t, unravel(y), args, one))[0]
-
-        return f
-
     def init(self, terms, t0, t1, y0, args):
         y, unravel = ravel_pytree(y0)
-        f = self._field(terms, args, unravel)(t0, y)
-        return self._new(t1 - t0, y, f, jnp.array(1))
+        return self._begin(t1 - t0, y, _field(terms, args, unravel)(t0, y), jnp.array(1))
 
-    def _new(self, h, y, f, evaluations):
-        N = self.max_order + 2
-        ages = jnp.arange(N) * h
-        phi = jnp.zeros((N, len(y))).at[0].set(f)
-        i = jnp.asarray
-        return History(ages, phi, y, i(1), i(1), h, i(0), i(True), i(True), evaluations)
+    def _begin(self, h: Any, y: Any, f: Any, evaluations: Any) -> History:
+        """A history of one value."""
+        rows = self.max_order + 2
+        phi = jnp.zeros((rows, len(y)), y.dtype).at[0].set(f)
+        one, yes = jnp.array(1), jnp.array(True)
+        return History(h * jnp.arange(rows), phi, y, yes, one, one, h, one, yes, jnp.ones_like(h), evaluations)
+
+    def _newest(self, f: Callable, t0: Any, h: Any, y: Any, state: History, made_jump: Any) -> tuple[History, Any]:
+        """The history with f(t0, y) as its newest value, or a new one; and whether y is not where the last step ended."""
+        moved = jnp.max(jnp.abs(y - state.y), initial=0.0) > ROUNDING * jnp.max(jnp.abs(y), initial=0.0)
+        stale = moved | ~state.exact | made_jump
+        value = jax.lax.cond(stale, lambda: f(t0, y), lambda: state.phi[0])
+        calls = state.evaluations + stale
+        kept = eqx.tree_at(lambda s: (s.phi, s.evaluations), state, (state.phi + (value - state.phi[0]), calls))
+        begin = made_jump | (h < LOST * state.planned)
+        return jax.tree.map(lambda a, b: jnp.where(begin, a, b), self._begin(h, y, value, calls), kept), moved
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        state = solver_state
-        tree0 = y0
-        y0, unravel = ravel_pytree(tree0)
-        f = self._field(terms, args, unravel)
-        h = t1 - t0
-        N = self.max_order + 2
-        gamma = _constant_steps(N + 1)
-        i = jnp.arange(1, N + 1)
-        moved = jnp.any(y0 != state.y)
-        stale = moved | ~state.exact | made_jump
-        f0 = jax.lax.cond(stale, lambda: f(t0, y0), lambda: state.phi[0])
-        phi = state.phi + (f0 - state.phi[0])
-        cost = state.evaluations + stale
-        fresh = self._new(h, y0, f0, state.evaluations)
-        restart = made_jump | (h < LOST * state.planned)
-        state = jax.tree.map(lambda a, b: jnp.where(restart, a, b), fresh, eqx.tree_at(lambda s: s.phi, state, phi))
-
-        k = state.order
-        known = i <= state.points
-        grown = h + state.ages
-        one = jnp.ones(1)
-        beta = jnp.concatenate([one, jnp.cumprod(grown[:-1] / state.ages[1:])])
-        sigma = jnp.concatenate([one, jnp.cumprod(i * h / grown)])[:-1]
-        star = jnp.where(known, beta, 0.0)[:, None] * state.phi
-        g = _integrals(1.0, h, state.ages)
+        y, unravel = ravel_pytree(y0)
+        f, h = _field(terms, args, unravel), t1 - t0
+        state, moved = self._newest(f, t0, h, y, solver_state, made_jump)
+        k, i = state.order, jnp.arange(1, self.max_order + 3)
+        rule = formula(h, state.ages)
+        star = jnp.where(i <= state.points, rule.beta, 0.0)[:, None] * state.phi
         used = jnp.where((i <= k)[:, None], star, 0.0)
-        p = y0 + h * (g @ used)
-        p1 = jnp.sum(used, axis=0)
-        fp = f(t1, p)
-        delta = fp - p1
-        y1 = p + h * g[k] * delta
+        predicted, slope = y + h * (rule.g @ used), jnp.sum(used, axis=0)
 
-        tol = self.root_finder
-        tree1 = unravel(y1)
-        size = scale(tol, tree0, tree1)
-        held = jax.lax.stop_gradient
+        size = _sizes(self.root_finder, unravel, y0, unravel(predicted))
+        d, found, calls, rate = self._correct(lambda y: f(t1, y), predicted, slope, rule, size, state)
+        y1 = predicted + h * rule.g[k] * d
+        finite = found & jnp.all(jnp.isfinite(y1))
+        y1 = jnp.where(finite, y1, jnp.nan)  # what the controller is prepared for
 
-        def norm(c, x):
-            return held(jnp.abs(c)) * tol.norm(jax.tree.map(lambda a, s: a / s, unravel(held(x)), held(size)))
+        size = _sizes(self.root_finder, unravel, y0, unravel(y1))
+        below = jnp.stack([d, d + star[k - 1], d + star[k - 1] + star[jnp.maximum(k - 2, 0)]])
+        same, lower, lowest = rule.errors[jnp.maximum(k - jnp.arange(3), 0)] * size(below)
+        error = h * jnp.abs(rule.g[k - 1] - rule.g[k]) * size(d[None])[0]
+        accept = finite & (error <= 1)
+        again = accept & ~moved & (self.corrector == "pece")
+        value = jax.lax.cond(again, lambda: f(t1, y1), lambda: slope + d)
 
-        at = lambda x, j: x[jnp.clip(j, 0, N - 1)]  # noqa: E731
-        erk = norm(h * at(sigma, k) * jnp.asarray(gamma)[k], delta)
-        err = norm(h * (g[k - 1] - g[k]), delta)
-        erkm1 = norm(h * at(sigma, k - 1) * jnp.asarray(gamma)[k - 1], delta + star[k - 1])
-        erkm2 = norm(h * at(sigma, k - 2) * jnp.asarray(gamma)[jnp.maximum(k - 2, 0)], delta + star[k - 1] + at(star, k - 2))
-        finite = jnp.isfinite(err) & jnp.all(jnp.isfinite(y1))
-        accept = finite & (err <= 1.0)
-        lower = jnp.where(k > 2, jnp.maximum(erkm1, erkm2) <= erk, (k == 2) & (erkm1 <= 0.5 * erk))
+        points = jnp.minimum(state.points + 1, len(i))
+        phi = value - jnp.concatenate([jnp.zeros_like(star[:1]), jnp.cumsum(star, axis=0)[:-1]])
+        phi = jnp.where((i <= points)[:, None], phi, 0.0)
+        higher = rule.errors[k + 1] * size(phi[k + 1][None])[0]
 
-        again = accept & ~moved
-        f1 = jax.lax.cond(again, lambda: f(t1, y1), lambda: fp)
-        cost = cost + 1 + again
+        even = jnp.where(jnp.abs(h - state.planned) < EVEN * h, state.even + 1, 1)
+        failed = (h < (1 - EVEN) * state.planned) & (state.points > 1)
+        starting = state.starting & ~failed & (k < self.max_order)
+        before = eqx.tree_at(lambda s: (s.points, s.even, s.starting), state, (points, even, starting))
+        order, starting, growth = self._choose(before, Errors(lowest, lower, same, higher))
+        shrink = _factor(error, k)
+        factor = jnp.where(accept, growth, jnp.where(found, jnp.where(finite, shrink, SMALLEST), SMALLEST))
 
-        points = jnp.minimum(state.points + 1, N)
-        sums = jnp.concatenate([jnp.zeros((1, len(y0))), jnp.cumsum(star, axis=0)[:-1]])
-        phi1 = jnp.where((i <= points)[:, None], f1 - sums, 0.0)
+        ages = jnp.concatenate([jnp.zeros_like(state.ages[:1]), h + state.ages[:-1]])
+        calls = state.evaluations + calls + again
+        exact = again | (self.corrector == "iteration")
+        new = History(ages, phi, y1, exact, points, order, h * factor, even, starting, rate, calls)
+        dense = {"y0": y0, "ages": state.ages, "terms": jnp.where((i == k + 1)[:, None], d, used)}
+        y1 = unravel(y1)
+        return y1, steered(self.root_finder, y0, y1, accept, factor), dense, new, diffrax.RESULTS.successful
 
-        same = jnp.abs(h / state.planned - 1) < 1e-2
-        even = jnp.where(same & (state.even > 0), state.even + 1, 1)
-        erkp1 = norm(h * jnp.asarray(gamma)[k + 1], phi1[k + 1])
-        can_raise = (k < self.max_order) & (points > k)
-        starting = state.starting & ~lower & (k < self.max_order) & (h >= 0.99 * state.planned)
-        judged = (even > k) & (points >= k + 2)
-        up = judged & can_raise & jnp.where(k > 1, (erkm1 > jnp.minimum(erk, erkp1)) & (erkp1 < erk), erkp1 < 0.5 * erk)
-        down = lower | (judged & (k > 1) & (erkm1 <= jnp.minimum(erk, erkp1)))
-        up, down = up & ~down, down & (k > self.min_order)
-        up = up | (starting & can_raise) | (can_raise & (k < self.min_order))
+    def _correct(self, f: Callable, y: Any, slope: Any, rule: Formula, size: Callable, state: History) -> tuple[Any, ...]:
+        """d, by which f exceeds its extrapolated value `slope`; whether it was found; calls of f; the rate of convergence."""
+        if self.corrector == "pece":
+            return f(y) - slope, jnp.array(True), jnp.array(1), state.rate
+        k = state.order
+        c, weight = rule.h * rule.g[k], rule.h * jnp.abs(rule.g[k - 1] - rule.g[k])
+
+        def iterate(carry, _):
+            d, change, rate, done, calls = carry
+            now = jax.lax.cond(done, lambda: d, lambda: f(y + c * d) - slope)
+            changed = weight * size((now - d)[None])[0]
+            measured = jnp.where(calls == 0, rate, jnp.maximum(RATE_MEMORY * rate, changed / jnp.maximum(change, TINY)))
+            rate, calls = jnp.where(done, rate, measured), calls + ~done
+            done = done | (changed * jnp.minimum(rate, 1.0) <= ITERATION_SHARE)
+            return (now, changed, rate, done, calls), None
+
+        expected = state.rate * rule.h / jnp.where(state.ages[1] == 0, rule.h, state.ages[1])
+        start = (jnp.zeros_like(y), jnp.zeros_like(weight), expected, jnp.array(False), jnp.array(0))
+        (d, _, rate, found, calls), _ = jax.lax.scan(iterate, start, length=self.root_find_max_steps)
+        return d, found, calls, rate
+
+    def _choose(self, state: History, e: Errors) -> tuple[Any, Any, Any]:
+        """After an accepted step, the order of the next, whether the method is still starting, and the factor of the step."""
+        k = state.order
+        falling = jnp.where(k > 2, jnp.maximum(e.lower, e.lowest) <= e.same, (k == 2) & (e.lower <= 0.5 * e.same))
+        falling = falling & (e.same > NEGLIGIBLE)
+        starting = state.starting & ~falling
+        judged = (state.even > k) & (state.points >= k + 2)  # by as many equal steps as it takes for the next difference
+        down = falling | (judged & (k > 1) & (e.lower <= jnp.minimum(e.same, e.higher)))
+        up = ~down & judged & (e.higher < jnp.where(k > 1, 1.0, 0.5) * e.same)
+        down, up = down & (k > self.min_order), up | starting | (k < self.min_order)
+        up = up & (k < self.max_order) & (k < state.points)
+        error = jnp.where(up, e.higher, jnp.where(down & ~up, e.lower, e.same))
         order = jnp.where(up, k + 1, jnp.where(down, k - 1, k))
-        e = jnp.where(up, erkp1, jnp.where(down, erkm1, erk))
-        double = (starting) | (e * 2.0 ** (order + 1) <= 0.5)
-        factor = jnp.where(double, 2.0, 1.0)
-        shrink = jnp.clip((0.5 / jnp.maximum(err, 1e-300)) ** (1.0 / (k + 1)), 0.2, 0.9)
-        factor = jnp.where(accept, factor, jnp.where(finite, shrink, 0.2))
-        y_error = steered(tol, tree0, tree1, accept, factor)
-        ages1 = jnp.concatenate([jnp.zeros(1), h + state.ages[:-1]])
-        new = History(ages1, phi1, y1, points, order, h * factor, even, starting, again, cost)
-        dense = {"y0": tree0, "ages": state.ages, "terms": jnp.where((i == k + 1)[:, None], delta, used)}
-        return tree1, y_error, dense, new, diffrax.RESULTS.successful
+        return order, starting, jnp.where(starting, 2.0, _factor(error, order))
+
+
+def _factor(error: Any, order: Any) -> Any:
+    """Of a step whose error is of this order."""
+    factor = (SHARE / jnp.maximum(error, TINY)) ** (1 / (order + 1))
+    return 2 ** (jnp.floor(RUNGS * jnp.log2(jnp.clip(factor, SMALLEST, LARGEST))) / RUNGS)
+
+
+def _field(terms: Any, args: Any, unravel: Callable) -> Callable:
+    """f as a function of time and of the state as a vector."""
+
+    def f(t, y):
+        unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # of the time that a step would take
+        return ravel_pytree(terms.vf_prod(t, unravel(y), args, unit))[0]
+
+    return f
+
+
+def _sizes(tolerances: Any, unravel: Callable, y0: Any, y1: Any) -> Callable:
+    """The norms of the rows of a matrix, relative to what a step may err."""
+    tolerances, y0, y1 = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (tolerances, y0, y1))
+    allowed = scale(tolerances, y0, y1)
+    size = jax.vmap(lambda x: tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))
+    return lambda rows: size(jax.lax.stop_gradient(rows))

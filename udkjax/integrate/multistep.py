@@ -1,8 +1,8 @@
 """What the multistep methods of variable order share: how they steer the step, and how they count.
 
-A method of variable order chooses its next order and step together. diffrax leaves the step to its controller, which sees an error
-estimate of one fixed order. So the methods here say what they want in the language of that controller: `steered` gives it an error
-from which `PIDController` draws the very factor that the method has chosen.
+A method of variable order chooses its next order and step together. diffrax leaves the step to its controller, which sees an
+error estimate of one fixed order. So the methods here say what they want in the language of that controller: `steered` gives it
+an error from which `PIDController` draws the very factor that the method has chosen.
 """
 
 from typing import Any, ClassVar
@@ -11,17 +11,21 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 
 SAFETY = 0.9  # of diffrax.PIDController, by default
 ERROR_ORDER = 2  # that the controller is told: the order of the error of the first step, which is of order one
 
 
 class Tolerances(eqx.Module):
-    """What a step may err, and in which norm. It stands where diffrax, looking for a root finder, puts its controller's tolerances."""
+    """What a step may err, and in which norm.
+
+    As `root_finder` of a method it stands where diffrax, looking for a root finder, puts its controller's tolerances.
+    """
 
     rtol: Any
     atol: Any
-    norm: Any = eqx.field(static=False)
+    norm: Any = optx.rms_norm
 
 
 def from_controller() -> Any:
@@ -49,8 +53,9 @@ def steered(tolerances: Tolerances, y0: Any, y1: Any, accept: Any, factor: Any) 
 class Multistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     """A multistep method of variable order and step.
 
-    Its solver state has a field `evaluations`: the calls of the vector field in `init` and in the steps that were accepted. A state
-    y0 that is not the last y1 (it was projected) is taken for the newest point of the history; `made_jump` begins a new history.
+    Its solver state has a field `evaluations`: the calls of the vector field in `init` and in the steps that were accepted. A
+    state y0 that is not the last y1 (it was projected) is taken for the newest point of the history; `made_jump` begins a new
+    history.
     """
 
     root_finder: eqx.AbstractVar[Any]

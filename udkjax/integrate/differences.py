@@ -1,0 +1,85 @@
+"""The polynomial through the newest values of f, as Adams methods integrate it.
+
+The values at the times t_n > t_{n-1} > ... are kept as Krogh's modified divided differences, which stay of the size of f:
+
+    phi_i(n) = psi_1(n) ... psi_{i-1}(n) f[t_n, ..., t_{n-i+1}],        psi_i(n) = t_n - t_{n-i}.
+
+For the step from t_n to t_{n+1} = t_n + h, with psi_i(n+1) = h + psi_{i-1}(n), the k newest are interpolated by
+
+    P(t_n + s h) = sum_{i<=k} c_i(s) phi*_i,        c_i(s) = prod_{j<i} (s h + psi_{j-1}(n)) / psi_j(n+1),
+    phi*_i = beta_i phi_i(n),                       beta_i = prod_{j<i} psi_j(n+1) / psi_j(n).
+
+c_{k+1} is zero at these k times and one at t_{n+1}: P + c_{k+1} d is the polynomial through one value more, d above P(t_{n+1}).
+The differences at t_{n+1}, where f is P(t_{n+1}) + d, are phi_i(n+1) = f - sum_{j<i} phi*_j.
+
+L. F. Shampine, M. K. Gordon, Computer Solution of Ordinary Differential Equations, 1975, chapters 5 and 6.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+HIGHEST = 12  # order; beyond it the methods are hardly stable
+# Gauss's points and weights on [0, 1]: they integrate every c_i exactly, and without cancellation, since no c_i is negative.
+POINTS, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.leggauss(HIGHEST // 2 + 1), (1.0, 0.0)))
+
+
+def _adams_moulton(count: int) -> np.ndarray:
+    """|gamma*_0|, |gamma*_1|, ...: of Adams-Moulton methods with a constant step, in terms of backward differences."""
+    gamma = np.zeros(count)
+    for i in range(count):
+        gamma[i] = (i == 0) - sum(gamma[j] / (i + 1 - j) for j in range(i))
+    return np.abs(gamma)
+
+
+GAMMA = _adams_moulton(HIGHEST + 2)
+
+
+class Formula(eqx.Module):
+    """What depends on the times alone. Index 0 belongs to i = 1."""
+
+    h: Any
+    beta: Float[Array, "N"]
+    g: Float[Array, "N"]  # integrals of c_i from 0 to 1
+    errors: Float[Array, "N"]  # h sigma_j |gamma*_j|: with phi_{j+1}(n+1), the local error of order j, were all steps equal to h
+
+
+def formula(h: Any, ages: Float[Array, "N"]) -> Formula:
+    """From the step ahead and the ages psi_0(n) = 0, psi_1(n), ... of the values."""
+    j = jnp.arange(1, len(ages))
+    ahead = h + ages[:-1]
+    beta = jnp.concatenate([jnp.ones_like(ages[:1]), jnp.cumprod(ahead / ages[1:])])
+    sigma = jnp.concatenate([jnp.ones_like(ages[:1]), jnp.cumprod(j * h / ahead)])
+    return Formula(h, beta, integrals(1.0, h, ages), h * sigma * GAMMA[: len(ages)])
+
+
+def integrals(s: Any, h: Any, ages: Float[Array, "N"]) -> Float[Array, "N"]:
+    """Of c_1, ..., c_N from 0 to s."""
+    at = s * POINTS[:, None]
+    factors = (at * h + ages[:-1]) / (h + ages[:-1])
+    c = jnp.concatenate([jnp.ones_like(factors[:, :1]), jnp.cumprod(factors, axis=1)], axis=1)
+    return s * (WEIGHTS @ c)
+
+
+class DifferenceInterpolation(diffrax.AbstractLocalInterpolation):
+    """The polynomial that the step itself has integrated, of the step's order."""
+
+    t0: Any
+    t1: Any
+    y0: Any
+    ages: Float[Array, "N"]
+    terms: Float[Array, "N y"]  # phi*_1, ..., phi*_k, d, 0, ...
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
+        y0, unravel = ravel_pytree(self.y0)
+        h = self.t1 - self.t0
+        s = (t0 - self.t0) / jnp.where(h == 0, 1.0, h)
+        return unravel(y0 + h * (integrals(s, h, self.ages) @ self.terms))
