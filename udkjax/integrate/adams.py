@@ -10,20 +10,15 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from udkjax.integrate.adams_order import SMALLEST, TINY, Errors, Pace, after_step, begin, factor
 from udkjax.integrate.differences import HIGHEST, DifferenceInterpolation, Formula, formula
 from udkjax.integrate.multistep import Multistep, from_controller, scale, steered
 
-SHARE = 0.25  # of the tolerance: the error that the next step is chosen for
-RUNGS = 4.0  # a step changes by powers of 2^(1/4): the factor does not follow the rounding errors in an estimate
-SMALLEST, LARGEST = 0.25, 2.0  # factors of a step
-NEGLIGIBLE = 1e-4  # relative to the tolerance: estimates below are of rounding errors, and say nothing about the order
-ROUNDING = 1e-14  # relative: a compiler may compute the same state twice, and not quite the same
-EVEN = 1e-2  # relative: two steps that differ by less count as of one size
 LOST = 0.05  # a step that so small a part of the one planned has to replace begins again with order one
+ROUNDING = 1e-14  # relative: a compiler may compute the same state twice, and not quite the same
 ITERATIONS = 3
 ITERATION_SHARE = 0.1  # of the tolerance, that may be left to an iteration that stops
 RATE_MEMORY = 0.3  # of the rate of convergence: a single fast iteration does not count for all
-TINY = 1e-300  # in the place of zero, where an error divides
 
 
 class History(eqx.Module):
@@ -34,31 +29,19 @@ class History(eqx.Module):
     y: Float[Array, "y"]  # to which phi belongs
     exact: Bool[Array, ""]  # whether phi_1 is f(t_n, y), not a value that the corrector has used
     points: Int[Array, ""]  # that are known: so many rows of phi count
-    order: Int[Array, ""]  # of the next step
-    planned: Float[Array, ""]  # size of the next step
-    even: Int[Array, ""]  # steps of equal size that were made up to here
-    starting: Bool[Array, ""]  # order and step rise with every step
-    rate: Float[Array, ""]  # at which the iteration converges, over the step made
+    pace: Pace
+    rate: Float[Array, ""]  # at which the iteration converged
     evaluations: Int[Array, ""]
-
-
-class Errors(eqx.Module):
-    """Estimated local errors of orders k - 2 to k + 1, relative to the tolerance, were all steps of one size."""
-
-    lowest: Any
-    lower: Any
-    same: Any
-    higher: Any
 
 
 class Adams(Multistep):
     """Adams-Bashforth-Moulton methods of orders 1 to 12: the order and the step vary.
 
     The integral of the polynomial through the k newest values of f predicts the next state, that of the polynomial through one
-    value more corrects it. With `corrector="pece"` the value is f at the predicted state, and f at the corrected state goes into
-    the history: two calls of f a step, one where the error is too large. With `corrector="iteration"` f is called again until the
-    state has converged: mostly once or twice, but with less stability. Order and step follow from the estimated errors of orders
-    k - 2 to k + 1.
+    value more corrects it (so that the result is of order k + 1). With `corrector="pece"` the value is f at the predicted state,
+    and f at the corrected state goes into the history: two calls of f a step, one where the error is too large. With
+    `corrector="iteration"` f is called again until the state has converged: mostly one or two calls, but at larger steps it is
+    less stable. Order and step follow from the estimated errors of orders k - 2 to k + 1.
 
     Use it as any diffrax solver, with a `PIDController` of default factors, which tells it the tolerances; for a given sequence
     of steps, give them as `root_finder=Tolerances(rtol, atol)`. Its solver state counts `evaluations`.
@@ -91,74 +74,70 @@ class Adams(Multistep):
         y, unravel = ravel_pytree(y0)
         return self._begin(t1 - t0, y, _field(terms, args, unravel)(t0, y), jnp.array(1))
 
-    def _begin(self, h: Any, y: Any, f: Any, evaluations: Any) -> History:
-        """A history of one value."""
-        rows = self.max_order + 2
-        phi = jnp.zeros((rows, len(y)), y.dtype).at[0].set(f)
-        one, yes = jnp.array(1), jnp.array(True)
-        return History(h * jnp.arange(rows), phi, y, yes, one, one, h, one, yes, jnp.ones_like(h), evaluations)
-
-    def _newest(self, f: Callable, t0: Any, h: Any, y: Any, state: History, made_jump: Any) -> tuple[History, Any]:
-        """The history with f(t0, y) as its newest value, or a new one; and whether y is not where the last step ended."""
-        moved = jnp.max(jnp.abs(y - state.y), initial=0.0) > ROUNDING * jnp.max(jnp.abs(y), initial=0.0)
-        stale = moved | ~state.exact | made_jump
-        value = jax.lax.cond(stale, lambda: f(t0, y), lambda: state.phi[0])
-        calls = state.evaluations + stale
-        kept = eqx.tree_at(lambda s: (s.phi, s.evaluations), state, (state.phi + (value - state.phi[0]), calls))
-        begin = made_jump | (h < LOST * state.planned)
-        return jax.tree.map(lambda a, b: jnp.where(begin, a, b), self._begin(h, y, value, calls), kept), moved
-
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         y, unravel = ravel_pytree(y0)
         f, h = _field(terms, args, unravel), t1 - t0
+        h = jnp.where(h > 0, h, solver_state.pace.planned)  # of a member of a batch that has come to its end
         state, moved = self._newest(f, t0, h, y, solver_state, made_jump)
-        k, i = state.order, jnp.arange(1, self.max_order + 3)
-        rule = formula(h, state.ages)
-        star = jnp.where(i <= state.points, rule.beta, 0.0)[:, None] * state.phi
-        used = jnp.where((i <= k)[:, None], star, 0.0)
+        k, rule, row = state.pace.order, formula(h, state.ages), jnp.arange(1, self.max_order + 3)[:, None]
+        star = jnp.where(row <= state.points, rule.beta[:, None] * state.phi, 0.0)
+        used = jnp.where(row <= k, star, 0.0)
         predicted, slope = y + h * (rule.g @ used), jnp.sum(used, axis=0)
 
         size = _sizes(self.root_finder, unravel, y0, unravel(predicted))
         d, found, calls, rate = self._correct(lambda y: f(t1, y), predicted, slope, rule, size, state)
         y1 = predicted + h * rule.g[k] * d
-        finite = found & jnp.all(jnp.isfinite(y1))
+        finite = jnp.all(jnp.isfinite(y1))
         y1 = jnp.where(finite, y1, jnp.nan)  # what the controller is prepared for
 
-        size = _sizes(self.root_finder, unravel, y0, unravel(y1))
+        size, estimates = _sizes(self.root_finder, unravel, y0, unravel(y1)), _held(rule)
         below = jnp.stack([d, d + star[k - 1], d + star[k - 1] + star[jnp.maximum(k - 2, 0)]])
-        same, lower, lowest = rule.errors[jnp.maximum(k - jnp.arange(3), 0)] * size(below)
-        error = h * jnp.abs(rule.g[k - 1] - rule.g[k]) * size(d[None])[0]
-        accept = finite & (error <= 1)
+        same, lower, lowest = estimates.errors[jnp.maximum(k - jnp.arange(3), 0)] * size(below)
+        error = estimates.gains(k) * size(d[None])[0]
+        accept = found & finite & (error <= 1)
         again = accept & ~moved & (self.corrector == "pece")
         value = jax.lax.cond(again, lambda: f(t1, y1), lambda: slope + d)
 
-        points = jnp.minimum(state.points + 1, len(i))
+        points = jnp.minimum(state.points + 1, len(row))
         phi = value - jnp.concatenate([jnp.zeros_like(star[:1]), jnp.cumsum(star, axis=0)[:-1]])
-        phi = jnp.where((i <= points)[:, None], phi, 0.0)
-        higher = rule.errors[k + 1] * size(phi[k + 1][None])[0]
-
-        even = jnp.where(jnp.abs(h - state.planned) < EVEN * h, state.even + 1, 1)
-        failed = (h < (1 - EVEN) * state.planned) & (state.points > 1)
-        starting = state.starting & ~failed & (k < self.max_order)
-        before = eqx.tree_at(lambda s: (s.points, s.even, s.starting), state, (points, even, starting))
-        order, starting, growth = self._choose(before, Errors(lowest, lower, same, higher))
-        shrink = _factor(error, k)
-        factor = jnp.where(accept, growth, jnp.where(found, jnp.where(finite, shrink, SMALLEST), SMALLEST))
+        phi = jnp.where(row <= points, phi, 0.0)
+        errors = Errors(lowest, lower, same, estimates.errors[k + 1] * size(phi[k + 1][None])[0])
+        pace, growth = after_step(state.pace, estimates.h, points, errors, self.min_order, self.max_order)
+        shrink = jnp.where(found & finite, factor(error, k), SMALLEST)
 
         ages = jnp.concatenate([jnp.zeros_like(state.ages[:1]), h + state.ages[:-1]])
-        calls = state.evaluations + calls + again
         exact = again | (self.corrector == "iteration")
-        new = History(ages, phi, y1, exact, points, order, h * factor, even, starting, rate, calls)
-        dense = {"y0": y0, "ages": state.ages, "terms": jnp.where((i == k + 1)[:, None], d, used)}
+        new = History(ages, phi, y1, exact, points, pace, rate, state.evaluations + calls + again)
+        dense = {"y0": y0, "ages": state.ages, "terms": jnp.where(row == k + 1, d, used)}
         y1 = unravel(y1)
-        return y1, steered(self.root_finder, y0, y1, accept, factor), dense, new, diffrax.RESULTS.successful
+        y_error = steered(self.root_finder, y0, y1, accept, jnp.where(accept, growth, shrink))
+        return y1, y_error, dense, new, diffrax.RESULTS.successful
+
+    def _begin(self, h: Any, y: Any, f: Any, evaluations: Any) -> History:
+        """A history of one value."""
+        rows, one = self.max_order + 2, jnp.array(1)
+        phi = jnp.zeros((rows, len(y)), y.dtype).at[0].set(f)
+        return History(h * jnp.arange(rows), phi, y, jnp.array(True), one, begin(_held(h)), jnp.ones_like(h), evaluations)
+
+    def _newest(self, f: Callable, t0: Any, h: Any, y: Any, state: History, made_jump: Any) -> tuple[History, Any]:
+        """The history with f(t0, y) as its newest value, or a new one; and whether y is not where the last step ended.
+
+        Where y was moved, it will be again: then f at the end of a step is left for the next step to call.
+        """
+        moved = jnp.max(jnp.abs(y - state.y), initial=0.0) > ROUNDING * jnp.max(jnp.abs(y), initial=0.0)
+        stale = moved | ~state.exact | made_jump
+        value = jax.lax.cond(stale, lambda: f(t0, y), lambda: state.phi[0])
+        calls = state.evaluations + stale
+        kept = eqx.tree_at(lambda s: (s.phi, s.evaluations), state, (state.phi + (value - state.phi[0]), calls))
+        lost = made_jump | (h < LOST * state.pace.planned)
+        return jax.tree.map(lambda a, b: jnp.where(lost, a, b), self._begin(h, y, value, calls), kept), moved
 
     def _correct(self, f: Callable, y: Any, slope: Any, rule: Formula, size: Callable, state: History) -> tuple[Any, ...]:
         """d, by which f exceeds its extrapolated value `slope`; whether it was found; calls of f; the rate of convergence."""
         if self.corrector == "pece":
             return f(y) - slope, jnp.array(True), jnp.array(1), state.rate
-        k = state.order
-        c, weight = rule.h * rule.g[k], rule.h * jnp.abs(rule.g[k - 1] - rule.g[k])
+        k = state.pace.order
+        c, weight = rule.h * rule.g[k], _held(rule).gains(k)
 
         def iterate(carry, _):
             d, change, rate, done, calls = carry
@@ -169,31 +148,10 @@ class Adams(Multistep):
             done = done | (changed * jnp.minimum(rate, 1.0) <= ITERATION_SHARE)
             return (now, changed, rate, done, calls), None
 
-        expected = state.rate * rule.h / jnp.where(state.ages[1] == 0, rule.h, state.ages[1])
+        expected = _held(state.rate * rule.h / state.ages[1])  # the rate is proportional to the step
         start = (jnp.zeros_like(y), jnp.zeros_like(weight), expected, jnp.array(False), jnp.array(0))
         (d, _, rate, found, calls), _ = jax.lax.scan(iterate, start, length=self.root_find_max_steps)
         return d, found, calls, rate
-
-    def _choose(self, state: History, e: Errors) -> tuple[Any, Any, Any]:
-        """After an accepted step, the order of the next, whether the method is still starting, and the factor of the step."""
-        k = state.order
-        falling = jnp.where(k > 2, jnp.maximum(e.lower, e.lowest) <= e.same, (k == 2) & (e.lower <= 0.5 * e.same))
-        falling = falling & (e.same > NEGLIGIBLE)
-        starting = state.starting & ~falling
-        judged = (state.even > k) & (state.points >= k + 2)  # by as many equal steps as it takes for the next difference
-        down = falling | (judged & (k > 1) & (e.lower <= jnp.minimum(e.same, e.higher)))
-        up = ~down & judged & (e.higher < jnp.where(k > 1, 1.0, 0.5) * e.same)
-        down, up = down & (k > self.min_order), up | starting | (k < self.min_order)
-        up = up & (k < self.max_order) & (k < state.points)
-        error = jnp.where(up, e.higher, jnp.where(down & ~up, e.lower, e.same))
-        order = jnp.where(up, k + 1, jnp.where(down, k - 1, k))
-        return order, starting, jnp.where(starting, 2.0, _factor(error, order))
-
-
-def _factor(error: Any, order: Any) -> Any:
-    """Of a step whose error is of this order."""
-    factor = (SHARE / jnp.maximum(error, TINY)) ** (1 / (order + 1))
-    return 2 ** (jnp.floor(RUNGS * jnp.log2(jnp.clip(factor, SMALLEST, LARGEST))) / RUNGS)
 
 
 def _field(terms: Any, args: Any, unravel: Callable) -> Callable:
@@ -208,7 +166,12 @@ def _field(terms: Any, args: Any, unravel: Callable) -> Callable:
 
 def _sizes(tolerances: Any, unravel: Callable, y0: Any, y1: Any) -> Callable:
     """The norms of the rows of a matrix, relative to what a step may err."""
-    tolerances, y0, y1 = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (tolerances, y0, y1))
+    tolerances, y0, y1 = _held((tolerances, y0, y1))
     allowed = scale(tolerances, y0, y1)
     size = jax.vmap(lambda x: tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))
-    return lambda rows: size(jax.lax.stop_gradient(rows))
+    return lambda rows: size(_held(rows))
+
+
+def _held(tree: Any) -> Any:
+    """The same values, of no interest to any derivative."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)

@@ -49,6 +49,10 @@ class Formula(eqx.Module):
     g: Float[Array, "N"]  # integrals of c_i from 0 to 1
     errors: Float[Array, "N"]  # h sigma_j |gamma*_j|: with phi_{j+1}(n+1), the local error of order j, were all steps equal to h
 
+    def gains(self, k: Any) -> Any:
+        """With d, the difference between the results of orders k and k + 1."""
+        return self.h * jnp.abs(self.g[k - 1] - self.g[k])
+
 
 def formula(h: Any, ages: Float[Array, "N"]) -> Formula:
     """From the step ahead and the ages psi_0(n) = 0, psi_1(n), ... of the values."""
@@ -80,6 +84,6 @@ class DifferenceInterpolation(diffrax.AbstractLocalInterpolation):
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
         y0, unravel = ravel_pytree(self.y0)
-        h = self.t1 - self.t0
-        s = (t0 - self.t0) / jnp.where(h == 0, 1.0, h)
+        h = jnp.where(self.t1 == self.t0, 1.0, self.t1 - self.t0)
+        s = (t0 - self.t0) / h
         return unravel(y0 + h * (integrals(s, h, self.ages) @ self.terms))
