@@ -8,7 +8,6 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from diffrax._local_interpolation import AbstractLocalInterpolation
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
@@ -60,7 +59,7 @@ class State(eqx.Module):
         return self.newton.factorizations
 
 
-class Interpolation(AbstractLocalInterpolation):
+class Interpolation(diffrax.AbstractLocalInterpolation):
     """The polynomial through the states at the end of a step and before, as many as the order of the step and one."""
 
     t0: Any
@@ -87,21 +86,21 @@ class BDF(Multistep):
     "fixed leading coefficient" form. The equation is solved by Newton's method with a Jacobian from forward-mode differentiation,
     kept for as many steps as it serves. Order and step follow from the estimated errors of orders k - 1, k and k + 1.
 
-    Use it as any diffrax solver, with a `PIDController` of default factors, which tells it the tolerances. Its solver state
-    counts `evaluations`, `jacobians` and `factorizations`. A step whose equation could not be solved is rejected.
+    Use it as any diffrax solver, with a `PIDController` of default factors, which tells it the tolerances; for a given sequence
+    of steps, give them as `root_finder=Tolerances(rtol, atol)`. Its solver state counts `evaluations`, `jacobians` and
+    `factorizations`. A step whose equation could not be solved is rejected.
 
-    Orders 3 to 5 damp no fast oscillations: where the equation has them, `max_order=2` may take larger steps.
+    Orders 3 to 5 are unstable for fast oscillations that are hardly damped: `max_order=2` takes larger steps there.
 
     Source: C. W. Gear, Numerical Initial Value Problems in Ordinary Differential Equations, 1971; formulas and error estimates as
     in K. E. Brenan, S. L. Campbell, L. R. Petzold, Numerical Solution of Initial-Value Problems in Differential-Algebraic
     Equations, 1996, chapter 5; the choice of order and step as in VODE (see `newton`).
     """
 
-    max_order: int = HIGHEST
-    min_order: int = 1
+    max_order: int = eqx.field(default=HIGHEST, static=True)
+    min_order: int = eqx.field(default=1, static=True)
     root_finder: Any = eqx.field(default_factory=from_controller)
-
-    root_find_max_steps: int = newton.ITERATIONS  # with one matrix: more rarely help
+    root_find_max_steps: int = eqx.field(default=newton.ITERATIONS, static=True)
 
     interpolation_cls: ClassVar = Interpolation
 
@@ -145,7 +144,7 @@ class BDF(Multistep):
 
         size = _Size(tolerances.norm, unravel, ravel_pytree(scale(tolerances, y0, y0))[0], error / NEWTON_SHARE)
         equation = newton.Implicit(terms, args, unravel, t1, predicted, v, h / gamma)
-        e, found, kept = newton.solve(equation, _held(size), state.newton)
+        e, found, kept = newton.solve(equation, _held(size), state.newton, self.root_find_max_steps)
         e = jnp.where(found, e, 0.0)
 
         j = i[:, None]  # rows: phi, columns: parts

@@ -24,7 +24,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Bool, Float, Int
 
-ITERATIONS = 3  # with one matrix: more rarely helps
+ITERATIONS = 3  # with one matrix, by default: more rarely help
 JACOBIAN_STEPS, MATRIX_STEPS = 50, 20  # for which they are kept at most
 CHANGE = 0.3  # of c, relatively, up to which M is kept
 FASTEST = 0.3  # the rate of convergence falls by this factor an iteration at most: one fast iteration proves little
@@ -97,10 +97,11 @@ class _Iteration(eqx.Module):
 
 
 @eqx.filter_custom_jvp
-def solve(equation: Implicit, size: Callable, kept: Kept) -> tuple[Float[Array, "n"], Bool[Array, ""], Kept]:
+def solve(equation: Implicit, size: Callable, kept: Kept, iterations: int) -> tuple[Float[Array, "n"], Bool[Array, ""], Kept]:
     """Return e, whether it was found, and what is kept for the next step.
 
-    `size` is a pytree that is called: of a correction it tells how far it matters, which shall be less than one.
+    `size` is a pytree that is called: of a correction it tells how much it matters, which shall be less than one. After so many
+    `iterations` with one matrix it is given up.
     """
     renew = kept.jacobian_age >= JACOBIAN_STEPS
     factor = renew | (kept.matrix_age >= MATRIX_STEPS) | ~(jnp.abs(equation.c / kept.c - 1) <= CHANGE)
@@ -115,7 +116,7 @@ def solve(equation: Implicit, size: Callable, kept: Kept) -> tuple[Float[Array, 
         first = now.count == 0
         rate = jnp.where(first, kept.rate, jnp.maximum(FASTEST * kept.rate, far / now.size))
         converged = far * jnp.minimum(1.0, rate) <= 1
-        hopeless = ~first & ~(far <= DIVERGING * now.size) | (now.count == ITERATIONS - 1) | ~jnp.isfinite(far)
+        hopeless = ~first & ~(far <= DIVERGING * now.size) | (now.count == iterations - 1) | ~jnp.isfinite(far)
         stuck, fresh = ~converged & hopeless, now.fresh | now.renew
         again = stuck & ~fresh
         kept = eqx.tree_at(lambda k: k.rate, kept, jnp.where(jnp.isfinite(rate) & ~stuck, rate, 1.0))

@@ -1,0 +1,252 @@
+"""Backward differentiation formulas: their order, cost and accuracy, and all that a diffrax solver has to do."""
+
+import math
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import udkjax as udk
+from benchmarks.problems import STIFF
+from udkjax.integrate.counting import count_evaluations, evaluations
+from udkjax.integrate.multistep import Tolerances
+
+# y(t0), y(t0 - h), ... of Gear's formulas, sum a[j] y[-j] = h y'
+GEAR = {
+    1: [1, -1],
+    2: [3 / 2, -2, 1 / 2],
+    3: [11 / 6, -3, 3 / 2, -1 / 3],
+    4: [25 / 12, -4, 3, -4 / 3, 1 / 4],
+    5: [137 / 60, -5, 5, -10 / 3, 5 / 4, -1 / 5],
+}
+
+
+def controller(rtol, atol):
+    return diffrax.PIDController(rtol=rtol, atol=atol, norm=optx.max_norm)
+
+
+@pytest.fixture(scope="module")
+def stiff(data):
+    """Runs of a stiff problem to several tolerances by one program, and its references."""
+    reference, done = data("stiff_problems"), {}
+
+    def runs(name):
+        if name not in done:
+            known = reference[name]
+            ts, scale, states = (np.array(known[key]) for key in ("times", "scale", "states"))
+            solve, called, traced = _solver_of(STIFF[name].f)
+            found, traces = [], []
+            for rtol in (1e-4, 1e-6, 1e-8):
+                called.clear()
+                run = solve(jnp.array(STIFF[name].y0), ts, rtol, rtol * scale)
+                jax.effects_barrier()
+                errors = np.abs(run.ys - states) / (scale + np.abs(states))
+                found.append((rtol, errors, run, len(called)))
+                traces.append(len(traced))
+            assert traces[0] == traces[-1]  # other numbers compile nothing
+            done[name] = found, known["vode"]
+        return done[name]
+
+    return runs
+
+
+def _solver_of(f):
+    """A program that solves y' = f, and lists of the calls of f that it makes and of those when it is traced."""
+    called, traced = [], []
+
+    def counted(t, y, args):
+        traced.append(None)
+        jax.debug.callback(lambda: called.append(None))
+        return f(t, y)
+
+    @jax.jit
+    def solve(y0, ts, rtol, atol):
+        solver, control = count_evaluations(udk.BDF(), controller(rtol, atol))
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(counted),
+            solver,
+            0.0,
+            ts[-1],
+            1e-6,
+            y0,
+            stepsize_controller=control,
+            saveat=diffrax.SaveAt(ts=ts, solver_state=True, controller_state=True),
+            max_steps=100_000,
+        )
+
+    return solve, called, traced
+
+
+@pytest.mark.parametrize("name", STIFF)
+class TestStiffProblems:
+    def test_error(self, stiff, name):
+        """At the end the error is within a factor of ten of the tolerance; on the way too, but before jumps, which enlarge it."""
+        for rtol, errors, _, _ in stiff(name)[0]:
+            assert errors[-1].max() < 10 * rtol
+            assert errors.max() < 30 * rtol
+
+    def test_calls_are_counted(self, stiff, name):
+        for _, _, run, called in stiff(name)[0]:
+            assert evaluations(run.controller_state) == called
+            assert run.solver_state.evaluations <= called
+
+    def test_cost(self, stiff, name):
+        """VODE, with the same formulas, takes as many right-hand sides for the same error, on the average of the tolerances."""
+        found, vode = stiff(name)
+        errors, calls = np.log([(row["error"], row["right_hand_sides"]) for row in vode]).T
+        curve = np.polynomial.Polynomial.fit(errors, calls, 2)
+        ratios = [called / np.exp(curve(np.log(errors.max()))) for _, errors, _, called in found]
+        assert max(ratios) < 1.5
+        assert np.mean(ratios) < 1.05
+
+    def test_jacobian_serves_many_steps(self, stiff, name):
+        for _, _, run, _ in stiff(name)[0]:
+            steps = int(run.stats["num_accepted_steps"])
+            assert run.solver_state.jacobians < steps / 20
+            assert run.solver_state.factorizations < steps / 5
+
+
+def start(y, order, h, solver, f):
+    """The state of a solver at t = 0 with the history y(0), y(-h), ... that a step of this order needs."""
+    terms, times = diffrax.ODETerm(f), -h * np.arange(order + 1)
+    state = solver.init(terms, 0.0, h, y(0.0), None)
+    differences = [sum((-1) ** j * math.comb(i, j) * y(times[j]) for j in range(i + 1)) for i in range(order + 1)]
+    phi = jnp.zeros_like(state.phi).at[: order + 1].set(jnp.stack(differences))
+    return terms, eqx.tree_at(lambda s: (s.phi, s.order), state, (phi, jnp.array(order)))
+
+
+@pytest.fixture(scope="module", params=range(1, 6))
+def formula(request):
+    """An order, and a function that makes steps of it: from the exact history of y' = -y^2, y = 1 / (2 + t)."""
+    order = request.param
+    solver = udk.BDF(max_order=order, min_order=order, root_finder=Tolerances(1e-12, 1e-12), root_find_max_steps=9)
+
+    @jax.jit
+    def steps(h):
+        terms, state = start(lambda t: jnp.array([1 / (2 + t)]), order, h, solver, lambda t, y, _: -(y**2))
+
+        def step(carry, i):
+            y, state = carry
+            y, _, _, state, _ = solver.step(terms, i * h, (i + 1) * h, y, None, state, False)
+            return (y, state), y
+
+        return jax.lax.scan(step, (jnp.array([0.5]), state), jnp.arange(128))[1][:, 0]
+
+    return order, steps
+
+
+def test_formula_is_gears(formula):
+    order, steps = formula
+    h = 0.1
+    new = float(steps(h)[0])
+    history = jnp.array([new, *(1 / (2 - h * j) for j in range(order))])
+    assert float(jnp.dot(jnp.array(GEAR[order]), history)) == pytest.approx(-h * new**2, abs=1e-12)
+
+
+def test_order_of_convergence(formula):
+    order, steps = formula
+    errors = [float(abs(steps(2.0 / n)[n - 1] - 0.25)) for n in (64, 128)]
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
+
+
+def test_uneven_steps_follow_a_polynomial():
+    """A step of order k after steps of any size continues a polynomial of degree k, however stiff the equation."""
+    times, t1 = np.array([0.0, -0.3, -0.35, -0.9, -1.0, -1.7]), 0.2
+    p = np.polynomial.Polynomial([1.0, -2.0, 0.5, 1.5, -0.7, 0.3])
+    solver = udk.BDF(root_finder=Tolerances(1e-12, 1e-12))
+    terms = diffrax.ODETerm(lambda t, y, _: jnp.polyval(jnp.array(p.deriv().coef[::-1]), t) - 1e6 * (y - y_exact(t)))
+    y_exact = lambda t: jnp.polyval(jnp.array(p.coef[::-1]), t)[None]  # noqa: E731
+    state = eqx.filter_jit(solver.init)(terms, 0.0, t1, y_exact(0.0), None)
+    divided = [np.prod(times[0] - times[1 : i + 1]) * _divided(p, times[: i + 1]) for i in range(6)]
+    nodes = jnp.append(jnp.array(times), -2.0)
+    phi = jnp.array([*divided, 0.0])[:, None]
+    state = eqx.tree_at(lambda s: (s.times, s.phi, s.order), state, (nodes, phi, jnp.array(5)))
+    y1, _, dense, _, _ = eqx.filter_jit(solver.step)(terms, 0.0, t1, y_exact(0.0), None, state, False)
+    np.testing.assert_allclose(y1, p(t1), rtol=1e-12)
+    between = solver.interpolation_cls(t0=0.0, t1=t1, **dense)
+    np.testing.assert_allclose(between.evaluate(0.13), p(0.13), rtol=1e-12)
+    np.testing.assert_allclose(between.evaluate(0.0, 0.13), p(0.13) - p(0.0), rtol=1e-12)
+
+
+def _divided(p, times):
+    if len(times) == 1:
+        return p(times[0])
+    return (_divided(p, times[:-1]) - _divided(p, times[1:])) / (times[0] - times[-1])
+
+
+def reaction(t, y, rates):
+    """x' = -k x^2 and its shadow z' = -s (z - x); without meaning where x is negative."""
+    k, s = rates
+    x = jnp.where(y["x"] < 0, jnp.nan, y["x"])
+    return {"x": -k * x**2, "z": -s * (y["z"] - x)}
+
+
+TS = jnp.array([0.5, 2.0])
+
+
+def react(k, s=1e3, start=1.0, first=1e-3, adjoint=None):
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(reaction),
+        udk.BDF(),
+        0.0,
+        2.0,
+        first,
+        {"x": jnp.asarray(start), "z": jnp.asarray(start)},
+        (k, s),
+        stepsize_controller=controller(1e-8, 1e-8),
+        saveat=diffrax.SaveAt(ts=TS),
+        adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
+        max_steps=512,
+    )
+
+
+@pytest.fixture(scope="module")
+def reacted():
+    solve = jax.jit(react)
+    return lambda k, s=1e3, first=1e-3: solve(k, s, 1.0, first)
+
+
+def test_stiffness_costs_nothing(reacted):
+    """z follows x + k x^2 / s, and its rate s does not bound the step."""
+    for s in (1e3, 1e6):
+        run, x = reacted(3.0, s), 1 / (1 + 3 * TS)
+        np.testing.assert_allclose(run.ys["x"], x, rtol=1e-7)
+        np.testing.assert_allclose(run.ys["z"], x + 3 * x**2 / s, rtol=20 / s**2 + 1e-7)
+        assert run.stats["num_steps"] < 300
+
+
+def test_step_without_a_solution_is_rejected(reacted):
+    """A first step of two makes x negative; the run recovers."""
+    run = reacted(3.0, first=2.0)
+    assert run.stats["num_rejected_steps"] > 0
+    np.testing.assert_allclose(run.ys["x"], 1 / (1 + 3 * TS), rtol=1e-7)
+
+
+def test_batch_equals_single_runs(reacted):
+    ks = jnp.array([0.3, 3.0, 30.0])
+    batch = jax.jit(jax.vmap(react))(ks)
+    for i, k in enumerate(ks):
+        single = reacted(k)
+        np.testing.assert_allclose(batch.ys["z"][i], single.ys["z"], rtol=1e-12)
+        assert batch.stats["num_steps"][i] == single.stats["num_steps"]
+
+
+def test_gradients(reacted):
+    """By rate and initial state, in both modes; of x exactly, of z by differences."""
+    k, h = 3.0, 1e-3
+    ahead = jax.jit(jax.jacfwd(lambda k, y: react(k, start=y, adjoint=diffrax.ForwardMode()).ys, argnums=(0, 1)))(k, 1.0)
+    back = jax.jit(jax.grad(lambda k, y: react(k, start=y).ys["z"][1], argnums=(0, 1)))(k, 1.0)
+    np.testing.assert_allclose(back, [by[1] for by in ahead["z"]], rtol=1e-10)
+    np.testing.assert_allclose(ahead["x"][0], -TS / (1 + k * TS) ** 2, rtol=1e-6)
+    np.testing.assert_allclose(ahead["x"][1], 1 / (1 + k * TS) ** 2, rtol=1e-6)
+    more, less = (reacted(k + d).ys["z"] for d in (h, -h))
+    np.testing.assert_allclose(ahead["z"][0], (more - less) / (2 * h), rtol=1e-5)
+
+
+def test_impossible_orders_are_named():
+    with pytest.raises(ValueError, match="1 <= min_order <= max_order <= 5; they are 1 and 6"):
+        udk.BDF(max_order=6)
