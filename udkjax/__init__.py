@@ -12,8 +12,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # the public names, for type checkers and editors; a test compares them with those below
     from udkjax import equations as equations
     from udkjax import pinv as pinv
+    from udkjax.equations import Augmented as Augmented
     from udkjax.equations import Baumgarte as Baumgarte
     from udkjax.equations import ConstrainedSystem as ConstrainedSystem
+    from udkjax.equations import CoordinatePartitioning as CoordinatePartitioning
+    from udkjax.equations import NullSpaceQR as NullSpaceQR
+    from udkjax.equations import NullSpaceSVD as NullSpaceSVD
     from udkjax.equations import accelerations as accelerations
     from udkjax.equations import check as check
     from udkjax.equations import energy as energy
@@ -82,7 +86,9 @@ _NAMES = {
         Spring TorsionSpring Force Torque Friction""",
     "udkjax.pinv": "SVD Varga Greville Householder GramSchmidt Elimination Auto",
     "udkjax.equations.assembly": "AssemblyError State assemble",
-    "udkjax.equations": "ConstrainedSystem Baumgarte accelerations check violation energy reactions",
+    "udkjax.equations": """
+        ConstrainedSystem Baumgarte accelerations check violation energy reactions
+        Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
     "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}

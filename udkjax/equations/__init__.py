@@ -5,7 +5,12 @@ from udkjax.equations.assembly import Check as Check
 from udkjax.equations.assembly import State as State
 from udkjax.equations.assembly import assemble as assemble
 from udkjax.equations.assembly import check as check
+from udkjax.equations.formulations import Augmented as Augmented
+from udkjax.equations.formulations import Formulation as Formulation
+from udkjax.equations.formulations import NullSpaceQR as NullSpaceQR
+from udkjax.equations.formulations import NullSpaceSVD as NullSpaceSVD
 from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
+from udkjax.equations.partitioning import CoordinatePartitioning as CoordinatePartitioning
 from udkjax.equations.quantities import Energy as Energy
 from udkjax.equations.quantities import accelerations as accelerations
 from udkjax.equations.quantities import energy as energy

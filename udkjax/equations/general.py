@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.equations.udwadia_kalaba import RANK_TOL, Baumgarte, Vector
+from udkjax.equations.motion import Motion, Vector
+from udkjax.equations.udwadia_kalaba import RANK_TOL, Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
 from udkjax.scene.fields import number
 
@@ -28,7 +29,7 @@ class ConstrainedSystem(eqx.Module):
     velocity_constraint: Callable[[Any, Any, Any], Any] | None = None
 
 
-class GeneralEquations(eqx.Module):
+class GeneralEquations(Motion):
     """The equations of a `ConstrainedSystem` by one method, with the interface that the integrator knows from a mechanism's.
 
     Rows of Psi come first, those of phi after them. With M = L L^T, D = A L^(-T) for the rows A = (Psi_q; phi_v):
@@ -38,7 +39,10 @@ class GeneralEquations(eqx.Module):
     system: ConstrainedSystem
     method: Pseudoinverse
     baumgarte: Baumgarte | None
-    left_out: tuple[int, ...] = eqx.field(static=True, default=())
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        return ()
 
     @property
     def branches(self) -> bool:
@@ -74,24 +78,32 @@ class GeneralEquations(eqx.Module):
 
     @property
     def constrained(self) -> bool:
-        """Whether there are any constraints."""
         return self.system.constraint is not None or self.system.velocity_constraint is not None
 
-    def _equation(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Any, Plus | None, Any]:
-        if not self.constrained:
-            return self._free(t, q, v), None, None, None
+    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
+        mass, force = (jnp.asarray(x) for x in (self.system.mass(q), self.system.force(t, q, v)))
+        return mass, force, *self._rows(t, q, v)
+
+    def _rows(self, t: Any, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"]]:
+        """A and c of A a = c."""
         rate = lambda t, q: self._psi_dot(t, q, v)  # noqa: E731
         gamma = -jax.jvp(rate, (t, q), (jnp.ones_like(t), v))[1]
         bend = jax.jvp(lambda t, q: self._phi(t, q, v), (t, q), (jnp.ones_like(t), v))[1]
-        slopes, free = self._slopes(t, q, v), self._free(t, q, v)
-        b = jnp.concatenate([gamma, -bend]) - slopes @ free
+        c = jnp.concatenate([gamma, -bend])
         if self.baumgarte is not None:
             alpha, beta = self.baumgarte.alpha, self.baumgarte.beta
             psi = self._psi(t, q)
-            b = b - 2 * alpha * jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)])
-            b = b.at[: len(psi)].add(-(beta**2) * psi)
+            c = c - 2 * alpha * jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)])
+            c = c.at[: len(psi)].add(-(beta**2) * psi)
+        return self._slopes(t, q, v), c
+
+    def _equation(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Any, Plus | None, Any]:
+        free = self._free(t, q, v)
+        if not self.constrained:
+            return free, None, None, None
+        slopes, c = self._rows(t, q, v)
         plus, weight = self._plus(q, slopes)
-        return free, weight, plus, b
+        return free, weight, plus, c - slopes @ free
 
     def _plus(self, q: Vector, slopes: Float[Array, "m n"]) -> tuple[Plus, Callable[[Vector], Vector]]:
         """D^+ and x -> L^(-T) x."""

@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.equations.general import ConstrainedSystem, GeneralEquations, prepare_general
-from udkjax.equations.udwadia_kalaba import Baumgarte, Equations, prepare
+from udkjax.equations.formulations import Formulation
+from udkjax.equations.general import ConstrainedSystem, prepare_general
+from udkjax.equations.motion import Motion
+from udkjax.equations.udwadia_kalaba import Baumgarte, prepare
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
@@ -27,12 +29,15 @@ class Energy(NamedTuple):
 
 
 def equations_of(
-    system: Mechanism | ConstrainedSystem, method: Pseudoinverse | None = None, baumgarte: Baumgarte | None = None
-) -> Equations | GeneralEquations:
-    """Prepare the equations of motion of whatever has some."""
-    if isinstance(system, ConstrainedSystem):
-        return prepare_general(system, method, baumgarte)
-    return prepare(system, method, baumgarte)
+    system: Mechanism | ConstrainedSystem,
+    method: Pseudoinverse | None = None,
+    baumgarte: Baumgarte | None = None,
+    formulation: Formulation | None = None,
+) -> Motion:
+    """Prepare the equations of motion of whatever has some, by the Udwadia-Kalaba equation or another formulation."""
+    general = isinstance(system, ConstrainedSystem)
+    equations = prepare_general(system, method, baumgarte) if general else prepare(system, method, baumgarte)
+    return equations if formulation is None else formulation.of(equations)
 
 
 def accelerations(
@@ -43,16 +48,17 @@ def accelerations(
     method: Pseudoinverse | None = None,
     stabilization: Baumgarte | None = None,
     multipliers: bool = False,
+    formulation: Formulation | None = None,
 ) -> Any:
     """Return a (bodies, 3) at time t (s), coordinates q and velocities v; with `multipliers` also lambda, one a row of Psi.
 
     a = a_F + M^(-1/2) D^+ b and lambda = -(D^+)^T D^+ b, of minimum norm where constraints are redundant (m/s^2, rad/s^2; N, N m,
     in the rows' order and with the sign of M a + Psi_q^T lambda = F). The state need not be closed. `Auto` looks at the rows that
     it leaves out, too: where they are not satisfied they were not redundant after all, and it takes singular values of all rows.
-    `Auto` and `Elimination` take lambda from singular values: a choice of rows has no minimum-norm multipliers. For a
-    `ConstrainedSystem` q, v and a are (n,).
+    `Auto` and `Elimination` take lambda from singular values: a choice of rows has no minimum-norm multipliers. A `formulation`
+    finds a in another way, but not lambda. For a `ConstrainedSystem` q, v and a are (n,).
     """
-    equations = equations_of(mechanism, method, stabilization)
+    equations = equations_of(mechanism, method, stabilization, formulation)
     t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
     a = equations.accelerations(t, q.ravel(), v.ravel(), watch=True).reshape(q.shape)
     return (a, equations.multipliers(t, q.ravel(), v.ravel())) if multipliers else a

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations.code import Code, code, scalars
+from udkjax.equations.motion import Motion, Vector
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, SparseElimination
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -27,8 +28,6 @@ from udkjax.scene.mechanism import Mechanism
 # Far above rounding and drift, far below the singular values of a mechanism in ordinary positions: with the states returned to
 # the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
 RANK_TOL = 1e-4
-
-Vector = Float[Array, "n"]
 
 
 class Baumgarte(eqx.Module):
@@ -44,7 +43,7 @@ class Baumgarte(eqx.Module):
         self.alpha, self.beta = number(alpha), number(beta)
 
 
-class Equations(eqx.Module):
+class Equations(Motion):
     """The equations of motion of one mechanism by one method: what an integrator needs, ready to be evaluated.
 
     Coordinates and velocities are flat vectors (3 bodies,): x, y, angle of each body in turn.
@@ -85,33 +84,44 @@ class Equations(eqx.Module):
         """Whether everything that the equation is made of is a number."""
         return jnp.all(jnp.isfinite(_stack(self.run("rows", t, q, v))))
 
+    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
+        """M, F, Psi_q and gamma - 2 alpha Psi_dot - beta^2 Psi, of all rows."""
+        values, b, free, root = self.arrays("rows", t, q, v)
+        M, A = 1 / root**2, self.code.pattern.dense(values) / root
+        return jnp.diag(M), M * free, A, b + A @ free
+
     def jacobian(self, t: Any, q: Vector) -> Float[Array, "m n"]:
         """Psi_q of all rows."""
-        values, _, root = _arrays(self, "closure", t, q, q)
+        values, _, root = self.arrays("closure", t, q, q)
         return self.code.pattern.dense(values) / root
 
     @property
     def left_out(self) -> tuple[int, ...]:
-        """The rows that the method does not see."""
         return self.code.left_out
 
     @property
     def constrained(self) -> bool:
-        """Whether there are any constraints."""
         return bool(self.code.pattern.shape[0])
 
     @property
     def branches(self) -> bool:
-        """Whether evaluating them takes a branch to singular values."""
         return self.branch and self.code.elimination == "check"
 
     def run(self, name: str, t: Any, q: Any, v: Any) -> list[Any]:
         """Evaluate one of the programs."""
         return self.code.program(name)([*self.constants, t, *scalars([q, v])])
 
+    def arrays(self, name: str, t: Any, q: Any, v: Any) -> list[Array]:
+        """What a program returns, as arrays: the values of D, the right-hand side, and vectors over the coordinates."""
+        outputs = self.run(name, t, q, v)
+        n, kept = len(q), self.code.kept_pattern if name.endswith("_kept") else self.code.pattern
+        bounds = [0, kept.slots, kept.slots + kept.shape[0]]
+        bounds += list(range(bounds[-1] + n, len(outputs) + 1, n))
+        return [_stack(outputs[i:j]) for i, j in pairwise(bounds)]
+
     def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Plus, Array, Vector]:
         """D^+ of all rows by a dense method, the right-hand side of the program `name`, and M^(-1/2)."""
-        values, residual, *vectors = _arrays(self, name, t, q, v)
+        values, residual, *vectors = self.arrays(name, t, q, v)
         return self.method.plus(self.code.pattern.dense(values)), residual, vectors[-1]
 
     @property
@@ -156,7 +166,7 @@ def plain_accelerations(equations: Equations, t: Any, q: Vector, v: Vector) -> V
     """a = a_F + M^(-1/2) D^+ b, on arrays."""
 
     def solve(plus: Plus, name: str) -> Vector:
-        _, b, free, root = _arrays(equations, name, t, q, v)
+        _, b, free, root = equations.arrays(name, t, q, v)
         return free + root * (plus @ b)
 
     return _by_method(equations, solve, "rows", t, q, v)
@@ -166,7 +176,7 @@ def plain_project(equations: Equations, t: Any, q: Vector, v: Vector) -> tuple[V
     """Two Newton steps in position and one in velocity."""
 
     def step(plus: Plus, name: str) -> Vector:
-        _, residual, root = _arrays(equations, name, t, q, v)
+        _, residual, root = equations.arrays(name, t, q, v)
         return -root * (plus @ residual)
 
     q = q + _by_method(equations, step, "closure", t, q, v)
@@ -178,7 +188,7 @@ def _plain_correction(equations: Equations, t: Any, q: Vector, v: Vector) -> tup
     """One Newton step in position and one in velocity, with one D^+: of a projected state it changes the tangents alone."""
 
     def step(plus: Plus, name: str) -> tuple[Vector, Vector]:
-        _, psi, root = _arrays(equations, name, t, q, v)
+        _, psi, root = equations.arrays(name, t, q, v)
         closed = q - root * (plus @ psi)
         rate = _stack(equations.run("psi_dot" + name.removeprefix("closure"), t, closed, v))
         return closed, v - root * (plus @ rate)
@@ -193,14 +203,14 @@ def _by_method(equations: Equations, use: Any, name: str, t: Any, q: Vector, v: 
         return use(_Unconstrained(), name)
 
     def dense(method: Pseudoinverse) -> Any:
-        return use(method.plus(programs.pattern.dense(_arrays(equations, name, t, q, v)[0])), name)
+        return use(method.plus(programs.pattern.dense(equations.arrays(name, t, q, v)[0])), name)
 
     if not isinstance(method, Auto | Elimination):
         return dense(method)
     if equations.branches:
         return dense(equations.exact().method)
     tol: Any = jnp.sqrt(jnp.asarray(method.branch_tol)) if isinstance(method, Auto) else method.rank_tol
-    return use(SparseElimination(programs.kept_pattern, tol).plus(_arrays(equations, name + "_kept", t, q, v)[0]), name + "_kept")
+    return use(SparseElimination(programs.kept_pattern, tol).plus(equations.arrays(name + "_kept", t, q, v)[0]), name + "_kept")
 
 
 class _Unconstrained:
@@ -208,15 +218,6 @@ class _Unconstrained:
 
     def __matmul__(self, b: Any) -> float:
         return 0.0
-
-
-def _arrays(equations: Equations, name: str, t: Any, q: Vector, v: Vector) -> list[Array]:
-    """What a program returns, as arrays: the values of D, the right-hand side, and vectors over the coordinates."""
-    outputs = equations.run(name, t, q, v)
-    n, kept = len(q), equations.code.kept_pattern if name.endswith("_kept") else equations.code.pattern
-    bounds = [0, kept.slots, kept.slots + kept.shape[0]]
-    bounds += list(range(bounds[-1] + n, len(outputs) + 1, n))
-    return [_stack(outputs[i:j]) for i, j in pairwise(bounds)]
 
 
 def _stack(values: list[Any]) -> Array:

@@ -7,9 +7,9 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.udwadia_kalaba import Equations
+from udkjax.equations.motion import Motion
 from udkjax.integrate.counting import again, tally
 from udkjax.integrate.multistep import Multistep
 from udkjax.integrate.wrapper import Wrapper
@@ -26,7 +26,8 @@ class Constrained(Wrapper):
     finite: a branch a step instead of one a stage, and a real one under vmap too as long as no member needs it. With `projected`
     the step ends on the constraint manifold. A derivative at its end that the solver would keep for the next step (FSAL) belongs
     to the state before projection; told that the state has jumped, the solver takes a new one. (Not so a multistep method, which
-    would forget its whole history: it sees for itself that its newest point was moved.) Error estimates, counted, and
+    would forget its whole history: it sees for itself that its newest point was moved.) Where the equations integrate only some
+    coordinates, errors are those of these alone. Error estimates, counted, and
     interpolation are the wrapped solver's own.
     """
 
@@ -49,9 +50,32 @@ class Constrained(Wrapper):
         return _second_thoughts(doubt, careful, quick)
 
     def _attempt(self, terms, t0, t1, y0, equations, solver_state, made_jump):
-        y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
+        equations, solver = equations.held(t0, *jnp.split(y0, 2)), self.solver
+        judged = None if equations.independent is None else jnp.tile(equations.independent, 2)
+        if judged is not None:
+            solver = _judging(solver, judged)
+        y1, error, dense, state, result = solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
         y1 = project(equations, t1, y1) if self.projected else y1
+        if judged is not None:
+            error = jnp.where(judged, jnp.asarray(error), jnp.where(jnp.isfinite(y1), 0.0, jnp.nan))
         return y1, tally(self.solver, error, solver_state, state, made_jump), dense, state, result
+
+
+class _Among(eqx.Module):
+    """A norm of some components."""
+
+    norm: Any
+    components: Bool[Array, "2n"]
+
+    def __call__(self, y: Float[Array, "2n"]) -> Any:
+        return self.norm(jnp.where(self.components, y, 0))
+
+
+def _judging(solver: diffrax.AbstractSolver, components: Bool[Array, "2n"]) -> Any:
+    """A multistep method judges its errors itself: let it see those of some components alone."""
+    if not isinstance(solver, Multistep):
+        return solver
+    return eqx.tree_at(lambda s: s.root_finder.norm, solver, _Among(solver.root_finder.norm, components))
 
 
 @eqx.filter_custom_jvp
@@ -83,7 +107,7 @@ def _second_thoughts(doubt: Any, careful: Any, quick: Any) -> Any:
     return jax.lax.cond(eqxi.unvmap_any(doubt), lambda: jax.tree.map(where, careful(), quick), lambda: quick)
 
 
-def project(equations: Equations, t: Any, y: Float[Array, "2n"]) -> Float[Array, "2n"]:
+def project(equations: Motion, t: Any, y: Float[Array, "2n"]) -> Float[Array, "2n"]:
     """(q, v) on the manifold."""
     q, v = jnp.split(y, 2)
     return jnp.concatenate(equations.project(t, q, v))
@@ -107,5 +131,5 @@ def project_all(equations: Any, ts: Float[Array, "T"], ys: Float[Array, "T 2n"])
     return jax.lax.cond(eqxi.unvmap_any(doubts), lambda: jax.lax.map(one, (ts, ys, quick, doubts)), lambda: quick)
 
 
-def _twice(equations: Equations, t: Any, y: Any) -> Any:
+def _twice(equations: Motion, t: Any, y: Any) -> Any:
     return jax.lax.scan(lambda y, _: (project(equations, t, y), None), y, None, length=2)[0]

@@ -11,10 +11,13 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.assembly import Closure, State, close, is_closed, require_closed
-from udkjax.equations.general import ConstrainedSystem, GeneralEquations
+from udkjax.equations.formulations import Formulation
+from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.motion import Motion
+from udkjax.equations.partitioning import Partitioned
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.redundancy import redundant_rows
-from udkjax.equations.udwadia_kalaba import Baumgarte, Equations
+from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.projection import Constrained, Projection, project_all
@@ -43,6 +46,7 @@ def simulate(
     max_steps: int = MAX_STEPS,
     drift_tol: ArrayLike | None = None,
     dt0: ArrayLike | None = None,
+    formulation: Formulation | None = None,
     throw: bool = True,
     progress: Any = None,
 ) -> Solution:
@@ -52,7 +56,9 @@ def simulate(
     (default `Auto`), `stabilization` is `Projection()`, a `Baumgarte` or None, `solver` any diffrax solver for ordinary
     differential equations (default Dopri8: of those measured in benchmarks/ the fastest at equal error, but for the tightest
     tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity. `dt0` is the first
-    step that is tried, in s; by default it is chosen, which takes one right-hand side. `progress=True` prints how far the run is.
+    step that is tried, in s; by default it is chosen, which takes one right-hand side. `formulation` finds the accelerations in
+    another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`, `NullSpaceSVD` or `CoordinatePartitioning`;
+    `method` then serves projection and derivatives. `progress=True` prints how far the run is.
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. For forward mode give `adjoint=diffrax.ForwardMode()`; reverse mode works as it is.
@@ -65,7 +71,8 @@ def simulate(
     if state is None and isinstance(mechanism, ConstrainedSystem):
         raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
     drift = number((DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE) if drift_tol is None else drift_tol)
-    numbers = (state, number(rtol), number(atol), Auto() if method is None else method, stabilization, drift, _step(dt0))
+    method = Auto() if method is None else method
+    numbers = (state, number(rtol), number(atol), method, stabilization, drift, _step(dt0), formulation)
     choices = (solver or diffrax.Dopri8(), adjoint or diffrax.RecursiveCheckpointAdjoint(), max_steps, _meter(progress))
 
     solution, closure, missed = _simulate(mechanism, ts, *numbers, *choices)
@@ -82,10 +89,12 @@ def simulate(
 
 
 @eqx.filter_jit
-def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol, dt0, solver, adjoint, max_steps, meter):
+def _simulate(
+    mechanism, ts, state, rtol, atol, method, stabilization, drift_tol, dt0, formulation, solver, adjoint, max_steps, meter
+):
     """Return the solution, the closure that it starts from, and whether that closure needs rows which the method leaves out."""
-    equations = equations_of(mechanism, method, stabilization if isinstance(stabilization, Baumgarte) else None)
-    projected = isinstance(stabilization, Projection) and equations.constrained
+    equations = equations_of(mechanism, method, stabilization if isinstance(stabilization, Baumgarte) else None, formulation)
+    projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, Partitioned))
     start, closure, closed, missed = _start(mechanism, equations, ts[0], state)
     y0 = jnp.concatenate([start.q.ravel(), start.v.ravel()])
     # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
@@ -120,6 +129,7 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     stats = counts(run.stats, right_hand_sides, projected, len(ts))
     settings = (
         ("method", type(method).__name__),
+        ("formulation", "UdwadiaKalaba" if formulation is None else type(formulation).__name__),
         ("stabilization", type(stabilization).__name__),
         ("solver", type(solver).__name__),
         ("max_steps", str(max_steps)),
@@ -128,10 +138,9 @@ def _simulate(mechanism, ts, state, rtol, atol, method, stabilization, drift_tol
     return Solution(ts, q, v, code, time, stats, rtol, atol, names, settings), closure, missed
 
 
-def derivative(t: Any, y: Float[Array, "2n"], equations: Equations | GeneralEquations) -> Float[Array, "2n"]:
+def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array, "2n"]:
     """(v, a)."""
-    q, v = jnp.split(y, 2)
-    return jnp.concatenate([v, equations.accelerations(t, q, v)])
+    return jnp.concatenate(equations.rates(t, *jnp.split(y, 2)))
 
 
 def _start(mechanism: Any, equations: Any, t: Any, state: State | None) -> tuple[State, Closure | None, Any, Any]:

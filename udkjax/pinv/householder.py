@@ -32,7 +32,14 @@ class Householder(Orthogonal):
 
 
 def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
-    """Householder's QR; each step takes the column with the largest remaining norm, and stops where it is at most `threshold`.
+    """Householder's QR; each step takes the column with the largest remaining norm, and stops where it is at most `threshold`."""
+    q, r, order, rank = complete_qr(D, threshold)
+    kept = jnp.arange(len(order)) < rank
+    return PivotedQR(jnp.where(kept, q[:, : len(order)], 0), jnp.where(kept[:, None], r[: len(order)], 0), order, rank)
+
+
+def complete_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
+    """The same with all of Q (m, m) and what is left of R (m, n): from `rank` on, the columns of Q span what D does not.
 
     Columns stay in their place, only their order is noted. (The pivoted QR of jax.scipy needs MAGMA on a GPU.)
     """
@@ -59,5 +66,4 @@ def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR
 
     start = jnp.eye(rows, dtype=D.dtype), D, jnp.arange(steps), jnp.array(0), jnp.zeros(columns, bool)
     q, r, order, rank, _ = jax.lax.fori_loop(0, steps, reflect, start)
-    kept = jnp.arange(steps) < rank
-    return PivotedQR(jnp.where(kept, q[:, :steps], 0), jnp.where(kept[:, None], r[:steps], 0), order, rank)
+    return PivotedQR(q, r, order, rank)

@@ -1,0 +1,186 @@
+"""Other ways to the accelerations (de Falco, Pennestri, Vita 2005, section 7), to be compared with the Udwadia-Kalaba equation.
+
+All of them solve, with A = Psi_q and c = gamma - 2 alpha Psi_dot - beta^2 Psi,
+
+    M a + A^T lambda = F,        A a = c,
+
+and where the rows of A are independent they all find the same a. Where rows are redundant, and in singular configurations, they
+differ in what they need to get by, and in whether they do.
+"""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float
+
+from udkjax.equations.motion import Motion, Vector
+from udkjax.equations.udwadia_kalaba import RANK_TOL
+from udkjax.pinv import Pseudoinverse
+from udkjax.pinv.householder import complete_qr
+from udkjax.pinv.rule import beyond
+from udkjax.scene.fields import number
+
+
+class Formulation(eqx.Module):
+    """A way to the accelerations of a system. Given to `simulate(..., formulation=...)`."""
+
+    @abstractmethod
+    def of(self, equations: Motion) -> Motion:
+        """The equations of a system, solved in this way."""
+
+
+class Solved(Formulation):
+    """A formulation that is a way to solve for a at a given state, and nothing else."""
+
+    def of(self, equations: Motion) -> "Formulated":
+        return Formulated(equations, self)
+
+    @abstractmethod
+    def solve(self, M: Float[Array, "n n"], F: Vector, A: Float[Array, "m n"], c: Float[Array, "m"]) -> Vector:
+        """a of M a + A^T lambda = F, A a = c."""
+
+
+class Augmented(Solved):
+    """Accelerations and multipliers at once:
+
+        [ M  A^T ] [   a    ]   [ F ]
+        [ A   0  ] [ lambda ] = [ c ].
+
+    Without a `method` by LU with partial pivoting, as is usual. Then the rows must be independent. Where they are not, the matrix
+    is singular, and LU does not notice: it divides by a pivot of pure rounding error. On a mechanism whose redundant rows are
+    satisfied to rounding that error goes into the multipliers, along the left null space of A, and leaves in the accelerations
+    what A^T makes of it. Where the pivot is exactly zero, as of a joint that is given twice, nothing is a number, and a run ends
+    at once with `Result.step_too_small`. With a pseudoinverse as `method`, for instance `Augmented(udk.SVD())`, a and lambda are
+    the solution of minimum norm: what is redundant is shared, and the accelerations are right, also in singular configurations
+    where the right-hand side is consistent. Its default `rank_tol` is the square of the others': a singular value sigma of
+    D = A M^(-1/2) is one of about sigma^2 here.
+    """
+
+    method: Pseudoinverse | None = None
+
+    def solve(self, M, F, A, c):
+        matrix = jnp.block([[M, A.T], [A, jnp.zeros((len(A), len(A)))]])
+        right = jnp.concatenate([F, c])
+        if self.method is None:
+            return jnp.linalg.solve(matrix, right)[: len(F)]
+        tol = RANK_TOL**2 if self.method.rank_tol is None else self.method.rank_tol
+        method = eqx.tree_at(lambda m: m.rank_tol, self.method, number(tol), is_leaf=lambda x: x is None)
+        return method.solve(matrix, right).x[: len(F)]
+
+
+class NullSpaceQR(Solved):
+    """Equations of motion along the null space of A, by pivoted QR: with A^T = Q R, Q = (Q_1, N) orthogonal,
+
+        a_p = Q_1 R_1^(-T) c,        N^T M N z = N^T (F - M a_p),        a = a_p + N z.
+
+    Q_1 has as many columns as A has independent rows: those that pivoting takes before the remainders fall to `rank_tol` of the
+    longest row. Redundant rows are left out, and which ones they are may change with the position; while they are satisfied that
+    changes nothing. In a singular configuration the rank falls, N gains a column, and the run goes on.
+    """
+
+    rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
+
+    def solve(self, M, F, A, c):
+        if not len(A):
+            return along(M, F, jnp.eye(len(F)), jnp.zeros_like(F))
+        threshold = self.rank_tol * jnp.linalg.norm(A, axis=1).max()
+        q, r, order, rank = complete_qr(A.T, threshold)
+        inside = jnp.arange(len(order)) < rank
+        triangle = jnp.where(inside[:, None] & inside, r[: len(order), order], jnp.eye(len(order)))
+        z = solve_triangular(triangle, jnp.where(inside, c[order], 0), trans=1)
+        a_p = q[:, : len(order)] @ z
+        null = jnp.where(jnp.arange(len(F)) < rank, 0, q)
+        return along(M, F, null, a_p)
+
+
+class NullSpaceSVD(Solved):
+    """Equations of motion along the null space of A, by singular values: with A = U S V^T, V = (V_1, N),
+
+        a_p = V_1 S_1^(-1) U_1^T c,        N^T M N z = N^T (F - M a_p),        a = a_p + N z.
+
+    Singular values up to `rank_tol` of the largest count as zero. Redundant rows that disagree are satisfied in the sense of
+    least squares; in a singular configuration N gains a column, and the run goes on. It differs from the Udwadia-Kalaba equation
+    by singular values in the metric of rank and least squares: A is not weighted by the masses.
+    """
+
+    rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
+
+    def solve(self, M, F, A, c):
+        if not len(A):
+            return along(M, F, jnp.eye(len(F)), jnp.zeros_like(F))
+        u, sigma, vt = jnp.linalg.svd(A, full_matrices=True)
+        size = len(sigma)
+        kept = beyond(sigma, self.rank_tol * sigma[0])
+        a_p = vt[:size].T @ (jnp.where(kept, 1 / jnp.where(kept, sigma, 1), 0) * (u[:, :size].T @ c))
+        null = jnp.where(jnp.arange(len(F)) < kept.sum(), 0, vt.T)
+        return along(M, F, null, a_p)
+
+
+def along(M: Float[Array, "n n"], F: Vector, N: Float[Array, "n k"], a_p: Vector) -> Vector:
+    """a = a_p + N z with N^T M N z = N^T (F - M a_p). The columns of N are independent; those that are zero do not count."""
+    projected = N.T @ M @ N
+    missing = jnp.all(N == 0, axis=0)
+    z = jnp.linalg.solve(projected + jnp.diag(jnp.where(missing, 1.0, 0.0)), N.T @ (F - M @ a_p))
+    return a_p + N @ z
+
+
+class Formulated(Motion):
+    """Equations of motion with the accelerations by another formulation.
+
+    Projection, multipliers and rows left out are those of the equations inside. So are derivatives: at constant rank the
+    accelerations are the same function.
+    """
+
+    equations: Motion
+    formulation: Solved
+
+    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+        return _accelerations(self, t, q, v)
+
+    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
+        return self.equations.multipliers(t, q, v)
+
+    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
+        return self.equations.matrices(t, q, v)
+
+    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        return self.equations.project(t, q, v)
+
+    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+        return self.equations.violation(t, q, v)
+
+    def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
+        return self.equations.is_finite(t, q, v)
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        return self.equations.left_out
+
+    @property
+    def constrained(self) -> bool:
+        return self.equations.constrained
+
+    @property
+    def branches(self) -> bool:
+        return self.equations.branches
+
+    @property
+    def quick(self) -> "Formulated":
+        return Formulated(self.equations.quick, self.formulation)
+
+
+@eqx.filter_custom_jvp
+def _accelerations(formulated: Formulated, t: Any, q: Vector, v: Vector) -> Vector:
+    return formulated.formulation.solve(*formulated.matrices(t, q, v))
+
+
+@_accelerations.def_jvp
+def _(primals, tangents):
+    plain = lambda formulated, *state: formulated.equations.accelerations(*state)  # noqa: E731
+    return _accelerations(*primals), eqx.filter_jvp(plain, primals, tangents)[1]
+
+
+__all__ = ["Augmented", "Formulated", "Formulation", "NullSpaceQR", "NullSpaceSVD", "along"]

@@ -1,0 +1,72 @@
+"""What an integrator asks of equations of motion, whoever writes them."""
+
+from abc import abstractmethod
+from typing import Any, Self
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float
+
+Vector = Float[Array, "n"]
+
+
+class Motion(eqx.Module):
+    """The equations of motion of one system, ready to be evaluated. Coordinates and velocities are flat vectors (n,)."""
+
+    @property
+    @abstractmethod
+    def left_out(self) -> tuple[int, ...]:
+        """The rows that the method does not see."""
+
+    @property
+    @abstractmethod
+    def constrained(self) -> bool:
+        """Whether there are any constraints."""
+
+    @property
+    @abstractmethod
+    def branches(self) -> bool:
+        """Whether evaluating them takes a branch to singular values."""
+
+    @property
+    @abstractmethod
+    def quick(self) -> "Motion":
+        """The same without a branch: what cannot be solved so is not a number."""
+
+    @abstractmethod
+    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+        """a. With `watch`, also rows that were left out are looked at."""
+
+    @abstractmethod
+    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
+        """lambda of all rows, of minimum norm."""
+
+    @abstractmethod
+    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
+        """M (n, n), F (n,), A (m, n) and c (m,) of M a + A^T lambda = F and A a = c, with Baumgarte's terms in c."""
+
+    @abstractmethod
+    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """q and v returned to the constraint manifold."""
+
+    @abstractmethod
+    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+        """Psi and the residuals of the velocities, of all rows."""
+
+    @abstractmethod
+    def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
+        """Whether everything that the equations are made of is a number."""
+
+    # Where only some coordinates are integrated. By default it is all of them.
+
+    def rates(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """What an integrator integrates: the rates of q and of v."""
+        return v, self.accelerations(t, q, v)
+
+    def held(self, t: Any, q: Vector, v: Vector) -> Self:
+        """The same, with what is chosen at the start of a step held until its end."""
+        return self
+
+    @property
+    def independent(self) -> Bool[Array, "n"] | None:
+        """Which coordinates and velocities are integrated, and so under error control. None: all."""
+        return None

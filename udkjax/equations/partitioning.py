@@ -1,0 +1,201 @@
+"""Coordinate partitioning (Wehage and Haug, ASME J. Mech. Des. 104 (1982) 247): only independent coordinates are integrated.
+
+Pivoting splits the coordinates into dependent ones, as many as D has independent columns, and the independent rest. With the
+independent q_i and v_i as they are, the dependent ones follow from the constraints,
+
+    Psi(t, q_d, q_i) = 0 by Newton's method,        Psi_dot(t, q, v_d, v_i) = 0, which is linear in v_d,
+
+and the equations of motion are those along the columns of N, one for each independent coordinate: the motion that the mechanism
+makes when this one moves with rate one and the other independent ones stay.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from udkjax.equations.formulations import Formulation, along
+from udkjax.equations.motion import Motion, Vector
+from udkjax.equations.udwadia_kalaba import RANK_TOL, Equations
+from udkjax.pinv import SVD, Plus
+from udkjax.pinv.householder import complete_qr
+from udkjax.scene.fields import number
+
+ITERATIONS = 10  # Newton's, from a prediction that is good: three or four are usual
+# m and rad: a dependent coordinate that lies farther from where the step predicts it might be that of another assembly of the
+# mechanism. Such a step is rejected, and a shorter one taken.
+STRIDE = 0.3
+
+
+class CoordinatePartitioning(Formulation):
+    """Integrate the independent coordinates and velocities alone; solve the constraints for the dependent ones at each stage.
+
+    The choice is made at the start of every step, by QR of D with column pivoting, and held until the step's end: so it is never
+    worse conditioned than the mechanism is. Dependent coordinates are carried along only as the first guess of Newton's method:
+    they do not enter the error estimate. A stage at which Newton's method does not converge, or ends farther than 0.3 m or rad
+    from that guess, is not a number: the step is tried shorter. So the constraints hold wherever the equations are evaluated.
+    There is nothing for `Baumgarte` to feed back (refused), and nothing for `Projection` to do: with it and without, a step ends
+    with the dependent coordinates solved for.
+
+    Redundant rows are satisfied in the sense of least squares. In a singular configuration the rank falls to what `rank_tol` of
+    the longest column of D leaves of it: there are more independent coordinates for that step, which the next ones constrain
+    again. Mechanisms only, since the rows of a `ConstrainedSystem` may be nonholonomic.
+    """
+
+    rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
+
+    def of(self, equations: Motion) -> "Partitioned":
+        if not isinstance(equations, Equations):
+            raise ValueError("CoordinatePartitioning takes a Mechanism: a ConstrainedSystem may have nonholonomic constraints")
+        if equations.code.gains:
+            raise ValueError(
+                "with CoordinatePartitioning the constraints hold at every stage: Baumgarte has nothing to feed back. "
+                "Take stabilization=None or Projection()"
+            )
+        return Partitioned(equations, self)
+
+
+class Partitioned(Motion):
+    """The equations of motion of the independent coordinates of a mechanism.
+
+    Without a partition held, it is chosen at each state anew.
+    """
+
+    equations: Equations
+    formulation: CoordinatePartitioning
+    dependent: Any = None  # which coordinates are, (n,), if that is held
+
+    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+        """a = a_p + N z at the state as it is."""
+        return _accelerations(self.held(t, q, v), t, q, v)
+
+    def rates(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """v and a at the state that the independent coordinates and velocities determine."""
+        held = self.held(t, q, v)
+        closed, v = _completed(held, t, q, v)
+        near = jnp.max(jnp.abs(closed - q), initial=0.0) <= STRIDE
+        return jnp.where(near, v, jnp.nan), _accelerations(held, t, closed, v)
+
+    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """Solve the constraints for what is dependent."""
+        return _completed(self.held(t, q, v), t, q, v)
+
+    def held(self, t: Any, q: Vector, v: Vector) -> "Partitioned":
+        """With the partition that pivoting chooses here."""
+        if self.dependent is not None:
+            return self
+        D = self._weighted(t, q)[0]
+        if not len(D):
+            return Partitioned(self.equations, self.formulation, jnp.zeros(len(q), bool))
+        _, _, order, rank = complete_qr(D, self.formulation.rank_tol * jnp.linalg.norm(D, axis=0).max())
+        dependent = jnp.zeros(len(q), bool).at[order].set(jnp.arange(len(order)) < rank)
+        return Partitioned(self.equations, self.formulation, jax.lax.stop_gradient(dependent))
+
+    @property
+    def independent(self) -> Bool[Array, "n"] | None:
+        return None if self.dependent is None else ~self.dependent
+
+    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
+        return self.equations.multipliers(t, q, v)
+
+    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
+        return self.equations.matrices(t, q, v)
+
+    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+        return self.equations.violation(t, q, v)
+
+    def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
+        return self.equations.is_finite(t, q, v)
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        return ()
+
+    @property
+    def constrained(self) -> bool:
+        return self.equations.constrained
+
+    @property
+    def branches(self) -> bool:
+        return False
+
+    @property
+    def quick(self) -> "Partitioned":
+        return self
+
+    def _weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """D, Psi and M^(-1/2)."""
+        equations = self.equations
+        values, psi, root = equations.arrays("closure", t, q, q)
+        return equations.code.pattern.dense(values), psi, root
+
+    def _plus(self, D: Float[Array, "m n"]) -> Plus:
+        """D^+ of the dependent columns: zero for the others."""
+        return SVD(self.formulation.rank_tol).plus(jnp.where(self.dependent, D, 0))
+
+
+# Derivatives. Where the partition is held, Psi(t, q_d, q_i) = 0 makes q_d a function of the rest. One Newton step from a state
+# that is closed changes nothing but the tangents, and gives those of that function.
+
+
+@jax.custom_jvp
+def _completed(held: Partitioned, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    if not held.constrained:
+        return q, v
+    tol = jnp.sqrt(jnp.finfo(q.dtype).eps)  # Newton's method squares it in the step that it does not take any more
+
+    def unfinished(state):
+        _, change, k = state
+        return (k < ITERATIONS) & (change > tol)
+
+    def step(state):
+        q, _, k = state
+        ahead = _newton(held, t, q)
+        return ahead, jnp.max(jnp.abs(ahead - q)) / (1 + jnp.max(jnp.abs(ahead))), k + 1
+
+    q, change, _ = jax.lax.while_loop(unfinished, step, (q, jnp.array(jnp.inf, q.dtype), 0))
+    q = jnp.where(change <= tol, q, jnp.nan)
+    return q, _velocity(held, t, q, v)
+
+
+@_completed.defjvp
+def _(primals, tangents):
+    held, t, q, v = primals
+    closed, rate = _completed(held, t, q, v)
+
+    def correct(held, t, q, v):
+        start = jnp.where(held.dependent, jax.lax.stop_gradient(closed), q)
+        q = _newton(held, t, start)
+        return q, _velocity(held, t, q, jnp.where(held.dependent, jax.lax.stop_gradient(rate), v))
+
+    return (closed, rate), jax.jvp(correct, (held, t, q, v), tangents)[1]
+
+
+def _newton(held: Partitioned, t: Any, q: Vector) -> Vector:
+    D, psi, root = held._weighted(t, q)
+    return q - root * (held._plus(D) @ psi)
+
+
+def _velocity(held: Partitioned, t: Any, q: Vector, v: Vector) -> Vector:
+    D, _, root = held._weighted(t, q)
+    return v - root * (held._plus(D) @ held.violation(t, q, v)[1])
+
+
+@jax.custom_jvp
+def _accelerations(held: Partitioned, t: Any, q: Vector, v: Vector) -> Vector:
+    M, F, A, c = held.matrices(t, q, v)
+    if not len(A):
+        return F / jnp.diag(M)
+    root = 1 / jnp.sqrt(jnp.diag(M))
+    plus = held._plus(A * root)
+    free = jnp.diag(jnp.where(held.dependent, 0.0, 1.0))
+    return along(M, F, free - root[:, None] * (plus @ (A @ free)), root * (plus @ c))
+
+
+@_accelerations.defjvp
+def _(primals, tangents):
+    """At constant rank the accelerations are those of the Udwadia-Kalaba equation."""
+    plain = lambda held, *state: held.equations.accelerations(*state)  # noqa: E731
+    return _accelerations(*primals), jax.jvp(plain, primals, tangents)[1]
