@@ -1,6 +1,7 @@
 """Backward differentiation formulas: their order, cost and accuracy, and all that a diffrax solver has to do."""
 
 import math
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -188,7 +189,7 @@ def reaction(t, y, rates):
 TS = jnp.array([0.5, 2.0])
 
 
-def react(k, s=1e3, start=1.0, first=1e-3, adjoint=None):
+def react(k, s=1e3, start=1.0, first=1e-3, adjoint=None) -> Any:
     return diffrax.diffeqsolve(
         diffrax.ODETerm(reaction),
         udk.BDF(),
