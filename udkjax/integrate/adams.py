@@ -14,6 +14,7 @@ from udkjax.integrate.adams_order import SMALLEST, TINY, Errors, Pace, after_ste
 from udkjax.integrate.differences import HIGHEST, DifferenceInterpolation, Formula, formula
 from udkjax.integrate.multistep import Multistep, from_controller, scale, steered
 
+STRICTER = 4.0  # than the tolerance: the errors of short steps add up, those of a Runge-Kutta method are fewer
 LOST = 0.05  # a step that so small a part of the one planned has to replace begins again with order one
 ROUNDING = 1e-14  # relative: a compiler may compute the same state twice, and not quite the same
 ITERATIONS = 3
@@ -168,7 +169,7 @@ def _sizes(tolerances: Any, unravel: Callable, y0: Any, y1: Any) -> Callable:
     """The norms of the rows of a matrix, relative to what a step may err."""
     tolerances, y0, y1 = _held((tolerances, y0, y1))
     allowed = scale(tolerances, y0, y1)
-    size = jax.vmap(lambda x: tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))
+    size = jax.vmap(lambda x: STRICTER * tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))
     return lambda rows: size(_held(rows))
 
 
