@@ -1,5 +1,10 @@
 """What more than one floor is tested with."""
 
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -8,6 +13,7 @@ from udkjax.study.cases import Case, Scope, plan
 from udkjax.study.drift_law import growth_rate, swing_of
 from udkjax.study.record import dataset
 
+DATA = Path(__file__).parent / "data"
 SCOPE = Scope(
     "made up",
     tolerances=(1e-8, 1e-6),
@@ -18,6 +24,27 @@ SCOPE = Scope(
 )
 INSTANTS = 81
 LOST = {1e-8: 10.0, 1e-6: 13.0}  # s
+
+
+@pytest.fixture(scope="session")
+def data():
+    """A file of reference values, by its name."""
+    return lambda name: json.loads((DATA / f"{name}.json").read_text())
+
+
+@pytest.fixture(scope="session")
+def placed():
+    """q and v (4, 3) of the paper's linkage with its links at `theta` (rad), turning at `rate` (rad/s)."""
+
+    def pose(theta, rate):
+        def q(s):
+            e = jnp.stack([jnp.cos(s), jnp.sin(s)])
+            links = [jnp.append(jnp.array([x, 0.0]) + e / 2, s) for x in (0.0, 1.0, 2.0)]
+            return jnp.stack([*links, jnp.append(jnp.array([1.0, 0.0]) + e, 0.0 * s)])
+
+        return jax.jvp(q, (jnp.asarray(theta, float),), (jnp.asarray(rate, float),))
+
+    return pose
 
 
 @pytest.fixture(scope="session")

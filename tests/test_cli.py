@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray
 
-from udkjax.cli import METHODS, SOLVERS, main
+from udkjax.cli import FORMULATIONS, METHODS, SOLVERS, main
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PARALLELOGRAM = EXAMPLES / "parallelogram.toml"
@@ -67,7 +67,14 @@ def test_what_a_run_prints_is_measured(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "choice", [["--method", "svd", "--rank-tol", 1e-4], ["--stabilization", "baumgarte", "--alpha", 2], ["--solver", "tsit5"]]
+    "choice",
+    [
+        ["--method", "svd", "--rank-tol", 1e-4],
+        ["--stabilization", "baumgarte", "--alpha", 2],
+        ["--solver", "tsit5"],
+        ["--solver", "adams", "--dt0", 1e-3],
+        ["--formulation", "augmented"],
+    ],
 )
 @pytest.mark.slow
 def test_choices_reach_the_simulation(tmp_path, choice):
@@ -79,12 +86,24 @@ def test_choices_reach_the_simulation(tmp_path, choice):
 
 
 def test_every_method_and_solver_exists():
-    import diffrax
-
     import udkjax as udk
+    from udkjax.integrate.solvers import solver_named
 
     assert all(hasattr(udk, name) for name in METHODS.values())
-    assert all(hasattr(diffrax, name) for name in SOLVERS.values())
+    assert all(solver_named(name) for name in SOLVERS.values())
+    assert all(hasattr(udk, name) for name in FORMULATIONS.values())
+
+
+@pytest.mark.parametrize(
+    ("choice", "problem"),
+    [
+        (["--formulation", "partitioning", "--stabilization", "baumgarte"], "keeps the constraints itself"),
+        (["--dt0", 0], "--dt0 0 must be positive"),
+    ],
+)
+def test_choices_that_make_no_sense(tmp_path, capsys, choice, problem):
+    assert udkjax("simulate", PARALLELOGRAM, "--t1", 1, "--out", tmp_path / "run.nc", *choice) == 2
+    assert problem in capsys.readouterr().err
 
 
 def test_all_mistakes_of_a_scene_are_named_and_nothing_is_written(tmp_path, capsys):

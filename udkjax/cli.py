@@ -27,7 +27,23 @@ METHODS = {
     "householder": "Householder",
     "gram-schmidt": "GramSchmidt",
 }
-SOLVERS = {"dopri8": "Dopri8", "dopri5": "Dopri5", "tsit5": "Tsit5", "bosh3": "Bosh3", "heun": "Heun", "kvaerno5": "Kvaerno5"}
+FORMULATIONS = {
+    "augmented": "Augmented",
+    "null-space-qr": "NullSpaceQR",
+    "null-space-svd": "NullSpaceSVD",
+    "partitioning": "CoordinatePartitioning",
+}
+SOLVERS = {
+    "dopri8": "Dopri8",
+    "dopri5": "Dopri5",
+    "tsit5": "Tsit5",
+    "bosh3": "Bosh3",
+    "heun": "Heun",
+    "kvaerno5": "Kvaerno5",
+    "verner65": "Verner65",
+    "adams": "Adams",
+    "bdf": "BDF",
+}
 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml")]
 
@@ -51,10 +67,12 @@ def simulate(
     atol: float = 1e-8,
     method: Literal["auto", "elimination", "svd", "varga", "greville", "householder", "gram-schmidt"] = "auto",
     rank_tol: float | None = None,
-    solver: Literal["dopri8", "dopri5", "tsit5", "bosh3", "heun", "kvaerno5"] = "dopri8",
+    formulation: Literal["udwadia-kalaba", "augmented", "null-space-qr", "null-space-svd", "partitioning"] = "udwadia-kalaba",
+    solver: Literal["dopri8", "dopri5", "tsit5", "bosh3", "heun", "kvaerno5", "verner65", "adams", "bdf"] = "dopri8",
     stabilization: Literal["projection", "baumgarte", "none"] = "projection",
     alpha: float = 5.0,
     beta: float = 5.0,
+    dt0: float | None = None,
     max_steps: int | None = None,
     plot: Path | None = None,
 ) -> None:
@@ -70,16 +88,22 @@ def simulate(
         atol: absolute tolerance of a step.
         method: pseudoinverse of the weighted constraint Jacobian.
         rank_tol: what this method counts as rank deficient; by default, what suits the method.
-        solver: integrator, by its name in diffrax.
+        formulation: how accelerations are found; partitioning integrates independent coordinates only, without Baumgarte.
+        solver: integrator, by its name in diffrax or, verner65, adams and bdf, here.
         stabilization: what keeps the constraints: a projection of each step, Baumgarte's terms, or nothing.
         alpha: Baumgarte's gain on the rate of the constraints (1/s).
         beta: Baumgarte's gain on the constraints (1/s).
+        dt0: first step to try (s); by default it is chosen.
         max_steps: give up after so many steps.
         plot: picture to write; by default beside the NetCDF file.
     """
     if not 0 < dt <= t1 - t0 < math.inf:
         _refuse(f"from --t0 {t0:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
     plot = plot or out.with_suffix(".png")
+    if dt0 is not None and not 0 < dt0 < math.inf:
+        _refuse(f"the first step --dt0 {dt0:g} must be positive")
+    if formulation == "partitioning" and stabilization == "baumgarte":
+        _refuse("--formulation partitioning keeps the constraints itself: take --stabilization projection or none")
     if plot == out:
         _refuse(f"--out {out} and --plot {plot} are the same file")
     for target in (out, plot):
@@ -87,10 +111,10 @@ def simulate(
             _refuse(f"there is no folder {target.parent} to write {target.name} to")
     mech, text = _load(scene)
 
-    import diffrax
     import numpy as np
 
     import udkjax as udk
+    from udkjax.integrate.solvers import solver_named
     from udkjax.show.plots import trajectory
     from udkjax.show.summary import run_summary
 
@@ -100,7 +124,9 @@ def simulate(
         "rtol": rtol,
         "atol": atol,
         "method": pseudoinverse() if rank_tol is None else pseudoinverse(rank_tol=rank_tol),
-        "solver": getattr(diffrax, SOLVERS[solver])(),
+        "formulation": getattr(udk, FORMULATIONS[formulation])() if formulation in FORMULATIONS else None,
+        "solver": solver_named(SOLVERS[solver]),
+        "dt0": dt0,
         "stabilization": stabilizations[stabilization](),
         "throw": False,
     }

@@ -1,14 +1,9 @@
-import json
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from udkjax import GROUND, Frame
-
-DATA = Path(__file__).parents[1] / "data"
 
 
 class Twin:
@@ -85,27 +80,6 @@ class Twin:
 @pytest.fixture(scope="session")
 def twin():
     return Twin
-
-
-@pytest.fixture(scope="session")
-def placed():
-    """q and v (4, 3) of the paper's linkage with its links at `theta` (rad), turning at `rate` (rad/s)."""
-
-    def pose(theta, rate):
-        def q(s):
-            e = jnp.stack([jnp.cos(s), jnp.sin(s)])
-            links = [jnp.append(jnp.array([x, 0.0]) + e / 2, s) for x in (0.0, 1.0, 2.0)]
-            return jnp.stack([*links, jnp.append(jnp.array([1.0, 0.0]) + e, 0.0 * s)])
-
-        return jax.jvp(q, (jnp.asarray(theta, float),), (jnp.asarray(rate, float),))
-
-    return pose
-
-
-@pytest.fixture(scope="session")
-def data():
-    """A file of reference values, by its name."""
-    return lambda name: json.loads((DATA / f"{name}.json").read_text())
 
 
 @pytest.fixture(scope="session")

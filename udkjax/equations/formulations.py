@@ -53,7 +53,7 @@ class Augmented(Solved):
     is singular, and LU does not notice: it divides by a pivot of pure rounding error. On a mechanism whose redundant rows are
     satisfied to rounding that error goes into the multipliers, along the left null space of A, and leaves in the accelerations
     what A^T makes of it. Where the pivot is exactly zero, as of a joint that is given twice, nothing is a number, and a run ends
-    at once with `Result.step_too_small`. With a pseudoinverse as `method`, for instance `Augmented(udk.SVD())`, a and lambda are
+    at once with `Result.not_finite`. With a pseudoinverse as `method`, for instance `Augmented(udk.SVD())`, a and lambda are
     the solution of minimum norm: what is redundant is shared, and the accelerations are right, also in singular configurations
     where the right-hand side is consistent. Its default `rank_tol` is the square of the others': a singular value sigma of
     D = A M^(-1/2) is one of about sigma^2 here.
@@ -153,7 +153,7 @@ class Formulated(Motion):
         return self.equations.violation(t, q, v)
 
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
-        return self.equations.is_finite(t, q, v)
+        return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
 
     @property
     def left_out(self) -> tuple[int, ...]:

@@ -107,7 +107,7 @@ class Partitioned(Motion):
         return self.equations.violation(t, q, v)
 
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
-        return self.equations.is_finite(t, q, v)
+        return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
 
     @property
     def left_out(self) -> tuple[int, ...]:

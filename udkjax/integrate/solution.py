@@ -29,7 +29,8 @@ CAUSES = {
     Result.step_limit: "the limit on steps was reached; raise `max_steps`, loosen the tolerances, or look for what is stiff",
     Result.step_too_small: "the step fell to the rounding of time: the right-hand side jumps or grows without bound here, "
     "or the tolerance is below what its rounding errors allow",
-    Result.not_finite: "a number that is not finite appeared; look at the loads and motions of the scene at this time",
+    Result.not_finite: "a number that is not finite appeared; look at the loads and motions of the scene at this time "
+    "(and, with `Augmented()`, at its redundant joints: plain LU cannot do with them)",
     Result.drift: "the constraints are violated by more than `drift_tol`: stabilize (`Projection()`), or, where the numbers "
     "of the scene make rows independent that were found redundant when it was built, build it anew or take method=SVD()",
     Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for the joints that stay open",

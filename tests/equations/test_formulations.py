@@ -1,0 +1,260 @@
+"""The other formulations: the same function where the Udwadia-Kalaba equation is regular; elsewhere they are what they are."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations import equations_of
+
+LU = udk.Augmented()
+ROBUST = {
+    "Augmented, SVD": udk.Augmented(udk.SVD()),
+    "NullSpaceQR": udk.NullSpaceQR(),
+    "NullSpaceSVD": udk.NullSpaceSVD(),
+    "CoordinatePartitioning": udk.CoordinatePartitioning(),
+}
+ALL = {"Augmented": LU, **ROBUST}
+
+
+def but_slow(names):
+    return [pytest.param(name, marks=pytest.mark.slow) for name in names.split()]
+
+
+REGULAR = ["slider_crank", "driven_pendulum"]
+REGULAR += but_slow("simple_pendulum compound_pendulum double_pendulum four_bar elliptic_trammel")
+REDUNDANT = ["parallelogram", *but_slow("n_four_bar scissor_lift peaucellier planetary_gear")]
+T0 = jnp.array(0.0)
+every_robust = pytest.mark.parametrize("formulation", ROBUST.values(), ids=ROBUST)
+
+
+def mechanism(name):
+    return getattr(udk.library, name)()
+
+
+def all_of(mech, t, q, v, formulations, baumgarte=None):
+    """Accelerations by the Udwadia-Kalaba equation, and by each of the formulations."""
+
+    @eqx.filter_jit  # all of them in one program, which evaluates what they share once
+    def run(formulations):
+        solve = lambda f: equations_of(mech, udk.SVD(), baumgarte, f).accelerations(t, q, v)  # noqa: E731
+        return solve(None), {name: solve(f) for name, f in formulations.items()}
+
+    return run(formulations)
+
+
+def agree(reference, found, tol=1e-10):
+    for name, a in found.items():
+        assert_allclose(a, reference, rtol=0, atol=tol * max(1.0, float(jnp.abs(reference).max())), err_msg=name)
+
+
+# --- the same function
+
+
+@pytest.mark.parametrize("name", REGULAR)
+def test_regular_mechanisms(name, closed):
+    """Driven ones too."""
+    mech = mechanism(name)
+    q, v = closed(mech)
+    agree(*all_of(mech, T0, q, v, ALL))
+
+
+@pytest.mark.parametrize("name", ["slider_crank", *but_slow("double_pendulum")])
+def test_off_the_manifold_and_with_gains(name, closed):
+    """Baumgarte's terms are in the right-hand side of them all. (With partitioning there are none: it closes each state.)"""
+    mech = mechanism(name)
+    q, v = closed(mech)
+    shift = jnp.asarray(np.random.default_rng(1).standard_normal((2, len(q)))) * 1e-2
+    solved = {k: f for k, f in ALL.items() if k != "CoordinatePartitioning"}
+    reference, found = all_of(mech, jnp.array(0.3), q + shift[0], v + shift[1], solved, udk.Baumgarte(3.0, 4.0))
+    agree(reference, found)
+    without, _ = all_of(mech, jnp.array(0.3), q + shift[0], v + shift[1], {})
+    assert jnp.abs(reference - without).max() > 1e-2
+
+
+@pytest.mark.parametrize("name", REDUNDANT)
+def test_redundant_mechanisms(name, closed):
+    mech = mechanism(name)
+    q, v = closed(mech)
+    agree(*all_of(mech, T0, q, v, ROBUST))
+
+
+def driven(forces):
+    """A double pendulum, its upper rod driven and its lower one free."""
+    bare = udk.library.double_pendulum(angles=(np.pi / 2, 0.3))
+    return udk.Mechanism(
+        bare.bodies, bare.joints, {"motor": udk.Driver(("ground", "upper"), "angle", udk.Sine(0.8, 3.0))}, forces
+    )
+
+
+SPRING = {"spring": udk.Spring(["ground", "lower"], [[0.3, 0.5], [0.1, 0.0]], stiffness=40.0, length=0.2, damping=3.0)}
+
+
+def test_a_driver_and_force_elements(twin, closed):
+    """Against the KKT equations written down plainly."""
+    mech = driven(SPRING)
+    q, v = closed(mech)
+    reference, found = all_of(mech, T0, q, v, ALL)
+    agree(reference, found)
+    assert_allclose(reference, twin.kkt(mech, T0, q, v)[0], atol=1e-9 * np.abs(reference).max())
+    assert np.abs(reference - twin.kkt(driven(None), T0, q, v)[0]).max() > 1.0
+
+
+def test_without_constraints():
+    stone = udk.Mechanism({"stone": udk.Body(2.0, 0.1, [0.0, 1.0], 0.3)})
+    reference, found = all_of(stone, T0, stone.q0.ravel(), stone.v0.ravel(), ALL)
+    assert_allclose(reference, [0.0, -9.81, 0.0])
+    agree(reference, found)
+
+
+class Ball(eqx.Module):
+    """A point mass on a sphere, in coordinates with a full mass matrix; the constraint is said `copies` times."""
+
+    copies: int = eqx.field(static=True, default=1)
+
+    def system(self):
+        mass = jnp.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.1], [0.0, 0.1, 3.0]])
+        gravity = jnp.array([0.0, 0.0, -9.81])
+        return udk.ConstrainedSystem(
+            lambda q: mass * (1 + q[0] ** 2),
+            lambda t, q, v: gravity - 0.1 * v,
+            lambda t, q: jnp.tile(q @ q - 1.0 - 0.1 * jnp.sin(t), self.copies),
+            lambda t, q, v: v[:1] - 0.2 * v[1:2],
+        )
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_systems_of_the_users_own(copies):
+    q, v = jnp.array([0.6, 0.1, -0.8]), jnp.array([0.2, 1.0, 0.3])
+    formulations = {k: f for k, f in ROBUST.items() if k != "CoordinatePartitioning"} | ({"Augmented": LU} if copies == 1 else {})
+    agree(*all_of(Ball(copies).system(), T0, q, v, formulations))
+
+
+def test_what_partitioning_refuses():
+    with pytest.raises(ValueError, match="nonholonomic constraints"):
+        equations_of(Ball().system(), None, None, udk.CoordinatePartitioning())
+    with pytest.raises(ValueError, match="Baumgarte has nothing to feed back"):
+        equations_of(mechanism("four_bar"), None, udk.Baumgarte(), udk.CoordinatePartitioning())
+
+
+# --- redundant rows, and singular configurations: the paper's linkage
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    return udk.library.parallelogram(np.deg2rad(-50))
+
+
+def test_plain_LU_divides_by_rounding_errors(linkage, placed, twin):
+    """Rank 23 of 24: what LU takes for a pivot is a rounding error, and so is what it makes of the multipliers."""
+    q, v = (x.ravel() for x in placed(-0.8, 1.3))
+    M, _, A, _ = equations_of(linkage, udk.SVD()).matrices(T0, q, v)
+    matrix = jnp.block([[M, A.T], [A, jnp.zeros((12, 12))]])
+    assert np.linalg.matrix_rank(matrix) == 23
+    pivots = np.sort(np.abs(np.diag(jax.scipy.linalg.lu(matrix)[2])))
+    assert pivots[0] < 1e-14 < 1e-2 < pivots[1]
+
+
+def test_and_by_nothing_where_a_joint_is_given_twice():
+    """There the pivot is exactly zero. The others take the copy for what it is."""
+    single = mechanism("compound_pendulum")
+    double = udk.Mechanism(single.bodies, {"pin": single.joints["pin"], "again": single.joints["pin"]})
+    q, v = single.q0.ravel(), jnp.array([0.3, 0.1, 0.0])
+    v = equations_of(single, udk.SVD()).project(T0, q, v)[1]
+    reference, found = all_of(double, T0, q, v, ALL)
+    assert not np.any(np.isfinite(found.pop("Augmented")))
+    agree(reference, found)
+    assert_allclose(reference, all_of(single, T0, q, v, {})[0], atol=1e-12)
+
+
+@every_robust
+def test_in_line(linkage, placed, formulation):
+    """All links in line, turning: the rank is 10, and the accelerations are still those of the parallelogram."""
+    q, v = (x.ravel() for x in placed(0.0, 1.3))
+    a = equations_of(linkage, udk.SVD(), None, formulation).accelerations(T0, q, v)
+    assert_allclose(a[2:9:3], -3.5 * 9.81 / 3.05, atol=1e-9)
+
+
+# --- derivatives
+
+
+@pytest.mark.parametrize("name", ["Augmented", "CoordinatePartitioning", *but_slow("NullSpaceQR NullSpaceSVD")])
+def test_derivatives(name, closed):
+    """With respect to time, state, masses and loads, forward and backward, against differences; and second ones."""
+    mech, formulation = driven(SPRING), ALL[name]
+    q, v = closed(mech)
+
+    def f(x):
+        varied = mech.with_parameters({"gravity": x[:2], "body.lower.mass": x[2], "force.spring.stiffness": x[3]})
+        return equations_of(varied, udk.Auto(), None, formulation).accelerations(x[4], q + x[5] * v, v + x[6])
+
+    x, h = jnp.array([0.3, -9.0, 1.3, 35.0, 0.1, 0.0, 0.0]), 1e-5
+    direction = jnp.asarray(np.random.default_rng(2).standard_normal(len(x)))
+    along = lambda s: f(x + s * direction)  # noqa: E731
+    slope = lambda s: jax.jvp(along, (s,), (jnp.ones(()),))[1]  # noqa: E731
+    forward, second = jax.jit(lambda s: jax.jvp(slope, (s,), (jnp.ones(()),)))(jnp.zeros(()))
+    values = jax.jit(along)
+    scale = float(jnp.abs(forward).max())
+    assert_allclose(forward, (values(h) - values(-h)) / (2 * h), rtol=0, atol=1e-7 * scale)
+    first = jax.jit(slope)
+    assert_allclose(second, (first(h) - first(-h)) / (2 * h), rtol=0, atol=1e-6 * float(jnp.abs(second).max()))
+    weights = jnp.cos(jnp.arange(6.0))
+    assert_allclose(jax.jit(jax.grad(lambda x: weights @ f(x)))(x) @ direction, weights @ forward, rtol=1e-9)
+
+
+def test_derivatives_where_rows_are_redundant(linkage, placed):
+    """One rule for all: those of the Udwadia-Kalaba equation, with three equal singular values."""
+    q, v = (x.ravel() for x in placed(-0.8, 1.3))
+
+    def gradient(formulation):
+        def f(g):
+            varied = linkage.with_parameters({"gravity": g})
+            return equations_of(varied, udk.SVD(), None, formulation).accelerations(T0, q, v)
+
+        return eqx.filter_jit(jax.jacfwd(f))(jnp.array([0.1, -9.81]))
+
+    expected = gradient(None)
+    assert jnp.abs(expected).max() > 0.1
+    for name, formulation in ROBUST.items():
+        assert_allclose(gradient(formulation), expected, atol=1e-11, err_msg=name)
+
+
+# --- completion of a partitioned state
+
+
+def test_the_dependent_follow_from_the_independent(linkage, placed):
+    """Move every dependent coordinate by up to 0.05: Newton finds back, and the independent ones stay to the bit."""
+    q, v = (x.ravel() for x in placed(-0.8, 1.3))
+    held = equations_of(linkage, None, None, udk.CoordinatePartitioning()).held(T0, q, v)
+    assert int(held.independent.sum()) == 1
+    off = jnp.where(held.independent, 0.0, 0.05 * jnp.cos(jnp.arange(12.0)))
+    closed, rate = held.project(T0, q + off, v + 10 * off)
+    assert_allclose(closed, q, atol=1e-13)
+    assert_allclose(rate, v, atol=1e-12)
+    assert (closed == q)[held.independent].all() and (rate == v)[held.independent].all()
+
+
+def test_a_guess_too_far_away_is_not_a_number(linkage, placed):
+    q, v = (x.ravel() for x in placed(-0.8, 1.3))
+    held = equations_of(linkage, None, None, udk.CoordinatePartitioning()).held(T0, q, v)
+    off = jnp.where(held.independent, 0.0, 0.4 * jnp.cos(jnp.arange(12.0)))
+    assert np.isnan(jnp.concatenate(held.rates(T0, q + off, v))).any()
+    assert np.isfinite(jnp.concatenate(held.rates(T0, q + 0.1 * off, v))).all()
+
+
+def test_completion_has_derivatives(linkage, placed):
+    """Along the independent coordinate: those of the parallelogram; along a dependent one: none."""
+    angle = jnp.array(-0.8)
+    pose = lambda s: jnp.concatenate([x.ravel() for x in placed(s, 1.3)])  # noqa: E731
+    y = pose(angle)
+    held = equations_of(linkage, None, None, udk.CoordinatePartitioning()).held(T0, *jnp.split(y, 2))
+    project = lambda y: jnp.concatenate(held.project(T0, *jnp.split(y, 2)))  # noqa: E731
+    jacobian = jax.jit(jax.jacfwd(project))(y)
+    along = jax.jvp(pose, (angle,), (jnp.ones(()),))[1]
+    assert_allclose(jacobian @ along, along, atol=1e-11)
+    dependent = jnp.tile(~held.independent, 2)
+    assert_allclose(jacobian[:, dependent], 0.0, atol=1e-11)
+    assert_allclose(jax.jit(jax.jacrev(project))(y), jacobian, atol=1e-11)

@@ -1,0 +1,162 @@
+"""Whole runs by the other formulations: they end where the Udwadia-Kalaba equation does, or say why not."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations import equations_of
+from udkjax.integrate.projection import Constrained
+from udkjax.integrate.simulate import derivative
+from udkjax.study import exact_coordinates
+
+FORMULATIONS = {
+    "Augmented": udk.Augmented(),
+    "NullSpaceQR": udk.NullSpaceQR(),
+    "NullSpaceSVD": udk.NullSpaceSVD(),
+    "CoordinatePartitioning": udk.CoordinatePartitioning(),
+}
+TS = np.linspace(0.0, 2.0, 9)
+
+
+def cases(*fast):
+    return pytest.mark.parametrize(
+        "formulation", [pytest.param(f, id=k, marks=[] if k in fast else pytest.mark.slow) for k, f in FORMULATIONS.items()]
+    )
+
+
+def tsit5(mech, formulation, ts=TS, tol=1e-9, **choices):
+    return udk.simulate(mech, ts, rtol=tol, atol=tol, solver=diffrax.Tsit5(), formulation=formulation, **choices)
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    """A four-bar with a spring and a damper, and how it moves."""
+    bare = udk.library.four_bar()
+    names = list(bare.bodies)
+    spring = udk.Spring(["ground", names[1]], [[0.2, 1.5], [0.1, 0.0]], stiffness=8.0, length=0.5, damping=0.4)
+    mech = udk.Mechanism(bare.bodies, bare.joints, bare.drivers, {"spring": spring})
+    return mech, tsit5(mech, None)
+
+
+# --- the same motion
+
+
+@cases("NullSpaceQR", "CoordinatePartitioning")
+@pytest.mark.parametrize("stabilization", [udk.Projection(), pytest.param(udk.Baumgarte(), marks=pytest.mark.slow)])
+def test_a_regular_mechanism(swinging, formulation, stabilization):
+    if isinstance(formulation, udk.CoordinatePartitioning) and isinstance(stabilization, udk.Baumgarte):
+        pytest.skip("refused: see tests/equations/test_formulations.py")
+    mech, reference = swinging
+    sol = tsit5(mech, formulation, stabilization=stabilization)
+    assert jnp.abs(reference.q - reference.q[0]).max() > 0.3
+    assert_allclose(sol.q, reference.q, atol=2e-7)
+    assert_allclose(sol.v, reference.v, atol=2e-6)
+    assert dict(sol.settings)["formulation"] == type(formulation).__name__
+
+
+@cases("CoordinatePartitioning")
+def test_a_driven_mechanism(formulation):
+    """No freedom is left: of independent coordinates there are none, and nothing is integrated but the clock."""
+    mech = udk.library.slider_crank()
+    ts = np.linspace(0.0, 1.0, 9)
+    sol = tsit5(mech, formulation, ts)
+    expected = exact_coordinates(mech, ts, sol.q[0], sol.v[0])
+    reference = udk.simulate(mech, ts, rtol=1e-10, atol=1e-10).q if expected is None else expected
+    assert_allclose(sol.q, reference, atol=1e-9)
+
+
+@cases("CoordinatePartitioning")
+def test_the_linkage(formulation):
+    """11 of 12 rows are independent. Plain LU is let off: see below."""
+    if isinstance(formulation, udk.Augmented):
+        formulation = udk.Augmented(udk.SVD())
+    mech = udk.library.parallelogram(np.deg2rad(-50))
+    sol = tsit5(mech, formulation)
+    assert_allclose(sol.q, exact_coordinates(mech, TS, sol.q[0], sol.v[0]), atol=2e-8)
+    assert jnp.abs(udk.violation(mech, sol)).max() < 1e-12
+
+
+# --- partitioning
+
+
+@pytest.fixture(scope="module")
+def partitioned():
+    """The linkage by partitioning and no stabilization."""
+    mech = udk.library.parallelogram(np.deg2rad(-50))
+    return mech, tsit5(mech, udk.CoordinatePartitioning(), stabilization=None)
+
+
+def test_constraints_hold_without_stabilization(partitioned):
+    """To rounding at every output, positions and velocities."""
+    mech, sol = partitioned
+    equations = equations_of(mech)
+    rest = [equations.violation(t, q.ravel(), v.ravel()) for t, q, v in zip(TS, sol.q, sol.v, strict=True)]
+    assert max(float(jnp.abs(r).max()) for pair in rest for r in pair) < 1e-13
+    assert dict(sol.settings)["stabilization"] == "NoneType"
+
+
+def test_only_what_is_independent_is_judged(partitioned):
+    """One step of a size that would fail: the error has one coordinate and its velocity; the others are zero."""
+    mech, _ = partitioned
+    equations = equations_of(mech, None, None, udk.CoordinatePartitioning())
+    y0 = jnp.concatenate([mech.q0.ravel(), mech.v0.ravel()])
+    solver, term = Constrained(diffrax.Tsit5(), True), diffrax.ODETerm(derivative)
+
+    @eqx.filter_jit
+    def step(dt):
+        state = solver.init(term, 0.0, dt, y0, equations)
+        y1, tally, *_ = solver.step(term, 0.0, dt, y0, equations, state, False)
+        return y1, tally.error
+
+    y1, error = step(jnp.array(0.2))
+    independent = equations.held(0.0, *jnp.split(y0, 2)).independent
+    assert int(independent.sum()) == 1
+    assert_allclose(error[~jnp.tile(independent, 2)], 0.0, atol=0)
+    assert (jnp.abs(error[jnp.tile(independent, 2)]) > 1e-10).all()
+    assert jnp.abs(equations.violation(0.2, *jnp.split(y1, 2))[0]).max() < 1e-13
+    _, lost = step(jnp.array(5.0))  # no prediction from which Newton's method finds back to this assembly
+    assert np.isnan(lost).any()
+
+
+@pytest.mark.slow
+def test_a_multistep_method(partitioned):
+    """It is told to judge its errors by the independent components, and keeps its history when others become independent."""
+    mech, reference = partitioned
+    sol = udk.simulate(mech, TS, rtol=1e-9, atol=1e-9, solver=udk.Adams(), formulation=udk.CoordinatePartitioning())
+    assert_allclose(sol.q, reference.q, atol=1e-7)
+    assert sol.stats["right_hand_sides"] < reference.stats["right_hand_sides"]
+
+
+@pytest.mark.slow
+def test_batches_gradients_and_traced_numbers(placed):
+    """By forward mode, against differences, under vmap and jit."""
+    mech = udk.library.parallelogram(np.deg2rad(-50))
+
+    def angle(p):
+        state = udk.State(*placed(p[0], 0.0))
+        changed = mech.with_parameters({"gravity": jnp.stack([0.0, -p[1]])})
+        return tsit5(changed, udk.CoordinatePartitioning(), TS[:3], 1e-10, state=state, adjoint=diffrax.ForwardMode()).q[-1, 0, 2]
+
+    points = jnp.array([[-0.9, 9.81], [-0.6, 5.0]])
+    values, slopes = jax.jit(jax.vmap(lambda p: (angle(p), jax.jacfwd(angle)(p))))(points)
+    single, h = jax.jit(angle), 1e-4
+    for p, value, slope in zip(points, values, slopes, strict=True):
+        assert_allclose(value, single(p), atol=1e-9)
+        differences = [(single(p + h * e) - single(p - h * e)) / (2 * h) for e in jnp.eye(2)]
+        assert_allclose(slope, differences, atol=1e-6)
+
+
+# --- where plain LU ends
+
+
+def test_plain_LU_on_redundant_rows():
+    """A joint given twice: the first right-hand side is not a number, and the run says so."""
+    single = udk.library.compound_pendulum()
+    mech = udk.Mechanism(single.bodies, {"pin": single.joints["pin"], "again": single.joints["pin"]})
+    with pytest.raises(udk.SimulationError, match=r"not finite at t = 0 s.*redundant joints"):
+        tsit5(mech, udk.Augmented())
