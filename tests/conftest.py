@@ -19,6 +19,7 @@ SCOPE = Scope(
     tolerances=(1e-8, 1e-6),
     stiff_end=2.0,
     starts=2,
+    others=("VODE", "Dopri8"),
     work_tolerances=(1e-6, 1e-8),
     gains_for=("SVD",),
 )
@@ -66,7 +67,7 @@ def study_data():
 def made_up(case: Case, number: int, rate: float) -> dict:
     """One run; every number of it is another one than that of every other run."""
     ts = np.linspace(0.0, case.end, INSTANTS)
-    drifts = case.alpha < 2 and case.group in ("paper", "rank held", "start", "law")
+    drifts = case.alpha < 2 and case.group in ("paper", "other integrators", "rank held", "start", "law")
     sigma = 1e-15 * np.exp((rate - case.alpha) * ts) if drifts else np.full(INSTANTS, 1e-15)
     lost = drifts and case.alpha == 0
     error = np.where(ts > LOST[case.tol], 1.0, case.tol) if lost else np.full(INSTANTS, case.tol * (1 + number / 1000))

@@ -64,6 +64,7 @@ def page(data: Any) -> str:
         paper_tables=report_tables.paper_tables(data),
         psi2_note=psi2_note(data),
         remarks=report_tables.remarks(data),
+        explained=report_tables.explained(data),
         better=report_tables.better(data),
         settings=report_tables.settings(data),
         repeat=repeat(data),

@@ -1,12 +1,13 @@
 """What the report says it found: sentences whose numbers are read from the dataset."""
 
 import json
+from itertools import pairwise
 
 import numpy as np
 
 from udkjax.show.report_figures import runs, tolerances
 from udkjax.show.report_tables import count, power, scientific
-from udkjax.study.comparison import published_time
+from udkjax.study.comparison import published_kind, published_time
 from udkjax.study.published import Row
 
 ROUNDING = 1e-16  # m: of a coordinate
@@ -22,6 +23,7 @@ def _sentences(data):
         chosen = [run for run in runs(data, "paper") if (run.alpha > 0) == stabilized]
         yield f"<b>The paper's runs {name}:</b> {_counted(chosen)}{_times_by_tolerance(data, chosen)}."
     yield from _spacing(data)
+    yield from _nearest(data)
     held = list(runs(data, "rank held"))
     if held:
         growth = [float(run.growth) for run in held if np.isfinite(run.growth)]
@@ -46,29 +48,43 @@ def _sentences(data):
 
 
 def _spacing(data):
-    """How much sooner a run is lost for a smaller TOL, by the law, here, and in the paper."""
+    """How much sooner a run is lost for a smaller TOL: by the law, here, and in the paper where a run halts."""
     tols = tolerances(data)
-    free = [[run for run in runs(data, "paper", tol=tol) if not run.alpha and np.isfinite(run.correct_to)] for tol in tols]
-    if len(tols) < 2 or not all(free):
+    free = {tol: [float(run.correct_to) for run in runs(data, "paper", tol=tol, alpha=0.0)] for tol in tols}
+    if not np.isfinite(list(free.values())).any(axis=1).all():
         return
-    law = np.diff(np.log(tols)) / _law(data)
-    here = np.diff([np.median([float(run.correct_to) for run in chosen]) for chosen in free])
-    published = {
-        table["tol"]: published_time(Row(**row))
-        for table in json.loads(data.attrs["published"])
-        for row in table["rows"]
-        if row["method"] == "SVD" and not table["alpha"]
-    }
-    paper = np.diff([published[tol] for tol in tols])
-    yield (
-        "<b>A smaller TOL loses a run sooner,</b> because the threshold is tied to it: the drift must grow from rounding to "
-        f"TOL. From each TOL ({', '.join(map(power, tols))}) to the next the law says {_list(law)} s; here it is {_list(here)} s "
-        f"(medians of the methods), in the paper {_list(paper)} s (SVD, the one method that behaves so there)."
-    )
+    halted = {table["tol"]: _halted(table, "SVD") for table in json.loads(data.attrs["published"]) if not table["alpha"]}
+    parts = []
+    for tol, above in pairwise(tols):
+        law, here = np.log(above / tol) / _law(data), np.nanmedian(free[above]) - np.nanmedian(free[tol])
+        paper = halted[above] - halted[tol]
+        parts.append(
+            f"between {power(tol)} and {power(above)} {here:.2f} s"
+            f"{f', in the paper {paper:.2f} s (SVD)' if np.isfinite(paper) else ''}, by the law {law:.2f} s"
+        )
+    if parts:
+        yield (
+            "<b>With the threshold tied to TOL, TOL decides when a run is lost,</b> because that is how far the drift must grow: "
+            f"{'; '.join(parts)} (medians of the methods; what method and integrator add by rounding differs, too)."
+        )
 
 
-def _list(values) -> str:
-    return " and ".join(f"{value:.2f}" for value in values)
+def _halted(table: dict, method: str) -> float:
+    """When a run of the paper halted (s); NaN where it did not."""
+    (row,) = [Row(**row) for row in table["rows"] if row["method"] == method]
+    return published_time(row) if published_kind(row) == "fails" else float("nan")
+
+
+def _nearest(data):
+    """What the paper's nearest relative of an integrator makes of its runs."""
+    groups = {"with the threshold TOL": "other integrators", "with the rank held at 11": "rank held"}
+    found = {name: list(runs(data, group, solver="VODE", alpha=0.0)) for name, group in groups.items()}
+    if all(found.values()):
+        spans = [f"{name} {_times_by_tolerance(data, chosen).removeprefix('; ')}" for name, chosen in found.items()]
+        yield (
+            "<b>By VODE, the nearest relative of the paper’s integrator,</b> runs without stabilization are, "
+            f"{', and '.join(spans)}. The table on it tells which rule for the rank each of the paper’s methods must have had."
+        )
 
 
 def _law(data) -> float:

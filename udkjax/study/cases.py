@@ -32,7 +32,7 @@ class Program(NamedTuple):
 class Case:
     """One run of the study."""
 
-    group: str  # "paper", "rank held", "small gains", "fixed rows", "default", "law", "start" or "work"
+    group: str  # "paper", "other integrators", "rank held", "small gains", "fixed rows", "default", "law", "start" or "work"
     method: str
     solver: str
     tol: float
@@ -73,7 +73,7 @@ class Scope:
     work_tolerances: tuple[float, ...] = WORK_TOLERANCES
     repeats: int = 5  # of a run, for its time
     patience: float = 3.0  # s: what took longer is timed once
-    also_held: tuple[tuple[str, str], ...] = ()  # methods by other integrators, which are run with the rank held
+    others: tuple[str, ...] = ()  # integrators by which the runs without stabilization are made again
     gains_for: tuple[str, ...] = METHODS  # the methods that are run with small gains
     better: bool = True  # whether what would have been better is done at all
 
@@ -83,7 +83,7 @@ _WORK = tuple(Program(method, solver, False) for method, solver in product((*MET
 FULL = Scope(
     "full",
     work=(*_WORK, Program("Auto", "Dopri8", True)),
-    also_held=tuple(("SVD", solver) for solver in INTEGRATORS[1:]),
+    others=("VODE", *INTEGRATORS[1:]),
 )
 QUICK = Scope(
     "quick",
@@ -92,7 +92,7 @@ QUICK = Scope(
     starts=10,
     work=(*(Program("SVD", solver, False) for solver in ("Adams", "Dopri8", "Tsit5")), Program("Auto", "Dopri8", True)),
     work_tolerances=WORK_TOLERANCES[::2],
-    also_held=(("SVD", "Dopri8"),),
+    others=("VODE", "Dopri8"),
     repeats=3,
     patience=0.5,
     gains_for=("SVD",),
@@ -112,7 +112,12 @@ def plan(scope: Scope, solver: str = "Adams") -> list[Case]:
     if scope.better:
         for tol in scope.tolerances:
             cases += [Case("rank held", method, solver, tol) for method in methods]
-            cases += [Case("rank held", m, integrator, tol) for m, integrator in scope.also_held]
+            for integrator in scope.others:
+                chosen = methods if integrator == "VODE" else methods[:1]
+                cases += [Case("other integrators", method, integrator, tol, tol) for method in chosen]
+                cases += [Case("rank held", method, integrator, tol) for method in chosen]
+                if integrator == "VODE":
+                    cases.append(Case("other integrators", chosen[0], integrator, tol, tol, alpha, beta, end=scope.stiff_end))
             cases += [Case("small gains", m, solver, tol, tol, gain, gain) for gain, m in product(SMALL_GAINS, gains_for)]
             cases += [Case("fixed rows", "Elimination", solver, tol), Case("default", "Auto", "Dopri8", tol, projected=True)]
             cases += [Case("law", scope.methods[0], solver, tol, None, gain, gain) for gain in LAW_GAINS]

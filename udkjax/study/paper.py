@@ -24,6 +24,7 @@ from udkjax.integrate.solvers import solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
 from udkjax.scene import Mechanism
 from udkjax.scene.library import parallelogram
+from udkjax.study import vode
 from udkjax.study.cases import FIRST_STEP, FULL, RANK_HELD, Case, Program, Scope, plan
 from udkjax.study.exact import exact_coordinates
 from udkjax.study.machine import cores
@@ -63,7 +64,8 @@ def study(
     for number, case in enumerate(cases):
         tell(f"run {number + 1} of {len(cases)}", (1 + 2 * done / total) / 3)
         inputs = _inputs(case, state, sigma, seed)
-        sol, seconds = _timed(partial(programs[case.program], *inputs), scope)
+        repeats = 1 if case.solver == vode.NAME else scope.repeats
+        sol, seconds = _timed(partial(programs[case.program], *inputs), scope, repeats)
         rows.append(_row(mech, case, inputs, sol, seconds))
         done += case.weight
     tell("done", 1.0)
@@ -84,6 +86,8 @@ def _compiled(mech: Mechanism, state: State, programs: set[Program], max_steps: 
     numbers = (jnp.linspace(0.0, 1.0, INSTANTS), state, *(jnp.asarray(x) for x in (1e-6, 1e-6, 0.0, 0.0)))
 
     def build(program: Program) -> Callable:
+        if program.solver == vode.NAME:
+            return vode.program(mech, partial(pseudoinverse, program.method), FIRST_STEP, max_steps, numbers)
         return jax.jit(partial(_run, mech, program, max_steps)).lower(*numbers).compile()
 
     found: dict[Program, Callable] = {}
@@ -128,11 +132,11 @@ def _inputs(case: Case, state: State, sigma: float, seed: int) -> tuple:
     return (jnp.linspace(0.0, case.end, INSTANTS), state, *numbers)
 
 
-def _timed(run: Callable, scope: Scope) -> tuple[Any, list[float]]:
+def _timed(run: Callable, scope: Scope, repeats: int) -> tuple[Any, list[float]]:
     """A solution, and the wall time (s) of each repeat of the run."""
     seconds: list[float] = []
     sol: Any = None
-    while len(seconds) < scope.repeats and sum(seconds) <= scope.patience:
+    while len(seconds) < repeats and sum(seconds) <= scope.patience:
         begun = time.perf_counter()
         sol = jax.block_until_ready(run())
         seconds.append(time.perf_counter() - begun)
@@ -166,7 +170,7 @@ def _row(mech: Mechanism, case: Case, inputs: tuple, sol: Any, seconds: list[flo
         "rank_tol": float(rank_tol) if case.method in DENSE else np.nan,
         "end": float(sol.time),
         "result": Result(int(sol.code)).name,
-        "cpu": float(np.median(seconds)),
+        "cpu": np.nan if case.solver == vode.NAME else float(np.median(seconds)),
         "repeats": len(seconds),
         **{key: int(value) for key, value in sol.stats.items()},
     }
