@@ -33,6 +33,12 @@ def tsit5(mech, formulation, ts=TS, tol=1e-9, **choices):
     return udk.simulate(mech, ts, rtol=tol, atol=tol, solver=diffrax.Tsit5(), formulation=formulation, **choices)
 
 
+def exact(mech, sol):
+    found = exact_coordinates(mech, sol.ts, sol.q[0], sol.v[0])
+    assert found is not None
+    return found
+
+
 @pytest.fixture(scope="module")
 def swinging():
     """A four-bar with a spring and a damper, and how it moves."""
@@ -65,9 +71,7 @@ def test_a_driven_mechanism(formulation):
     mech = udk.library.slider_crank()
     ts = np.linspace(0.0, 1.0, 9)
     sol = tsit5(mech, formulation, ts)
-    expected = exact_coordinates(mech, ts, sol.q[0], sol.v[0])
-    reference = udk.simulate(mech, ts, rtol=1e-10, atol=1e-10).q if expected is None else expected
-    assert_allclose(sol.q, reference, atol=1e-9)
+    assert_allclose(sol.q, exact(mech, sol), atol=1e-9)
 
 
 @cases("CoordinatePartitioning")
@@ -77,7 +81,7 @@ def test_the_linkage(formulation):
         formulation = udk.Augmented(udk.SVD())
     mech = udk.library.parallelogram(np.deg2rad(-50))
     sol = tsit5(mech, formulation)
-    assert_allclose(sol.q, exact_coordinates(mech, TS, sol.q[0], sol.v[0]), atol=2e-8)
+    assert_allclose(sol.q, exact(mech, sol), atol=2e-8)
     assert jnp.abs(udk.violation(mech, sol)).max() < 1e-12
 
 
@@ -160,3 +164,35 @@ def test_plain_LU_on_redundant_rows():
     mech = udk.Mechanism(single.bodies, {"pin": single.joints["pin"], "again": single.joints["pin"]})
     with pytest.raises(udk.SimulationError, match=r"not finite at t = 0 s.*redundant joints"):
         tsit5(mech, udk.Augmented())
+
+
+LONG = np.linspace(0.0, 20.0, 81)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("angle", "rate"), [(-50, 0.0), (45, 0.0), (0, 0.0), (90, -1.0)], ids=["ordinary", "45", "in line", "up"]
+)
+@pytest.mark.parametrize("formulation", [pytest.param(f, id=k) for k, f in FORMULATIONS.items()])
+def test_twenty_seconds(formulation, angle, rate):
+    """The last three starts cross singular configurations. Plain LU gets stuck at the first of them, and says so."""
+    mech = udk.library.parallelogram(np.deg2rad(angle), rate)
+    sol = udk.simulate(mech, LONG, rtol=1e-9, atol=1e-9, formulation=formulation, max_steps=5000, throw=False)
+    wrong = np.nanmax(np.abs(exact(mech, sol) - sol.q))
+    if isinstance(formulation, udk.Augmented) and angle != -50:
+        assert sol.result == udk.Result.step_limit
+        assert sol.time < 11.0
+    else:
+        assert sol.result == udk.Result.successful
+    assert wrong < 2e-6
+
+
+@pytest.mark.slow
+def test_plain_LU_divides_the_drift_by_a_rounding_error():
+    """Not stabilized, it needs ever smaller steps for what the redundant row disagrees by."""
+    mech = udk.library.parallelogram(np.deg2rad(-50))
+    choices = {"rtol": 1e-9, "atol": 1e-9, "stabilization": None, "max_steps": 5000, "throw": False}
+    sol = udk.simulate(mech, LONG, formulation=udk.Augmented(), **choices)
+    assert sol.result == udk.Result.step_limit
+    assert sol.time < 8.0
+    assert udk.simulate(mech, LONG[:41], formulation=udk.NullSpaceSVD(), **choices).result == udk.Result.successful

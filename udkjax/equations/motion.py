@@ -67,6 +67,6 @@ class Motion(eqx.Module):
         return self
 
     @property
-    def independent(self) -> Bool[Array, "n"] | None:
-        """Which coordinates and velocities are integrated, and so under error control. None: all."""
+    def independent(self) -> Any:
+        """Which coordinates and velocities are integrated, and so under error control: booleans (n,), or None: all."""
         return None
