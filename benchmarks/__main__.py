@@ -4,7 +4,7 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-NAMES = ("right_hand_side", "simulate")
+NAMES = ("right_hand_side", "simulate", "integrators")
 
 parser = argparse.ArgumentParser("python -m benchmarks", description="Measure udkjax against what a user would write without it.")
 parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; without one: all")
