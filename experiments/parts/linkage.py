@@ -1,0 +1,27 @@
+"""The paper's linkage from any start, and its exact motion."""
+
+import numpy as np
+from jaxtyping import Float
+
+import udkjax as udk
+from udkjax.study.exact import exact_coordinates
+
+OUTPUTS = 481  # of every run: 24 a second where it lasts 20 s; always as many, so that one compiled program serves all runs
+
+
+def start(degrees: float, rate: float = 0.0) -> udk.State:
+    """Return the closed state with the links at an angle (degrees), turning at a rate (rad/s)."""
+    placed = udk.library.parallelogram(np.deg2rad(degrees), rate)
+    return udk.State(placed.q0, placed.v0)
+
+
+def exact(ts: Float[np.ndarray, "T"], state: udk.State) -> Float[np.ndarray, "T bodies 3"]:
+    """Return the exact coordinates (m, rad) from a start on."""
+    q = exact_coordinates(udk.library.parallelogram(), ts, state.q, state.v)
+    assert q is not None
+    return q
+
+
+def errors(ts: Float[np.ndarray, "T"], q, state: udk.State) -> Float[np.ndarray, " T"]:
+    """Return the largest error of any coordinate (m, rad) at each output; not a number where the run has ended."""
+    return np.abs(np.asarray(q) - exact(ts, state)).max(axis=(1, 2))
