@@ -125,9 +125,16 @@ def psi2_note(data) -> str:
 def _counted(chosen) -> str:
     """Say how many runs are correct, lost, or fail."""
     kinds = [str(run.kind.item()) for run in chosen]
-    names = {"correct": "correct", "correct up to": "correct only for a while", "fails": "given up while still correct"}
-    parts = [f"{kinds.count(kind)} {text}" for kind, text in names.items() if kind in kinds]
-    return f"of {len(chosen)} runs " + ", ".join(parts)
+    names = {
+        "correct": "correct to the end",
+        "correct up to": "correct only for a while",
+        "fails": "given up while still correct",
+    }
+    counts = {text: kinds.count(kind) for kind, text in names.items() if kind in kinds}
+    if len(counts) == 1:
+        return f"all {len(kinds)} runs are {next(iter(counts))}"
+    *most, last = (f"{number} are {text}" for text, number in counts.items())
+    return f"of {len(kinds)} runs {', '.join(most)} and {last}"
 
 
 def _times_by_tolerance(data, chosen) -> str:

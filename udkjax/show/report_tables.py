@@ -9,6 +9,7 @@ from string import ascii_lowercase
 from udkjax.show.report_figures import runs, tolerances
 
 NOTHING = "–"
+GAP = "\u202f"  # a narrow space that does not break
 RULES = {
     "SVD": "D = U S V<sup>T</sup>; singular values at or below TOL count as zero",
     "Varga": "two QR factorizations by Householder reflections, the first with column pivoting; the rank is read from the "
@@ -58,7 +59,7 @@ def power(value: float) -> str:
 
 def count(value: float | None) -> str:
     """Write an integer in groups of three digits."""
-    return NOTHING if value is None or value < 0 else f"{int(value):,}".replace(",", " ")
+    return NOTHING if value is None or value < 0 else f"{int(value):,}".replace(",", GAP)
 
 
 def seconds(value: float | None) -> str:
@@ -73,24 +74,25 @@ def result(run) -> str:
     return words if cause == "successful" else f"{words} ({CAUSES.get(cause, cause)})"
 
 
-def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], name: str) -> str:
-    """Return an HTML table; `head` is its rows of column heads, and the first cell of each row, all of it HTML, is its name.
+def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], words: Sequence[int]) -> str:
+    """Return an HTML table of `rows` of cells, all of them HTML; the first of each row is its name.
 
-    A row of one cell is the title of those below it.
+    `head` is its rows of column heads. The columns `words`, counted from 0, hold words, the others numbers. A row of one cell is
+    the title of those below it.
     """
     body, width = [], max(line.count("<th") + line.count("rowspan") for line in head)
     for first, *rest in rows:
-        cells = "".join(f"<td>{cell}</td>" for cell in rest)
+        kinds = (' class="words"' if k in words else "" for k in range(1, len(rest) + 1))
+        cells = "".join(f"<td{kind}>{cell}</td>" for kind, cell in zip(kinds, rest, strict=True))
         body.append(f'<th scope="row">{first}</th>{cells}' if rest else f'<th scope="rowgroup" colspan="{width}">{first}</th>')
-    parts = ("".join(f"<tr>{line}</tr>\n" for line in lines) for lines in (head, body))
-    return '<table class="{}">\n<caption>{}</caption>\n<thead>\n{}</thead>\n<tbody>\n{}</tbody>\n</table>'.format(
-        name, caption, *parts
-    )
+    heads, lines = ("".join(f"<tr>{line}</tr>\n" for line in part) for part in (head, body))
+    return f"<table>\n<caption>{caption}</caption>\n<thead>\n{heads}</thead>\n<tbody>\n{lines}</tbody>\n</table>"
 
 
-def columns(*names: str) -> str:
-    """Return the heads of columns."""
-    return "".join(f'<th scope="col">{name}</th>' for name in names)
+def columns(*names: str, words: int = 0) -> str:
+    """Return the heads of columns, the first `words` of them of words, the others of numbers."""
+    kinds = ("" if k < words else ' class="number"' for k in range(len(names)))
+    return "".join(f'<th scope="col"{kind}>{name}</th>' for kind, name in zip(kinds, names, strict=True))
 
 
 def rules(data) -> str:
@@ -98,9 +100,9 @@ def rules(data) -> str:
     methods = json.loads(data.attrs["setting_methods"])
     return table(
         "What each method was told to count as zero, in the units of D.",
-        [columns("method", "rule")],
+        [columns("method", "rule", words=2)],
         [(method, RULES[method]) for method in methods],
-        "words",
+        [1],
     )
 
 
@@ -138,11 +140,11 @@ def _paper_table(published: dict, ours: dict) -> str:
     pairs = ("result", "Σψ² (m²)", "NFUNC", "NSTEPS", "CPU (s)")
     head = ['<th scope="col" rowspan="2">method</th>']
     head += [f'<th scope="colgroup" colspan="2">{pair}</th>' for pair in pairs]
-    head += ['<th scope="col" rowspan="2">exact error (rad)</th><th scope="col" rowspan="2">see</th>']
+    head += [f'<th scope="col" rowspan="2" class="number">{name}</th>' for name in ("largest<br>error (rad)", "see")]
     caption = f"<b>Table {published['number']}.</b> TOL = {power(published['tol'])}, {gains}, {length}."
     notes = "".join(f"<br><sup>{k + 1}</sup> Misprint in the paper: {escape(text)}." for k, text in enumerate(misprints))
-    second = columns(*(5 * ("paper", "here")))
-    return table(caption + notes, ["".join(head), second], rows, "paper")
+    second = columns(*(5 * ("paper", "here")), words=2)
+    return table(caption + notes, ["".join(head), second], rows, [1, 2])
 
 
 def remarks(data) -> str:
@@ -154,7 +156,8 @@ def remarks(data) -> str:
 
 def better(data) -> str:
     """Return what would have been better, one table a tolerance."""
-    head = columns("method", "result", "Σψ² (m²)", "NFUNC", "NSTEPS", "CPU (s)", "exact error (rad)", "at the end (rad)")
+    names = ("method", "result", "Σψ² (m²)", "NFUNC", "NSTEPS", "CPU (s)", "largest<br>error (rad)", "error at the<br>end (rad)")
+    head = columns(*names, words=2)
     found = []
     for tol in tolerances(data):
         rows: list[Sequence[str]] = []
@@ -164,7 +167,7 @@ def better(data) -> str:
                 rows.append([title.format(rank_held=data.attrs["setting_rank_held"])])
             rows += [_better_row(run, data.attrs["setting_solver"]) for run in chosen]
         if rows:
-            found.append(table(f"TOL = {power(tol)}, {float(data.t_end.max()):g} s.", [head], rows, "better"))
+            found.append(table(f"TOL = {power(tol)}, {float(data.t_end.max()):g} s.", [head], rows, [1]))
     return "\n".join(found)
 
 
@@ -190,9 +193,9 @@ def explained(data) -> str:
     head = [
         '<th scope="col" rowspan="2">method</th><th scope="colgroup" colspan="3">result</th>'
         '<th scope="colgroup" colspan="3">NFUNC</th>',
-        columns(*(2 * ("paper", "threshold TOL", "rank held at 11"))),
+        columns(*(2 * ("paper", "threshold TOL", "rank held at 11")), words=3),
     ]
-    return table("The paper’s runs without stabilization, and VODE’s with two rules for the rank.", head, rows, "paper words3")
+    return table("The paper’s runs without stabilization, and VODE’s with two rules for the rank.", head, rows, [1, 2, 3])
 
 
 def _better_row(run, usual: str) -> list[str]:
@@ -218,4 +221,6 @@ def settings(data) -> str:
         if kind in ("setting", "version"):
             rows.append((f"{kind}: {rest.replace('_', ' ')}", escape(f"{value:g}" if isinstance(value, float) else f"{value}")))
     rows += [(name, escape(str(data.attrs[name]))) for name in ("machine", "date")]
-    return table("Settings, versions and machine, as they stand in the data file.", [columns("name", "value")], rows, "words")
+    return table(
+        "Settings, versions and machine, as they stand in the data file.", [columns("name", "value", words=2)], rows, [1]
+    )
