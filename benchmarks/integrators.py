@@ -17,6 +17,7 @@ from benchmarks.common import Compiled, machine, report
 from benchmarks.problems import PROBLEMS, STIFF, Problem
 from udkjax.integrate.counting import count_evaluations, evaluations
 
+Run = Callable[[float], tuple[float, ...]]  # from a tolerance to an error and counts
 FIRST = 1e-6  # step that is tried
 FINER = 10 ** -np.arange(3.0, 12.01, 0.5)  # tolerances of the yardstick: its calls at any error lie between two of them
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
@@ -102,10 +103,10 @@ def _counted(problem: Problem) -> Any:
 
 
 def main(smoke: bool = False, out: Path | None = None):
-    """Print the errors and the calls of the right-hand side, and their ratio to those of a code of the same family at equal error.
+    """Print the errors and the calls of the right-hand side, and their ratio to those of a known code at equal error.
 
-    It is VODE's Adams methods, or where the problem is stiff the backward differentiation formulas of LSODA (those of VODE, as
-    SciPy has translated it in 1.17, take a hundred times the steps that the Fortran code took).
+    This is VODE's Adams methods, or where the problem is stiff the backward differentiation formulas of LSODA (those of VODE, as
+    SciPy translated it for its version 1.17, take up to a hundred times the steps that the Fortran code took).
     """
     about, figures = machine(), []
     tolerances = TOLERANCES[2:3] if smoke else TOLERANCES
