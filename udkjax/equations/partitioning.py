@@ -14,9 +14,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from udkjax.equations.formulations import Formulation, along
+from udkjax.equations.formulations import Formulation, Rewritten, along
 from udkjax.equations.motion import Motion, Vector
 from udkjax.equations.udwadia_kalaba import RANK_TOL, Equations
 from udkjax.pinv import SVD, Plus
@@ -58,7 +58,7 @@ class CoordinatePartitioning(Formulation):
         return Partitioned(equations, self)
 
 
-class Partitioned(Motion):
+class Partitioned(Rewritten):
     """The equations of motion of the independent coordinates of a mechanism.
 
     Without a partition held, it is chosen at each state anew.
@@ -98,33 +98,9 @@ class Partitioned(Motion):
     def independent(self) -> Any:
         return None if self.dependent is None else ~self.dependent
 
-    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
-        return self.equations.multipliers(t, q, v)
-
-    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
-        return self.equations.matrices(t, q, v)
-
-    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
-        return self.equations.violation(t, q, v)
-
-    def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
-        return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
-
     @property
     def left_out(self) -> tuple[int, ...]:
         return ()
-
-    @property
-    def constrained(self) -> bool:
-        return self.equations.constrained
-
-    @property
-    def branches(self) -> bool:
-        return False
-
-    @property
-    def quick(self) -> "Partitioned":
-        return self
 
     def _weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """D, Psi and M^(-1/2)."""

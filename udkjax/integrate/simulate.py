@@ -133,6 +133,7 @@ def _simulate(
         ("stabilization", type(stabilization).__name__),
         ("solver", type(solver).__name__),
         ("max_steps", str(max_steps)),
+        ("first_step", "chosen" if dt0 is None else "given"),
     )
     names = getattr(mechanism, "body_names", ())
     return Solution(ts, q, v, code, time, stats, rtol, atol, names, settings), closure, missed
