@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from udkjax.study.comparison import REMARKS, published_kind, published_row, published_time, remark
+from udkjax.study.comparison import REMARKS, nearer, published_kind, published_row, published_time, remark
 from udkjax.study.published import TABLES
 
 READ = json.loads((Path(__file__).parents[1] / "data" / "seed_paper_tables.json").read_text())["tables"]
@@ -73,6 +73,20 @@ def test_each_difference_gets_its_remark(method, tol, alpha, kind, correct_to, l
     table, row = published_row(method, tol, alpha) or pytest.fail("not published")
     assert remark(row, table, kind, correct_to) == letter
     assert letter in REMARKS
+
+
+@pytest.mark.parametrize(
+    ("method", "tol", "tied", "held", "fits"),
+    [
+        ("SVD", 1e-10, 8.1, 16.7, "threshold TOL"),
+        ("Greville", 1e-10, 8.7, 17.4, "rank held at 11"),
+        ("Greville", 1e-10, 8.7, 15.9, "neither"),
+        ("GramSchmidt", 1e-6, 12.5, 19.0, "rank held at 11"),  # correct: to the end, 20 s
+    ],
+)
+def test_the_rule_that_fits_the_paper_is_found(method, tol, tied, held, fits):
+    _, row = published_row(method, tol, 0.0) or pytest.fail("not published")
+    assert nearer(row, tied, held, 20.0) == fits
 
 
 def test_every_verdict_on_every_published_run_has_a_remark():

@@ -7,6 +7,8 @@ from math import floor, isfinite, log10
 from string import ascii_lowercase
 
 from udkjax.show.report_figures import runs, tolerances
+from udkjax.study.comparison import nearer
+from udkjax.study.published import Row
 
 NOTHING = "–"
 GAP = "\u202f"  # a narrow space that does not break
@@ -187,15 +189,23 @@ def explained(data) -> str:
             method = row["method"]
             if method in held and method in tied:
                 work = [count(row["nfunc"]), *(count(float(by[method].right_hand_sides)) for by in (tied, held))]
-                rows.append([method, f"<i>{escape(row['result'])}</i>", result(tied[method]), result(held[method]), *work])
+                times = (_lost(by[method]) for by in (tied, held))
+                fits = nearer(Row(**row), *times, end=float(held[method].t_end))
+                rows.append([method, f"<i>{escape(row['result'])}</i>", result(tied[method]), result(held[method]), *work, fits])
     if not rows:
         return ""
     head = [
         '<th scope="col" rowspan="2">method</th><th scope="colgroup" colspan="3">result</th>'
-        '<th scope="colgroup" colspan="3">NFUNC</th>',
+        '<th scope="colgroup" colspan="3">NFUNC</th><th scope="col" rowspan="2">fits the paper</th>',
         columns(*(2 * ("paper", "threshold TOL", "rank held at 11")), words=3),
     ]
-    return table("The paper’s runs without stabilization, and VODE’s with two rules for the rank.", head, rows, [1, 2, 3])
+    return table("The paper’s runs without stabilization, and VODE’s with two rules for the rank.", head, rows, [1, 2, 3, 7])
+
+
+def _lost(run) -> float:
+    """When a run ceased to be right (s): when it was lost, or given up, or at its end."""
+    times = [float(run[name]) for name in ("correct_to", "failed_at")]
+    return min((time for time in times if isfinite(time)), default=float(run.t_end))
 
 
 def _better_row(run, usual: str) -> list[str]:

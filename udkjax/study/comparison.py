@@ -12,8 +12,7 @@ REMARKS = {
     "a": "As in the paper.",
     "b": "Lost by the drift, as in the paper, at about the same time.",
     "c": "Lost by the drift, as in the paper, but earlier: here the rank rises to 12 as soon as the drift lifts the twelfth "
-    "singular value to TOL. With the rank held at 11 the loss comes later (see “Rank held at 11”), at times near those that the "
-    "paper prints; so, we infer, its threshold for this method was not TOL.",
+    "singular value to TOL. With the rank held at 11 the loss comes later, at times near those of the paper (next section).",
     "d": "Lost by the drift, as in the paper, but later. When depends on the size of the rounding errors, hence on the order of "
     "operations, and by the law of the drift each factor of ten counts 1.3 s.",
     "e": "The paper's run halts, ours goes on and is wrong. The cause we know of is the same: as the drift lifts the twelfth "
@@ -47,6 +46,14 @@ def remark(row: Row, table: Table, kind: str, correct_to: float) -> str:
         return "k"
     later = correct_to - published_time(row)
     return "b" if abs(later) <= CLOSE else "d" if later > 0 else "c"
+
+
+def nearer(row: Row, tied: float, held: float, end: float) -> str:
+    """Say to which of two runs, lost at `tied` and `held` (s), the paper's is near; a right one counts as lost at `end`."""
+    printed = end if published_kind(row) == "correct" else published_time(row)
+    away = {"threshold TOL": abs(tied - printed), "rank held at 11": abs(held - printed)}
+    name = min(away, key=away.__getitem__)
+    return name if away[name] <= CLOSE else "neither"
 
 
 def published_kind(row: Row) -> str:

@@ -7,7 +7,7 @@ beside the paper's runs stand those that would have been better. `study` returns
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from typing import Any
 
@@ -56,18 +56,20 @@ def study(
     mech = parallelogram(np.radians(start))
     state = assemble(mech)
     cases = plan(scope, solver)
-    programs = _compiled(mech, state, {case.program for case in cases}, scope.max_steps, lambda part: tell("compiling", part / 3))
+    waiting = sum(program.seconds for program in {case.program for case in cases}) / cores()
+    total = waiting + sum(case.seconds for case in cases)
+    programs = _compiled(mech, state, cases, scope.max_steps, lambda what, part: tell(what, part * waiting / total))
     compiled = time.perf_counter() - begun
 
     sigma = np.linalg.svd(np.asarray(_matrices(mech, *(jnp.asarray(x)[None] for x in (0.0, state.q, state.v)))[0][0]))[1][0]
-    total, done, rows = sum(case.weight for case in cases), 0.0, []
+    done, rows = waiting, []
     for number, case in enumerate(cases):
-        tell(f"run {number + 1} of {len(cases)}", (1 + 2 * done / total) / 3)
+        tell(f"run {number + 1} of {len(cases)}", done / total)
         inputs = _inputs(case, state, sigma, seed)
         repeats = 1 if case.solver == vode.NAME else scope.repeats
         sol, seconds = _timed(partial(programs[case.program], *inputs), scope, repeats)
         rows.append(_row(mech, case, inputs, sol, seconds))
-        done += case.weight
+        done += case.seconds
     tell("done", 1.0)
     times = {"seconds": time.perf_counter() - begun, "seconds_compiling": compiled}
     settings = {
@@ -81,7 +83,7 @@ def study(
     return dataset(mech, state, cases, rows, settings, times)
 
 
-def _compiled(mech: Mechanism, state: State, programs: set[Program], max_steps: int, tell: Callable) -> dict[Program, Callable]:
+def _compiled(mech: Mechanism, state: State, cases: list[Case], max_steps: int, tell: Tell) -> dict[Program, Callable]:
     """All programs, compiled on as many threads as there are cores: XLA does it without Python's lock."""
     numbers = (jnp.linspace(0.0, 1.0, INSTANTS), state, *(jnp.asarray(x) for x in (1e-6, 1e-6, 0.0, 0.0)))
 
@@ -90,12 +92,14 @@ def _compiled(mech: Mechanism, state: State, programs: set[Program], max_steps: 
             return vode.program(mech, partial(pseudoinverse, program.method), FIRST_STEP, max_steps, numbers)
         return jax.jit(partial(_run, mech, program, max_steps)).lower(*numbers).compile()
 
-    found: dict[Program, Callable] = {}
+    programs = sorted({case.program for case in cases})
+    done, total = 0.0, sum(program.seconds for program in programs)
     with ThreadPoolExecutor(cores()) as pool:
-        for program, made in zip(sorted(programs), pool.map(build, sorted(programs)), strict=True):
-            found[program] = made
-            tell(len(found) / len(programs))
-    return found
+        made = {pool.submit(build, program): program for program in programs}
+        for number, future in enumerate(as_completed(made), 1):
+            done += made[future].seconds
+            tell(f"compiled {number} of {len(programs)}", done / total)
+    return {program: future.result() for future, program in made.items()}
 
 
 def _run(mech: Mechanism, program: Program, max_steps: int, ts, state, tol, rank_tol, alpha, beta) -> Any:
