@@ -39,14 +39,14 @@ def stiff(data):
         if name not in done:
             known = reference[name]
             ts, scale, states = (np.array(known[key]) for key in ("times", "scale", "states"))
-            solve, called, traced = _solver_of(STIFF[name].f)
+            solve, called, differentiated, traced = _solver_of(STIFF[name].f)
             found, traces = [], []
             for rtol in (1e-4, 1e-6, 1e-8):
-                called.clear()
+                called.clear(), differentiated.clear()
                 run = solve(jnp.array(STIFF[name].y0), ts, rtol, rtol * scale)
                 jax.effects_barrier()
                 errors = np.abs(run.ys - states) / (scale + np.abs(states))
-                found.append((rtol, errors, run, len(called)))
+                found.append((rtol, errors, run, len(called), len(differentiated)))
                 traces.append(len(traced))
             assert traces[0] == traces[-1]  # other numbers compile nothing
             done[name] = found, known["vode"]
@@ -56,13 +56,22 @@ def stiff(data):
 
 
 def _solver_of(f):
-    """A program that solves y' = f, and lists of the calls of f that it makes and of those when it is traced."""
-    called, traced = [], []
+    """A program that solves y' = f, and lists of what it does: call f, differentiate it, trace it."""
+    called, differentiated, traced = [], [], []
+
+    @jax.custom_jvp
+    def watched(y):
+        return y
+
+    @watched.defjvp
+    def _(primals, tangents):
+        jax.debug.callback(lambda: differentiated.append(None))
+        return primals[0], tangents[0]
 
     def counted(t, y, args):
         traced.append(None)
         jax.debug.callback(lambda: called.append(None))
-        return f(t, y)
+        return f(t, watched(y))
 
     @jax.jit
     def solve(y0, ts, rtol, atol):
@@ -79,35 +88,37 @@ def _solver_of(f):
             max_steps=100_000,
         )
 
-    return solve, called, traced
+    return solve, called, differentiated, traced
 
 
 @pytest.mark.parametrize("name", STIFF)
 class TestStiffProblems:
     def test_error(self, stiff, name):
         """At the end the error is within a factor of ten of the tolerance; on the way too, but before jumps, which enlarge it."""
-        for rtol, errors, _, _ in stiff(name)[0]:
+        for rtol, errors, *_ in stiff(name)[0]:
             assert errors[-1].max() < 10 * rtol
             assert errors.max() < 30 * rtol
 
     def test_calls_are_counted(self, stiff, name):
-        for _, _, run, called in stiff(name)[0]:
+        for _, _, run, called, _ in stiff(name)[0]:
             assert evaluations(run.controller_state) == called
             assert run.solver_state.evaluations <= called
 
     def test_cost(self, stiff, name):
-        """VODE, with the same formulas, takes as many right-hand sides for the same error, on the average of the tolerances."""
+        """VODE, with the same formulas, takes more right-hand sides for the same error, on the average of the tolerances."""
         found, vode = stiff(name)
         errors, calls = np.log([(row["error"], row["right_hand_sides"]) for row in vode]).T
         curve = np.polynomial.Polynomial.fit(errors, calls, 2)
-        ratios = [called / np.exp(curve(np.log(errors.max()))) for _, errors, _, called in found]
+        ratios = [called / np.exp(curve(np.log(errors.max()))) for _, errors, _, called, _ in found]
         assert max(ratios) < 1.5
-        assert np.mean(ratios) < 1.05
+        assert np.mean(ratios) < 1.0
 
     def test_jacobian_serves_many_steps(self, stiff, name):
-        for _, _, run, _ in stiff(name)[0]:
-            steps = int(run.stats["num_accepted_steps"])
-            assert run.solver_state.jacobians < steps / 20
+        """Where none is taken, none is computed; diffrax forgets those of steps that were rejected."""
+        for _, _, run, _, differentiated in stiff(name)[0]:
+            steps, counted = int(run.stats["num_accepted_steps"]), int(run.solver_state.jacobians)
+            assert counted <= differentiated <= counted + run.stats["num_rejected_steps"]
+            assert differentiated < steps / 15
             assert run.solver_state.factorizations < steps / 5
 
 
@@ -246,6 +257,50 @@ def test_gradients(reacted):
     np.testing.assert_allclose(ahead["x"][1], 1 / (1 + k * TS) ** 2, rtol=1e-6)
     more, less = (reacted(k + d).ys["z"] for d in (h, -h))
     np.testing.assert_allclose(ahead["z"][0], (more - less) / (2 * h), rtol=1e-5)
+
+
+def swing(t, y, args):
+    return {"x": y["v"], "v": -y["x"]}
+
+
+def test_event_backward_in_time():
+    """cos t falls to zero at -pi / 2; on the way the step's own polynomial is the solution, and its derivative."""
+    event = diffrax.Event(lambda t, y, args, **_: y["x"], optx.Newton(1e-12, 1e-12))
+    run: Any = diffrax.diffeqsolve(
+        diffrax.ODETerm(swing),
+        udk.BDF(),
+        0.0,
+        -4.0,
+        -1e-3,
+        {"x": jnp.array(1.0), "v": jnp.array(0.0)},
+        stepsize_controller=controller(1e-8, 1e-8),
+        event=event,
+        saveat=diffrax.SaveAt(t1=True, dense=True),
+        max_steps=256,
+    )
+    assert float(run.ts[0]) == pytest.approx(-math.pi / 2, abs=1e-7)
+    assert float(run.ys["v"][0]) == pytest.approx(1.0, abs=1e-7)
+    for t in (-0.1, -0.7, -1.5):
+        assert float(run.evaluate(t)["x"]) == pytest.approx(math.cos(t), abs=1e-7)
+        assert float(run.derivative(t)["x"]) == pytest.approx(-math.sin(t), abs=1e-5)
+
+
+def test_jump_begins_a_new_history():
+    """y' = -k (y - u(t)), u leaping from 0 to 1: told of the leap, the solver does not look for it by rejected steps."""
+    k = 50.0
+    run: Any = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, _: -k * (y - jnp.where(t < 1, 0.0, 1.0))),
+        udk.BDF(),
+        0.0,
+        1.1,
+        1e-3,
+        jnp.array([1.0]),
+        stepsize_controller=diffrax.ClipStepSizeController(controller(1e-7, 1e-7), jump_ts=jnp.array([1.0])),
+        saveat=diffrax.SaveAt(t1=True),
+        max_steps=512,
+    )
+    assert float(run.ys[0, 0]) == pytest.approx(1 - math.exp(-k * 0.1), abs=1e-6)
+    assert run.stats["num_rejected_steps"] < 15
 
 
 def test_impossible_orders_are_named():

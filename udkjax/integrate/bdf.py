@@ -16,10 +16,11 @@ from udkjax.integrate.multistep import Multistep, from_controller, scale, steere
 
 HIGHEST = 5  # the formula of order six is of little use, the seventh unstable
 # By how much the estimated error of the next step shall be below the tolerance, if it is of order k - 1, k or k + 1; and the part
-# of it that an iteration may leave. VODE has 6, 6, 10 and 0.1; with these fewer steps are rejected, an error made of many steps
-# is not far above the tolerance, and for the same error it takes up to a fifth fewer right-hand sides (see tests).
+# of it that an iteration may leave. VODE has 6, 6, 10 and 0.1; with these fewer steps are rejected, and the same error takes
+# fewer right-hand sides.
 LOWER, SAME, HIGHER = 40.0, 40.0, 60.0
 NEWTON_SHARE = 0.02
+BETTER = 1.1  # another order allows a step larger by this factor, or it is not taken
 WORTHWHILE = 1.5  # the step grows by no smaller factor: while it is steady, M is kept and the error estimates are good
 LARGEST, SMALLEST = 10.0, 0.2  # factors of a step; those of diffrax.PIDController, by default
 LOST = 0.05  # what replaces so small a part of the step planned is of order one: there has been a jump
@@ -185,18 +186,22 @@ class BDF(Multistep):
         return jax.lax.cond(eqxi.unvmap_any(made_jump), begin, lambda: state)
 
     def _choose(self, k: Any, errors: Float[Array, "3"], wait: Any, retried: Any) -> tuple[Any, Any, Any]:
-        """After an accepted step: the factor of the next, its order, and how long to wait with another."""
+        """After an accepted step: the factor of the next, its order, and how long to wait with another.
+
+        A better order is taken also where the step does not grow: a run may stand far above the error that it aims at, since a
+        step that was accepted does not shrink.
+        """
         orders = k + jnp.array([-1, 0, 1])
         wait = wait - 1
         due = (wait <= 0) & ~retried
         factors = _factor(errors, orders, jnp.array([LOWER, SAME, HIGHER]))
         may = jnp.array([False, True, False]) | due & (orders >= self.min_order) & (orders <= self.max_order)
         factors = jnp.where(may, factors, 0.0)
-        best = jnp.argmax(factors.at[1].multiply(1 + 1e-9))
-        change = (factors[best] >= WORTHWHILE) & ~retried
-        order = jnp.where(change, orders[best], k)
+        best = jnp.argmax(factors.at[1].multiply(BETTER))
+        grow = (factors[best] >= WORTHWHILE) & ~retried
+        order = jnp.where(grow | (factors[best] >= 1), orders[best], k)
         wait = jnp.where(order != k, order + 1, jnp.where(due, 2, jnp.maximum(wait, jnp.where(retried, 2, 0))))
-        return jnp.where(change, jnp.minimum(factors[best], LARGEST), 1.0), order, wait
+        return jnp.where(grow, jnp.minimum(factors[best], LARGEST), 1.0), order, wait
 
 
 class _Size(eqx.Module):
