@@ -23,10 +23,7 @@ FORMULATIONS = {
 TS = np.linspace(0.0, 2.0, 9)
 
 
-def cases(*fast):
-    return pytest.mark.parametrize(
-        "formulation", [pytest.param(f, id=k, marks=[] if k in fast else pytest.mark.slow) for k, f in FORMULATIONS.items()]
-    )
+every = pytest.mark.parametrize("formulation", FORMULATIONS.values(), ids=FORMULATIONS)
 
 
 def tsit5(mech, formulation, ts=TS, tol=1e-9, **choices):
@@ -52,8 +49,9 @@ def swinging():
 # --- the same motion
 
 
-@cases("NullSpaceQR", "CoordinatePartitioning")
-@pytest.mark.parametrize("stabilization", [udk.Projection(), pytest.param(udk.Baumgarte(), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@every
+@pytest.mark.parametrize("stabilization", [udk.Projection(), udk.Baumgarte()])
 def test_a_regular_mechanism(swinging, formulation, stabilization):
     if isinstance(formulation, udk.CoordinatePartitioning) and isinstance(stabilization, udk.Baumgarte):
         pytest.skip("refused: see tests/equations/test_formulations.py")
@@ -65,7 +63,8 @@ def test_a_regular_mechanism(swinging, formulation, stabilization):
     assert dict(sol.settings)["formulation"] == type(formulation).__name__
 
 
-@cases("CoordinatePartitioning")
+@pytest.mark.slow
+@every
 def test_a_driven_mechanism(formulation):
     """No freedom is left: of independent coordinates there are none, and nothing is integrated but the clock."""
     mech = udk.library.slider_crank()
@@ -74,7 +73,8 @@ def test_a_driven_mechanism(formulation):
     assert_allclose(sol.q, exact(mech, sol), atol=1e-9)
 
 
-@cases("CoordinatePartitioning")
+@pytest.mark.slow
+@every
 def test_the_linkage(formulation):
     """11 of 12 rows are independent. Plain LU is let off: see below."""
     if isinstance(formulation, udk.Augmented):
@@ -96,8 +96,9 @@ def partitioned():
 
 
 def test_constraints_hold_without_stabilization(partitioned):
-    """To rounding at every output, positions and velocities."""
+    """To rounding at every output, positions and velocities; and the motion is the exact one."""
     mech, sol = partitioned
+    assert_allclose(sol.q, exact(mech, sol), atol=2e-8)
     equations = equations_of(mech)
     rest = [equations.violation(t, q.ravel(), v.ravel()) for t, q, v in zip(TS, sol.q, sol.v, strict=True)]
     assert max(float(jnp.abs(r).max()) for pair in rest for r in pair) < 1e-13
@@ -173,7 +174,7 @@ LONG = np.linspace(0.0, 20.0, 81)
 @pytest.mark.parametrize(
     ("angle", "rate"), [(-50, 0.0), (45, 0.0), (0, 0.0), (90, -1.0)], ids=["ordinary", "45", "in line", "up"]
 )
-@pytest.mark.parametrize("formulation", [pytest.param(f, id=k) for k, f in FORMULATIONS.items()])
+@every
 def test_twenty_seconds(formulation, angle, rate):
     """The last three starts cross singular configurations. Plain LU gets stuck at the first of them, and says so."""
     mech = udk.library.parallelogram(np.deg2rad(angle), rate)

@@ -82,7 +82,7 @@ class NullSpaceQR(Solved):
     longest row. Redundant rows are left out; which ones may change with the position, and while they are satisfied that changes
     nothing. So their drift does not grow by itself: the paper's linkage is right to 5e-9 after 20 s at 1e-9 without any
     stabilization. In a singular configuration the rank falls and N gains a column: with `Projection` the run crosses, but where
-    the choice of rows jumps near it, in up to five times the steps of `NullSpaceSVD`.
+    the choice of rows jumps near it, in up to nine times the steps of `NullSpaceSVD`.
     """
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
