@@ -12,7 +12,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from udkjax.show import report_figures, report_tables
-from udkjax.show.report_findings import findings, growth_time, psi2_note, repeat
+from udkjax.show.report_findings import findings, growth_time, psi2_note, repeat, second_choice
 
 FIGURES: dict[str, tuple[Callable[[Any], Figure], str, str]] = {
     "linkage": (
@@ -70,6 +70,7 @@ def page(data: Any) -> str:
         repeat=repeat(data),
         growth_time=growth_time(data),
         citation=data.attrs["citation"],
+        second_choice=second_choice(data),
         start=f"{data.attrs['setting_start']:g}°".replace("-", "−"),
         inferred="inferred: the paper does not print it" if data.attrs["setting_start"] in (-45.0, -50.0) else "chosen here",
         lost=f"{data.attrs['setting_lost']:g}",
@@ -92,7 +93,8 @@ def figure(data: Any, name: str) -> str:
         buffer = io.BytesIO()
         draw(data).savefig(buffer, format="svg", metadata={"Date": None})
     source = base64.b64encode(buffer.getvalue()).decode()
-    return f'<figure><img src="data:image/svg+xml;base64,{source}" alt="{alt}"><figcaption>{caption}</figcaption></figure>'
+    image = f'<img src="data:image/svg+xml;base64,{source}" alt="{alt}">'
+    return f'<figure class="{name}">{image}<figcaption>{caption}</figcaption></figure>'
 
 
 def _drawable(data: Any, name: str) -> bool:

@@ -41,7 +41,7 @@ def linkage(data) -> Figure:
     """Draw the mechanism at its start, and in later poses of the exact motion."""
     mech = loads(data.attrs["scene"])
     ts = np.linspace(0.0, float(data.attrs["law_period"]) / 2, 41)
-    figure = Figure(figsize=(WIDTH * 0.6, 2.9), layout="constrained")
+    figure = Figure(figsize=(WIDTH * 0.6, 2.3), layout="constrained")
     axes = figure.subplots()
     q = exact_coordinates(mech, ts, mech.q0, mech.v0)
     if q is not None:
@@ -128,7 +128,7 @@ def growth(data) -> Figure:
     for run in runs(data, "start", tol=middle):
         drift.semilogy(run.time, run.sigma_12, color="0.8", lw=0.6, zorder=1)
     levels = []
-    for run in runs(data, "rank held", tol=middle):
+    for run in runs(data, "rank held", tol=middle, solver=data.attrs["setting_solver"]):
         _log(drift, run, "sigma_12", LEAST_SIGMA, _colour(data, run))
         law = np.interp(run.time, data.law_time, data.law_drift)
         low, high = data.attrs["setting_fitted"]

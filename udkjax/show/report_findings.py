@@ -28,10 +28,14 @@ def _sentences(data):
     if held:
         growth = [float(run.growth) for run in held if np.isfinite(run.growth)]
         law = _law(data)
-        rates = f"; the drift grows at {min(growth):.2f} to {max(growth):.2f} 1/s" if growth else ""
+        rates = f"; the drift grows at {_span(growth, '.3f')} 1/s" if growth else ""
+        lost = [float(run.correct_to) for run in runs(data, "start") if np.isfinite(run.correct_to)]
+        luck = (
+            f" {len(lost)} starts that differ by rounding are lost between {min(lost):.1f} and {max(lost):.1f} s." if lost else ""
+        )
         yield (
             f"<b>A threshold that is not tied to TOL does not save them:</b> with the rank held at 11, {_counted(held)}"
-            f"{_times_by_tolerance(data, held)}{rates}, by the law {law:.3f} 1/s. The cause is the redundancy itself."
+            f"{_times_by_tolerance(data, held)}{rates}, by the law {law:.3f} 1/s. The cause is the redundancy itself.{luck}"
         )
     gains = list(runs(data, "small gains"))
     stiff = [run for run in runs(data, "paper") if run.alpha > 0]
@@ -100,6 +104,17 @@ def growth_time(data) -> str:
     return (
         f"Its rate of growth is {rate:.3f} 1/s: from {power(ROUNDING)} m to {power(data.attrs['setting_lost'])} it takes {took},"
     )
+
+
+def second_choice(data) -> str:
+    """Say what another start that fits the paper's results would change."""
+    other = float(data.attrs["law_rate_second"])
+    if abs(data.attrs["setting_start"] - data.attrs["start_second"]) < 1:
+        return ""
+    return (
+        f" From {data.attrs['start_second']:g}°, which would fit the paper too, the drift grows at {other:.3f} 1/s instead of "
+        f"{_law(data):.3f} 1/s, so that all runs are right for longer, by a factor of {_law(data) / other:.2f}."
+    ).replace(" -", " −")
 
 
 def psi2_note(data) -> str:

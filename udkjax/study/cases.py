@@ -59,6 +59,11 @@ class Case:
         return self.alpha > 100
 
     @property
+    def timed(self) -> bool:
+        """Whether its time is shown: not of runs of which only the drift is, nor where Python takes part."""
+        return self.group not in ("start", "law") and self.solver != "VODE"
+
+    @property
     def seconds(self) -> float:
         """How long it takes, roughly: what is said of the time left rests on it."""
         return 6.0 * self.end / END if self.stiff else 0.3

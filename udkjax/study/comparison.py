@@ -48,12 +48,15 @@ def remark(row: Row, table: Table, kind: str, correct_to: float) -> str:
     return "b" if abs(later) <= CLOSE else "d" if later > 0 else "c"
 
 
-def nearer(row: Row, tied: float, held: float, end: float) -> str:
-    """Say to which of two runs, lost at `tied` and `held` (s), the paper's is near; a right one counts as lost at `end`."""
+def nearer(row: Row, tied: float, held: float, end: float) -> tuple[str, float]:
+    """Return to which of two runs, lost at `tied` and `held` (s), the paper's is nearer, and how much later that one is lost (s).
+
+    A run that is right counts as lost at its `end`.
+    """
     printed = end if published_kind(row) == "correct" else published_time(row)
-    away = {"threshold TOL": abs(tied - printed), "rank held at 11": abs(held - printed)}
-    name = min(away, key=away.__getitem__)
-    return name if away[name] <= CLOSE else "neither"
+    later = {"threshold TOL": tied - printed, "rank held at 11": held - printed}
+    name = min(later, key=lambda rule: abs(later[rule]))
+    return name, later[name]
 
 
 def published_kind(row: Row) -> str:

@@ -66,8 +66,7 @@ def study(
     for number, case in enumerate(cases):
         tell(f"run {number + 1} of {len(cases)}", done / total)
         inputs = _inputs(case, state, sigma, seed)
-        repeats = 1 if case.solver == vode.NAME else scope.repeats
-        sol, seconds = _timed(partial(programs[case.program], *inputs), scope, repeats)
+        sol, seconds = _timed(partial(programs[case.program], *inputs), scope.repeats if case.timed else 1, scope.patience)
         rows.append(_row(mech, case, inputs, sol, seconds))
         done += case.seconds
     tell("done", 1.0)
@@ -136,11 +135,11 @@ def _inputs(case: Case, state: State, sigma: float, seed: int) -> tuple:
     return (jnp.linspace(0.0, case.end, INSTANTS), state, *numbers)
 
 
-def _timed(run: Callable, scope: Scope, repeats: int) -> tuple[Any, list[float]]:
-    """A solution, and the wall time (s) of each repeat of the run."""
+def _timed(run: Callable, repeats: int, patience: float) -> tuple[Any, list[float]]:
+    """A solution, and the wall time (s) of each repeat of the run; no further repeat after `patience` (s)."""
     seconds: list[float] = []
     sol: Any = None
-    while len(seconds) < repeats and sum(seconds) <= scope.patience:
+    while len(seconds) < repeats and sum(seconds) <= patience:
         begun = time.perf_counter()
         sol = jax.block_until_ready(run())
         seconds.append(time.perf_counter() - begun)
