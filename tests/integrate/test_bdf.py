@@ -42,7 +42,8 @@ def stiff(data):
             solve, called, differentiated, traced = _solver_of(STIFF[name].f)
             found, traces = [], []
             for rtol in (1e-4, 1e-6, 1e-8):
-                called.clear(), differentiated.clear()
+                called.clear()
+                differentiated.clear()
                 run = solve(jnp.array(STIFF[name].y0), ts, rtol, rtol * scale)
                 jax.effects_barrier()
                 errors = np.abs(run.ys - states) / (scale + np.abs(states))
@@ -97,7 +98,7 @@ class TestStiffProblems:
         """At the end the error is within a factor of ten of the tolerance; on the way too, but before jumps, which enlarge it."""
         for rtol, errors, *_ in stiff(name)[0]:
             assert errors[-1].max() < 10 * rtol
-            assert errors.max() < 30 * rtol
+            assert errors.max() < 20 * rtol
 
     def test_calls_are_counted(self, stiff, name):
         for _, _, run, called, _ in stiff(name)[0]:
@@ -301,6 +302,21 @@ def test_jump_begins_a_new_history():
     )
     assert float(run.ys[0, 0]) == pytest.approx(1 - math.exp(-k * 0.1), abs=1e-6)
     assert run.stats["num_rejected_steps"] < 15
+
+
+@pytest.mark.slow
+def test_linkage():
+    """The projection of each step costs BDF no steps, and large gains, which make the drift stiff, hardly any."""
+    mech, ts = udk.library.parallelogram(), jnp.linspace(0.0, 5.0, 11)
+    exact = udk.simulate(mech, ts, rtol=1e-11, atol=1e-11)
+    tols = {"rtol": 1e-8, "atol": 1e-8, "solver": udk.BDF()}
+    projected = udk.simulate(mech, ts, **tols)
+    free = udk.simulate(mech, ts, stabilization=None, **tols)
+    gains = udk.simulate(mech, ts, stabilization=udk.Baumgarte(1000.0, 100.0), **tols)
+    for run in (projected, free, gains):
+        np.testing.assert_allclose(run.q, exact.q, atol=1e-6)
+    assert projected.stats["steps"] < 1.1 * free.stats["steps"]
+    assert gains.stats["steps"] < 2 * free.stats["steps"]
 
 
 def test_impossible_orders_are_named():
