@@ -14,7 +14,7 @@ from udkjax.integrate.adams_order import SMALLEST, TINY, Errors, Pace, after_ste
 from udkjax.integrate.differences import HIGHEST, DifferenceInterpolation, Formula, formula
 from udkjax.integrate.multistep import Multistep, from_controller, scale, steered
 
-STRICTER = 4.0  # than the tolerance: the errors of short steps add up, those of a Runge-Kutta method are fewer
+STRICTER = 8.0  # than the tolerance: the errors of its many short steps add up
 LOST = 0.05  # a step that so small a part of the one planned has to replace begins again with order one
 ROUNDING = 1e-14  # relative: a compiler may compute the same state twice, and not quite the same
 ITERATIONS = 3
