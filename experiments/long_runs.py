@@ -271,8 +271,9 @@ def headline(data: xarray.Dataset) -> str:
     )
     return (
         f"median exponents: energy {np.median(energy):.2f}, phase {np.median(phase):.2f}; the energy's error makes "
-        f"{np.median(part):.0%} of the phase's; A01 at {tol:.0e} after {float(ends.time.max()):.0f} s: {told}; linkage, 20 s, "
-        f"1e-9, Dopri8: energy wrong by {float(budget.at_step_ends):.1e} J at step ends, {float(budget.at_outputs):.1e} J at outputs"
+        f"{np.median(part):.0%} of the phase's; A01 at {tol:.0e} after {float(ends.time.max()):.0f} s: {told}; linkage, "
+        f"20 s, 1e-9, Dopri8: energy wrong by {float(budget.at_step_ends):.1e} J at step ends, "
+        f"{float(budget.at_outputs):.1e} J at outputs"
     )
 
 
