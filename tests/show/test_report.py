@@ -7,7 +7,7 @@ import pytest
 
 from udkjax.show import report, report_tables
 from udkjax.show.progress import Progress
-from udkjax.show.report_findings import findings, psi2_note, repeat
+from udkjax.show.report_findings import findings, nfunc_note, psi2_note, repeat
 from udkjax.study.record import read, save
 
 VOID = {"meta", "img", "br", "link"}
@@ -128,6 +128,7 @@ def test_findings_count_what_the_tables_show(study_data):
     assert "the drift grows at 1.770 1/s, by the law 1.770 1/s" in text
     assert "4 starts that differ by rounding are lost between 10.0 and 13.0 s" in text
     assert "with the paper's gains: all 10 runs are correct to the end" in text
+    assert "NFUNC is 534 to 537 times ours" in nfunc_note(study_data)  # 80.1e6 / 10 / 15e3
     assert "times ours" in psi2_note(study_data) and "unexplained" in psi2_note(study_data)
 
 

@@ -12,7 +12,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from udkjax.show import report_figures, report_tables
-from udkjax.show.report_findings import findings, growth_time, psi2_note, repeat, second_choice
+from udkjax.show.report_findings import findings, growth_time, nfunc_note, psi2_note, repeat, second_choice
 
 FIGURES: dict[str, tuple[Callable[[Any], Figure], str, str]] = {
     "linkage": (
@@ -62,6 +62,7 @@ def page(data: Any) -> str:
         findings=findings(data),
         rules=report_tables.rules(data),
         paper_tables=report_tables.paper_tables(data),
+        nfunc_note=nfunc_note(data),
         psi2_note=psi2_note(data),
         remarks=report_tables.remarks(data),
         explained=report_tables.explained(data),

@@ -10,6 +10,7 @@ from udkjax.show.report_tables import count, power, scientific
 from udkjax.study.comparison import published_kind, published_time
 from udkjax.study.published import Row
 
+PAPER_END = 20.0  # s
 ROUNDING = 1e-16  # m: of a coordinate
 
 
@@ -117,24 +118,41 @@ def second_choice(data) -> str:
     ).replace(" -", " −")
 
 
+def nfunc_note(data) -> str:
+    """Say how many times the right-hand sides here the paper counts, a second of motion, where both runs are right to the end."""
+    pairs = [(row, run) for pairs in _printed(data).values() for row, run in pairs if row.result == run.kind == "correct"]
+    ratios = [row.nfunc * float(run.t_end) / PAPER_END / float(run.right_hand_sides) for row, run in pairs if row.nfunc]
+    if not ratios:
+        return ""
+    return (
+        f"Where both runs are right to the end the paper’s NFUNC is {_span(ratios, '.0f')} times ours, a second of motion. "
+        "We infer that a cumulative counter was added up over the output points (one every 0.01 s would give a factor of 1000), "
+        "and NSTEPS likewise."
+    )
+
+
 def psi2_note(data) -> str:
     """Say how far the paper's sums of squared violations are from ours."""
-    ratios: dict[bool, list[float]] = {False: [], True: []}
-    for table in json.loads(data.attrs["published"]):
-        printed = {row["method"]: row["psi2"] for row in table["rows"] if row["psi2"]}
-        for run in runs(data, "paper", tol=table["tol"]):
-            if (run.alpha > 0) == (table["alpha"] > 0) and run.method.item() in printed and run.psi2_end > 0:
-                ratios[table["alpha"] > 0].append(printed[run.method.item()] / float(run.psi2_end))
-    parts = [
-        f"{scientific(min(found), 0)} to {scientific(max(found), 0)} times ours {name}"
-        for name, found in (("without stabilization", ratios[False]), ("with it", ratios[True]))
-        if found
-    ]
+    ratios = {
+        name: [row.psi2 / float(run.psi2_end) for row, run in pairs if row.psi2 and run.psi2_end > 0]
+        for name, pairs in _printed(data).items()
+    }
+    parts = [f"{scientific(min(found), 0)} to {scientific(max(found), 0)} times ours {n}" for n, found in ratios.items() if found]
     return (
         f"The paper’s Σψ² is {' and '.join(parts)}: unexplained. It does not say at which instants its sum is taken."
         if parts
         else ""
     )
+
+
+def _printed(data) -> dict[str, list]:
+    """The paper's lines, each with our run, without and with stabilization."""
+    pairs: dict[str, list] = {"without stabilization": [], "with it": []}
+    for table in json.loads(data.attrs["published"]):
+        rows = {row["method"]: Row(**row) for row in table["rows"]}
+        ours = runs(data, "paper", tol=table["tol"], alpha=table["alpha"])
+        pairs["with it" if table["alpha"] else "without stabilization"] += [(rows[run.method.item()], run) for run in ours]
+    return pairs
 
 
 def _counted(chosen) -> str:
