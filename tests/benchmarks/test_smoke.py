@@ -9,7 +9,7 @@ import pytest
 
 benchmarks = pytest.importorskip("benchmarks", reason="not in a source tree")
 
-from benchmarks import right_hand_side, simulate  # noqa: E402
+from benchmarks import integrators, right_hand_side, simulate  # noqa: E402
 from benchmarks.common import Compiled, alternate, ratio  # noqa: E402
 from benchmarks.scripts import by_cholesky, by_pinv  # noqa: E402
 
@@ -29,6 +29,20 @@ def test_simulate(capsys):
     ours = [row for row in figures if row["name"].startswith("udkjax")]
     assert ours and all(row["error"] < 1e-7 for row in ours)
     assert all(row["error"] < 1e-3 for row in figures)
+
+
+def test_integrators():
+    figures = integrators.main(smoke=True)
+    assert {row["solver"] for row in figures} == {"VODE", "DOP853", "Adams", "LSODA", "Radau", "BDF"}
+    assert all(0 < row["error"] < 200 * row["tol"] and row["calls"] > 100 for row in figures)
+    assert all(row["ratio"] < 1.5 for row in figures if row["solver"] in ("Adams", "BDF"))
+
+
+def test_work_at_equal_error():
+    """Between two points that were measured, on a straight line in logarithms; not beyond them."""
+    work = integrators.Work([(1e-4, 100), (1e-8, 400)])
+    assert work.at(1e-6) == pytest.approx(200)
+    assert np.isnan(work.at(1e-9))
 
 
 def test_baselines_agree_with_the_closed_form():
