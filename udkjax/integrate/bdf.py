@@ -134,7 +134,7 @@ class BDF(Multistep):
         retried = h < (1 - 1e-3) * state.planned
         k = jnp.where(h < LOST * state.planned, 1, state.order)
 
-        psi = t1 - state.times
+        psi = t1 - state.times  # p and its derivative at t1, from the first k + 1 rows
         parts = _weights(state.times, t1)[:, None] * state.phi
         slopes = jnp.concatenate([jnp.zeros(1), jnp.cumsum(1 / psi[:-1])])
         i = jnp.arange(len(psi))
@@ -148,7 +148,7 @@ class BDF(Multistep):
         e, found, kept = newton.solve(equation, _held(size), state.newton, self.root_find_max_steps)
         e = jnp.where(found, e, 0.0)
 
-        j = i[:, None]  # rows: phi, columns: parts
+        j = i[:, None]  # new differences: phi[j] = y1 - (the sum of the parts before j), taken from e so that little cancels
         signs = jnp.where((j <= i) & (i <= k), 1.0, 0.0) - jnp.where((i > k) & (i < j), 1.0, 0.0)
         phi = signs @ parts + e
         y1 = unravel(phi[0])
