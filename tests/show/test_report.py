@@ -140,7 +140,15 @@ def test_the_page_says_how_to_repeat_it_and_what_was_cut(study_data):
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(4.5e-4, "4.5·10<sup>−4</sup>"), (9.96e-5, "1.0·10<sup>−4</sup>"), (12.0, "1.2·10<sup>1</sup>"), (0.0, "0"), (np.nan, "–")],
+    [
+        (4.5e-4, "4.5·10<sup>−4</sup>"),
+        (9.96e-5, "1.0·10<sup>−4</sup>"),
+        (12.0, "1.2·10<sup>1</sup>"),
+        (2.04, "2.0"),
+        (0.997, "1.0"),
+        (0.0, "0"),
+        (np.nan, "–"),
+    ],
 )
 def test_numbers_are_written_in_full(value, text):
     assert report_tables.scientific(value) == text

@@ -88,7 +88,7 @@ def _nearest(data):
         spans = [f"{name} {_times_by_tolerance(data, chosen).removeprefix('; ')}" for name, chosen in found.items()]
         yield (
             "<b>By VODE, the nearest relative of the paper’s integrator,</b> runs without stabilization are, "
-            f"{', and '.join(spans)}. The table on it tells which rule for the rank each of the paper’s methods must have had."
+            f"{', and '.join(spans)}. A table below says which rule is nearer to each of the paper’s results."
         )
 
 

@@ -47,10 +47,10 @@ def scientific(value: float | None, digits: int = 1) -> str:
         return "0"
     exponent = floor(log10(abs(value)))
     mantissa = f"{value / 10.0**exponent:.{digits}f}"
-    if exponent == 0:
-        return mantissa
     if mantissa.startswith("10"):
         exponent, mantissa = exponent + 1, f"{1:.{digits}f}"
+    if exponent == 0:
+        return mantissa
     return f"{mantissa}·10<sup>{str(exponent).replace('-', '−')}</sup>"
 
 
