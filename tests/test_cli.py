@@ -167,6 +167,7 @@ def test_a_report_is_drawn_from_its_data_alone(tmp_path, monkeypatch, capsys, st
     [
         (["--start", "10"], "--start 10"),
         (["--start", "-90"], "at -90 they hang"),
+        (["--seed", "-1"], "--seed -1"),
         (["--out", "report.pdf"], "neither a page"),
         (["--out", "nowhere/report.html"], "no folder nowhere"),
         (["--out", "nowhere/report"], "no folder nowhere"),

@@ -168,6 +168,8 @@ def report(
         from_file: draw the page from this file instead of running anything.
     """
     target = out if out.suffix == ".html" else out / "report.html"
+    if seed < 0:
+        _refuse(f"--seed {seed} must not be negative")
     if out.suffix not in ("", ".html"):
         _refuse(f"--out {out} is neither a page (.html) nor a folder")
     folder = target.parent if out.suffix else out.parent
