@@ -20,8 +20,8 @@ REMARKS = {
     "on its limits.",
     "f": "The paper's run halts and so does ours, for the known cause: the drift lifts the twelfth singular value above the "
     "threshold, the rank jumps to 12 and the equations turn stiff.",
-    "g": "Unexplained. The paper's run halts at about 8 s with a violation of 9.9e-2, whatever TOL is; ours depends on TOL, and no "
-    "rule for the rank that is tried here halts it so.",
+    "g": "Unexplained. The paper's run halts at about 8 s with a violation of 9.9e-2, whatever TOL is; ours depends on TOL, and "
+    "no rule for the rank that is tried here halts it so.",
     "h": "Unexplained. With Baumgarte's gains the constraints are held, the rank stays at 11, and nothing here stops the run.",
     "i": "Unexplained. The paper's run is right to the end, ours is lost by the drift, whose law does not know TOL.",
     "j": "Unexplained: the paper's run is right to the end, ours fails.",
