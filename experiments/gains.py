@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 import udkjax as udk
 from experiments.common import described, panels, tracked
 from experiments.parts.drift_law import linkage, scalar_law
-from experiments.parts.linkage import OUTPUTS, errors, start
+from experiments.parts.linkage import OUTPUTS, errors, parallelogram, start
 from udkjax.show.plots import COLOURS
 
 STARTS = (-45.0, -20.0)  # degrees, at rest
@@ -39,7 +39,7 @@ def study(smoke: bool) -> xarray.Dataset:
     """Errors, drift and cost of every start, tolerance and pair of gains, by singular values."""
     gains = ((0.0, 0.0), (REFERENCE, REFERENCE), PAPER) if smoke else (*((a, a) for a in EQUAL), PAPER)
     starts, tolerances = (STARTS[:1], TOLERANCES[:3:2]) if smoke else (STARTS, TOLERANCES)
-    mech, ts = udk.library.parallelogram(), np.linspace(0.0, END, OUTPUTS)
+    mech, ts = parallelogram(), np.linspace(0.0, END, OUTPUTS)
     shape = (len(starts), len(tolerances), len(gains))
     found = {name: np.full(shape, np.nan) for name in ("error", "drift", "right_hand_sides")}
     for case in tracked(np.ndindex(shape), "gains"):

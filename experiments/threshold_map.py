@@ -23,7 +23,7 @@ from matplotlib.patches import Rectangle
 
 import udkjax as udk
 from experiments.common import described, panels, tracked
-from experiments.parts.linkage import OUTPUTS, errors, start
+from experiments.parts.linkage import OUTPUTS, errors, parallelogram, start
 from udkjax.show.plots import COLOURS
 
 METHODS = {
@@ -52,7 +52,7 @@ def study(smoke: bool) -> xarray.Dataset:
     """When each method, at each threshold and tolerance, loses the linkage, and its error at 20 s."""
     thresholds = THRESHOLDS[:3:2] if smoke else THRESHOLDS
     tolerances = TOLERANCES[1:2] if smoke else TOLERANCES
-    ts, state, mech = np.linspace(0.0, END, OUTPUTS), start(DEGREES), udk.library.parallelogram()
+    ts, state, mech = np.linspace(0.0, END, OUTPUTS), start(DEGREES), parallelogram()
     maps = runs(smoke)
     lost = np.full((len(maps), len(tolerances), len(thresholds)), np.nan)
     error = lost.copy()
