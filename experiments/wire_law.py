@@ -33,7 +33,7 @@ from udkjax.show.plots import COLOURS
 STARTS = (-20.0, -30.0, -45.0, -50.0, -70.0)  # degrees, at rest
 GAINS = ((0.0, 0.0), (2.0, 2.0), (1.0, 0.5), (3.0, 1.0), (1.0, 3.0))  # alpha, beta in 1/s; the last lets the drift oscillate
 TOL = 1e-13  # of integration: 1e-4 of the drift at its smallest
-TRUNCATE = 1e-2  # relative: above what a drift opens, below the smallest singular value along these motions
+TRUNCATE = 1e-2  # in the units of D: above what a drift opens, below the smallest singular value along these motions
 SMALL, LARGE = 1e-9, 1e-5  # where a drift that grows or falls begins: rounding, and what is of second order, stay far below it
 SPAN = np.log(1e5)  # by which it may grow or fall meanwhile, but for a whole number of periods
 OUTPUTS, KEPT = 481, 4  # of every run, divisible by 1 to 4 periods; of which each fourth is kept
@@ -43,7 +43,9 @@ BOUND = 1e-5  # relative: of the rates measured
 def simulated(motion: Motion, state: udk.State, alpha: float, beta: float, periods: int) -> tuple[np.ndarray, np.ndarray]:
     """Return times and Psi (T, m) of the full nonlinear equations, by singular values, their rank held."""
     ts = np.linspace(0, periods * motion.period, OUTPUTS)
-    sol = udk.simulate(motion.mechanism, ts, state, TOL, TOL, udk.SVD(TRUNCATE), udk.Baumgarte(alpha, beta), drift_tol=np.inf)
+    sol = udk.simulate(
+        motion.mechanism, ts, state, TOL, TOL, udk.SVD.absolute(TRUNCATE), udk.Baumgarte(alpha, beta), drift_tol=np.inf
+    )
     return ts, np.asarray(udk.violation(motion.mechanism, sol))
 
 
