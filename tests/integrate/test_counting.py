@@ -127,6 +127,13 @@ class Branching(eqx.Module):
     def project(self, t, q, v):
         return q, v
 
+    def held(self, t, q, v):
+        return self
+
+    @property
+    def independent(self):
+        return None
+
 
 @pytest.mark.parametrize("projected", [True, False])
 def test_attempts_made_again_count_twice(calls, projected):
