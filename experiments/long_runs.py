@@ -10,8 +10,8 @@ The local error of an integrator is the same from period to period, as long as t
 
     dpsi = c t + Omega'(E) int dE dt:        a part ~ t, and one ~ t^2, which wins (Hairer, Lubich, Wanner, 2006, section X.3).
 
-An Adams method changes its order and its steps irregularly, so that gains and losses of energy nearly cancel from period to
-period: at small tolerances its energy wanders more than it drifts.
+An Adams method changes its order and its steps irregularly, so that gains and losses nearly cancel from period to period: its
+energy may wander for long before it drifts.
 
 Projection returns states to the constraint manifold, on which E is free: it does not conserve it. But without it the loops
 open, and the reactions do work on that, dE/dt = -lambda^T Psi_dot, which is more than what the steps themselves do wrong. What
@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from scipy.special import ellipk, ellipkinc
 
 import udkjax as udk
@@ -250,12 +251,11 @@ def holds(data: xarray.Dataset) -> dict[str, bool]:
         "exact solution and benchmark agree": float(data.reference_error) < 1e-9,
     }
     if "Adams" in data.solver:
-        adams, best = (data.sel(solver=name, tol=1e-10) for name in ("Adams", "Dopri8"))
-        parts["Adams loses less phase than Dopri8 for 60 % of the right-hand sides"] = bool(
-            (
-                (np.abs(adams.phase) < np.abs(best.phase)).isel(sample=-1)
-                & (adams.right_hand_sides < 0.6 * best.right_hand_sides)
-            ).all()
+        adams, looser = data.sel(solver="Adams", tol=1e-10), data.sel(solver="Dopri8", tol=1e-8)
+        less = (np.abs(adams.phase) < 0.1 * np.abs(looser.phase)).isel(sample=-1)
+        cheaper = adams.right_hand_sides < looser.right_hand_sides
+        parts["Adams at 1e-10 costs less than Dopri8 at 1e-8 and loses less than a tenth of the phase"] = bool(
+            (less & cheaper).all()
         )
     return parts
 
@@ -294,6 +294,7 @@ def figure(data: xarray.Dataset) -> Figure:
         for number, solver in enumerate(data.solver.values):
             one = ends.sel(solver=solver)
             row[2].loglog(one.right_hand_sides, np.abs(one.phase), "o-", ms=4, color=COLOURS[number], label=str(solver))
+        row[2].xaxis.set_minor_formatter(NullFormatter())
         row[2].set(xlabel="right-hand sides", ylabel="phase error at the end (rad)")
     names = [f"{style}: rtol = atol = {tol:.0e}" for tol, style in zip(data.tol.values, ("solid", "dashed", "dotted"))]
     page.suptitle(", ".join(names), fontsize=9)
