@@ -6,6 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
@@ -181,7 +182,7 @@ def _times(ts: ArrayLike) -> Float[Array, "T"]:
     ts = number(ts)
     if ts.ndim != 1 or len(ts) < 2:
         raise ValueError(f"ts must be a vector of at least two output times, from the start on; its shape is {ts.shape}")
-    if not isinstance(ts, Tracer) and not bool(jnp.all(jnp.diff(ts) > 0)):
+    if not isinstance(ts, Tracer) and not np.all(np.diff(ts) > 0):  # by NumPy: while something else is traced, jnp would trace it
         raise ValueError("ts must increase from each output time to the next")
     return ts
 

@@ -29,8 +29,9 @@ TABLEAU = diffrax.ButcherTableau(
     b_error=_row("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616") - _row("13/160 0 2375/5984 5/16 12/85 3/44 0 0"),
 )
 
-# Column m: coefficients of s^(m + 1). Of the weights b(s) of the eight stages that meet the conditions of order 4 at every s, those
-# whose residuals in the conditions of order 5, and then of order 6, are smallest. b(1) is b_sol; b'(0) is the first stage alone.
+# Column m: coefficients of s^(m + 1). Of the weights b(s) of the eight stages that meet the conditions of order 4 at every s,
+# those whose residuals in the conditions of order 5, and then of order 6, are smallest. b(1) is b_sol; b'(0) is the first stage
+# alone.
 DENSE = np.array(
     [
         [1.0, -2.7926169818074067, 2.6533780544166103, -0.6910024927492995, -0.09940999448060499, 0.0046514146207005174],

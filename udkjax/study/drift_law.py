@@ -1,8 +1,8 @@
 """The law of the drift of a redundantly constrained linkage: a bead on a wire that turns with its links.
 
-On the constraint manifold D of the paper's linkage has rank 11, and its left null vector turns with the links. While the rank is
-held at 11 a pseudoinverse enforces the acceleration constraints of the other rows only, so a drift rho along the null vector
-obeys, to first order,
+On the constraint manifold D of the paper's linkage has rank 11. While the rank is held at 11 a pseudoinverse enforces P Psi'' = 0
+only, P the projector on the range of D, and that range turns with the links. The drift lies in the range; of its size rho in the
+direction into which the left null vector turns, this leaves, to first order,
 
     rho'' + 2 alpha rho' + (beta^2 - theta'^2) rho = 0.
 
