@@ -130,6 +130,7 @@ def test_findings_count_what_the_tables_show(study_data):
     assert "with the paper's gains: all 10 runs are correct to the end" in text
     assert "NFUNC is 534 to 537 times ours" in nfunc_note(study_data)  # 80.1e6 / 10 / 15e3
     assert "times ours" in psi2_note(study_data) and "unexplained" in psi2_note(study_data)
+    assert "the paper has 1.1·10<sup>−4</sup> to 9.7·10<sup>−4</sup> m² where it was correct up to" in psi2_note(study_data)
 
 
 def test_the_page_says_how_to_repeat_it_and_what_was_cut(study_data):

@@ -138,11 +138,32 @@ def psi2_note(data) -> str:
         for name, pairs in _printed(data).items()
     }
     parts = [f"{scientific(min(found), 0)} to {scientific(max(found), 0)} times ours {n}" for n, found in ratios.items() if found]
-    return (
-        f"The paper’s Σψ² is {' and '.join(parts)}: unexplained. It does not say at which instants its sum is taken."
-        if parts
+    if not parts:
+        return ""
+    ours = [_when_lost(run) for run in runs(data, "rank held", solver="VODE", alpha=0.0) if np.isfinite(run.correct_to)]
+    paper = [
+        row["psi2"]
+        for table in json.loads(data.attrs["published"])
+        for row in table["rows"]
+        if not table["alpha"] and published_kind(Row(**row)) == "correct up to"
+    ]
+    held = (
+        f" But with the rank held at 11, by VODE, it is {_range(ours)} m² at the first output time at which a run is lost, and "
+        f"grows tenfold in {np.log(10) / 2 / _law(data):.1f} s; the paper has {_range(paper)} m² where it was correct up to a "
+        "time: another sign of such a rule."
+        if ours and paper
         else ""
     )
+    return f"The paper’s Σψ² is {' and '.join(parts)}: unexplained. It does not say at which instants its sum is taken.{held}"
+
+
+def _when_lost(run) -> float:
+    """The sum of squared violations at the first output time at which a run is lost."""
+    return float(run.psi2[np.searchsorted(run.time.values, float(run.correct_to), side="right")])
+
+
+def _range(values) -> str:
+    return f"{scientific(min(values))} to {scientific(max(values))}"
 
 
 def _printed(data) -> dict[str, list]:
