@@ -4,7 +4,6 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -23,6 +22,7 @@ from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.projection import Constrained, Projection, project_all
 from udkjax.integrate.solution import Result, SimulationError, Solution
+from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -121,7 +121,7 @@ def _simulate(
     ys = jnp.where(reached[:, None], ys, y0).at[0].set(y0)  # a run without any accepted step has saved nothing
     if projected:
         ys = jnp.concatenate([ys[:1], project_all(equations, ts[1:], ys[1:])])
-    seen = _held(Run(equations, run.result, ts, ys, reached, t_end[0], end[0], closed, missed, drift_tol))
+    seen = undifferentiated(Run(equations, run.result, ts, ys, reached, t_end[0], end[0], closed, missed, drift_tol))
     code, time, reached = outcome(seen)
     ys = jnp.where(reached[:, None], ys, jnp.nan)
     q, v = (y.reshape(len(ts), *start.q.shape) for y in jnp.split(ys, 2, axis=1))
@@ -159,17 +159,12 @@ def _first_step(equations: Any, ts: Array, y0: Array, rtol: Any, atol: Any) -> A
 
     As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off.
     """
-    equations, y0, rtol, atol = _held((equations.quick, y0, rtol, atol))
+    equations, y0, rtol, atol = undifferentiated((equations.quick, y0, rtol, atol))
     scale = atol + rtol * jnp.abs(y0)
     size, slope = jnp.max(jnp.abs(y0) / scale), jnp.max(jnp.abs(derivative(ts[0], y0, equations)) / scale)
     span = ts[-1] - ts[0]
     ordinary = jnp.isfinite(slope) & (slope > 0) & (size > 0)
     return jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, slope, 1.0), span), 1e-4 * span)
-
-
-def _held(tree: Any) -> Any:
-    """The same values, of no interest to any derivative."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def _controller(rtol: Any, atol: Any, ts: Array) -> diffrax.PIDController:
