@@ -24,6 +24,7 @@ def test_right_hand_side(tmp_path, capsys):
     assert "udkjax Elimination" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_simulate(capsys):
     figures = simulate.main(smoke=True)
     ours = [row for row in figures if row["name"].startswith("udkjax")]

@@ -94,6 +94,7 @@ def test_redundancy_along_a_motion(in_angles, method):
     assert_allclose(sol.q, in_angles, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_batch_and_a_gradient():
     """Each radius is its own motion; derivatives of the end with respect to radius and speed against differences."""
 

@@ -9,7 +9,8 @@ pytest.importorskip("experiments", reason="not in a source tree")
 
 from experiments.common import HERE, NAMES, described, load, run, tracked
 
-SLOW: set[str] = {"singular_crossing", "inconsistent_starts", "precision"}  # studies whose small runs compile for long
+# studies whose small runs compile for long
+SLOW: set[str] = {"singular_crossing", "inconsistent_starts", "precision", "gains", "threshold_map"}
 README = (HERE / "README.md").read_text(encoding="utf-8")
 
 

@@ -215,7 +215,8 @@ class TestDerivatives:
     a, t = jnp.array([4.0, 9.0, 1.0]), jnp.array([3.0, 1.0, 2.0])
     exact = (-t * jnp.sin(jnp.sqrt(a) * t) / (2 * jnp.sqrt(a)), -jnp.sqrt(a) * jnp.sin(jnp.sqrt(a) * t))
 
-    @pytest.mark.parametrize("corrector", ["pece", pytest.param("iteration", marks=pytest.mark.slow)])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("corrector", ["pece", "iteration"])
     def test_reverse_of_a_batch(self, corrector):
         """Whose members end at different times."""
         end = lambda a, t: self.end(a, t, diffrax.RecursiveCheckpointAdjoint(), corrector)  # noqa: E731

@@ -201,7 +201,10 @@ SOLVERS = {
 FINE = np.sort(np.append(np.linspace(0.0, 1.0, 38), [1 / np.pi, 0.333]))
 
 
-@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(s, id=name, marks=pytest.mark.slow if name in ("Dopri5", "Kvaerno5") else ()) for name, s in SOLVERS.items()],
+)
 def test_outputs_lie_on_the_manifold_with_every_solver(pendulum, motion, solver):
     sol = udk.simulate(pendulum, FINE, rtol=1e-6, atol=1e-6, solver=solver)
     assert jnp.abs(udk.violation(pendulum, sol)).max() < 1e-14
