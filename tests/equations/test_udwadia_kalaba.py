@@ -64,6 +64,22 @@ def test_in_line_too(linkage, placed, method):
     assert_allclose(a[:, :3, 2], np.stack([-3.5 * 9.81 * np.cos(theta) / 3.05] * 3, 1), atol=1e-10)
 
 
+@pytest.mark.parametrize("method", [udk.Auto(), udk.SVD(), udk.GramSchmidt()], ids=["Auto", "SVD", "GramSchmidt"])
+@pytest.mark.parametrize("ratio", [1.0, 1e4, 1e8, 1e10])
+def test_a_light_rod_carries_a_heavy_one(method, ratio):
+    """Two equations in the angles from hanging, solved by a determinant whose terms are all positive."""
+    s1, s2, w1, w2 = 0.4, -0.7, 1.0, 0.5
+    mech = udk.library.double_pendulum((s1, s2), (w1, w2), (1.0, 1.0), (1.0, ratio))
+    sin, cos, g = np.sin(s1 - s2), np.cos(s1 - s2), 9.81
+    upper, lower, both = 1 / 3, ratio / 3, ratio / 2
+    h1 = -both * sin * w2**2 - (0.5 + ratio) * g * np.sin(s1)
+    h2 = both * sin * w1**2 - ratio / 2 * g * np.sin(s2)
+    determinant = upper * lower + ratio**2 * (1 / 12 + sin**2 / 4)
+    exact = [(lower * h1 - both * cos * h2) / determinant, ((upper + ratio) * h2 - both * cos * h1) / determinant]
+    a = udk.accelerations(mech, 0.0, mech.q0, mech.v0, method)
+    assert_allclose(a[:, 2], exact, rtol=1e-13 * max(ratio, 100.0) ** 0.5)
+
+
 def reference(data, case):
     rows = data("seed_fivebar_parallelogram")["cases"][case]["reference"].values()
     return {key: np.array([np.asarray(row[key], float) for row in rows]) for key in next(iter(rows))}

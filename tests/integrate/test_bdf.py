@@ -95,10 +95,9 @@ def _solver_of(f):
 @pytest.mark.parametrize("name", STIFF)
 class TestStiffProblems:
     def test_error(self, stiff, name):
-        """At the end the error is within a factor of ten of the tolerance; on the way too, but before jumps, which enlarge it."""
+        """It is within a factor of ten of the tolerance, at the end and on the way, before jumps, which enlarge it, too."""
         for rtol, errors, *_ in stiff(name)[0]:
-            assert errors[-1].max() < 10 * rtol
-            assert errors.max() < 20 * rtol
+            assert errors.max() < 10 * rtol
 
     def test_calls_are_counted(self, stiff, name):
         for _, _, run, called, _ in stiff(name)[0]:

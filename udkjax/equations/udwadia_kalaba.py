@@ -28,6 +28,7 @@ from udkjax.scene.mechanism import Mechanism
 # Far above rounding and drift, far below the singular values of a mechanism in ordinary positions: with the states returned to
 # the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
 RANK_TOL = 1e-4
+ORDINARY = 100.0  # the ratio of masses up to which that holds: see `rank_tolerance`
 
 
 class Baumgarte(eqx.Module):
@@ -137,11 +138,11 @@ class Equations(Motion):
 def prepare(mechanism: Mechanism, method: Pseudoinverse | None = None, baumgarte: Baumgarte | None = None) -> Equations:
     """Prepare a mechanism for a method (default `Auto`). Its numbers may be traced; its structure decides what is compiled.
 
-    A method without a `rank_tol` gets `RANK_TOL`. Without knowledge of which rows are redundant (a mechanism that was built from
-    traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
+    A method without a `rank_tol` gets `rank_tolerance`. Without knowledge of which rows are redundant (a mechanism that was built
+    from traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
     """
     chosen: Any = Auto() if method is None else method
-    tol = number(RANK_TOL) if chosen.rank_tol is None else chosen.rank_tol
+    tol = rank_tolerance(mechanism) if chosen.rank_tol is None else chosen.rank_tol
     chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)
     left_out, elimination, drop = mechanism.left_out or (), None, number(0.0)
     if isinstance(chosen, Elimination):
@@ -157,6 +158,17 @@ def prepare(mechanism: Mechanism, method: Pseudoinverse | None = None, baumgarte
     numbers = [*scalars(jax.tree.leaves(mechanism)), *gains, drop]
     constants = [jnp.asarray(c) for c in programs.prologue(numbers)]
     return Equations(constants, chosen, programs)
+
+
+def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:
+    """Return `RANK_TOL`, less where masses are far apart.
+
+    Where a light body carries a heavy one the singular values of D = Psi_q M^(-1/2) are as far apart as the roots of the masses,
+    in any position: a ratio of 1e8 brings a constraint between them down to 1e-4 of the largest.
+    """
+    masses = jnp.stack([body.mass for body in mechanism.bodies.values()])
+    ratio = jax.lax.stop_gradient(masses.min() / masses.max())
+    return RANK_TOL * jnp.minimum(1.0, jnp.sqrt(ORDINARY * ratio))
 
 
 # --- plain

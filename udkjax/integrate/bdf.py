@@ -16,10 +16,11 @@ from udkjax.integrate.multistep import Multistep, from_controller, scale, steere
 from udkjax.integrate.undifferentiated import undifferentiated
 
 HIGHEST = 5  # the formula of order six is of little use, the seventh unstable
-# By how much the estimated error of the next step shall be below the tolerance, if it is of order k - 1, k or k + 1; and the part
-# of it that an iteration may leave. VODE has 6, 6, 10 and 0.1; with these fewer steps are rejected, and the same error takes
-# fewer right-hand sides.
-LOWER, SAME, HIGHER = 40.0, 40.0, 60.0
+STRICTER = 8.0  # than the tolerance: the errors of many steps add up, and near a jump they grow
+# By how much, beyond that, the estimated error of the next step shall be below the tolerance, if it is of order k - 1, k or
+# k + 1; and the part of the error that an iteration may leave. VODE has 6, 6, 10 and 0.1. With these an error made of many steps
+# is a few times the tolerance, and the same error takes no more right-hand sides than VODE (see tests).
+LOWER, SAME, HIGHER = 10.0, 10.0, 15.0
 NEWTON_SHARE = 0.02
 BETTER = 1.1  # another order allows a step larger by this factor, or it is not taken
 WORTHWHILE = 1.5  # the step grows by no smaller factor: while it is steady, M is kept and the error estimates are good
@@ -144,7 +145,7 @@ class BDF(Multistep):
         gamma = jnp.cumsum(1 / (1.0 + i))[k - 1]
         error = _error_constant(k, h / psi)
 
-        size = _Size(tolerances.norm, unravel, ravel_pytree(scale(tolerances, y0, y0))[0], error / NEWTON_SHARE)
+        size = _Size(tolerances.norm, unravel, ravel_pytree(scale(tolerances, y0, y0))[0], STRICTER * error / NEWTON_SHARE)
         equation = newton.Implicit(terms, args, unravel, t1, predicted, v, h / gamma)
         e, found, kept = newton.solve(equation, undifferentiated(size), state.newton, self.root_find_max_steps)
         e = jnp.where(found, e, 0.0)
@@ -154,7 +155,7 @@ class BDF(Multistep):
         phi = signs @ parts + e
         y1 = unravel(phi[0])
 
-        weighed = _Size(tolerances.norm, unravel, ravel_pytree(scale(tolerances, y0, y1))[0], 1.0)
+        weighed = _Size(tolerances.norm, unravel, ravel_pytree(scale(tolerances, y0, y1))[0], STRICTER)
         errors = undifferentiated(_errors(k, h / psi, phi, weighed).at[1].set(error * weighed(e)))
         accept = found & (errors[1] <= 1)
         factor, order, wait = self._choose(k, errors, state.wait, retried)
