@@ -54,8 +54,8 @@ class Multistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     """A multistep method of variable order and step.
 
     Its solver state has a field `evaluations`: the calls of the vector field in `init` and in the steps that were accepted. A
-    state y0 that is not the last y1 (it was projected) is taken for the newest point of the history; `made_jump` begins a new
-    history.
+    state y0 that is not the last y1 (it was projected) replaces the newest point of the history, or moves all of it there;
+    `made_jump` begins a new history.
     """
 
     root_finder: eqx.AbstractVar[Any]
