@@ -10,13 +10,15 @@ of singular values.
 """
 
 import dataclasses
-from functools import partial
+from functools import partial, reduce
 from itertools import pairwise
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations.code import Code, code, scalars
@@ -166,9 +168,12 @@ def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:
     Where a light body carries a heavy one the singular values of D = Psi_q M^(-1/2) are as far apart as the roots of the masses,
     in any position: a ratio of 1e8 brings a constraint between them down to 1e-4 of the largest.
     """
-    masses = jnp.stack([body.mass for body in mechanism.bodies.values()])
-    ratio = jax.lax.stop_gradient(masses.min() / masses.max())
-    return RANK_TOL * jnp.minimum(1.0, jnp.sqrt(ORDINARY * ratio))
+    masses = [body.mass for body in mechanism.bodies.values()]
+    known = not any(isinstance(mass, Tracer) for mass in masses)
+    xp: Any = np if known else jnp  # while something else is traced, jnp would trace what is known, too
+    masses = [xp.asarray(mass) for mass in masses]
+    ratio = reduce(xp.minimum, masses) / reduce(xp.maximum, masses)
+    return jax.lax.stop_gradient(number(RANK_TOL * xp.minimum(1.0, xp.sqrt(ORDINARY * ratio))))
 
 
 # --- plain
