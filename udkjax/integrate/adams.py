@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.integrate.adams_order import SMALLEST, TINY, Errors, Pace, after_step, begin, factor
 from udkjax.integrate.differences import HIGHEST, DifferenceInterpolation, Formula, formula
-from udkjax.integrate.multistep import Multistep, from_controller, scale, steered
+from udkjax.integrate.multistep import Multistep, check_orders, field, from_controller, scale, steered
 from udkjax.integrate.undifferentiated import undifferentiated
 
 STRICTER = 8.0  # than the tolerance: the errors of its many short steps add up
@@ -61,16 +61,12 @@ class Adams(Multistep):
     interpolation_cls: ClassVar[Callable[..., DifferenceInterpolation]] = DifferenceInterpolation
 
     def __check_init__(self):
-        if not 1 <= self.min_order <= self.max_order <= HIGHEST:
-            raise ValueError(f"1 <= min_order <= max_order <= {HIGHEST}; they are {self.min_order} and {self.max_order}")
+        check_orders(self.min_order, self.max_order, HIGHEST)
         if self.corrector not in ("pece", "iteration"):
             raise ValueError(f'corrector is "pece" or "iteration", not {self.corrector!r}')
 
     def order(self, terms):
         return self.max_order
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
         y, unravel = ravel_pytree(y0)
@@ -161,11 +157,7 @@ class Adams(Multistep):
 def _field(terms: Any, args: Any, unravel: Callable) -> Callable:
     """f as a function of time and of the state as a vector."""
 
-    def f(t, y):
-        unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # of the time that a step would take
-        return ravel_pytree(terms.vf_prod(t, unravel(y), args, unit))[0]
-
-    return f
+    return lambda t, y: field(terms, t, unravel(y), args)
 
 
 def _sizes(tolerances: Any, unravel: Callable, y0: Any, y1: Any) -> Callable:

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from udkjax.integrate import newton
-from udkjax.integrate.multistep import Multistep, from_controller, scale, steered
+from udkjax.integrate.multistep import Multistep, check_orders, field, from_controller, scale, steered
 from udkjax.integrate.undifferentiated import undifferentiated
 
 HIGHEST = 5  # the formula of order six is of little use, the seventh unstable
@@ -108,18 +108,14 @@ class BDF(Multistep):
     interpolation_cls: ClassVar = Interpolation
 
     def __check_init__(self):
-        if not 1 <= self.min_order <= self.max_order <= HIGHEST:
-            raise ValueError(f"1 <= min_order <= max_order <= {HIGHEST}; they are {self.min_order} and {self.max_order}")
+        check_orders(self.min_order, self.max_order, HIGHEST)
 
     def order(self, terms):
         return self.max_order
 
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
-
     def init(self, terms, t0, t1, y0, args):
         y = ravel_pytree(y0)[0]
-        return self._begin(newton.nothing_kept(len(y), y.dtype), newton.field(terms, t0, y0, args), t0, t1, y)
+        return self._begin(newton.nothing_kept(len(y), y.dtype), field(terms, t0, y0, args), t0, t1, y)
 
     def _begin(self, kept: newton.Kept, f: Float[Array, "n"], t0: Any, t1: Any, y: Float[Array, "n"]) -> State:
         """A history of one state, as if the state had always changed at the rate f."""
@@ -182,7 +178,7 @@ class BDF(Multistep):
             return state
 
         def begin():
-            new = self._begin(state.newton, newton.field(terms, t0, y0, args), t0, t1, y)
+            new = self._begin(state.newton, field(terms, t0, y0, args), t0, t1, y)
             return jax.tree.map(lambda a, b: jnp.where(made_jump, a, b), new, state)
 
         return jax.lax.cond(eqxi.unvmap_any(made_jump), begin, lambda: state)

@@ -12,6 +12,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
 SAFETY = 0.9  # of diffrax.PIDController, by default
 ERROR_ORDER = 2  # that the controller is told: the order of the error of the first step, which is of order one
@@ -50,6 +52,18 @@ def steered(tolerances: Tolerances, y0: Any, y1: Any, accept: Any, factor: Any) 
     return jax.tree.map(lambda s: size / tolerances.norm(ones) * s, scale(tolerances, y0, y1))
 
 
+def field(terms: Any, t: Any, y: Any, args: Any) -> Float[Array, "n"]:
+    """The derivative of y, as a vector."""
+    unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # of the time that a step would take
+    return ravel_pytree(terms.vf_prod(t, y, args, unit))[0]
+
+
+def check_orders(least: int, most: int, highest: int) -> None:
+    """Refuse orders that a family of methods does not have."""
+    if not 1 <= least <= most <= highest:
+        raise ValueError(f"1 <= min_order <= max_order <= {highest}; they are {least} and {most}")
+
+
 class Multistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     """A multistep method of variable order and step.
 
@@ -60,6 +74,9 @@ class Multistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
 
     root_finder: eqx.AbstractVar[Any]
     term_structure: ClassVar = diffrax.AbstractTerm
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
 
     def error_order(self, terms):
         return ERROR_ORDER

@@ -20,9 +20,10 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Bool, Float, Int
+
+from udkjax.integrate.multistep import field
 
 ITERATIONS = 3  # with one matrix, by default: more rarely help
 JACOBIAN_STEPS, MATRIX_STEPS = 50, 20  # for which they are kept at most
@@ -65,12 +66,6 @@ class Kept(eqx.Module):
     evaluations: Int[Array, ""]
     jacobians: Int[Array, ""]
     factorizations: Int[Array, ""]
-
-
-def field(terms: Any, t: Any, y: Any, args: Any) -> Float[Array, "n"]:
-    """The derivative of y, as a vector."""
-    derivative = terms.vf_prod(t, y, args, terms.contr(jnp.zeros_like(t), jnp.ones_like(t)))
-    return ravel_pytree(derivative)[0]
 
 
 def nothing_kept(n: int, dtype: Any) -> Kept:
