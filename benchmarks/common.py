@@ -3,7 +3,6 @@
 import json
 import os
 import platform
-import re
 import statistics
 import time
 from collections.abc import Callable
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+
+from udkjax.study.machine import processor
 
 
 class Compiled:
@@ -60,14 +61,10 @@ def ratio(slow: list[float], fast: list[float]) -> float:
 
 def machine() -> dict[str, Any]:
     """Describe what the figures belong to."""
-    cpu = platform.processor() or platform.machine()
-    if Path("/proc/cpuinfo").exists():
-        models = re.findall(r"model name\s*:\s*(.*)", Path("/proc/cpuinfo").read_text())
-        cpu = models[0] if models else cpu
     load = os.getloadavg() if hasattr(os, "getloadavg") else None
     packages = {name: version(name) for name in ("jax", "jaxlib", "equinox", "diffrax", "numpy")}
     return {
-        "cpu": cpu,
+        "cpu": processor(),
         "cores": os.cpu_count(),
         "load": load and [round(x, 2) for x in load],
         "python": platform.python_version(),

@@ -27,8 +27,7 @@ class Constrained(Wrapper):
     the step ends on the constraint manifold. A derivative at its end that the solver would keep for the next step (FSAL) belongs
     to the state before projection; told that the state has jumped, the solver takes a new one. (Not so a multistep method, which
     would forget its whole history: it sees for itself that its newest point was moved.) Where the equations integrate only some
-    coordinates, errors are those of these alone. Error estimates, counted, and
-    interpolation are the wrapped solver's own.
+    coordinates, errors are those of these alone. Error estimates, with their counts, and interpolation are the wrapped solver's.
     """
 
     solver: diffrax.AbstractSolver

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from udkjax.integrate.solution import versions
+from udkjax.study.machine import cores
 
 FLAGS = ("JAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 FAST_PYTHON = (3, 12)
@@ -18,7 +19,7 @@ def doctor() -> str:
     lines = {
         **versions(),
         "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
-        "cores": f"{_cores()} of {os.cpu_count()}",
+        "cores": f"{cores()} of {os.cpu_count()}",
         "devices": ", ".join(f"{device} ({device.device_kind})" for device in jax.devices()),
         "precision": f"{jnp.result_type(float)}",
         "environment": ", ".join(f"{key}={value}" for key, value in sorted(os.environ.items()) if key.startswith(FLAGS)) or "-",
@@ -38,7 +39,3 @@ def _advice():
         yield f"jax {jax.__version__} runs single trajectories several times slower than jax 0.12: pip install --upgrade jax"
     if jnp.result_type(float) != jnp.float64:
         yield "float64 is off, so that loops close to single precision only: unset JAX_ENABLE_X64, or set it to 1"
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

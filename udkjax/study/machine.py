@@ -12,10 +12,11 @@ def cores() -> int:
 
 def machine() -> str:
     """Name the processor, how many of its cores may be used, and the system."""
-    return f"{_processor()}, {cores()} of {os.cpu_count()} cores, {platform.system()} {platform.release()}"
+    return f"{processor()}, {cores()} of {os.cpu_count()} cores, {platform.system()} {platform.release()}"
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Name the processor."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
