@@ -75,8 +75,9 @@ class Mechanism(eqx.Module):
         found = _checked(given, gravity, name)
         self.name, self.gravity, self.left_out = name, number(gravity), left_out
         self.body_names, self._bodies = _columns(found["body"])
-        self.joint_names, self._joints = _columns([(key, self._resolved(c)) for key, c in found["joint"]])
-        self.driver_names, self._drivers = _columns([(key, self._resolved(c)) for key, c in found["driver"]])
+        known = dict(found["body"])
+        self.joint_names, self._joints = _columns([(key, _resolved(c, known)) for key, c in found["joint"]])
+        self.driver_names, self._drivers = _columns([(key, _resolved(c, known)) for key, c in found["driver"]])
         self.force_names, self._forces = _columns(found["force"])
         if left_out is None:
             self.left_out = find_redundant_rows(self)
@@ -144,12 +145,6 @@ class Mechanism(eqx.Module):
         new, gravity = replaced(self, values)
         return Mechanism(new["body"], new["joint"], new["driver"], new["force"], gravity, self.name, self.left_out)
 
-    def _resolved(self, constraint):
-        if type(constraint).resolved is Constraint.resolved:  # most joints: spares the sines and cosines of every body
-            return constraint
-        bodies = self.bodies
-        return constraint.resolved(*(_FIXED if name == GROUND else bodies[name].frame() for name in constraint.attached))
-
 
 def _checked(given: Mapping[str, list], gravity: Any, name: str) -> dict[str, list[tuple[str, Any]]]:
     """Return all elements with plain numbers made arrays; raise `SceneError` where anything is wrong with any of them."""
@@ -172,6 +167,12 @@ def _checked(given: Mapping[str, list], gravity: Any, name: str) -> dict[str, li
     if problems:
         raise SceneError(problems, name)
     return found
+
+
+def _resolved(constraint: Constraint, bodies: Mapping[str, Body]) -> Constraint:
+    if type(constraint).resolved is Constraint.resolved:  # most joints: spares the sines and cosines of every body
+        return constraint
+    return constraint.resolved(*(_FIXED if name == GROUND else bodies[name].frame() for name in constraint.attached))
 
 
 def numbered(elements: Sequence[Any], names: Sequence[str | None] = ()) -> list[str]:
