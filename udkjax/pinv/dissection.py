@@ -1,0 +1,168 @@
+"""Nested dissection: an order of elimination whose tree is as shallow as the graph allows.
+
+Removing a separator leaves parts that do not touch each other; each is dissected in turn, and the separator is eliminated
+after all of them (A. George, SIAM J. Numer. Anal. 10, 345 (1973)). The parts below one separator can be eliminated at the same
+time, so a chain of n blocks takes log2 n stages where any order from end to end takes n.
+
+Separators are sought where the graphs of planar mechanisms have small ones: a single block whose removal disconnects a part
+(chains, trees, loops in series), else a level set of a breadth-first search (grids of loops).
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+# A part of at most so many rows is eliminated whole, as one dense front. Larger ones trade levels for arithmetic.
+WHOLE = 6
+# No side of a separator holds more than this share of a part: with 2/3, the depth grows like log n whatever the graph.
+BALANCE = 2 / 3
+
+
+class Front(NamedTuple):
+    """A node of the elimination tree: the blocks it eliminates, and the later ones that these are coupled to."""
+
+    eliminated: list[int]
+    boundary: list[int]  # in the order of their elimination
+    children: list[int]  # at most two, by their place in the list of fronts
+    depth: int  # 0 at a root
+
+
+def dissect(sizes: Sequence[int], pairs: Iterable[tuple[int, int]], whole: int = WHOLE) -> list[Front]:
+    """Return the elimination tree of a graph of blocks, children before their parents.
+
+    Every front has at most two children (fronts that eliminate nothing join more), so that its sum of updates has a fixed form;
+    parts that do not touch have roots of their own.
+    """
+    near: list[list[int]] = [[] for _ in sizes]
+    for i, j in pairs:
+        near[i].append(j)
+        near[j].append(i)
+    tree = _Tree(sizes, near, whole)
+    roots = [tree.grow(part) for part in _components(near, range(len(sizes)))]
+    return tree.fronts(roots)
+
+
+class _Tree:
+    def __init__(self, sizes: Sequence[int], near: list[list[int]], whole: int):
+        self.sizes, self.near, self.whole = sizes, near, whole
+        self.eliminated: list[list[int]] = []  # by node, children before their parents
+        self.children: list[list[int]] = []
+        self.height: list[int] = []
+
+    def grow(self, part: list[int]) -> int:
+        """Add the tree of a connected part, and return its root."""
+        rows = sum(self.sizes[i] for i in part)
+        if rows <= self.whole:
+            return self.add(part, [])
+        separator = self.separator(part)
+        if 2 * sum(self.sizes[i] for i in separator) > rows:
+            return self.add(part, [])  # too tightly coupled to be worth two levels
+        rest = set(part).difference(separator)
+        below = [self.grow(p) for p in _components(self.near, rest)]
+        while len(below) > 2:  # the two shallowest are joined, which adds least to the depth
+            below.sort(key=lambda node: -self.height[node])
+            below.append(self.add([], [below.pop(), below.pop()]))
+        return self.add(separator, below)
+
+    def add(self, eliminated: list[int], children: list[int]) -> int:
+        self.eliminated.append(eliminated)
+        self.children.append(children)
+        self.height.append(1 + max((self.height[c] for c in children), default=-1))
+        return len(self.height) - 1
+
+    def separator(self, part: list[int]) -> list[int]:
+        """Return the smallest separator found that leaves no side too large; of several, the most even."""
+        sizes, near = self.sizes, self.near
+        levels = _levels(near, part, _levels(near, part, part[0])[-1][-1])
+        total, before = sum(sizes[i] for i in part), 0
+        best = (total, total, part)
+        for number, level in enumerate(levels):
+            following = set(levels[number + 1]) if number + 1 < len(levels) else set()
+            cut = [i for i in level if not following.isdisjoint(near[i])] or level
+            rows = sum(sizes[i] for i in cut)
+            here = sum(sizes[i] for i in level)
+            larger = max(before + here - rows, total - before - here)
+            before += here
+            if larger <= BALANCE * total and (rows, larger) < best[:2]:
+                best = rows, larger, cut
+        if len(best[2]) > 1:
+            single, larger = _articulation(sizes, near, part)
+            if larger <= BALANCE * total and sizes[single] < best[0]:
+                return [single]
+        return best[2]
+
+    def fronts(self, roots: list[int]) -> list[Front]:
+        place, depth = {}, {root: 0 for root in roots}
+        for node, blocks in enumerate(self.eliminated):
+            place.update({i: (node, k) for k, i in enumerate(blocks)})
+        for node in reversed(range(len(self.children))):
+            depth.update({child: depth[node] + 1 for child in self.children[node]})
+        boundary: list[list[int]] = []
+        for node, blocks in enumerate(self.eliminated):
+            later = {j for i in blocks for j in self.near[i] if place[j][0] > node}
+            later.update(j for child in self.children[node] for j in boundary[child] if place[j][0] != node)
+            boundary.append(sorted(later, key=lambda j: place[j]))
+        return [Front(e, b, c, depth[node]) for node, (e, b, c) in enumerate(zip(self.eliminated, boundary, self.children, strict=True))]
+
+
+def _components(near: list[list[int]], part: Iterable[int]) -> list[list[int]]:
+    left, found = set(part), []
+    for start in sorted(left):
+        if start in left:
+            left.remove(start)
+            reached = [start]
+            for i in reached:
+                for j in near[i]:
+                    if j in left:
+                        left.remove(j)
+                        reached.append(j)
+            found.append(reached)
+    return found
+
+
+def _levels(near: list[list[int]], part: list[int], start: int) -> list[list[int]]:
+    """Return the blocks of a connected part by their distance from one of them."""
+    left, levels = set(part), [[start]]
+    left.remove(start)
+    while left:
+        level = []
+        for i in levels[-1]:
+            for j in near[i]:
+                if j in left:
+                    left.remove(j)
+                    level.append(j)
+        levels.append(level)
+    return levels
+
+
+def _articulation(sizes: Sequence[int], near: list[list[int]], part: list[int]) -> tuple[int, float]:
+    """Return the block of a connected part whose removal leaves the smallest largest piece, and that piece's rows.
+
+    By one depth-first search: a child whose subtree has no edge back above its parent becomes a piece of its own (R. Tarjan,
+    SIAM J. Comput. 1, 146 (1972)).
+    """
+    inside, total = set(part), sum(sizes[i] for i in part)
+    start = part[0]
+    number, low, below = {start: 0}, {start: 0}, {start: sizes[start]}
+    pieces: dict[int, list[int]] = {start: []}  # the rows of the subtrees that the removal of a block cuts off
+    stack = [(start, iter(near[start]))]
+    while stack:
+        i, edges = stack[-1]
+        for j in edges:
+            if j in inside and j not in number:
+                number[j] = low[j] = len(number)
+                below[j], pieces[j] = sizes[j], []
+                stack.append((j, iter(near[j])))
+                break
+            if j in inside:
+                low[i] = min(low[i], number[j])
+        else:
+            stack.pop()
+            if stack:
+                parent = stack[-1][0]
+                low[parent] = min(low[parent], low[i])
+                below[parent] += below[i]
+                if low[i] >= number[parent]:
+                    pieces[parent].append(below[i])
+    largest = {i: max([total - sizes[i] - sum(pieces[i]), *pieces[i]]) for i in part}
+    best = min(part, key=lambda i: largest[i])
+    return best, largest[best]
