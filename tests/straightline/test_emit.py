@@ -21,12 +21,18 @@ def test_barriers_have_derivatives_of_every_order(emit):
     np.testing.assert_allclose(jax.vmap(g)(jnp.stack([x, -x])), jax.vmap(f)(jnp.stack([x, -x])), rtol=1e-14)
 
 
+def without_pair(text: str) -> str:
+    """A module without the function for sine and cosine, which has barriers of its own."""
+    before, _, after = text.partition("func.func private @_sincos")
+    return before + after.partition("func.func")[2]
+
+
 @pytest.mark.parametrize("every", [None, 1, 2, 5, 100])
 def test_barriers_change_nothing_but_their_number(emit, every):
     f = lambda x: jnp.sin(x) * x - jnp.cos(x[::-1]) / (1.0 + x * x)  # noqa: E731
     program = emit(f, X, cut_every=every)
-    operations = sum(program.program.count().values())
-    text = jax.jit(program.__call__).lower(jnp.asarray(X)).as_text()
+    operations = len(program.program.order)
+    text = without_pair(jax.jit(program.__call__).lower(jnp.asarray(X)).as_text())
     assert text.count("optimization_barrier") <= (operations // every if every else 0)
     assert ("optimization_barrier" in text) == (every is not None and every < operations)
     np.testing.assert_allclose(program(jnp.asarray(X))[0], f(X), rtol=1e-14)
@@ -35,7 +41,8 @@ def test_barriers_change_nothing_but_their_number(emit, every):
 def test_a_barrier_holds_only_what_is_used_later(emit):
     """A chain: each operation uses the one before, so that no barrier needs more than one value."""
     program = emit(lambda x: jnp.sin(jnp.cos(jnp.sin(jnp.cos(jnp.sin(x))))), 0.3, cut_every=1)
-    lines = [s for s in jax.jit(program.__call__).lower(0.3).as_text().splitlines() if "optimization_barrier" in s]
+    text = without_pair(jax.jit(program.__call__).lower(0.3).as_text())
+    lines = [s for s in text.splitlines() if "optimization_barrier" in s]
     assert len(lines) == 5
     assert all(line.count("tensor<f64>") == 1 for line in lines)
 

@@ -16,11 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.straightline.graph import Details, Graph, Node, Scalar
+from udkjax.straightline.trigonometry import sincos
 
 # Operations between two optimization barriers. Without any, XLA repeats everything for each output; with too many it cannot fuse.
 CUT_EVERY = 48
 
-_FLOATS = ("sin", "cos", "tanh", "exp")  # of these names math and NumPy have functions, too
+_PAIR = ("sin", "cos")
+_FLOATS = (*_PAIR, "tanh", "exp")  # of these names math and NumPy have functions, too
 
 
 class Program:
@@ -48,10 +50,11 @@ class Program:
 
     def _run(self, values: Sequence[Any]) -> list[Any]:
         known: dict[int, Any] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
+        pairs: dict[int, tuple[Any, Any]] = {}
         recent: list[int] = []
         for k, index in enumerate(self.order):
             node = self.graph.nodes[index]
-            known[index] = _evaluate(node, known)
+            known[index] = _evaluate(node, known, pairs)
             if node.kind not in ("constant", "call"):
                 recent.append(index)
             if self.cut_every and len(recent) >= self.cut_every:
@@ -65,14 +68,17 @@ class Program:
             known.update(zip(traced, cut([known[i] for i in traced]), strict=True))
 
     def count(self) -> dict[str, int]:
-        """How many operations of each kind the program holds."""
+        """How many operations of each kind the program holds; the sine and cosine of one angle are one."""
         counts: dict[str, int] = {}
+        angles = set()
         for index in self.order:
             node = self.graph.nodes[index]
             name = str(node.detail) if node.kind in ("apply", "call") else node.kind
-            if name not in ("constant", "pick", "input"):
+            if name in _PAIR:
+                angles.add(node.arguments[0].index)
+            elif name not in ("constant", "pick", "input"):
                 counts[name] = counts.get(name, 0) + 1
-        return counts
+        return counts | ({"sincos": len(angles)} if angles else {})
 
 
 @jax.custom_jvp
@@ -117,13 +123,15 @@ def _signed(known: dict[int, Any], scalar: Scalar) -> Any:
     return value if scalar.sign > 0 else -value
 
 
-def _evaluate(node: Node, known: dict[int, Any]) -> Any:
+def _evaluate(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, Any]]) -> Any:
     if node.kind == "constant":
         return node.detail
     if node.kind == "pick":
         output, flat = node.detail
         array = known[node.arguments[0].index][output]
         return array.reshape(-1)[flat]
+    if node.kind == "apply" and node.detail.primitive.name in _PAIR and isinstance(known[node.arguments[0].index], jax.Array):
+        return _one_of_pair(node, known, pairs)
     values = [_signed(known, a) for a in node.arguments]
     match node.kind:
         case "add":
@@ -141,6 +149,15 @@ def _evaluate(node: Node, known: dict[int, Any]) -> Any:
         case "call":
             return _call(node.detail, node.arguments, values)
     raise AssertionError(node.kind)
+
+
+def _one_of_pair(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, Any]]) -> Any:
+    """The sine or cosine of an angle, both of which are evaluated when the first of them is needed."""
+    (angle,), name = node.arguments, node.detail.primitive.name
+    if angle.index not in pairs:
+        pairs[angle.index] = sincos(known[angle.index])
+    value = pairs[angle.index][_PAIR.index(name)]
+    return -value if name == "sin" and angle.sign < 0 else value
 
 
 def _library(x: float) -> Any:

@@ -1,0 +1,109 @@
+"""Sine and cosine of one angle together, by arithmetic alone.
+
+On the CPU, XLA asks the C library for each double-precision sine and cosine, one element after the other. Here x is reduced by
+n = round(2 x / pi) to r = x - n pi/2, with pi/2 in four parts of which the products with n are exact (Cody and Waite), and the
+sine and cosine of r are the polynomials of fdlibm (Sun Microsystems 1993, k_sin.c and k_cos.c): compiled, it takes the width that
+the processor has. No step relies on a multiplication and an addition being rounded apart or together, so that it does no harm
+where a compiler contracts them.
+
+Accurate to 2 ulp for |x| < 1e6. Beyond, to the ulps of x, which is as well as the angle itself is known: the pair stays one of
+sine and cosine for angles of any size. Single precision, and devices other than the CPU, take what XLA has.
+"""
+
+import math
+from functools import reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+# pi/2 in three parts of 33 bits, whose products with integers below 2^20 are exact, and a rest: fdlibm, e_rem_pio2.c.
+_PARTS = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624871116645580e-21, 8.47842766036889956997e-32)
+# (sin r - r) / r^3 and (cos r - 1 + r^2 / 2) / r^4 in powers of r^2, highest first, for |r| <= pi/4.
+_SINE = (
+    1.58969099521155010221e-10,
+    -2.50507602534068634195e-08,
+    2.75573137070700676789e-06,
+    -1.98412698298579493134e-04,
+    8.33333333332248946124e-03,
+    -1.66666666666666324348e-01,
+)
+_COSINE = (
+    -1.13596475577881948265e-11,
+    2.08757232129817482790e-09,
+    -2.75573143513906633035e-07,
+    2.48015872894767294178e-05,
+    -1.38888888888741095749e-03,
+    4.16666666666666019037e-02,
+)
+
+
+def sincos(x: Any) -> tuple[Any, Any]:
+    """Return sin x and cos x, elementwise; x in rad. Differentiable to any order: the derivatives are the pair itself."""
+    return tuple(sincos_p.bind(jnp.asarray(x, jnp.result_type(x, float))))
+
+
+def _by_polynomials(x: Any) -> tuple[Any, Any]:
+    # Without the barriers XLA would compute what both results share once for each of them, and both for each of their uses. Another
+    # between polynomials and turning saves operations and no time.
+    n, r = jax.lax.optimization_barrier(_reduced(x))
+    return jax.lax.optimization_barrier(_turned(n, *_near_zero(r)))
+
+
+def _reduced(x: Any) -> tuple[Any, Any]:
+    """n and x - n pi/2."""
+    a, b, c, d = _PARTS
+    n = jax.lax.round(x * (2 / math.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
+    rest = x - n * a
+    high = rest - n * b
+    low = (rest - high) - n * b  # what rounding took from it
+    r = (high + (low - n * c)) - n * d
+    return n, jnp.minimum(jnp.maximum(r, -1.0), 1.0)  # from 1e16 on n is not exact: where r means nothing, keep a cosine a cosine
+
+
+def _near_zero(r: Any) -> tuple[Any, Any]:
+    z = r * r
+    s, c = (reduce(lambda value, k: value * z + k, p[1:], jnp.full_like(z, p[0])) for p in (_SINE, _COSINE))
+    return r + r * (z * s), (1.0 - 0.5 * z) + z * z * c
+
+
+def _turned(n: Any, s: Any, c: Any) -> tuple[Any, Any]:
+    """Turn by n right angles."""
+    quadrant = n - 4.0 * jnp.floor(n * 0.25)
+    first, second, third = quadrant == 1.0, quadrant == 2.0, quadrant == 3.0
+    s, c = jax.lax.select(first | third, c, s), jax.lax.select(first | third, s, c)
+    return jax.lax.select(second | third, -s, s), jax.lax.select(first | second, -c, c)
+
+
+# A primitive, so that programs hold one operation for each pair, and that each platform gets its own form of it.
+sincos_p = Primitive("sincos")
+sincos_p.multiple_results = True
+sincos_p.def_impl(jax.jit(sincos_p.bind))
+sincos_p.def_abstract_eval(lambda x: (x, x))
+batching.primitive_batchers[sincos_p] = lambda xs, axes: (sincos_p.bind(*xs), [axes[0]] * 2)
+
+
+def _derivative(primals, tangents):
+    (x,), (dx,) = primals, tangents
+    s, c = sincos_p.bind(x)
+    return [s, c], [c * dx, -(s * dx)]
+
+
+ad.primitive_jvps[sincos_p] = _derivative
+
+
+# jitted: all pairs of one shape are calls of one function
+@jax.jit
+def _sincos_of_the_library(x: Any) -> tuple[Any, Any]:
+    return jnp.sin(x), jnp.cos(x)
+
+
+@jax.jit
+def _sincos_on_cpu(x: Any) -> tuple[Any, Any]:
+    return _by_polynomials(x) if x.dtype == jnp.float64 else _sincos_of_the_library(x)
+
+
+mlir.register_lowering(sincos_p, mlir.lower_fun(_sincos_of_the_library, multiple_results=True))
+mlir.register_lowering(sincos_p, mlir.lower_fun(_sincos_on_cpu, multiple_results=True), platform="cpu")
