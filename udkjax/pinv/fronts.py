@@ -43,14 +43,14 @@ class Group:
     corner: np.ndarray  # (summands, b, b, fronts)
     carried: np.ndarray  # (summands, e, fronts)
     passed: np.ndarray  # (summands, b, fronts)
-    above: np.ndarray  # (b, fronts): places in the solutions (e + b, fronts) of the level above, flattened, group after group
+    above: np.ndarray  # (b, fronts): places in the solution found so far
 
 
 class Plan(NamedTuple):
-    """The groups of every level, the deepest first."""
+    """The groups of every level, the deepest first. Solutions (e, fronts) are found from the root, group after group."""
 
     levels: list[list[Group]]
-    solution: np.ndarray  # (blocks, width): places in what is eliminated, (e, fronts), level after level, group after group
+    solution: np.ndarray  # (blocks, width): places in the solution found
 
 
 class Matrix:
@@ -92,7 +92,6 @@ class _Seat(NamedTuple):
     number: int
     update: int  # (b, b, fronts)
     right: int  # (b, fronts)
-    solution: int  # (e + b, fronts)
 
 
 def plan(sizes: Sequence[int], pairs: np.ndarray, fronts: Sequence[Front]) -> Plan:
@@ -103,40 +102,38 @@ def plan(sizes: Sequence[int], pairs: np.ndarray, fronts: Sequence[Front]) -> Pl
     for k, front in enumerate(fronts):
         depths[front.depth].append(k)
     shapes = [(len(e), len(b)) for e, b in zip(eliminated, boundary, strict=True)]
-    layout, seats = [], {}
+    layout, seats, found, end = [], {}, np.zeros(matrix.first[-1], int), 0
     for members in depths:
-        begin, groups = (0, 0, 0), []
+        begin, groups = (0, 0), []
         for e, b, inside in _grouped(members, shapes):
             # The last front of a level's first group is empty: its updates are the zero that others refer to.
             count = len(inside) + (not groups)
-            seats.update({k: _Seat(e, b, count, f, *begin) for f, k in enumerate(inside)})
-            begin = begin[0] + b * b * count, begin[1] + b * count, begin[2] + (e + b) * count
+            for f, k in enumerate(inside):
+                seats[k] = _Seat(e, b, count, f, *begin)
+                found[eliminated[k]] = end + f + count * np.arange(len(eliminated[k]))
+            begin, end = (begin[0] + b * b * count, begin[1] + b * count), end + e * count
             groups.append((e, b, count, inside))
         layout.append(groups)
-    levels, solution, base = [], np.zeros((matrix.blocks, matrix.width), int), 0
     met = _met(fronts, seats, eliminated, boundary)
-    parent = {child: k for k, front in enumerate(fronts) for child in front.children}
+    levels = []
     for depth in reversed(range(len(layout))):
         groups = []
         zero = layout[depth + 1][0][2] - 1 if depth + 1 < len(layout) else 0
         for e, b, count, inside in layout[depth]:
-            at, above = np.full((e + b, count), -1), np.zeros((b, count), int)
+            at = np.full((e + b, count), -1)
             for f, k in enumerate(inside):
                 at[: shapes[k][0], f], at[e : e + shapes[k][1], f] = eliminated[k], boundary[k]
-                if k in parent:
-                    seat = seats[parent[k]]
-                    above[: shapes[k][1], f] = seat.solution + met[k] * seat.fronts + seat.number
-            row, front = np.nonzero(at[:e] >= 0)
-            solution[matrix.block[at[row, front]], matrix.offset[at[row, front]]] = base + row * count + front
-            base += e * count
             entries = matrix.places(at[:e, None], at[None])
             entries[np.arange(e), np.arange(e)] += at[:e] < 0  # the pivot of a row of padding is one
             rows = np.where(at[:e] < 0, 0, matrix.block[at[:e]] * matrix.width + matrix.offset[at[:e]])
             updates, right = _received(e + b, [fronts[k].children for k in inside], count, seats, met)
             parts = updates[:, :e, :e], updates[:, :e, e:], updates[:, e:, e:], right[:, :e], right[:, e:]
             sources = (_summands(part, zero) for part in parts)
+            above = np.where(at[e:] < 0, 0, found[at[e:]])
             groups.append(Group(e, b, count, *(_places(p) for p in (entries, rows, *sources, above))))
         levels.append(groups)
+    solution = np.zeros((matrix.blocks, matrix.width), int)
+    solution[matrix.block, matrix.offset] = found
     return Plan(levels, _places(solution))
 
 

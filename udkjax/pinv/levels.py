@@ -28,10 +28,11 @@ UNROLLED = 8
 class Factor(NamedTuple):
     """L diag(p) L^T of a group of fronts, and what couples it to their boundaries."""
 
-    lower: Array  # (e, e, fronts): L^-1
-    coupling: Array  # (e, b, fronts): diag(p)^-1 W
+    rows: Array  # (e, e + b, fronts): left of the diagonal L^-1, from there on diag(p) L^T and W
     inverse_pivots: Array  # (e, fronts)
 
+
+cut = lax.optimization_barrier  # between steps that XLA would otherwise repeat for every use
 
 Factors = tuple[tuple[Factor, ...], ...]
 
@@ -67,108 +68,91 @@ class Levels:
             drop: a pivot is what remains of its row's diagonal entry when the rows eliminated before it are taken out, so a
                 small one says that the row depends on them. Less than one. The factors of such a matrix are of no use.
         """
-        safe = jnp.asarray(True)
         if not self.sizes:
-            return (), safe
+            return (), jnp.asarray(True)
         entries = jnp.concatenate([diagonal.ravel(), coupling.ravel(), jnp.array([0.0, 1.0], diagonal.dtype)])
-        factors, sent = [], None
+        factors, safe, sent = [], [], None
         for level in self.plan.levels:
             done = [_eliminate(group, entries, sent, drop) for group in level]
             factors.append(tuple(factor for factor, _, _ in done))
-            safe = safe & jnp.stack([s for _, _, s in done]).all()
+            safe += [s for _, _, s in done]
             sent = _flat([update for _, update, _ in done])
-        return tuple(factors), safe
+        return tuple(factors), jnp.concatenate(safe).all()
 
     def solve(self, factors: Factors, r: Array) -> Array:
         """Return y (blocks, b) with S y = r (blocks, b); zero beyond a block's size."""
         if not self.sizes:
             return r
-        levels, right, sent, reduced = self.plan.levels, r.ravel(), None, []
-        for level, group_factors in zip(levels, factors, strict=True):
-            done = [_forward(group, factor, right, sent) for group, factor in zip(level, group_factors, strict=True)]
+        levels = list(zip(self.plan.levels, factors, strict=True))
+        right, sent, reduced = r.ravel(), None, []
+        for groups, group_factors in levels:
+            done = [_forward(group, factor, right, sent) for group, factor in zip(groups, group_factors, strict=True)]
             reduced.append([z for z, _ in done])
             sent = _flat([u for _, u in done])
-        found, above = [], None
-        for level, group_factors, zs in reversed(list(zip(levels, factors, reduced, strict=True))):
-            done = [_backward(*each, above) for each in zip(level, group_factors, zs, strict=True)]
-            above = _flat([jnp.concatenate(xs) for xs in done])
-            found.append(_flat([x for x, _ in done]))
-        y = _take(jnp.concatenate(found[::-1]), self.plan.solution)
+        found = jnp.zeros(0, r.dtype)
+        for (groups, group_factors), zs in reversed(list(zip(levels, reduced, strict=True))):
+            found = cut(_flat([found, *(_backward(*each, found) for each in zip(groups, group_factors, zs, strict=True))]))
+        y = _take(found, self.plan.solution)
         return y if min(self.sizes) == self.width else y * (np.arange(self.width) < np.array(self.sizes)[:, None])
 
 
 def _eliminate(group: Group, entries: Array, sent: Array | None, drop: Array | float) -> tuple[Factor, Array, Array]:
     """Return the factor of a group, its updates (b, b, fronts), and whether its pivots are safe."""
     e, b = group.eliminated, group.boundary
-    own = _take(entries, group.entries)
-    diagonal = own[np.arange(e), np.arange(e)]
-    front = jnp.concatenate([_sum(sent, group.pivot, own[:, :e]), _sum(sent, group.side, own[:, e:])], axis=1)
-    rows = lax.optimization_barrier((_rows if e <= UNROLLED else _rows_by_loop)(front))
-    pivots = rows[np.arange(e), np.arange(e)]
-    inverse = 1 / pivots
-    lower = jnp.where(np.tri(e, k=-1, dtype=bool)[..., None], rows[:, :e], np.eye(e)[..., None])
-    coupling = rows[:, e:] * inverse[:, None]
-    lower, coupling, inverse = lax.optimization_barrier((lower, coupling, inverse))
+    own = cut(_take(entries, group.entries))
+    rows = cut(jnp.concatenate([_sum(sent, group.pivot, own[:, :e]), _sum(sent, group.side, own[:, e:])], axis=1))
+    if e <= UNROLLED:
+        for j in range(e - 1):
+            rows = cut(_pivot(j, rows))
+    else:
+        rows = lax.fori_loop(0, e - 1, _pivot, rows)
+    pivots = _diagonal(rows)
+    inverse = cut(1 / pivots)
+    safe = (pivots > drop * _diagonal(own)).all(0)
     corner = _sum(sent, group.corner, jnp.zeros((b, b, group.fronts), entries.dtype))
-    update = corner - _products("jaf,jbf->abf", rows[:, e:], coupling)
-    return Factor(lower, coupling, inverse), update, (pivots > drop * diagonal).all()
+    update = corner - _products(rows[:, e:, None], rows[:, None, e:] * inverse[:, None, None])
+    return Factor(rows, inverse), cut(update), safe
 
 
-def _rows(front: Array) -> Array:
-    """Eliminate the rows (e, e + b, fronts) one after another: left of the diagonal L^-1, from there on diag(p) L^T and W.
-
-    A row keeps L^-1 where the elimination has left zeros; the pivot's own column takes the multiplier.
-    """
-    done: list[Array] = []
-    for i, row in enumerate(front):
-        for j, before in enumerate(done):
-            multiplier = row[j] / before[j]
-            row = jnp.where((np.arange(len(row)) == j)[:, None], -multiplier, row - multiplier * before)
-        done.append(lax.optimization_barrier(row))
-    return jnp.stack(done) if done else front
-
-
-def _rows_by_loop(front: Array) -> Array:
-    """`_rows`, with the same operations in a loop over the pivots."""
-
-    def eliminate(j: Array, front: Array) -> Array:
-        row = lax.dynamic_index_in_dim(front, j, 0, keepdims=False)
-        multiplier = lax.dynamic_index_in_dim(front, j, 1, keepdims=False) / lax.dynamic_index_in_dim(row, j, 0, keepdims=False)
-        own = (np.arange(front.shape[1]) == j)[:, None]
-        later = (np.arange(front.shape[0]) > j)[:, None, None]
-        return jnp.where(later, jnp.where(own, -multiplier[:, None], front - multiplier[:, None] * row), front)
-
-    return lax.fori_loop(0, front.shape[0], eliminate, front)
+def _pivot(j: int | Array, rows: Array) -> Array:
+    """Take row j out of those after it; where that leaves zeros, keep L^-1 instead."""
+    row = lax.dynamic_index_in_dim(rows, j, 0, keepdims=False)
+    multiplier = lax.dynamic_index_in_dim(rows, j, 1, keepdims=False) * cut(1 / lax.dynamic_index_in_dim(row, j, 0, keepdims=False))
+    later, own = (np.arange(rows.shape[0]) > j)[:, None, None], (np.arange(rows.shape[1]) == j)[:, None]
+    return jnp.where(later, jnp.where(own, 0, rows) - multiplier[:, None] * jnp.where(own, 1, row), rows)
 
 
 def _forward(group: Group, factor: Factor, right: Array, sent: Array | None) -> tuple[Array, Array]:
-    """Return L^-1 r of a group's rows, divided by the pivots, and what it sends up, W^T diag(p)^-1 L^-1 r taken out."""
-    r = _sum(sent, group.carried, _take(right, group.rows))
-    z = _products("ijf,jf->if", factor.lower, r)
-    passed = _sum(sent, group.passed, jnp.zeros((group.boundary, group.fronts), r.dtype))
-    return z * factor.inverse_pivots, passed - _products("jbf,jf->bf", factor.coupling, z)
+    """Return diag(p)^-1 L^-1 r of a group's rows, and what it sends up: W^T diag(p)^-1 L^-1 r, taken out."""
+    e, b = group.eliminated, group.boundary
+    r = cut(_sum(sent, group.carried, _take(right, group.rows)))
+    z = cut(_products(_lower(factor).swapaxes(0, 1), r[:, None]) * factor.inverse_pivots)
+    passed = _sum(sent, group.passed, jnp.zeros((b, group.fronts), r.dtype))
+    return z, cut(passed - _products(factor.rows[:, e:], z[:, None]))
 
 
-def _backward(group: Group, factor: Factor, z: Array, above: Array | None) -> tuple[Array, Array]:
-    """Return the solution at a group's rows, and at its boundary, where the level above knows it."""
-    x = jnp.zeros((group.boundary, group.fronts), z.dtype) if above is None else _take(above, group.above)
-    return _products("jif,jf->if", factor.lower, z - _products("jbf,bf->jf", factor.coupling, x)), x
+def _backward(group: Group, factor: Factor, z: Array, found: Array) -> Array:
+    """Return the solution at a group's rows, when it has been found at their boundaries."""
+    x = cut(_take(found, group.above))
+    t = z - _products(factor.rows[:, group.eliminated :].swapaxes(0, 1), x[:, None]) * factor.inverse_pivots
+    return cut(_products(_lower(factor), cut(t)[:, None]))
 
 
-def _products(subscripts: str, a: Array, b: Array) -> Array:
-    """A product of matrices for every front: written out where the sum is short, since XLA makes one loop of that."""
-    inputs, output = subscripts.split("->")
-    summed = next(s for s in inputs.split(",")[1] if s not in output)
-    one, two = inputs.split(",")
-    terms = a.shape[one.index(summed)]
-    if not 0 < terms <= UNROLLED:
-        return jnp.einsum(subscripts, a, b)
-    result = None
-    for k in range(terms):
-        x, y = lax.index_in_dim(a, k, one.index(summed), False), lax.index_in_dim(b, k, two.index(summed), False)
-        term = jnp.einsum(f"{one.replace(summed, '')},{two.replace(summed, '')}->{output}", x, y)
-        result = term if result is None else result + term
-    return result
+def _diagonal(rows: Array) -> Array:
+    return jnp.stack([rows[i, i] for i in range(len(rows))]) if len(rows) else rows[:, 0]
+
+
+def _lower(factor: Factor) -> Array:
+    """L^-1 (e, e, fronts)."""
+    e = len(factor.rows)
+    return jnp.where(np.tri(e, k=-1, dtype=bool)[..., None], factor.rows[:, :e], np.eye(e)[..., None])
+
+
+def _products(a: Array, b: Array) -> Array:
+    """Sum a b over their first axes: written out where that is short, since XLA makes one loop along the fronts of it."""
+    if not 0 < len(a) <= UNROLLED:
+        return (a * b).sum(0)
+    return sum((a[k] * b[k] for k in range(1, len(a))), a[0] * b[0])
 
 
 def _take(values: Array, places: np.ndarray) -> Array:
