@@ -10,8 +10,10 @@ For a constraint with residual Psi(t, q) the graph gets, all by forward differen
 and Psi_q one column at a time, each along a unit vector whose zeros the graph folds away: a row is {column: scalar}.
 """
 
+import dataclasses
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -81,23 +83,12 @@ class Expressions:
 
     def _constraint(self, element: Any, scalars: Any):
         moving = self._moving(element)
-        one, zero = self.graph.constant(1.0), self.graph.constant(0.0)
-        q, v = [self.q[k] for k in moving], [self.v[k] for k in moving]
-        along, bend = _traced(element, tuple(name == GROUND for name in self.mechanism.frames_of(element)))
+        state = [self.t, [self.q[k] for k in moving], [self.v[k] for k in moving]]
+        value, rows, rate, gamma = differentiated(self.graph, self._alike(element), jax.tree.leaves(scalars), *state)
+        return value, [{moving[k]: entry for k, entry in row.items()} for row in rows], rate, gamma
 
-        def derivative(program, dt, dq) -> list[np.ndarray]:
-            numbers = [np.asarray(s, object) for s in (self.t, *q, dt, *dq)]
-            return program(self.graph, jax.tree.leaves(scalars), numbers)
-
-        value, rate = _scalars(derivative(along, one, v))
-        (acceleration,) = _scalars(derivative(bend, one, v))
-        rows: list[Row] = [{} for _ in value]
-        for k, column in enumerate(moving):
-            unit = [one if i == k else zero for i in range(len(moving))]
-            for row, entry in zip(rows, _scalars(derivative(along, zero, unit))[1], strict=True):
-                if not entry.is_zero:
-                    row[column] = entry
-        return value, rows, rate, [-s for s in acceleration]
+    def _alike(self, element: Any) -> "Alike":
+        return alike(element, self.mechanism.frames_of(element))
 
     def _moving(self, element: Any) -> list[int]:
         return [self.start[name] + k for name in self.mechanism.frames_of(element) if name != GROUND for k in range(3)]
@@ -146,11 +137,8 @@ class Expressions:
 
     def _force(self, element: Any, scalars: Any) -> tuple[list[Scalar], Scalar]:
         moving = self._moving(element)
-        loads, energy = _traced_force(element, tuple(name == GROUND for name in self.mechanism.frames_of(element)))
-        numbers = [np.asarray(s, object) for s in (self.t, *(self.q[k] for k in moving), *(self.v[k] for k in moving))]
-        outputs = loads(self.graph, jax.tree.leaves(scalars), numbers)
-        (stored,) = energy(self.graph, jax.tree.leaves(scalars), numbers)
-        return [_scalar(s) for s in outputs], _scalar(stored)
+        state = [self.t, [self.q[k] for k in moving], [self.v[k] for k in moving]]
+        return applied(self.graph, self._alike(element), jax.tree.leaves(scalars), *state)
 
 
 def _scalar(array: Any) -> Scalar:
@@ -182,20 +170,70 @@ def _frames(ground: tuple[bool, ...], q: Any, v: Any = None) -> list[Frame]:
     return frames
 
 
+class Alike(NamedTuple):
+    """What elements have in common that are traced once: all but the names of their bodies and the values of their numbers."""
+
+    tree: Any
+    shapes: tuple
+    ground: tuple[bool, ...]  # which of its frames are the ground's
+
+    @property
+    def moving(self) -> int:
+        """How many bodies move in it."""
+        return len(self.ground) - sum(self.ground)
+
+
+def alike(element: Any, frames: Sequence[str]) -> Alike:
+    """Return an element's structure; `frames` are the names of the bodies that it sees."""
+    numbers = {name: GROUND if name == GROUND else str(k) for k, name in enumerate(frames)}
+    nameless = object.__new__(type(element))
+    for name, value in vars(element).items():
+        object.__setattr__(nameless, name, value)
+    for field in dataclasses.fields(element):
+        if field.name == "bodies" or "names" in field.metadata:
+            value = getattr(element, field.name)
+            renamed = numbers.get(value, "") if isinstance(value, str) else tuple(numbers.get(name, "") for name in value)
+            object.__setattr__(nameless, field.name, renamed)
+    leaves, tree = jax.tree.flatten(nameless)
+    return Alike(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(name == GROUND for name in frames))
+
+
+def differentiated(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
+    """Psi, the rows of Psi_q over the columns of q, Psi_dot and gamma of a constraint on scalars."""
+    along, bend = _traced(*kind)
+    one, zero = graph.constant(1.0), graph.constant(0.0)
+
+    def derivative(program, dt, dq) -> list[list[Scalar]]:
+        return _scalars(program(graph, leaves, [np.asarray(s, object) for s in (t, *q, dt, *dq)]))
+
+    value, rate = derivative(along, one, v)
+    (acceleration,) = derivative(bend, one, v)
+    rows: list[Row] = [{} for _ in value]
+    for k in range(len(q)):
+        unit = [one if i == k else zero for i in range(len(q))]
+        for row, entry in zip(rows, derivative(along, zero, unit)[1], strict=True):
+            if not entry.is_zero:
+                row[k] = entry
+    return value, rows, rate, [-s for s in acceleration]
+
+
+def applied(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
+    """The generalized loads of a force element over the columns of q, and its potential, on scalars."""
+    loads, energy = _traced_force(*kind)
+    numbers = [np.asarray(s, object) for s in (t, *q, *v)]
+    (stored,) = energy(graph, leaves, numbers)
+    return [_scalar(s) for s in loads(graph, leaves, numbers)], _scalar(stored)
+
+
 def _residual(element: Any, ground: tuple[bool, ...], t: Any, q: Any) -> jax.Array:
     rows = element.residual(t, *_frames(ground, q))
     rows = rows if isinstance(rows, list | tuple) else list(jnp.atleast_1d(rows))
     return jnp.stack([jnp.asarray(r, jnp.result_type(float)) for r in rows])
 
 
-def _traced(element: Any, ground: tuple[bool, ...]) -> tuple[Any, Any]:
-    leaves, tree = jax.tree.flatten(element)
-    return _traced_structure(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), ground)
-
-
 @lru_cache(maxsize=256)
-def _traced_structure(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
-    """Trace a residual's first and second derivative along (dt, dq); elements of equal structure share the trace."""
+def _traced(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
+    """Trace a residual's first and second derivative along (dt, dq)."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
@@ -214,13 +252,8 @@ def _traced_structure(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tup
     return trace(along, leaves, numbers), trace(bend, leaves, numbers)
 
 
-def _traced_force(element: Any, ground: tuple[bool, ...]) -> tuple[Any, Any]:
-    leaves, tree = jax.tree.flatten(element)
-    return _traced_force_structure(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), ground)
-
-
 @lru_cache(maxsize=256)
-def _traced_force_structure(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
+def _traced_force(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
     """Trace a force element's generalized loads, -dV/dq of its potential plus what it states itself, and its potential."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]

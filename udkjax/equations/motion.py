@@ -70,3 +70,33 @@ class Motion(eqx.Module):
     def independent(self) -> Any:
         """Which coordinates and velocities are integrated, and so under error control: booleans (n,), or None: all."""
         return None
+
+
+class MechanismMotion(Motion):
+    """The equations of motion of a mechanism, whose coordinates and velocities are x, y, angle of each body in turn."""
+
+    @property
+    @abstractmethod
+    def row_names(self) -> list[tuple[str, int]]:
+        """The constraint that each row of Psi belongs to, and its number within it."""
+
+    @property
+    @abstractmethod
+    def stabilized(self) -> bool:
+        """Whether Baumgarte's terms are fed back."""
+
+    @abstractmethod
+    def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+        """Kinetic and potential energy (J)."""
+
+    @abstractmethod
+    def jacobian(self, t: Any, q: Vector) -> Float[Array, "m n"]:
+        """Psi_q of all rows."""
+
+    @abstractmethod
+    def weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """D, Psi and M^(-1/2), of all rows."""
+
+    @abstractmethod
+    def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Any, Array, Vector]:
+        """D^+ by the method, what it is to be applied to (`b`, `psi` or `psi_dot`), and M^(-1/2)."""

@@ -169,7 +169,7 @@ def _checked(given: Mapping[str, list], gravity: Any, name: str) -> dict[str, li
     return found
 
 
-def _resolved(constraint: Constraint, bodies: Mapping[str, Body]) -> Constraint:
+def _resolved(constraint: Any, bodies: Mapping[str, Body]) -> Any:
     if type(constraint).resolved is Constraint.resolved:  # most joints: spares the sines and cosines of every body
         return constraint
     return constraint.resolved(*(_FIXED if name == GROUND else bodies[name].frame() for name in constraint.attached))

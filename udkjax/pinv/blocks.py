@@ -1,0 +1,164 @@
+"""Rows in blocks, each on a few blocks of columns: D^+ of thousands of rows by elimination of D D^T, level by level (levels.py).
+
+A block holds the rows of one constraint, and is stored as `columns`: entry (r, c, s) is what slot s has in row r and column c.
+Slot s = k blocks + i is the k-th block of columns that block i meets. Blocks of fewer rows are padded with
+zeros. A matrix is this one array, whatever its size.
+"""
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from udkjax.pinv.levels import Levels
+from udkjax.pinv.rule import Pseudoinverse, number
+
+GATHERED = 4  # terms of a sum that are fetched; what is beyond, in a few sums of many terms, is sent
+
+
+class Sums:
+    """Sums of slots by targets: x[..., k] is the sum of values[..., s] over the slots s with targets[s] = k (none where < 0)."""
+
+    def __init__(self, targets: np.ndarray, count: int):
+        slots = np.flatnonzero(targets >= 0)
+        slots = slots[np.argsort(targets[slots], kind="stable")]
+        target = targets[slots]
+        rank = np.arange(len(slots)) - np.searchsorted(target, target)  # of a slot among those of its target
+        depth = min(GATHERED, int(rank.max(initial=-1)) + 1)
+        self.near = np.full((depth, count), len(targets))
+        for k in range(depth):
+            self.near[k, target[rank == k]] = slots[rank == k]
+        self.far, self.there = slots[rank >= depth], target[rank >= depth]
+        self.count = count
+
+    def __call__(self, values: Float[Array, "*shape slots"]) -> Float[Array, "*shape count"]:
+        padded = jnp.concatenate([values, jnp.zeros_like(values[..., :1])], -1)
+        total = jnp.zeros((*values.shape[:-1], self.count), values.dtype)
+        for fetched in self.near:
+            total = total + padded[..., fetched]
+        return total.at[..., self.there].add(values[..., self.far]) if len(self.far) else total
+
+
+class BlockPattern:
+    """Which blocks of columns (of `width` columns each, `count` of them) each block of rows meets, and how many rows it has."""
+
+    def __init__(self, sizes: Sequence[int], meets: Sequence[Sequence[int]], width: int, count: int):
+        self.sizes, self.width, self.count = np.asarray(sizes, int), width, count
+        self.blocks, self.rows = len(sizes), max(sizes, default=0)
+        self.deep = max((len(m) for m in meets), default=1) or 1
+        self.columns = np.full((self.deep, self.blocks), -1)  # of each slot: the block of columns, or -1
+        for i, met in enumerate(meets):
+            self.columns[: len(met), i] = met
+        self.columns = self.columns.ravel()
+        self.by_column = Sums(self.columns, count)
+        self.pairs, self.shares = self._pairs()
+        self.levels = Levels.of(self.sizes.tolist(), self.pairs.tolist())
+
+    def _pairs(self) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+        """The pairs of blocks that meet the same columns; and in turns: pairs, and the slots of both in which they meet."""
+        order = np.argsort(self.columns, kind="stable")
+        order = order[self.columns[order] >= 0]
+        ends = np.flatnonzero(np.diff(self.columns[order])) + 1
+        found: dict[tuple[int, int], list[tuple[int, int]]] = {}
+        for slots in np.split(order, ends) if len(order) else []:
+            for one, two in combinations(sorted((s % self.blocks, s) for s in slots.tolist()), 2):
+                found.setdefault((one[0], two[0]), []).append((one[1], two[1]))
+        turns = max(map(len, found.values()), default=0)
+        shares = []
+        for turn in range(turns):
+            which = [p for p, slots in enumerate(found.values()) if len(slots) > turn]
+            slots = np.array([slots[turn] for slots in found.values() if len(slots) > turn])
+            shares.append((np.array(which), slots[:, 0], slots[:, 1]))
+        return np.array(list(found), int).reshape(-1, 2), shares
+
+    def gram(self, D: Float[Array, "r c s"]) -> tuple[Float[Array, "blocks r r"], Float[Array, "pairs r r"]]:
+        """The blocks of D D^T: those on the diagonal, and [i, j] for each of the pairs (i, j)."""
+        r, c, _ = D.shape
+        whole = D.reshape(r, c, self.deep, self.blocks)
+        diagonal = [[jnp.sum(whole[i] * whole[j], (0, 1)) for j in range(i + 1)] for i in range(r)]
+        filled = [[diagonal[max(i, j)][min(i, j)] for j in range(r)] for i in range(r)]
+        coupling = jnp.zeros((len(self.pairs), r, r), D.dtype)
+        for turn, (which, one, two) in enumerate(self.shares):
+            left, right = D[:, :, one], D[:, :, two]
+            product = jnp.stack([jnp.stack([jnp.sum(left[i] * right[j], 0) for j in range(r)], -1) for i in range(r)], -2)
+            coupling = coupling.at[which].add(product) if turn else product
+        return jnp.stack([jnp.stack(row, -1) for row in filled], -2), coupling
+
+    def matvec(self, D: Float[Array, "r c s"], x: Float[Array, "c count"]) -> Float[Array, "r blocks"]:
+        """D x, with x by blocks of columns."""
+        product = jnp.sum(D * x[:, np.maximum(self.columns, 0)], 1)
+        return jnp.sum(product.reshape(self.rows, self.deep, self.blocks), 1)
+
+    def rmatvec(self, D: Float[Array, "r c s"], y: Float[Array, "r blocks"]) -> Float[Array, "c count"]:
+        """D^T y."""
+        return self.by_column(jnp.sum(D * jnp.tile(y, (1, self.deep))[:, None], 0))
+
+
+class BlockFactors(NamedTuple):
+    """D, and the factors of D D^T."""
+
+    D: Float[Array, "r c s"]
+    factors: Any
+    rank: Int[Array, ""]
+
+
+class BlockElimination(Pseudoinverse):
+    """Elimination of independent rows that come in blocks: the operator is `columns`, as above; b and x are flat.
+
+    b has the rows of all blocks one after another, padding included, and x is (width count). A pivot is safe if it exceeds
+    `rank_tol`^2 times its row's diagonal entry of D D^T: what remains of the row is longer than `rank_tol` of it. Rows that are
+    not independent have no place here: the rank is then counted as zero. With `damping` d, D^+ stands for D^T (D D^T + d diag)^-1.
+    """
+
+    damping: Float[Array, ""] | None = None
+    pattern: Any = eqx.field(static=True, default=None)
+
+    def __init__(self, pattern: BlockPattern, rank_tol: ArrayLike = 1e-8, damping: ArrayLike | None = None):
+        self.rank_tol, self.relative, self.damping, self.pattern = number(rank_tol), True, number(damping), pattern
+
+    def admit(self, D: Any) -> Any:
+        return jnp.asarray(D)
+
+    def shape(self, D: Any) -> tuple[int, int]:
+        return self.pattern.rows * self.pattern.blocks, self.pattern.width * self.pattern.count
+
+    def matvec(self, D, x):
+        return flat(self.pattern.matvec(D, by_block(x, self.pattern.width)))
+
+    def rmatvec(self, D, y):
+        return flat(self.pattern.rmatvec(D, by_block(y, self.pattern.rows)))
+
+    def factor(self, D: Float[Array, "r c s"]) -> BlockFactors:
+        factors, safe = factorized(self.pattern, D, jnp.asarray(self.rank_tol) ** 2, self.damping)
+        return BlockFactors(D, factors, jnp.where(safe, self.pattern.sizes.sum(), 0))
+
+    def apply(self, factors: BlockFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+        return self.rmatvec(factors.D, self._square(factors, b))
+
+    def apply_transpose(self, factors: BlockFactors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+        return self._square(factors, self.matvec(factors.D, c))
+
+    def _square(self, factors: BlockFactors, b: Float[Array, "m"]) -> Float[Array, "m"]:
+        return self.pattern.levels.solve(factors.factors, b.reshape(-1, self.pattern.rows)).ravel()
+
+
+def factorized(pattern: BlockPattern, D: Float[Array, "r c s"], drop: Any, damping: Any = None) -> tuple[Any, Bool[Array, ""]]:
+    """Factorize D D^T; return what `Levels.solve` takes, and whether every pivot exceeds `drop` times its row's diagonal."""
+    diagonal, coupling = pattern.gram(D)
+    if damping is not None:
+        diagonal = diagonal * (1 + damping * jnp.eye(pattern.rows))
+    return pattern.levels.factor(diagonal, coupling, drop)
+
+
+def by_block(x: Float[Array, "n"], size: int) -> Float[Array, "size count"]:
+    """Split a flat vector of blocks of equal size, block by block, into one array a place in the block."""
+    return x.reshape(-1, size).T
+
+
+def flat(x: Float[Array, "size count"]) -> Float[Array, "n"]:
+    """Undo `by_block`."""
+    return x.T.ravel()
