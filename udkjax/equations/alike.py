@@ -15,7 +15,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.equations.expressions import Alike, alike, applied, differentiated
-from udkjax.scene.mechanism import Mechanism
+from udkjax.pinv.blocks import take
+from udkjax.scene.mechanism import Mechanism, attached
 from udkjax.straightline import Graph, Program, Scalar, frontier
 
 POSITIONS, VELOCITIES = ("x", "y", "angle"), ("vx", "vy", "omega")
@@ -129,10 +130,13 @@ class Group(NamedTuple):
     members: np.ndarray  # (elements,)
     bodies: np.ndarray  # (moving, elements)
 
-    def numbers(self, elements: Sequence[Any], root: Any, shared: Sequence[Any]) -> Float[Array, "constants elements"]:
-        """What the programs need of parameters alone; `root` is M^(-1/2) (bodies, 3), `shared` gravity and gains."""
+    def stacked(self, elements: Sequence[Any]) -> list[Any]:
+        """The numbers of the elements: for each leaf an array (elements, ...)."""
         leaves = [jax.tree.leaves(elements[i]) for i in self.members]
-        stacked = [stack(column) for column in zip(*leaves, strict=True)]
+        return [stack(column) for column in zip(*leaves, strict=True)]
+
+    def constants(self, stacked: Sequence[Array], root: Any, shared: Sequence[Any]) -> Float[Array, "constants elements"]:
+        """What the programs need of parameters alone; `root` is M^(-1/2) (bodies, 3), `shared` gravity and gains."""
         values = [leaf[(slice(None), *place)] for leaf in stacked for place in np.ndindex(*leaf.shape[1:])]
         if isinstance(self.kind, ConstraintKind):
             values += [root[bodies, k] for bodies in self.bodies for k in (0, 2)]
@@ -146,7 +150,7 @@ class Group(NamedTuple):
         """Evaluate outputs: for each name a list of arrays (elements,), or of numbers where they are known."""
         program, used, varying = self.kind.program(names)
         size = len(self.members)
-        state = [fields[name][self.bodies[body]] for name, body, _ in used]
+        state = [take(fields[name], self.bodies[body]) for name, body, _ in used]
         found = {}
         if varying:
             call = jax.vmap(lambda c, s: [jnp.asarray(x) for x in program([*c, t, *s])], axis_size=size)
@@ -167,10 +171,10 @@ def stack(values: Sequence[Any]) -> Any:
 
 def groups(mechanism: Mechanism, elements: Sequence[Any], make: Any, split: Sequence[Any] | None = None) -> list[Group]:
     """Group elements by their structure, and by what `split` says of each of them."""
-    place = {name: k for k, name in enumerate(mechanism.body_names)}
+    place, joints = {name: k for k, name in enumerate(mechanism.body_names)}, mechanism.joints
     found: dict[Any, list[tuple[int, list[int]]]] = {}
     for i, element in enumerate(elements):
-        frames = mechanism.frames_of(element)
+        frames = attached(element, joints)  # a method of a large module takes a look at all of its leaves
         key = alike(element, frames), split[i] if split else None
         found.setdefault(key, []).append((i, [place[name] for name in frames if name in place]))
     result = []

@@ -127,17 +127,32 @@ class Layout:
     def numbers(self, mechanism: Mechanism, gains: Sequence[Any]) -> dict[str, Any]:
         """Everything that depends on parameters alone."""
         bodies = list(mechanism.bodies.values())
-        mass, inertia = jnp.asarray(stack([b.mass for b in bodies])), jnp.asarray(stack([b.inertia for b in bodies]))
-        root = jnp.sqrt(1 / jnp.stack([mass, mass, inertia], -1))
         constraints, forces = list(mechanism.constraints.values()), list(mechanism.forces.values())
-        shared = [mechanism.gravity[0], mechanism.gravity[1], *gains]
-        return {
-            "root": root.T,
-            "mass": jnp.stack([mass, inertia]),
-            "gravity": jnp.append(jnp.asarray(mechanism.gravity), 0.0),
-            "constraints": [g.numbers(constraints, root, shared) for g in self.constraints],
-            "forces": [g.numbers(forces, root, ()) for g in self.forces],
-        }
+        return self._numbers(
+            stack([b.mass for b in bodies]),
+            stack([b.inertia for b in bodies]),
+            mechanism.gravity,
+            list(gains),
+            [g.stacked(constraints) for g in self.constraints],
+            [g.stacked(forces) for g in self.forces],
+        )
+
+    @cached_property
+    def _numbers(self) -> Any:
+        """One program for all of it: what is known is computed at once, without tracing as many arrays as there are elements."""
+
+        def numbers(mass, inertia, gravity, gains, constraints, forces):
+            root = jnp.sqrt(1 / jnp.stack([mass, mass, inertia], -1))
+            shared = [gravity[0], gravity[1], *gains]
+            return {
+                "root": root.T,
+                "mass": jnp.stack([mass, inertia]),
+                "gravity": jnp.append(gravity, 0.0),
+                "constraints": [g.constants(s, root, shared) for g, s in zip(self.constraints, constraints, strict=True)],
+                "forces": [g.constants(s, root, ()) for g, s in zip(self.forces, forces, strict=True)],
+            }
+
+        return jax.jit(numbers)
 
 
 def _constraint_kind(structure: Any, baumgarte: bool, loaded: bool) -> Any:

@@ -39,8 +39,13 @@ class Sums:
         padded = jnp.concatenate([values, jnp.zeros_like(values[..., :1])], -1)
         total = jnp.zeros((*values.shape[:-1], self.count), values.dtype)
         for fetched in self.near:
-            total = total + padded[..., fetched]
-        return total.at[..., self.there].add(values[..., self.far]) if len(self.far) else total
+            total = total + take(padded, fetched)
+        return total.at[..., self.there].add(take(values, self.far)) if len(self.far) else total
+
+
+def take(values: Float[Array, "*shape n"], places: np.ndarray) -> Array:
+    """values[..., places], for places that are known to exist."""
+    return values.at[..., places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 class BlockPattern:
@@ -83,14 +88,14 @@ class BlockPattern:
         filled = [[diagonal[max(i, j)][min(i, j)] for j in range(r)] for i in range(r)]
         coupling = jnp.zeros((len(self.pairs), r, r), D.dtype)
         for turn, (which, one, two) in enumerate(self.shares):
-            left, right = D[:, :, one], D[:, :, two]
+            left, right = take(D, one), take(D, two)
             product = jnp.stack([jnp.stack([jnp.sum(left[i] * right[j], 0) for j in range(r)], -1) for i in range(r)], -2)
             coupling = coupling.at[which].add(product) if turn else product
         return jnp.stack([jnp.stack(row, -1) for row in filled], -2), coupling
 
     def matvec(self, D: Float[Array, "r c s"], x: Float[Array, "c count"]) -> Float[Array, "r blocks"]:
         """D x, with x by blocks of columns."""
-        product = jnp.sum(D * x[:, np.maximum(self.columns, 0)], 1)
+        product = jnp.sum(D * take(x, np.maximum(self.columns, 0)), 1)
         return jnp.sum(product.reshape(self.rows, self.deep, self.blocks), 1)
 
     def rmatvec(self, D: Float[Array, "r c s"], y: Float[Array, "r blocks"]) -> Float[Array, "c count"]:
@@ -111,7 +116,8 @@ class BlockElimination(Pseudoinverse):
 
     b has the rows of all blocks one after another, padding included, and x is (width count). A pivot is safe if it exceeds
     `rank_tol`^2 times its row's diagonal entry of D D^T: what remains of the row is longer than `rank_tol` of it. Rows that are
-    not independent have no place here: the rank is then counted as zero. With `damping` d, D^+ stands for D^T (D D^T + d diag)^-1.
+    not independent have no place here: the rank is then counted as zero. `damping` d makes the diagonal of D D^T 1 + d times
+    as large.
     """
 
     damping: Float[Array, ""] | None = None

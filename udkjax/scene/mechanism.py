@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND, Body, Frame
@@ -109,19 +110,17 @@ class Mechanism(eqx.Module):
 
     def frames_of(self, element: Constraint | ForceElement) -> tuple[str, ...]:
         """Return the names of the bodies whose frames an element gets, in that order."""
-        if isinstance(element, Friction):
-            return self.joints[element.joint].attached
-        return element.attached if isinstance(element, Constraint) else element.bodies
+        return attached(element, self.joints if isinstance(element, Friction) else {})
 
     @property
     def q0(self) -> Float[Array, "bodies 3"]:
         """The initial guess of the coordinates: x, y (m) and angle (rad) of each body."""
-        return jnp.stack([jnp.append(body.position, body.angle) for body in self._bodies])
+        return _side_by_side([body.position for body in self._bodies], [body.angle for body in self._bodies])
 
     @property
     def v0(self) -> Float[Array, "bodies 3"]:
         """The initial guess of the velocities (m/s, rad/s)."""
-        return jnp.stack([jnp.append(body.velocity, body.angular_velocity) for body in self._bodies])
+        return _side_by_side([body.velocity for body in self._bodies], [body.angular_velocity for body in self._bodies])
 
     def with_left_out(self, rows: tuple[int, ...] | None) -> "Mechanism":
         """Return the mechanism with another choice of rows of Psi to leave out as redundant."""
@@ -144,6 +143,13 @@ class Mechanism(eqx.Module):
         """
         new, gravity = replaced(self, values)
         return Mechanism(new["body"], new["joint"], new["driver"], new["force"], gravity, self.name, self.left_out)
+
+
+def attached(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:
+    """Return the names of the bodies whose frames an element gets, in that order, where `joints` are those of its mechanism."""
+    if isinstance(element, Friction):
+        return joints[element.joint].attached
+    return element.attached if isinstance(element, Constraint) else element.bodies
 
 
 def _checked(given: Mapping[str, list], gravity: Any, name: str) -> dict[str, list[tuple[str, Any]]]:
@@ -192,6 +198,12 @@ def _acts(cls: type) -> bool:
 def _as_number(leaf):
     """Convert the plain numbers of user-written elements, which would be static."""
     return number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
+
+
+def _side_by_side(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
+    known = not any(isinstance(x, Tracer) for x in (*vectors, *numbers))  # by NumPy: jnp takes its time for each array
+    stack: Any = (lambda arrays: np.stack([np.asarray(a) for a in arrays])) if known else jnp.stack
+    return jnp.concatenate([stack(vectors), stack(numbers)[:, None]], 1)
 
 
 def _columns(items: Sequence[tuple[str, Element]]) -> tuple[tuple[str, ...], tuple[Element, ...]]:
