@@ -1,22 +1,45 @@
-"""`python -m benchmarks NAME [--smoke] [--out FILE]`."""
+"""`python -m benchmarks [NAME ...] [--smoke] [--out FOLDER]`."""
 
 import argparse
+import json
 from importlib import import_module
 from pathlib import Path
 
-NAMES = ("right_hand_side", "simulate", "integrators")
+NAMES = ("right_hand_side", "integrators", "trajectory", "batch", "gradients", "startup", "scaling", "peers")
 
-parser = argparse.ArgumentParser("python -m benchmarks", description="Measure udkjax against what a user would write without it.")
-parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; without one: all")
-parser.add_argument("--smoke", action="store_true", help="run everything once, to see that it runs; measures nothing")
-parser.add_argument("--out", type=Path, help="also write the figures to this JSON file (with several names: into this folder)")
-arguments = parser.parse_args()
-if unknown := set(arguments.names) - set(NAMES):
-    parser.error(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
-names = arguments.names or NAMES
-for name in names:
-    out = arguments.out
-    if out and len(names) > 1:
+
+def main(words: list[str] | None = None) -> None:
+    """Run the benchmarks, then hold what is promised against all figures, those of earlier runs in the folder among them."""
+    parser = argparse.ArgumentParser("python -m benchmarks", description="Measure udkjax against what would be used without it.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; without one: all")
+    parser.add_argument("--smoke", action="store_true", help="run everything once, tiny, to see that it runs; measures nothing")
+    parser.add_argument("--out", type=Path, help="folder for the figures (NAME.json, table.json) and the page (index.html)")
+    arguments = parser.parse_args(words)
+    if unknown := set(arguments.names) - set(NAMES):
+        parser.error(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
+
+    from benchmarks import native, page, peers, table
+    from benchmarks.common import machine, report
+
+    out, figures = arguments.out, {}
+    if out:
         out.mkdir(parents=True, exist_ok=True)
-        out = out / f"{name}.json"
-    import_module(f"benchmarks.{name}").main(smoke=arguments.smoke, out=out)
+    for name in NAMES:
+        file = out / f"{name}.json" if out else None
+        if name in (arguments.names or NAMES):
+            print(f"\n--- {name}")
+            figures[name] = import_module(f"benchmarks.{name}").main(smoke=arguments.smoke, out=file)
+        elif file and file.exists():
+            figures[name] = json.loads(file.read_text())["figures"]
+    about, judged = machine(), table.judge(figures)
+    table.show(judged)
+    report(about, judged, out / "table.json" if out else None)
+    if out:
+        missing = [name for name in NAMES if name not in figures]
+        missing += ["C++ (no compiler)"] if native.program() is None else []
+        missing += [f"{peer.name} (not installed)" for peer in getattr(peers, "PEERS", ()) if peer.available() is None]
+        page.write(figures, judged, about, missing, out / "index.html")
+
+
+if __name__ == "__main__":
+    main()

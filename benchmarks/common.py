@@ -1,16 +1,17 @@
-"""How everything here is measured: compiled once, warmed up, blocked, the candidates in turn, medians."""
+"""How everything here is measured: compiled once, warmed up, blocked, the candidates in turn, medians; at equal error."""
 
 import json
 import os
 import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from udkjax.study.machine import processor
 
@@ -42,21 +43,70 @@ class Compiled:
         self(*arguments)
         return time.perf_counter() - start
 
+    def cpu_seconds(self, *arguments: Any, at_least: float = 0.02) -> float:
+        """CPU time of a run, of all threads: the mean of as many as take `at_least` seconds. What else runs matters less to it."""
+        start, runs = time.process_time(), 0
+        while runs == 0 or time.process_time() - start < at_least:
+            self(*arguments)
+            runs += 1
+        return (time.process_time() - start) / runs
+
 
 def alternate(candidates: dict[str, Compiled], arguments: tuple, rounds: int) -> dict[str, list[float]]:
     """Time each candidate once a round: what slows the machine down for a while slows all of them."""
     for candidate in candidates.values():
         candidate(*arguments)
-    times: dict[str, list[float]] = {name: [] for name in candidates}
+    return in_turn({name: lambda c=candidate: c.seconds(*arguments) for name, candidate in candidates.items()}, rounds)
+
+
+def in_turn(timers: dict[Any, Callable[[], float]], rounds: int) -> dict[Any, list[float]]:
+    """The same of anything that returns how long it took."""
+    times: dict[Any, list[float]] = {name: [] for name in timers}
     for _ in range(rounds):
-        for name, candidate in candidates.items():
-            times[name].append(candidate.seconds(*arguments))
+        for name, timer in timers.items():
+            times[name].append(timer())
     return times
 
 
 def ratio(slow: list[float], fast: list[float]) -> float:
     """The median of the ratios within a round."""
     return statistics.median(s / f for s, f in zip(slow, fast, strict=True))
+
+
+class Work:
+    """What it costs to reach an error: a polygon through (error, cost), straight in logarithms."""
+
+    def __init__(self, points: Iterable[tuple[float, float]]):
+        self.error, self.cost = np.log(np.array(sorted(points))).reshape(-1, 2).T
+
+    def at(self, error: float) -> float:
+        """The cost at this error, between two that were measured; nan outside."""
+        if not len(self.error):
+            return float("nan")
+        return float(np.exp(np.interp(np.log(error), self.error, self.cost, left=np.nan, right=np.nan)))
+
+
+def frontier(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Those (error, cost) than which no other is both more accurate and cheaper, by error."""
+    left: list[tuple[float, float]] = []
+    for error, cost in sorted(p for p in points if np.isfinite(p).all() and p[0] > 0):
+        if not left or cost < left[-1][1]:
+            left.append((error, cost))
+    return left
+
+
+def at_equal_error(times: dict[Any, list[float]], errors: dict[Any, float], target: float) -> dict[str, list[float]]:
+    """What each candidate costs at the error `target`, in each round; nan where none of its settings reaches it.
+
+    Keys of `times` and `errors` are pairs (candidate, setting).
+    """
+    names = dict.fromkeys(name for name, _ in times)
+    rounds = range(min(len(seconds) for seconds in times.values()))
+
+    def curve(name: str, turn: int) -> Work:
+        return Work(frontier((errors[key], seconds[turn]) for key, seconds in times.items() if key[0] == name))
+
+    return {name: [curve(name, turn).at(target) for turn in rounds] for name in names}
 
 
 def machine() -> dict[str, Any]:
@@ -77,5 +127,14 @@ def report(about: dict[str, Any], figures: Any, out: Path | None):
     """Print the machine; write everything if asked to."""
     print("; ".join(f"{k} {v}" for k, v in about.items()))
     if out:
-        out.write_text(json.dumps({"machine": about, "figures": figures}, indent=1) + "\n")
+        out.write_text(json.dumps(_finite({"machine": about, "figures": figures}), indent=1, allow_nan=False) + "\n")
         print(f"written to {out}")
+
+
+def _finite(tree: Any) -> Any:
+    """JSON knows no nan: null."""
+    if isinstance(tree, dict):
+        return {key: _finite(value) for key, value in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [_finite(value) for value in tree]
+    return None if isinstance(tree, float) and not np.isfinite(tree) else tree

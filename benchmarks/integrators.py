@@ -13,7 +13,7 @@ import optimistix as optx
 from scipy.integrate import ode, solve_ivp
 
 import udkjax as udk
-from benchmarks.common import Compiled, machine, report
+from benchmarks.common import Compiled, Work, machine, report
 from benchmarks.problems import PROBLEMS, STIFF, Problem
 from udkjax.integrate.counting import count_evaluations, evaluations
 
@@ -29,17 +29,6 @@ FOR_NOT_STIFF = {
     "BDF": udk.BDF(),
 }
 FOR_STIFF = {"BDF": udk.BDF()}
-
-
-class Work:
-    """Calls of the right-hand side against the error, of one method on one problem."""
-
-    def __init__(self, points: list[tuple[float, int]]):
-        self.error, self.calls = np.log(np.array(sorted(points))).T
-
-    def at(self, error: float) -> float:
-        """Calls at this error, between two that were measured; nan outside."""
-        return float(np.exp(np.interp(np.log(error), self.error, self.calls, left=np.nan, right=np.nan)))
 
 
 def ours(problem: Problem, solver: diffrax.AbstractSolver) -> Compiled:

@@ -15,15 +15,9 @@ import numpy as np
 SOURCE = Path(__file__).with_name("linkage.cpp")
 FLAGS = ("-std=c++17", "-O3", "-march=native")
 STATE = 24  # 12 coordinates, 12 velocities
-PARAMETERS = (
-    "link1.mass",
-    "link2.mass",
-    "link3.mass",
-    "coupler.mass",
-    "link1.inertia",
-    "link2.inertia",
-    "link3.inertia",
-    "gravity",
+PARAMETERS = (  # in the order of the gradient
+    *("link1.mass", "link2.mass", "link3.mass", "coupler.mass"),
+    *("link1.inertia", "link2.inertia", "link3.inertia", "gravity"),
 )
 
 
@@ -53,7 +47,8 @@ def run(states: bool = False, starts: Any = None, **settings: Any) -> dict[str, 
     Settings are those in the head of linkage.cpp; `starts` are the angles of a batch, in rad.
     """
     found = program()
-    assert found is not None
+    if found is None:
+        raise FileNotFoundError("no C++ compiler")
     with tempfile.TemporaryDirectory() as there:
         if starts is not None:
             np.asarray(starts, float).tofile(Path(there) / "starts")

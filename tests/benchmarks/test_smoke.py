@@ -9,8 +9,8 @@ import pytest
 
 benchmarks = pytest.importorskip("benchmarks", reason="not in a source tree")
 
-from benchmarks import integrators, right_hand_side, simulate  # noqa: E402
-from benchmarks.common import Compiled, alternate, ratio  # noqa: E402
+from benchmarks import batch, gradients, integrators, right_hand_side, startup, trajectory  # noqa: E402
+from benchmarks.common import Compiled, Work, alternate, at_equal_error, frontier, ratio  # noqa: E402
 from benchmarks.scripts import by_cholesky, by_pinv  # noqa: E402
 
 
@@ -25,11 +25,32 @@ def test_right_hand_side(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_simulate(capsys):
-    figures = simulate.main(smoke=True)
-    ours = [row for row in figures if row["name"].startswith("udkjax")]
-    assert ours and all(row["error"] < 1e-7 for row in ours)
-    assert all(row["error"] < 1e-3 for row in figures)
+def test_trajectory():
+    figures = trajectory.main(smoke=True)
+    errors = {
+        name: [row["error"] for row in figures if row["name"] == name and "tol" in row] for name in ("udkjax", "script, 1e-04")
+    }
+    assert len(errors["udkjax"]) == 4 and all(error < 1e-7 for error in errors["udkjax"])
+    assert all(error < 1e-3 for error in errors["script, 1e-04"])
+
+
+@pytest.mark.slow
+def test_batch():
+    figures = batch.main(smoke=True)
+    assert all(row["error"] < 1e-3 and row["per_second"] > 0 for row in figures if "tol" in row)
+    assert figures[-1]["name"] == "two cores" and figures[-1]["speedup"] > 0
+
+
+@pytest.mark.slow
+def test_gradients():
+    """Which are held against the C++ program's inside."""
+    figures = gradients.main(smoke=True)
+    assert {"udkjax"} <= {row["name"] for row in figures if row["mode"] == "forward"}
+
+
+def test_startup():
+    names = {row["name"]: row["seconds"] for row in startup.main(smoke=True)}
+    assert 0 < names["python"] < names["import udkjax"]
 
 
 def test_integrators():
@@ -41,9 +62,25 @@ def test_integrators():
 
 def test_work_at_equal_error():
     """Between two points that were measured, on a straight line in logarithms; not beyond them."""
-    work = integrators.Work([(1e-4, 100), (1e-8, 400)])
+    work = Work([(1e-4, 100), (1e-8, 400)])
     assert work.at(1e-6) == pytest.approx(200)
     assert np.isnan(work.at(1e-9))
+
+
+def test_what_is_worse_in_both_is_left_out():
+    assert frontier([(1e-6, 3.0), (1e-4, 5.0), (1e-8, 8.0), (float("nan"), 1.0), (1e-4, 2.0)]) == [
+        (1e-8, 8.0),
+        (1e-6, 3.0),
+        (1e-4, 2.0),
+    ]
+
+
+def test_each_round_at_equal_error():
+    errors = {("a", 1): 1e-4, ("a", 2): 1e-8, ("b", 1): 1e-3, ("b", 2): 1e-5}
+    times = {("a", 1): [1.0, 2.0], ("a", 2): [4.0, 8.0], ("b", 1): [1.0, 1.0], ("b", 2): [2.0, 2.0]}
+    costs = at_equal_error(times, errors, 1e-6)
+    assert costs["a"] == pytest.approx([2.0, 4.0])
+    assert np.isnan(costs["b"]).all()
 
 
 def test_baselines_agree_with_the_closed_form():

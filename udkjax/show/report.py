@@ -90,12 +90,17 @@ def write(data: Any, target: Path) -> None:
 def figure(data: Any, name: str) -> str:
     """Return one of the `FIGURES` as HTML, its picture inside."""
     draw, alt, caption = FIGURES[name]
+    return embedded(lambda: draw(data), alt, caption, name)
+
+
+def embedded(draw: Callable[[], Figure], alt: str, caption: str, kind: str = "") -> str:
+    """Return a picture with its caption as HTML that needs no other file."""
     with rc_context({"svg.hashsalt": "udkjax", "path.simplify_threshold": 1.0}):
         buffer = io.BytesIO()
-        draw(data).savefig(buffer, format="svg", metadata={"Date": None})
+        draw().savefig(buffer, format="svg", metadata={"Date": None})
     source = base64.b64encode(buffer.getvalue()).decode()
     image = f'<img src="data:image/svg+xml;base64,{source}" alt="{alt}">'
-    return f'<figure class="{name}">{image}<figcaption>{caption}</figcaption></figure>'
+    return f'<figure class="{kind}">{image}<figcaption>{caption}</figcaption></figure>'
 
 
 def _drawable(data: Any, name: str) -> bool:

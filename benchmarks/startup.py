@@ -1,0 +1,58 @@
+"""How long one waits for the first result: import, --help, the first trajectory without and with a warm compilation cache."""
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common import machine, report
+
+TIMES = 5
+FIRST = """
+import numpy as np
+import udkjax as udk
+udk.simulate(udk.library.parallelogram(), np.linspace(0.0, 20.0, 401))
+"""
+PROGRAMS = {
+    "python": "pass",
+    "import jax": "import jax",
+    "import udkjax": "import udkjax",
+    "udkjax --help": "import sys; sys.argv = ['udkjax', '--help']; from udkjax.cli import main; main()",
+    "first trajectory, no cache": FIRST,
+    "first trajectory, cached": FIRST,
+}
+
+
+def waited(code: str, cache: Path) -> dict[str, float]:
+    """Wall and CPU time (s) of a Python process that keeps compiled programs below `cache`."""
+    environment = os.environ | {"XDG_CACHE_HOME": str(cache), "LOCALAPPDATA": str(cache)}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    before, start = os.times(), time.perf_counter()
+    subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.DEVNULL, check=True)
+    after = os.times()
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    return {"seconds": time.perf_counter() - start, "cpu_seconds": cpu}
+
+
+def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+    """Print the time from the start of Python to its end, medians."""
+    about, figures = machine(), []
+    programs = {name: code for name, code in PROGRAMS.items() if not smoke or code != FIRST}
+    print(f"{'start of a process':28} {'s':>7} {'CPU s':>7}")
+    with tempfile.TemporaryDirectory() as warm:
+        for name, code in programs.items():
+            runs = []
+            if name.endswith(", cached"):
+                waited(code, Path(warm))
+            for _ in range(1 if smoke else TIMES):
+                with tempfile.TemporaryDirectory() as cold:
+                    runs.append(waited(code, Path(cold if name.endswith("no cache") else warm)))
+            row = {"name": name, **{key: statistics.median(run[key] for run in runs) for key in runs[0]}}
+            figures.append(row)
+            print(f"{name:28} {row['seconds']:7.2f} {row['cpu_seconds']:7.2f}")
+    report(about, figures, out)
+    return figures

@@ -1,0 +1,103 @@
+"""What is promised, as data: each claim with its target, and where in the figures it is read."""
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+Rows = list[dict[str, Any]]
+Figures = dict[str, Rows]  # by benchmark
+
+
+class Claim(NamedTuple):
+    """A figure that is to be at most `target`, or at least."""
+
+    name: str
+    benchmark: str
+    target: float
+    read: Callable[[Rows], float | None]
+    at_least: bool = False
+
+    def judged(self, figures: Figures) -> dict[str, Any]:
+        """Return the claim with what was measured: `holds` is None where it was not."""
+        figure = self.read(figures[self.benchmark]) if self.benchmark in figures else None
+        if figure is not None and figure != figure:
+            figure = None
+        holds = None if figure is None else figure >= self.target if self.at_least else figure <= self.target
+        bound = f"{'≥' if self.at_least else '≤'} {self.target:g}"
+        return {"claim": self.name, "benchmark": self.benchmark, "target": bound, "figure": figure, "holds": holds}
+
+
+def pick(rows: Rows, key: str, **wanted: Any) -> list[Any]:
+    """The values of `key` in the rows that have the values `wanted`."""
+    chosen = (row for row in rows if all(row.get(name) == value for name, value in wanted.items()))
+    return [row[key] for row in chosen if row.get(key) is not None]
+
+
+def value(key: str, **wanted: Any) -> Callable[[Rows], float | None]:
+    """Read one value."""
+    return lambda rows: next(iter(pick(rows, key, **wanted)), None)
+
+
+def _reciprocal(read: Callable[[Rows], float | None]) -> Callable[[Rows], float | None]:
+    def found(rows: Rows) -> float | None:
+        number = read(rows)
+        return None if number is None else 1 / number
+
+    return found
+
+
+def _least(key: str, names: tuple[str, ...], **wanted: Any) -> Callable[[Rows], float | None]:
+    return lambda rows: min((x for name in names for x in pick(rows, key, name=name, **wanted) if x == x), default=None)
+
+
+def _claims() -> Iterable[Claim]:
+    motions = {-45.0: "hanging", 60.0: "crossing"}
+    scripts = ("script, 1e-04", "script, 1e-10")
+    for start, motion in motions.items():
+        for target in (1e-6, 1e-8, 1e-10):
+            at = {"start": start, "target": target}
+            against = _reciprocal(value("times_ours", name="C++", **at))
+            yield Claim(f"20 s, {motion}, error {target:.0e}: time, in times C++", "trajectory", 1.0, against)
+            against = _least("times_ours", scripts, **at)
+            yield Claim(f"20 s, {motion}, error {target:.0e}: a script's time, in times ours", "trajectory", 20.0, against, True)
+    for kind in ("end only", "201 outputs"):
+        for start, motion in motions.items():
+            at: dict[str, Any] = {"start": start, "target": 1e-6, "outputs": kind}
+            rate = value("per_second", name="udkjax", **at)
+            promised = kind == "end only" and motion == "hanging"
+            yield (
+                Claim(f"batch, 10 s, {motion}, {kind}, error 1e-6: trajectories a second and core", "batch", 18_000.0, rate, True)
+                if promised
+                else Claim(
+                    f"batch, 10 s, {motion}, {kind}, error 1e-6: time, in times C++ in lanes",
+                    "batch",
+                    1.0,
+                    _reciprocal(value("times_ours", name="C++, 8 lanes", **at)),
+                )
+            )
+    for count in (1, 2, 4, 8):
+        forward = value("times_run", name="udkjax", mode="forward", parameters=count)
+        yield Claim(f"gradient, {count} parameters, forward, in times the run", "gradients", 1 + 0.5 * count, forward)
+    reverse = value("times_run", name="udkjax", mode="reverse", parameters=8)
+    yield Claim("gradient, 8 parameters, reverse, in times the run", "gradients", 5.0, reverse)
+    for name, target in STARTS.items():
+        yield Claim(f"start: {name}, s", "startup", target, value("seconds", name=name))
+
+
+STARTS = {"import udkjax": 1.5, "udkjax --help": 0.4, "first trajectory, no cache": 4.0, "first trajectory, cached": 1.5}
+CLAIMS = tuple(_claims())
+
+
+def judge(figures: Figures) -> Rows:
+    """Hold every claim against the figures."""
+    return [claim.judged(figures) for claim in CLAIMS]
+
+
+def show(judged: Rows) -> None:
+    """Print the table."""
+    print(f"\n{'claim':72} {'target':>8} {'figure':>10}  holds")
+    for row in judged:
+        figure = "-" if row["figure"] is None else f"{row['figure']:.4g}"
+        print(f"{row['claim']:72} {row['target']:>8} {figure:>10}  {VERDICT[row['holds']]}")
+
+
+VERDICT = {True: "yes", False: "NO", None: "not measured"}
