@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.equations import prepare
-from udkjax.equations.udwadia_kalaba import plain_accelerations, plain_project
+from udkjax.equations.plain import plain_accelerations, plain_project
 
 CLASSES = (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)
 METHODS = {cls.__name__: cls() for cls in CLASSES}

@@ -1,13 +1,14 @@
 """The programs of one structure: what has to be computed for a method and a stabilization, and nothing else."""
 
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
+from udkjax.equations.derivative import Derivative
 from udkjax.equations.expressions import Expressions, expressions
 from udkjax.pinv.sparse import Row, absolute, all_of, factorize, greater, multipliers, pattern, transpose_times
 from udkjax.scene.mechanism import Mechanism
@@ -50,19 +51,49 @@ class Code:
             self._describe("_kept", self.kept, self.kept_values)
             self._eliminate()
         self._programs: dict[str, Program] = {}
+        self._derivatives: dict[tuple[str, tuple[bool, ...]], Derivative] = {}
         wanted = [s for name, outputs in self.outputs.items() for s in outputs]
         self.constants = frontier(graph, wanted, lambda node: node.depends <= {"parameter"})
         self.prologue = Program(graph, [*equations.inputs, *self.gains, self.drop], self.constants)
 
     def _describe(self, suffix: str, rows: Sequence[int], values: list[Scalar]):
         e = self.equations
-        self.outputs["rows" + suffix] = [*values, *(self._b(i) for i in rows), *e.free, *self.root]
+        self.outputs["rows" + suffix] = [*values, *(self.b(i) for i in rows), *e.free, *self.root]
         self.outputs["closure" + suffix] = [*values, *(e.psi[i] for i in rows), *self.root]
         self.outputs["rate" + suffix] = [*values, *(e.psi_dot[i] for i in rows), *self.root]
         self.outputs["psi" + suffix] = [e.psi[i] for i in rows]
         self.outputs["psi_dot" + suffix] = [e.psi_dot[i] for i in rows]
 
-    def _b(self, i: int) -> Scalar:
+    def _eliminate(self):
+        """The equation for rows that are independent: a = a_F + M^(-1) Psi_q^T y with D D^T y = b."""
+        graph, e = self.graph, self.equations
+        self.compliance = [graph.constant(1.0) / m for m in e.mass]
+        self._gram = factorize([self.D[i] for i in self.kept], self.drop)
+        safe = all_of(self._gram.kept, graph)
+        self.y = self.solved([self.b(i) for i in self.kept])
+        self.a = [f + s for f, s in zip(e.free, self.spread(self.y), strict=True)]
+        self.outputs["accelerations"] = [*self.a, safe]
+        watched = all_of([safe, *(self._satisfied(i, self.a) for i in self.left_out)], graph)
+        self.outputs["accelerations_watched"] = [*self.a, watched]
+        self.residual = [graph.input(f"r{k}", "residual") for k in range(len(self.kept))]
+        self.outputs["step"] = self.spread(self.solved(self.residual))
+        early = frontier(graph, self.outputs["step"], lambda node: "residual" not in node.depends)
+        self.factors = [s for s in early if not s.node.depends <= {"parameter"}]
+        self.outputs["factor"] = [*self.factors, safe]
+
+    def solved(self, b: Sequence[Scalar]) -> list[Scalar]:
+        """y with D D^T y = b, of the rows kept; zero where a row was dropped."""
+        return multipliers(self._gram, b) if b else []
+
+    def pulled(self, y: Sequence[Scalar]) -> list[Scalar]:
+        """Psi_q^T y, of the rows kept."""
+        return transpose_times([self.equations.psi_q[i] for i in self.kept], y, self.n, self.graph.constant(0.0))
+
+    def spread(self, y: Sequence[Scalar]) -> list[Scalar]:
+        """M^(-1) Psi_q^T y, of the rows kept."""
+        return [c * s for c, s in zip(self.compliance, self.pulled(y), strict=True)]
+
+    def b(self, i: int) -> Scalar:
         """gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F of one row."""
         e = self.equations
         b = e.gamma[i] - sum((entry * e.free[k] for k, entry in e.psi_q[i].items()), self.graph.constant(0.0))
@@ -71,34 +102,11 @@ class Code:
             b = b - alpha * 2.0 * e.psi_dot[i] - beta * beta * e.psi[i]
         return b
 
-    def _eliminate(self):
-        """The equation for rows D that are independent: x = D^T y with D D^T y = b."""
-        graph, rows = self.graph, [self.D[i] for i in self.kept]
-        factors = factorize(rows, self.drop, 0.0 if self.elimination == "drop" else math.nan)
-        safe = all_of(factors.kept, graph)
-
-        def scaled(b: list[Scalar]) -> list[Scalar]:
-            x = (
-                transpose_times(rows, multipliers(factors, b), self.n, graph.constant(0.0))
-                if b
-                else [graph.constant(0.0)] * self.n
-            )
-            return [r * s for r, s in zip(self.root, x, strict=True)]
-
-        a = [f + s for f, s in zip(self.equations.free, scaled([self._b(i) for i in self.kept]), strict=True)]
-        self.outputs["accelerations"] = [*a, safe]
-        self.outputs["accelerations_watched"] = [*a, all_of([safe, *(self._satisfied(i, a) for i in self.left_out)], graph)]
-        self.residual = [graph.input(f"r{k}", "residual") for k in range(len(rows))]
-        self.outputs["step"] = scaled(self.residual)
-        early = frontier(graph, self.outputs["step"], lambda node: "residual" not in node.depends)
-        self.factors = [s for s in early if not s.node.depends <= {"parameter"}]
-        self.outputs["factor"] = [*self.factors, safe]
-
     def _satisfied(self, i: int, a: list[Scalar]) -> Scalar:
         """Whether the accelerations satisfy a row that was left out: if they do, they are those of all rows."""
         zero = self.graph.constant(0.0)
         terms = [entry * (a[k] - self.equations.free[k]) for k, entry in self.equations.psi_q[i].items()]
-        b = self._b(i)
+        b = self.b(i)
         size = sum((absolute(term) for term in terms), absolute(b))
         return greater(size * CONSISTENT + TINY, absolute(sum(terms, zero) - b))
 
@@ -108,6 +116,12 @@ class Code:
             state = [*self.factors, *self.residual] if name == "step" else [e.t, *e.q, *e.v]
             self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name])
         return self._programs[name]
+
+    def derivative(self, name: str, moving: tuple[bool, ...]) -> Derivative:
+        """The derivative of "accelerations" or "projection" along some of constants, t, q and v: those that are `moving`."""
+        if (name, moving) not in self._derivatives:
+            self._derivatives[name, moving] = Derivative(self, name, moving)
+        return self._derivatives[name, moving]
 
 
 @lru_cache(maxsize=64)
@@ -129,3 +143,9 @@ def structure(mechanism: Mechanism) -> tuple[Any, tuple]:
 def scalars(leaves: Sequence[Any]) -> list[Any]:
     """All numbers of some arrays, in the order in which the graph counts them."""
     return [leaf[place] for leaf in leaves for place in np.ndindex(*np.shape(leaf))]
+
+
+def stacked(values: Sequence[Any]) -> Array:
+    """Some numbers as one vector."""
+    values = [jax.numpy.asarray(x, jax.numpy.result_type(float)) for x in values]
+    return jax.numpy.stack(values) if values else jax.numpy.zeros(0)

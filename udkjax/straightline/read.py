@@ -88,7 +88,7 @@ def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
     if name == "dot_general" and np.issubdtype(dtype, np.floating):
         return [_dot(graph, inputs[0], inputs[1], parameters["dimension_numbers"], shape)]
     if name in ("dynamic_slice", "gather") and all(s.constant is not None for i in inputs[1:] for s in i.flat):
-        return [_select(equation, inputs)]
+        return [np.asarray(_select(equation, inputs), object)]
     if name == "split":
         return np.split(inputs[0], np.cumsum(parameters["sizes"])[:-1], parameters["axis"])
     if all(s.constant is not None for i in inputs for s in i.flat) and not equation.effects:
@@ -122,7 +122,7 @@ def _fold(primitive: Any, parameters: dict, values: Sequence[Any]) -> Any:
 
 def _known(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """What a primitive gives for known values, such as indices."""
-    values = [_values(i) for i in inputs]
+    values = [_values(i).astype(v.aval.dtype) for i, v in zip(inputs, equation.invars, strict=True)]  # an empty one has no type
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*map(jax.numpy.asarray, values), **equation.params)
     return [_constants(graph, r) for r in (results if equation.primitive.multiple_results else [results])]
@@ -135,10 +135,14 @@ def _values(array: np.ndarray) -> np.ndarray:
 
 def _select(equation: Any, inputs: list[np.ndarray]) -> np.ndarray:
     """Which elements an indexing with known indices takes: let JAX take them from an array of their places."""
-    places = np.arange(inputs[0].size).reshape(inputs[0].shape)
-    indices = [_values(i) for i in inputs[1:]]
-    parameters = {**equation.params, "fill_value": None} if "fill_value" in equation.params else equation.params
-    return inputs[0].reshape(-1)[_fold(equation.primitive, parameters, [places, *indices])]
+    array, *indices = inputs
+    places, outside = np.arange(array.size).reshape(array.shape), array.size  # what stands for an index beyond the end
+    parameters = {**equation.params, "fill_value": outside} if "fill_value" in equation.params else equation.params
+    taken = _fold(equation.primitive, parameters, [places, *(_values(i) for i in indices)])
+    if not np.any(taken == outside):
+        return array.reshape(-1)[taken]
+    graph, fill = array.flat[0].graph, equation.params["fill_value"]
+    return np.append(array.reshape(-1), graph.constant(np.nan if fill is None else fill, array.flat[0].node.dtype))[taken]
 
 
 def _integer_power(x: Scalar, y: int) -> Scalar:

@@ -1,0 +1,238 @@
+"""Differentiate a graph: the chain rule, gathered into one sparse matrix of expressions.
+
+A differential is a combination of those of the inputs, d f = sum (df/dx) dx, kept as a row {x: df/dx}. The partial derivatives
+are expressions of the same graph, so that what they share with the function, a cosine, say, is one node, and what is zero
+vanishes. They hold for any number of directions at once, and transposed for reverse mode: neither is taken through the nodes.
+
+An opaque node (an array primitive) is a station on the way: what it returns counts as further inputs, whose differentials
+follow from those of its arguments by JAX's own rule for the primitive, forward or transposed.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import jax
+import numpy as np
+
+from udkjax.straightline.graph import Details, Graph, Node, Scalar
+from udkjax.straightline.read import read
+
+Row = dict[int, Scalar]  # partial derivatives, by the index of the node with respect to which they are taken
+
+
+class Differential:
+    """The differentials of `outputs` along `inputs`.
+
+    What `inputs` and `fixed` are made of is not looked at, and `fixed` does not move.
+    """
+
+    def __init__(self, graph: Graph, outputs: Iterable[Scalar], inputs: Sequence[Scalar], fixed: Iterable[Scalar] = ()):
+        self.graph, self.inputs = graph, list(inputs)
+        given = {s.index for s in (*self.inputs, *fixed)}
+        self._rows: dict[int, Row] = {s.index: {s.index: graph.constant(1.0, s.node.dtype)} for s in self.inputs}
+        self._stations: dict[int, list[int]] = {}  # opaque nodes that move, and their results
+        for index in _between(graph, given, [s.index for s in outputs]):
+            row = self._differentiated(index)
+            if row:
+                self._rows[index] = row
+
+    def row(self, output: Scalar) -> Row:
+        """The partial derivatives of one output."""
+        row = self._rows.get(output.index, {})
+        return row if output.sign > 0 else {k: -p for k, p in row.items()}
+
+    def along(self, tangents: Mapping[int, Scalar]) -> Row:
+        """From the tangents of inputs, by index, those of everything that rows refer to. An input without one does not move."""
+        known = {k: t for k, t in tangents.items() if not t.is_zero}
+        for station, results in self._stations.items():
+            arguments = [product(self.row(a), known, self.graph) for a in self.graph.nodes[station].arguments]
+            known.update(_pushed(self.graph, station, results, arguments))
+        return known
+
+    def back(self, cotangents: Row) -> list[Scalar]:
+        """From the cotangents of everything that rows refer to, by index, those of the inputs."""
+        known = dict(cotangents)
+        for station, results in reversed(self._stations.items()):
+            seeds = {k: known.pop(k) for k in results if k in known}
+            if seeds:
+                arguments = self.graph.nodes[station].arguments
+                pulled = _pulled(self.graph, station, seeds, [bool(self.row(a)) for a in arguments])
+                for argument, cotangent in zip(arguments, pulled, strict=True):
+                    accumulate(known, self.row(argument), cotangent)
+        return [known.get(s.index, self.graph.constant(0.0, s.node.dtype)) for s in self.inputs]
+
+    def _differentiated(self, index: int) -> Row:
+        graph, node = self.graph, self.graph.nodes[index]
+        if node.kind in ("input", "constant", "call") or not np.issubdtype(node.dtype, np.floating):
+            return {}
+        if node.kind == "pick":
+            (call,) = node.arguments
+            if not any(self.row(a) for a in call.node.arguments):
+                return {}
+            self._stations.setdefault(call.index, []).append(index)
+            return {index: graph.constant(1.0, node.dtype)}
+        if node.kind == "apply" and node.detail.primitive.name == "select_n":
+            return self._chosen(node)
+        result: Row = {}
+        for k, argument in enumerate(node.arguments):
+            row = self.row(argument)
+            if row:
+                accumulate(result, row, _partial(graph, index, node, k))
+        return {k: p for k, p in result.items() if not p.is_zero}
+
+    def _chosen(self, node: Node) -> Row:
+        which, *cases = node.arguments
+        rows, zero = [self.row(a) for a in cases], self.graph.constant(0.0, node.dtype)
+        parts = {k: (which, *(row.get(k, zero) for row in rows)) for row in rows for k in row}
+        choose = lambda *values: values[1 + int(values[0])]  # noqa: E731
+        detail = node.detail
+        return {k: self.graph.apply(detail.primitive, detail.parameters, p, node.dtype, choose) for k, p in parts.items()}
+
+
+def tangents(graph: Graph, outputs: Sequence[Scalar], seeds: Mapping[Scalar, Scalar]) -> list[Scalar]:
+    """The directional derivatives of outputs, `seeds` being the tangents of inputs. What has no seed does not move."""
+    differential = Differential(graph, outputs, list(seeds))
+    known = differential.along({s.index: t if s.sign > 0 else -t for s, t in seeds.items()})
+    return [product(differential.row(s), known, graph) for s in outputs]
+
+
+def cotangents(graph: Graph, outputs: Sequence[Scalar], seeds: Sequence[Scalar], inputs: Sequence[Scalar]) -> list[Scalar]:
+    """The derivatives of sum(seeds * outputs) with respect to inputs."""
+    differential, found = Differential(graph, outputs, inputs), {}
+    for output, seed in zip(outputs, seeds, strict=True):
+        accumulate(found, differential.row(output), seed)
+    return [c if s.sign > 0 else -c for c, s in zip(differential.back(found), inputs, strict=True)]
+
+
+def product(row: Row, known: Mapping[int, Scalar], graph: Graph) -> Scalar:
+    """A row times a vector."""
+    return sum((p * known[k] for k, p in row.items() if k in known), graph.constant(0.0))
+
+
+def accumulate(total: Row, row: Row, factor: Scalar) -> None:
+    """Add a multiple of a row to another one."""
+    if factor.is_zero:
+        return
+    for k, p in row.items():
+        total[k] = total[k] + p * factor if k in total else p * factor
+
+
+def _between(graph: Graph, given: set[int], wanted: Sequence[int]) -> list[int]:
+    found, stack = set(), list(wanted)
+    while stack:
+        index = stack.pop()
+        if index not in found and index not in given:
+            found.add(index)
+            stack.extend(a.index for a in graph.nodes[index].arguments)
+    return sorted(found)
+
+
+def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
+    """The derivative of a node with respect to its k-th argument."""
+    one, value = graph.constant(1.0, node.dtype), Scalar(graph, index)
+    match node.kind:
+        case "add":
+            return one
+        case "sub":
+            return one if k == 0 else -one
+        case "mul":
+            return node.arguments[1 - k]
+        case "div":
+            reciprocal = one / node.arguments[1]
+            return reciprocal if k == 0 else -(value * reciprocal)
+        case "sqrt":
+            return graph.constant(0.5, node.dtype) / value
+    detail, dtypes = node.detail, tuple(a.node.dtype for a in node.arguments)
+    (slope,) = read(graph, _slope(detail, dtypes, k), [np.asarray(a, object) for a in node.arguments])
+    return slope.item()
+
+
+# --- by JAX's own rules
+
+
+@lru_cache(maxsize=256)
+def _slope(detail: Details, dtypes: tuple, k: int) -> Any:
+    """The derivative of a primitive on scalars with respect to its k-th argument, as a jaxpr."""
+
+    def slope(*scalars):
+        f = lambda x: detail.primitive.bind(*scalars[:k], x, *scalars[k + 1 :], **detail.parameters)  # noqa: E731
+        return jax.jvp(f, (scalars[k],), (jax.numpy.ones((), dtypes[k]),))[1]
+
+    return jax.make_jaxpr(slope)(*(jax.ShapeDtypeStruct((), d) for d in dtypes))
+
+
+def _pushed(graph: Graph, station: int, results: Sequence[int], tangents: Sequence[Scalar]) -> Row:
+    """The tangents of what an opaque node returns."""
+    node = graph.nodes[station]
+    arrays, dots = _arrays(node, node.arguments), _arrays(node, tangents)
+    moving = [k for k, dot in enumerate(dots) if any(not s.is_zero for s in dot.flat)]
+    if not moving:
+        return {}
+    wanted = _outputs(graph, results)
+
+    def pushed(arrays, dots):
+        return jax.jvp(_of(node.detail, arrays, moving, wanted), [arrays[k] for k in moving], dots)[1]
+
+    jaxpr = jax.make_jaxpr(pushed)(_structs(arrays), _structs([dots[k] for k in moving]))
+    found = dict(zip(wanted, read(graph, jaxpr, [*arrays, *(dots[k] for k in moving)]), strict=True))
+    return {k: _picked(graph, k, found) for k in results if not _picked(graph, k, found).is_zero}
+
+
+def _pulled(graph: Graph, station: int, seeds: Row, moves: Sequence[bool]) -> list[Scalar]:
+    """The cotangents of the arguments of an opaque node, from those of what it returns."""
+    node = graph.nodes[station]
+    arrays, wanted = _arrays(node, node.arguments), _outputs(graph, list(seeds))
+    moving = [k for k, flags in enumerate(_arrays(node, moves)) if flags.any()]
+    shapes = jax.eval_shape(lambda *a: _of(node.detail, a, [], wanted)(), *_structs(arrays))
+    cts = [np.full(s.shape, graph.constant(0.0, s.dtype), object) for s in shapes]
+    for k, seed in seeds.items():
+        output, flat = graph.nodes[k].detail
+        cts[wanted.index(output)].reshape(-1)[flat] = seed
+
+    def pulled(arrays, cts):
+        return jax.vjp(_of(node.detail, arrays, moving, wanted), *(arrays[k] for k in moving))[1](cts)
+
+    jaxpr = jax.make_jaxpr(pulled)(_structs(arrays), list(shapes))
+    result = [np.full(a.shape, graph.constant(0.0), object) for a in arrays]
+    for k, cotangent in zip(moving, read(graph, jaxpr, [*arrays, *cts]), strict=True):
+        result[k] = cotangent
+    return [s for array in result for s in array.flat]
+
+
+def _of(detail: Details, arrays: Sequence[Any], moving: Sequence[int], wanted: Sequence[int]) -> Any:
+    """An array primitive as a function of some of its arguments, with some of its results."""
+
+    def function(*some):
+        values = list(arrays)
+        for k, value in zip(moving, some, strict=True):
+            values[k] = value
+        results = detail.primitive.bind(*values, **detail.parameters)
+        results = results if detail.primitive.multiple_results else [results]
+        return [results[k] for k in wanted]
+
+    return function
+
+
+def _outputs(graph: Graph, results: Sequence[int]) -> list[int]:
+    return sorted({graph.nodes[k].detail[0] for k in results})
+
+
+def _picked(graph: Graph, k: int, found: Mapping[int, np.ndarray]) -> Scalar:
+    output, flat = graph.nodes[k].detail
+    return found[output].flat[flat]
+
+
+def _arrays(node: Node, scalars: Sequence[Any]) -> list[np.ndarray]:
+    arrays, start = [], 0
+    for shape in node.detail.shapes:
+        size = int(np.prod(shape))
+        array = np.empty(size, object)
+        array[:] = scalars[start : start + size]
+        arrays.append(array.reshape(shape))
+        start += size
+    return arrays
+
+
+def _structs(arrays: Sequence[np.ndarray]) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(a.shape, a.flat[0].node.dtype if a.size else float) for a in arrays]
