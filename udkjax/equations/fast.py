@@ -54,7 +54,7 @@ def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vecto
 
 def _checked(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
     """Take what elimination gave where its pivots are safe, or where it drops the others itself; else turn to singular values."""
-    if equations.code.elimination == "drop":
+    if equations.code.elimination == "drop" or not equations.doubt:
         return fast
     if equations.branches:
         return jax.lax.cond(safe, lambda: fast, lambda: plain(equations.exact(), *state))

@@ -32,6 +32,11 @@ class Motion(eqx.Module):
     def quick(self) -> "Motion":
         """The same without a branch: what cannot be solved so is not a number."""
 
+    @property
+    def forgiving(self) -> "Motion":
+        """The same without a branch, for states near the manifold: rows that depend on others are not asked to close further."""
+        return self.quick
+
     @abstractmethod
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
         """a. With `watch`, also rows that were left out are looked at."""

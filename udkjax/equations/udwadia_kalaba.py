@@ -63,6 +63,7 @@ class Equations(MechanismMotion):
     branch: bool = eqx.field(
         static=True, default=True
     )  # whether `Auto` turns to singular values itself, or says NaN where it should
+    doubt: bool = eqx.field(static=True, default=True)  # whether it says anything of rows that elimination drops
 
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
         """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
@@ -154,6 +155,11 @@ class Equations(MechanismMotion):
     def quick(self) -> "Equations":
         """The same without a branch: what `Auto` cannot solve by elimination is not a number."""
         return dataclasses.replace(self, branch=False)
+
+    @property
+    def forgiving(self) -> "Equations":
+        """The same without a branch: `Auto` drops rows that depend on others, as `Elimination` does."""
+        return dataclasses.replace(self, branch=False, doubt=False)
 
     def exact(self) -> "Equations":
         """The same by singular values of all rows: what `Auto` turns to."""
