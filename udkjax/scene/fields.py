@@ -7,6 +7,7 @@ shape, and the metadata below what else must hold. Files and Python are checked 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -16,7 +17,10 @@ Numbers = ArrayLike | Sequence[Any]  # a number, an array, or nested lists of nu
 
 def number(value: Numbers) -> Float[Array, "..."]:
     """Make an array leaf of a number: a Python float as a field would be static, and each new value would compile anew."""
-    return jnp.asarray(value, dtype=jnp.result_type(float))
+    dtype = jnp.result_type(float)
+    if all(isinstance(x, float | int | np.number | np.ndarray) for x in jax.tree.leaves(value)):
+        value = np.asarray(value, dtype)  # JAX would compile a program to convert it
+    return jnp.asarray(value, dtype=dtype)
 
 
 def optional(value: Numbers | None) -> Float[Array, "..."] | None:

@@ -202,8 +202,9 @@ def _as_number(leaf):
 
 def _side_by_side(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
     known = not any(isinstance(x, Tracer) for x in (*vectors, *numbers))  # by NumPy: jnp takes its time for each array
-    stack: Any = (lambda arrays: np.stack([np.asarray(a) for a in arrays])) if known else jnp.stack
-    return jnp.concatenate([stack(vectors), stack(numbers)[:, None]], 1)
+    if known:
+        return number(np.column_stack([np.stack([np.asarray(x) for x in vectors]), [np.asarray(x) for x in numbers]]))
+    return jnp.column_stack([jnp.stack(vectors), jnp.stack(numbers)])
 
 
 def _columns(items: Sequence[tuple[str, Element]]) -> tuple[tuple[str, ...], tuple[Element, ...]]:

@@ -38,7 +38,7 @@ def parallelogram(
 
     links = ("link1", "link2", "link3")
     physics = [(mass, inertia)] * 3 + [(coupler_mass, coupler_inertia)]
-    half = 0.5 * number(length)
+    half = 0.5 * length
     return Mechanism(
         moving((*links, "coupler"), physics, pose, angle, angular_velocity),
         {f"A{i + 1}": Revolute((GROUND, link), [(float(i), 0.0), (-half, 0.0)]) for i, link in enumerate(links)}

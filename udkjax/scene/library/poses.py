@@ -15,23 +15,29 @@ from udkjax.scene.bodies import Body
 from udkjax.scene.fields import Numbers, number
 
 ORIGINS = ((0.0, 0.0), (0.0, 0.0))
+FEW = 32  # bodies whose motion is compiled as a whole
 
 
 def moving(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: Numbers, rate: Numbers) -> dict[str, Body]:
     """Make the bodies of the (mass, inertia)s, at the [(position, angle), ...] of pose(s), moving as s does at its rate."""
-    places, rates = jax.jvp(pose, (number(s),), (number(rate),))
-    motion = zip(names, physics, places, rates, strict=True)
-    return {name: Body(mass, inertia, *place, *speed) for name, (mass, inertia), place, speed in motion}
+
+    def motion(s, rate):
+        return jax.jvp(pose, (s,), (rate,))
+
+    # By itself each operation is a program to compile, of which large mechanisms need no more than small ones.
+    places, rates = (jax.jit(motion) if len(names) <= FEW else motion)(number(s), number(rate))
+    bodies = zip(names, physics, places, rates, strict=True)
+    return {name: Body(mass, inertia, *place, *speed) for name, (mass, inertia), place, speed in bodies}
 
 
 def uniform_rod(mass: ArrayLike, length: ArrayLike) -> tuple:
     """Return mass and inertia of a uniform rod."""
-    return number(mass), number(mass) * number(length) ** 2 / 12
+    return number(mass), number(mass * length**2 / 12)
 
 
 def uniform_disc(mass: ArrayLike, radius: ArrayLike) -> tuple:
     """Return mass and inertia of a uniform disc."""
-    return number(mass), number(mass) * number(radius) ** 2 / 2
+    return number(mass), number(mass * radius**2 / 2)
 
 
 def bar(start, end):
@@ -56,4 +62,4 @@ def apex(start, end, a, b):
 
 def down(gravity: ArrayLike) -> Float[Array, "2"]:
     """Return the acceleration of gravity along -y."""
-    return jnp.stack([number(0.0), 0.0 - number(gravity)])
+    return number([0.0, 0.0 - gravity])
