@@ -46,8 +46,8 @@ def sincos(x: Any) -> tuple[Any, Any]:
 
 
 def _by_polynomials(x: Any) -> tuple[Any, Any]:
-    # Without the barriers XLA would compute what both results share once for each of them, and both for each of their uses. Another
-    # between polynomials and turning saves operations and no time.
+    # Without the barriers XLA would compute what both results share once for each of them, and both for each of their uses.
+    # Another between polynomials and turning saves operations and no time.
     n, r = jax.lax.optimization_barrier(_reduced(x))
     return jax.lax.optimization_barrier(_turned(n, *_near_zero(r)))
 
