@@ -34,6 +34,25 @@ def data():
 
 
 @pytest.fixture(scope="session")
+def compilations():
+    """What XLA compiles while a function runs: how long each program took (s). Also where a cache spares the compiler its work."""
+    seen: list[float] = []
+
+    def listen(event: str, duration_secs: float, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            seen.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+
+    def during(run) -> list[float]:
+        seen.clear()
+        run()
+        return list(seen)
+
+    return during
+
+
+@pytest.fixture(scope="session")
 def placed():
     """q and v (4, 3) of the paper's linkage with its links at `theta` (rad), turning at `rate` (rad/s)."""
 

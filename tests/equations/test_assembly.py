@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import check, redundant_rows
+from udkjax.equations import assembly, check, redundant_rows
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +152,41 @@ def test_nothing_to_close():
     state = udk.assemble(mech)
     assert_allclose(state.q, [[1.0, 2.0, 0.3]])
     assert_allclose(state.v, [[4.0, 5.0, 6.0]])
+
+
+# --- known numbers and traced ones
+
+SCENES = ["parallelogram", "slider_crank"]
+MORE = [name for name in udk.library.__all__ if name not in SCENES]
+
+
+@pytest.mark.parametrize("name", [*SCENES, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE)])
+def test_known_numbers_are_closed_as_traced_ones_are(name):
+    """To the same branch by the same steps, from guesses that are closed, rough and hopeless, and where it cannot close."""
+    mech = getattr(udk.library, name)()
+    random = np.random.default_rng(0)
+    traced = jax.jit(lambda mech, state: assembly.close(mech, 0.1, state))
+    joint = next(name for name, j in mech.joints.items() if hasattr(j, "points"))
+    torn = mech.with_parameters({f"joint.{joint}.points[0][0]": 7.0})
+    for scene, size in ((mech, 0.0), (mech, 0.2), (mech, 3.0), (torn, 0.2)):
+        q = scene.q0 + size * random.uniform(-1, 1, scene.q0.shape)
+        guess = udk.State(q, scene.v0 + size * random.standard_normal(q.shape))
+        known, expected = assembly.close(scene, 0.1, guess), traced(scene, guess)
+        assert int(known.rank) == int(expected.rank)
+        assert bool(assembly.is_closed(known)) == bool(assembly.is_closed(expected))
+        for found, value in zip(jax.tree.leaves(known), jax.tree.leaves(expected), strict=True):
+            assert_allclose(found, value, atol=1e-11)
+
+
+def test_closing_known_numbers_compiles_nothing(linkage, compilations):
+    guess = udk.State(np.asarray(linkage.q0) + 0.1, np.asarray(linkage.v0))
+    assert compilations(lambda: udk.assemble(linkage, 0.0, guess)) == []
+
+
+def test_known_numbers_stay_known_while_others_are_traced(linkage):
+    found = []
+    jax.jit(lambda x: (found.append(udk.assemble(linkage).q), x)[1])(1.0)
+    assert np.asarray(found[0]).shape == (4, 3)
 
 
 # --- derivatives

@@ -3,8 +3,8 @@
 A program is lowered to StableHLO, and its operations are counted, one for each number that an operation computes. `arithmetic`
 are the floating-point operations proper (add, subtract, multiply, divide, negate, absolute value, powers and roots); sines and
 cosines, comparisons and selections are counted apart. The sine and cosine of one angle, `sincos`, are one function, called once
-for each pair: it is not entered, its own operations are not among those counted. A program that holds a loop, a branch or a routine of a library cannot be
-counted like this; `operations` refuses it, which says that there is none.
+for each pair: it is not entered, its own operations are not among those counted. A program that holds a loop, a branch or a
+routine of a library cannot be counted like this; `operations` refuses it, which says that there is none.
 """
 
 import math

@@ -19,15 +19,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from udkjax.equations.closing import HALVINGS, ITERATIONS, assembled, assembled_by_numpy, direction, limited
+from udkjax.equations.motion import MechanismMotion
 from udkjax.equations.redundancy import dependent_constraints, redundant_rows
-from udkjax.equations.udwadia_kalaba import Equations, prepare
-from udkjax.pinv import SVD
+from udkjax.equations.udwadia_kalaba import is_large, prepare_to_close
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
-STRIDE = 0.3  # rad and m: the longest change of a coordinate in one Gauss-Newton step
-ITERATIONS = 40
-HALVINGS = 12
 # Of the size of the coordinates (m, rad): what counts as closed. Rounding leaves 1e-15; a scene that cannot be closed leaves what
 # its lengths are wrong by.
 CLOSED = 1e-9
@@ -76,28 +74,37 @@ def assemble(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = Non
     return closure.state
 
 
-@eqx.filter_jit
 def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None) -> Closure:
-    """As `assemble`, with the residuals instead of an error."""
-    equations = prepare(mechanism, SVD())
-    t = number(t)
+    """As `assemble`, with the residuals instead of an error.
+
+    Where all numbers are known the closure is, too, also while something else is traced.
+    """
+    if is_large(mechanism) or not _known((mechanism, t, state)):
+        return _close(mechanism, t, state)
+    with jax.ensure_compile_time_eval():
+        guess = State(mechanism.q0, mechanism.v0) if state is None else state
+        q, v, psi, psi_dot, rank = assembled_by_numpy(mechanism, t, guess.q, guess.v)
+        return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), number(psi), number(psi_dot), jnp.asarray(rank))
+
+
+@eqx.filter_jit
+def _close(mechanism: Mechanism, t: ArrayLike, state: State | None) -> Closure:
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
-    rank = jnp.array(0)
-    if equations.code.pattern.shape[0]:
-        q = _closed(equations, t, q)
-        for _ in range(2):  # the second removes the rounding errors of the first
-            plus, residual, root = equations.linearized("rate", t, q, v)
-            v, rank = v - root * (plus @ residual), plus.rank
-    psi, psi_dot = equations.violation(t, q, v)
-    return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, rank)
+    q, v, psi, psi_dot, rank = assembled(prepare_to_close(mechanism), _closed, number(t), q, v)
+    return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank))
+
+
+def _known(tree: Any) -> bool:
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def is_closed(closure: Closure) -> Any:
     """Whether the residuals are rounding errors (see `CLOSED`)."""
-    q, v = jnp.abs(closure.state.q).max(initial=0.0), jnp.abs(closure.state.v).max(initial=0.0)
-    psi, psi_dot = (jnp.abs(r).max(initial=0.0) for r in (closure.psi, closure.psi_dot))
-    tol = max(CLOSED, 64.0 * float(jnp.finfo(q.dtype).eps))
+    xp: Any = np if _known(closure) else jnp
+    parts = (closure.state.q, closure.state.v, closure.psi, closure.psi_dot)
+    q, v, psi, psi_dot = (xp.max(xp.abs(xp.asarray(x)), initial=0.0) for x in parts)
+    tol = max(CLOSED, 64.0 * float(jnp.finfo(closure.psi.dtype).eps))
     return (psi <= tol * (1.0 + q)) & (psi_dot <= tol * (1.0 + v))
 
 
@@ -106,10 +113,11 @@ def require_closed(mechanism: Mechanism, closure: Closure) -> None:
     closed = is_closed(closure)
     if isinstance(closed, Tracer) or closed:
         return
-    equations = prepare(mechanism, SVD()).code.equations
+    equations = prepare_to_close(mechanism)
     worst: dict[str, float] = {}
-    open_position = bool(jnp.abs(closure.psi).max() > CLOSED * (1.0 + jnp.abs(closure.state.q).max()))
-    residual = closure.psi if open_position else closure.psi_dot
+    q, psi, psi_dot = (np.asarray(x) for x in (closure.state.q, closure.psi, closure.psi_dot))
+    open_position = bool(np.abs(psi).max() > CLOSED * (1.0 + np.abs(q).max()))
+    residual = psi if open_position else psi_dot
     for (name, _), r in zip(equations.row_names, residual, strict=True):
         worst[name] = max(worst.get(name, 0.0), abs(float(r)))
     listed = sorted((n for n in worst if worst[n] > CLOSED), key=lambda n: -worst[n])
@@ -141,9 +149,9 @@ class Check(NamedTuple):
 def check(mechanism: Mechanism) -> Check:
     """Count rows, rank and degrees of freedom, name redundant rows, and say how well the initial guess closes."""
     closure = close(mechanism)
-    equations = prepare(mechanism, SVD())
+    equations = prepare_to_close(mechanism)
     before = equations.violation(0.0, mechanism.q0.ravel(), mechanism.v0.ravel())[0]
-    names, rows = equations.code.equations.row_names, len(before)
+    names, rows = equations.row_names, len(before)
     closed = bool(is_closed(closure))
     left_out = redundant_rows(mechanism) if closed else None
     rank = int(closure.rank) if left_out is None else rows - len(left_out)
@@ -161,21 +169,13 @@ def check(mechanism: Mechanism) -> Check:
     )
 
 
-def _correction(equations: Equations, t: Any, q: Any) -> Any:
-    """-M^(-1/2) D^+ Psi."""
-    plus, psi, root = equations.linearized("closure", t, q, q)
-    return -root * (plus @ psi)
+def _size(equations: MechanismMotion, t: Any, q: Any) -> Any:
+    return jnp.linalg.norm(equations.violation(t, q, q)[0])
 
 
-def _size(equations: Equations, t: Any, q: Any) -> Any:
-    return jnp.linalg.norm(jnp.stack(equations.run("psi", t, q, q)))
-
-
-def _step(equations: Equations, t: Any, q: Any) -> tuple[Any, Any]:
+def _step(equations: MechanismMotion, t: Any, q: Any) -> tuple[Any, Any]:
     """One damped step, and whether it made the residual smaller."""
-    step = _correction(equations, t, q)
-    longest = jnp.max(jnp.abs(step))
-    step = step * jnp.where(longest > STRIDE, STRIDE / jnp.where(longest > STRIDE, longest, 1.0), 1.0)
+    step = limited(direction(equations, t, q), jnp)
     here, ahead = jax.lax.stop_gradient((q, step))
     equations = jax.lax.stop_gradient(equations)
     size = _size(equations, t, here)
@@ -186,11 +186,11 @@ def _step(equations: Equations, t: Any, q: Any) -> tuple[Any, Any]:
 
     scale, k = jax.lax.while_loop(worse, lambda trial: (0.5 * trial[0], trial[1] + 1), (jnp.ones(()), 0))
     better = k < HALVINGS
-    return q + jnp.where(better, scale, 0.0) * step, better
+    return jnp.where(better, q + scale * step, q), better
 
 
 @jax.custom_jvp
-def _closed(equations: Equations, t: Any, q: Any) -> Any:
+def _closed(equations: MechanismMotion, t: Any, q: Any) -> Any:
     def unfinished(carry):
         _, better, k = carry
         return better & (k < ITERATIONS)
@@ -202,7 +202,7 @@ def _closed(equations: Equations, t: Any, q: Any) -> Any:
     return jax.lax.while_loop(unfinished, body, (q, jnp.array(True), 0))[0]
 
 
-def _closed_plain(equations: Equations, t: Any, q: Any) -> Any:
+def _closed_plain(equations: MechanismMotion, t: Any, q: Any) -> Any:
     """The same steps as `_closed`, in a loop of fixed length that reverse mode can follow.
 
     A step that no longer lowers the residual is taken in the derivative all the same: at a closed state it changes nothing but
@@ -211,7 +211,7 @@ def _closed_plain(equations: Equations, t: Any, q: Any) -> Any:
 
     def body(q, _):
         ahead, better = _step(equations, t, q)
-        settled = q + _correction(equations, t, q)
+        settled = q + direction(equations, t, q)
         return jnp.where(better, ahead, settled), None
 
     return jax.lax.scan(body, q, None, length=ITERATIONS)[0]
