@@ -21,7 +21,7 @@ from udkjax.equations.alike import Fields, Group, constraint_kind, force_kind, g
 from udkjax.equations.code import CONSISTENT, TINY, structure
 from udkjax.equations.motion import MechanismMotion, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
-from udkjax.pinv.blocks import BlockElimination, BlockPattern, Sums, by_block, factorized, flat
+from udkjax.pinv.blocks import BlockElimination, BlockPattern, Sums, by_block, factorized, flat, take
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline.trigonometry import sincos
 
@@ -90,13 +90,22 @@ class Selection:
 
     def dense(self, D: Float[Array, "r 3 s"]) -> Float[Array, "rows n"]:
         """D as a matrix, rows in the user's order."""
-        matrix = jnp.zeros((len(self.rows), self._bodies, 3), D.dtype)
-        within, block = self.entry
-        for k in range(self.deep):
-            met = np.array([m[k] if len(m) > k else -1 for m in self._meets])[block]
-            there = np.flatnonzero(met >= 0)
-            matrix = matrix.at[there, met[there]].add(D[within[there], :, k * self.blocks + block[there]])
-        return matrix.reshape(len(self.rows), -1)
+        row, column, place = self.entries
+        return jnp.zeros((len(self.rows), 3 * self._bodies), D.dtype).at[row, column].set(take(D.ravel(), place))
+
+    @cached_property
+    def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of every entry of D: its row in the user's order, its column, and its place in `D.ravel()`."""
+        row_at = np.full((self.height, self.blocks), -1)
+        row_at[self.entry] = np.arange(len(self.rows))
+        body = np.full((self.deep, self.blocks), -1)
+        for i, met in enumerate(self._meets):
+            body[: len(met), i] = met
+        shape = (self.height, 3, self.deep, self.blocks)
+        there = (row_at[:, None, None] >= 0) & (body >= 0) & np.ones((3, 1, 1), bool)
+        r, c, k, block = np.nonzero(np.broadcast_to(there, shape))
+        place = np.ravel_multi_index((r, c, k, block), shape)
+        return row_at[r, block], 3 * body[k, block] + c, place
 
 
 class Layout:
@@ -138,6 +147,17 @@ class Layout:
         )
 
     @cached_property
+    def position(self) -> Any:
+        """A program of the numbers, t (s) and q: Psi in the user's order, and D as its blocks hold it."""
+
+        def position(numbers, t, q):
+            q = jnp.asarray(q)
+            D, psi = self.all.evaluate(["D", "psi"], numbers["constraints"], t, fields_of(q, q))
+            return self.all.listed(psi), D
+
+        return jax.jit(position)
+
+    @cached_property
     def _numbers(self) -> Any:
         """One program for all of it: what is known is computed at once, without tracing as many arrays as there are elements."""
 
@@ -163,6 +183,14 @@ def _constraint_kind(structure: Any, baumgarte: bool, loaded: bool) -> Any:
 def layout(tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool) -> Layout:
     """Return the layout of the mechanisms with this tree and with numbers of these shapes and types."""
     return Layout(jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes]), left_out, baumgarte)
+
+
+def fields_of(q: Vector, v: Vector) -> Fields:
+    """What elements see of the bodies."""
+    x, y, angle = by_block(q, 3)
+    vx, vy, omega = by_block(v, 3)
+    sin, cos = sincos(angle)
+    return {"x": x, "y": y, "angle": angle, "sin": sin, "cos": cos, "vx": vx, "vy": vy, "omega": omega}
 
 
 class LargeEquations(MechanismMotion):
@@ -322,10 +350,7 @@ class LargeEquations(MechanismMotion):
         return len(kept.rows) + jnp.sum(missed)
 
     def _fields(self, q: Vector, v: Vector, free: Any = None) -> Fields:
-        x, y, angle = by_block(q, 3)
-        vx, vy, omega = by_block(v, 3)
-        sin, cos = sincos(angle)
-        fields = {"x": x, "y": y, "angle": angle, "sin": sin, "cos": cos, "vx": vx, "vy": vy, "omega": omega}
+        fields = fields_of(q, v)
         return fields if free is None else fields | dict(zip(("fx", "fy", "fangle"), free, strict=True))
 
     def _arrays(self, rows: Selection, names: Sequence[str], t: Any, q: Vector, v: Vector, free: Any = None) -> list[Array]:

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.equations.formulations import Formulation, Rewritten, along
-from udkjax.equations.motion import Motion, Vector
-from udkjax.equations.udwadia_kalaba import RANK_TOL, Equations
+from udkjax.equations.motion import MechanismMotion, Motion, Vector
+from udkjax.equations.udwadia_kalaba import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 from udkjax.scene.fields import number
@@ -48,9 +48,9 @@ class CoordinatePartitioning(Formulation):
     rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
 
     def of(self, equations: Motion) -> "Partitioned":
-        if not isinstance(equations, Equations):
+        if not isinstance(equations, MechanismMotion):
             raise ValueError("CoordinatePartitioning takes a Mechanism: a ConstrainedSystem may have nonholonomic constraints")
-        if equations.code.gains:
+        if equations.stabilized:
             raise ValueError(
                 "with CoordinatePartitioning the constraints hold at every stage: Baumgarte has nothing to feed back. "
                 "Take stabilization=None or Projection()"
@@ -64,7 +64,7 @@ class Partitioned(Rewritten):
     Without a partition held, it is chosen at each state anew.
     """
 
-    equations: Equations
+    equations: MechanismMotion
     formulation: CoordinatePartitioning
     dependent: Any = None  # which coordinates are, (n,), if that is held
 
@@ -87,7 +87,7 @@ class Partitioned(Rewritten):
         """With the partition that pivoting chooses here."""
         if self.dependent is not None:
             return self
-        D = self._weighted(t, q)[0]
+        D = self.equations.weighted(t, q)[0]
         if not len(D):
             return Partitioned(self.equations, self.formulation, jnp.zeros(len(q), bool))
         _, _, order, rank = complete_qr(D, self.formulation.rank_tol * jnp.linalg.norm(D, axis=0).max())
@@ -101,12 +101,6 @@ class Partitioned(Rewritten):
     @property
     def left_out(self) -> tuple[int, ...]:
         return ()
-
-    def _weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """D, Psi and M^(-1/2)."""
-        equations = self.equations
-        values, psi, root = equations.arrays("closure", t, q, q)
-        return equations.code.pattern.dense(values), psi, root
 
     def _plus(self, D: Float[Array, "m n"]) -> Plus:
         """D^+ of the dependent columns: zero for the others."""
@@ -151,12 +145,12 @@ def _(primals, tangents):
 
 
 def _newton(held: Partitioned, t: Any, q: Vector) -> Vector:
-    D, psi, root = held._weighted(t, q)
+    D, psi, root = held.equations.weighted(t, q)
     return q - root * (held._plus(D) @ psi)
 
 
 def _velocity(held: Partitioned, t: Any, q: Vector, v: Vector) -> Vector:
-    D, _, root = held._weighted(t, q)
+    D, _, root = held.equations.weighted(t, q)
     return v - root * (held._plus(D) @ held.violation(t, q, v)[1])
 
 

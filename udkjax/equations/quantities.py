@@ -74,7 +74,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Any) -> Float[
 
 def energy(mechanism: Mechanism, solution: Any) -> Energy:
     """Return kinetic energy v^T M v / 2 and potential energy (J) at each output time."""
-    return _along(mechanism, solution, lambda equations, t, q, v: Energy(*equations.run("energy", t, q, v)))
+    return _along(mechanism, solution, lambda equations, t, q, v: Energy(*equations.energy(t, q, v)))
 
 
 def reactions(
@@ -95,7 +95,7 @@ def reactions(
         return -jnp.asarray(equations.jacobian(t, q)) * multipliers[:, None]
 
     by_row = _along(mechanism, solution, loads, SVD() if method is None else method, stabilization)
-    row_names = [name for name, _ in prepare(mechanism, SVD()).code.equations.row_names]
+    row_names = [name for name, _ in prepare(mechanism, SVD()).row_names]
     result: dict[str, dict[str, Array]] = {}
     for name, element in mechanism.constraints.items():
         load = by_row[:, [k for k, n in enumerate(row_names) if n == name]].sum(1)

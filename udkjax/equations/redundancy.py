@@ -9,13 +9,15 @@ compiled for it.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.core import Tracer
 
 from udkjax.equations.code import code, scalars
+from udkjax.equations.sparse_rows import SparseRows
+from udkjax.equations.udwadia_kalaba import is_large
 from udkjax.scene.mechanism import Mechanism
 
 # Relative to the largest singular value, with rows scaled to length one, at a closed position: redundant rows leave rounding
@@ -49,6 +51,21 @@ class Position(NamedTuple):
         """Whether the rank is beyond doubt: near a singular configuration small residuals are large distances from closure."""
         return bool(np.all((self.sigma <= RANK_TOL * self.sigma[0]) | (self.sigma > CLEAR * self.sigma[0])))
 
+    @property
+    def smallest(self) -> float:
+        """The smallest singular value that counts, relative to the largest."""
+        return float(self.sigma[self.rank - 1] / self.sigma[0])
+
+    def along(self, heading: np.ndarray) -> np.ndarray:
+        """The part of a motion that the constraints allow."""
+        free = self.vt[self.rank :]
+        return free.T @ (free @ heading)
+
+    @property
+    def null_space(self) -> np.ndarray:
+        """The combinations of rows that vanish, (rows, redundant)."""
+        return self.u[:, self.rank :]
+
 
 @np.errstate(all="ignore")  # what is not finite does not close
 def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
@@ -56,7 +73,7 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     leaves = jax.tree.leaves(mechanism)
     if any(isinstance(leaf, Tracer) for leaf in leaves):
         return None
-    rows = Rows(mechanism)
+    rows: Any = rows_of(mechanism)
     if not rows.count:
         return ()
     first = rows.close(0.0, np.asarray(mechanism.q0, float).ravel())
@@ -69,9 +86,8 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
         if any(p.clear and p.rank == rows.count for p in found):
             return ()
         last = found[-1]
-        free = last.vt[last.rank :]
         heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(rows.size) / np.sqrt(rows.size)
-        heading = free.T @ (free @ heading)  # onward, so that the motion gets around
+        heading = last.along(heading)  # onward, so that the motion gets around
         moved = last.q + TURN * rows.root * heading / max(np.abs(rows.root * heading).max(), 1e-300)
         position = rows.close(TICK * (k + 1), moved)
         if position is None or not position.clear or not np.any(heading):  # stuck: jump
@@ -83,19 +99,27 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
         return None
     rank = max(p.rank for p in found)
     generic = [p for p in found if p.rank == rank]
-    ordinary = [p for p in generic if p.sigma[rank - 1] > ORDINARY * p.sigma[0]] or generic
-    return dispensable([p.u[:, rank:] for p in ordinary])
+    chosen = []
+    for members, found in rows.parts_of(generic):
+        ordinary = [part for part in found if part.smallest > ORDINARY] or found
+        chosen += members[list(dispensable([part.null_space for part in ordinary]))].tolist()
+    return tuple(sorted(chosen))
 
 
 def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...]:
     """Return the names of the constraints whose rows depend on each other at a closed position: those in the left null space."""
-    rows = Rows(mechanism)
+    rows = rows_of(mechanism)
     position = rows.close(0.0, np.asarray(q, float).ravel()) if rows.count else None
     if position is None:
         return ()
-    involved = np.linalg.norm(position.u[:, position.rank :], axis=1) > 1e-6
+    involved = np.asarray((abs(position.null_space) > 1e-6).sum(axis=1)).ravel() > 0
     names = [name for (name, _), part in zip(rows.names, involved, strict=True) if part]
     return tuple(dict.fromkeys(names))
+
+
+def rows_of(mechanism: Mechanism, large: bool | None = None) -> "Rows | SparseRows":
+    """Psi and D of a mechanism with known numbers: dense, or for large scenes sparse."""
+    return SparseRows(mechanism) if (is_large(mechanism) if large is None else large) else Rows(mechanism)
 
 
 def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
@@ -138,6 +162,10 @@ class Rows:
         length = np.linalg.norm(D, axis=1)
         length[length == 0.0] = 1.0
         return psi, psi / length, D / length[:, None]
+
+    def parts_of(self, positions: list[Position]) -> list[tuple[np.ndarray, list[Position]]]:
+        """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""
+        return [(np.arange(self.count), positions)]
 
     def close(self, t: float, q: np.ndarray) -> Position | None:
         """Levenberg-Marquardt in the mass metric, with steps of limited length; None where it does not close.

@@ -8,6 +8,7 @@ says that the row depends on them; it is dropped, and counted out of the rank.
 
 from collections.abc import Sequence
 from functools import lru_cache
+from heapq import heapify, heappop, heappush
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -82,13 +83,18 @@ def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
         for k in row:
             meets.setdefault(k, set()).add(i)
     near = [set().union(*(meets[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
-    left, order = set(range(len(rows))), []
+    order: list[int] = []
+    queue, left = [(len(others), i) for i, others in enumerate(near)], set(range(len(rows)))
+    heapify(queue)
     while left:
-        i = min(left, key=lambda i: (len(near[i]), i))
+        degree, i = heappop(queue)
+        if i not in left or degree != len(near[i]):  # counted anew since
+            continue
         left.remove(i)
         order.append(i)
         for k in near[i]:
             near[k] = (near[k] | near[i]) - {i, k}
+            heappush(queue, (len(near[k]), k))
     return order
 
 

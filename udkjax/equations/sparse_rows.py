@@ -1,0 +1,203 @@
+"""Which rows of a large scene depend on each other, by sparse arithmetic: what redundancy.py does by singular values.
+
+D has rows of length one here, and D D^T is eliminated in an order of least fill. A pivot is the square of what remains of its
+row when the rows before it are taken out; a row of which nothing remains depends on those before it, is left out of the
+elimination, and gives one vector of the left null space: itself, minus the combination of rows that it is. These vectors are
+sparse. Rows that share none of them have nothing to do with each other: each set of rows that depend on each other, of a few
+dozen in most scenes, is decided about by itself, by singular values.
+"""
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, csr_array, eye_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from udkjax.equations.code import structure
+from udkjax.equations.large import layout
+from udkjax.pinv.sparse import minimum_degree
+from udkjax.scene.mechanism import Mechanism
+
+# Squares of lengths: what rounding leaves of a dependent row; and what is beyond doubt, as CLEAR in redundancy.py.
+NOTHING = 1e-11
+CLEAR = 1e-8
+NEGLIGIBLE = 1e-6  # of a combination of rows of length one: what does not count as being part of it
+DAMPING = (1e-3, 1e-11)  # of closing: at first, and the least that keeps redundant rows from dividing by nothing
+ITERATIONS = 100
+CLOSED = 1e-11  # as in redundancy.py
+TURN = 0.35
+COLUMNS = 64  # solved for at a time
+
+
+class SparsePosition(NamedTuple):
+    """A closed position, with the elimination of its rows."""
+
+    t: float
+    q: np.ndarray
+    D: Any  # sparse
+    pivots: np.ndarray  # of the rows, in their own order
+    kept: np.ndarray  # the rows that something remains of
+    dropped: np.ndarray
+
+    @property
+    def rank(self) -> int:
+        return len(self.kept)
+
+    @property
+    def clear(self) -> bool:
+        """Whether the rank is beyond doubt."""
+        return bool(np.all(self.pivots[self.kept] > CLEAR))
+
+    @property
+    def smallest(self) -> float:
+        """The shortest remainder of a row that is kept."""
+        return float(np.sqrt(self.pivots[self.kept].min(initial=1.0)))
+
+    def along(self, heading: np.ndarray) -> np.ndarray:
+        """The part of a motion that the constraints allow."""
+        solve = splu(csc_array(self.D @ self.D.T + DAMPING[1] * eye_array(self.D.shape[0])), **_SYMMETRIC).solve
+        for _ in range(2):
+            heading = heading - self.D.T @ solve(self.D @ heading)
+        return heading
+
+    @property
+    def null_space(self) -> Any:
+        """The combinations of rows that vanish, (rows, redundant)."""
+        rows, count = self.D.shape[0], len(self.dropped)
+        if not count:
+            return csc_array((rows, 0))
+        kept = self.D[self.kept]
+        solve = splu(csc_array(kept @ kept.T), **_SYMMETRIC).solve
+        parts = []
+        for start in range(0, count, COLUMNS):
+            dropped = self.dropped[start : start + COLUMNS]
+            right = (kept @ self.D[dropped].T).toarray()
+            found = np.zeros((rows, len(dropped)))
+            found[self.kept] = -solve(right)
+            found[dropped, np.arange(len(dropped))] = 1.0
+            found[np.abs(found) < NEGLIGIBLE] = 0.0
+            parts.append(coo_array(found))
+        return csc_array(_beside(parts, rows))
+
+
+_SYMMETRIC: dict[str, Any] = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}, "diag_pivot_thresh": 0.0}
+
+
+def _beside(parts: list[Any], rows: int) -> Any:
+    shift = np.cumsum([0, *(p.shape[1] for p in parts)])
+    place = np.concatenate([p.row for p in parts]), np.concatenate([p.col + s for p, s in zip(parts, shift, strict=False)])
+    return coo_array((np.concatenate([p.data for p in parts]), place), shape=(rows, shift[-1]))
+
+
+class SparseRows:
+    """Psi and D of a mechanism with known numbers; D sparse. The interface is that of `redundancy.Rows`."""
+
+    def __init__(self, mechanism: Mechanism):
+        self._layout = layout(*structure(mechanism), (), False)
+        numbers = self._layout.numbers(mechanism, ())
+        self.count, self.size = self._layout.count, 3 * self._layout.bodies
+        self.names = self._layout.row_names
+        self.root = np.asarray(numbers["root"]).T.ravel()
+        self._evaluate = lambda t, q: self._layout.position(numbers, t, q)
+
+    @cached_property
+    def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Row, column and place in `columns` of every entry of D."""
+        return self._layout.all.entries
+
+    @cached_property
+    def _order(self) -> list[int]:
+        rows: list[set[int]] = [set() for _ in range(self.count)]
+        for i, k in zip(*self._places[:2], strict=True):
+            rows[i].add(k // 3)
+        return minimum_degree(rows)
+
+    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, csr_array]:
+        """Psi, and Psi and D scaled to rows of D of length one (which changes no solution of a consistent system)."""
+        psi, values = (np.asarray(x) for x in self._evaluate(t, q))
+        row, column, place = self._places
+        D = csr_array((values.ravel()[place], (row, column)), shape=(self.count, self.size))
+        length = np.sqrt(D.multiply(D).sum(axis=1))
+        length[length == 0.0] = 1.0
+        return psi, psi / length, csr_array(D.multiply(1 / length[:, None]))
+
+    def close(self, t: float, q: np.ndarray) -> SparsePosition | None:
+        """Levenberg-Marquardt in the mass metric, with steps of limited length; None where it does not close."""
+        damping, least = DAMPING
+        psi, scaled, D = self.at(t, q)
+        for _ in range(ITERATIONS):
+            if not (np.all(np.isfinite(psi)) and np.all(np.isfinite(D.data))):
+                return None
+            if np.abs(psi).max() <= CLOSED * (1.0 + np.abs(q).max()):
+                return self._position(t, q, D)
+            system = csc_array(D @ D.T + damping * eye_array(self.count))
+            step = -self.root * (D.T @ splu(system, **_SYMMETRIC).solve(scaled))
+            ahead = q + step * min(1.0, TURN / max(np.abs(step).max(), 1e-300))
+            trial = self.at(t, ahead)
+            if np.linalg.norm(trial[0]) < np.linalg.norm(psi):
+                q, (psi, scaled, D), damping = ahead, trial, max(0.1 * damping, least)
+            elif damping > 1e6:
+                return None
+            else:
+                damping = max(100.0 * damping, least)
+        return None
+
+    def parts_of(self, positions: list[SparsePosition]) -> list[tuple[np.ndarray, list["Part"]]]:
+        """Sets of rows that depend on each other, and how each stands in the positions."""
+        return parts(positions)
+
+    def _position(self, t: float, q: np.ndarray, D: csr_array) -> SparsePosition:
+        pivots = remainders(csr_array(D @ D.T), self._order)
+        beyond = pivots > NOTHING
+        return SparsePosition(t, q, D, pivots, np.flatnonzero(beyond), np.flatnonzero(~beyond))
+
+
+def remainders(gram: csr_array, order: list[int]) -> np.ndarray:
+    """The pivots of D D^T in the order of elimination, for rows of length one; dependent rows are passed over."""
+    place = np.empty(len(order), int)
+    place[order] = np.arange(len(order))
+    column: list[dict[int, float]] = [{} for _ in order]
+    entries = coo_array(gram)
+    for i, j, value in zip(place[entries.row].tolist(), place[entries.col].tolist(), entries.data.tolist(), strict=True):
+        if i >= j:
+            column[j][i] = value
+    pivots = np.zeros(len(order))
+    for j, below in enumerate(column):
+        pivot = below.pop(j, 0.0)
+        pivots[order[j]] = pivot
+        if pivot <= NOTHING:
+            continue
+        rows = sorted(below)
+        for n, k in enumerate(rows):
+            multiplier, target = below[k] / pivot, column[k]
+            for i in rows[n:]:
+                target[i] = target.get(i, 0.0) - multiplier * below[i]
+        below.clear()
+    return pivots
+
+
+class Part(NamedTuple):
+    """Some rows at one position, by themselves: an orthonormal basis of their left null space."""
+
+    smallest: float  # singular value that counts, relative to the largest
+    null_space: np.ndarray
+
+
+def parts(positions: list[SparsePosition]) -> list[tuple[np.ndarray, list[Part]]]:
+    """Split the rows into sets that depend on each other, and look at each set by itself."""
+    every = _beside([coo_array(p.null_space) for p in positions], len(positions[0].pivots))
+    rows, columns = every.shape
+    links = coo_array((np.ones(every.nnz), (every.row, rows + every.col)), shape=(rows + columns, rows + columns))
+    involved = np.unique(every.row)
+    _, label = np.unique(connected_components(links, directed=False)[1][involved], return_inverse=True)
+    sets = [involved[label == k] for k in range(label.max(initial=-1) + 1)]
+    return [(members, [_part(p, members) for p in positions]) for members in sets]
+
+
+def _part(position: SparsePosition, members: np.ndarray) -> Part:
+    touched = position.D[members]
+    u, sigma, _ = np.linalg.svd(touched[:, np.unique(touched.indices)].toarray())
+    rank = len(members) - int(np.isin(members, position.dropped).sum())
+    return Part(float(sigma[rank - 1] / sigma[0]) if rank else 1.0, u[:, rank:])
