@@ -1,12 +1,20 @@
 """What more than one floor is tested with."""
 
 import json
+import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
+# Programs compiled by the tests stay out of the user's cache; the processes of one run share theirs.
+OWN_CACHE = None if "UDKJAX_COMPILATION_CACHE" in os.environ else tempfile.mkdtemp(prefix="udkjax-cache-")
+if OWN_CACHE:
+    os.environ["UDKJAX_COMPILATION_CACHE"] = OWN_CACHE
 
 import udkjax as udk
 from udkjax.study.cases import Case, Scope, plan
@@ -27,6 +35,11 @@ INSTANTS = 81
 LOST = {1e-8: 10.0, 1e-6: 13.0}  # s
 
 
+def pytest_unconfigure():
+    if OWN_CACHE:
+        shutil.rmtree(OWN_CACHE, ignore_errors=True)
+
+
 @pytest.fixture(scope="session")
 def data():
     """A file of reference values, by its name."""
@@ -35,7 +48,7 @@ def data():
 
 @pytest.fixture(scope="session")
 def compilations():
-    """What XLA compiles while a function runs: how long each program took (s). Also where a cache spares the compiler its work."""
+    """What XLA compiles while a function runs, or takes from a cache: how long each program took (s)."""
     seen: list[float] = []
 
     def listen(event: str, duration_secs: float, **_):

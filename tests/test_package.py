@@ -13,13 +13,14 @@ import udkjax
 ROOT = Path(udkjax.__file__).parent
 
 BELOW = {
+    "environment": set(),
     "straightline": set(),
     "pinv": {"straightline"},
     "scene": set(),
     "equations": {"scene", "pinv", "straightline"},
     "integrate": {"equations", "scene", "pinv", "straightline"},
     "study": {"integrate", "equations", "scene", "pinv", "straightline"},
-    "show": {"study", "integrate", "equations", "scene", "pinv", "straightline"},
+    "show": {"environment", "study", "integrate", "equations", "scene", "pinv", "straightline"},
 }
 ONLY_IN = {"diffrax": {"integrate", "cli"}, "matplotlib": {"show"}, "tyro": {"cli"}, "msgspec": {"scene"}}
 

@@ -1,13 +1,14 @@
 """Planar mechanisms with any redundancy of constraints: simulated, batched and differentiated in JAX.
 
 Nothing is imported before it is used, so that the command line answers at once. Importing this package turns float64 on in
-JAX, unless the environment says `JAX_ENABLE_X64=0`.
+JAX, unless the environment says `JAX_ENABLE_X64=0`, and lets JAX keep compiled programs in the user's cache folder, unless it
+says `UDKJAX_COMPILATION_CACHE=0`, or names another folder there.
 """
 
-import os
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
+
+from udkjax.environment import enable_compilation_cache, enable_float64
 
 if TYPE_CHECKING:  # the public names, for type checkers and editors; a test compares them with those below
     from udkjax import equations as equations
@@ -114,11 +115,5 @@ def __dir__():
     return sorted({*globals(), *__all__})
 
 
-def _enable_float64():
-    os.environ["JAX_ENABLE_X64"] = os.environ.get("JAX_ENABLE_X64") or "1"
-    wanted = os.environ["JAX_ENABLE_X64"].lower() not in ("0", "n", "no", "f", "false", "off")
-    if wanted and "jax" in sys.modules:  # it has read its environment already
-        sys.modules["jax"].config.update("jax_enable_x64", True)
-
-
-_enable_float64()
+enable_float64()
+enable_compilation_cache()

@@ -24,3 +24,14 @@ def test_what_makes_runs_slow_is_said_with_the_cure(monkeypatch, python, version
 def test_single_precision_is_said():
     with jax.enable_x64(False):
         assert any("float64 is off" in line for line in doctor._advice())
+
+
+def test_where_compiled_programs_are_is_said(tmp_path):
+    (tmp_path / "jit_f-0-cache").write_bytes(bytes(3 * 2**20))
+    before = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        for folder, said in ((str(tmp_path), f"1 kept in {tmp_path}, 3 MiB"), (None, "not kept")):
+            jax.config.update("jax_compilation_cache_dir", folder)
+            assert said in doctor.doctor()
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)

@@ -3,14 +3,16 @@
 import os
 import platform
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
+from udkjax.environment import programs_in
 from udkjax.integrate.solution import versions
 from udkjax.study.machine import cores
 
-FLAGS = ("JAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
+FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 FAST_PYTHON = (3, 12)
 
 
@@ -22,11 +24,20 @@ def doctor() -> str:
         "cores": f"{cores()} of {os.cpu_count()}",
         "devices": ", ".join(f"{device} ({device.device_kind})" for device in jax.devices()),
         "precision": f"{jnp.result_type(float)}",
+        "compiled programs": _cache(),
         "environment": ", ".join(f"{key}={value}" for key, value in sorted(os.environ.items()) if key.startswith(FLAGS)) or "-",
     }
     width = max(map(len, lines))
     advice = [f"! {line}" for line in _advice()] or ["nothing to complain about"]
     return "\n".join([f"{key:<{width}}  {value}" for key, value in lines.items()] + advice)
+
+
+def _cache() -> str:
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if not folder or not jax.config.jax_enable_compilation_cache:  # pyright: ignore[reportAttributeAccessIssue]
+        return "not kept"
+    sizes = [size for _, size, _ in programs_in(Path(folder))]
+    return f"{len(sizes)} kept in {folder}, {sum(sizes) / 2**20:.0f} MiB"
 
 
 def _advice():

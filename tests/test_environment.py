@@ -1,0 +1,95 @@
+"""What importing the package sets up: where compiled programs are kept, and that nothing suffers where they cannot be."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from udkjax import environment
+
+PRINT = "import jax, udkjax; print(jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs)"
+RUN = """
+import udkjax as udk, jax
+counts = {"hit": 0, "miss": 0}
+def listen(event, **_):
+    for kind in counts:
+        counts[kind] += f"compilation_cache/cache_{kind}" in event
+jax.monitoring.register_event_listener(listen)
+mech = udk.library.double_pendulum()
+a = udk.accelerations(mech, 0.0, mech.q0, mech.v0)
+print([x.hex() for x in a.ravel().tolist()], counts["hit"], counts["miss"])
+"""
+
+
+def python(code: str, **environment: object) -> str:
+    clean = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu", **{k: str(v) for k, v in environment.items()}}
+    done = subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=True)
+    assert "Traceback" not in done.stderr
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize("order", [PRINT, PRINT.replace("jax, udkjax", "udkjax, jax")], ids=["jax first", "udkjax first"])
+def test_the_cache_is_in_the_users_cache_folder(tmp_path, order):
+    assert python(order, HOME=tmp_path, XDG_CACHE_HOME=tmp_path / "caches") == f"{tmp_path / 'caches' / 'udkjax' / 'jax'} 0.0"
+    assert list(tmp_path.iterdir()) == []  # nothing is made before there is something to keep
+
+
+@pytest.mark.parametrize(
+    ("choice", "expected"),
+    [
+        ({"UDKJAX_COMPILATION_CACHE": "0"}, "None 1.0"),
+        ({"UDKJAX_COMPILATION_CACHE": "/tmp/elsewhere"}, "/tmp/elsewhere 0.0"),
+        ({"JAX_COMPILATION_CACHE_DIR": "/tmp/mine"}, "/tmp/mine 1.0"),
+        ({"XDG_CACHE_HOME": "/dev/null"}, "None 1.0"),  # in which nobody can make a folder
+        ({"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "5", "UDKJAX_COMPILATION_CACHE": "/tmp/here"}, "/tmp/here 5.0"),
+    ],
+    ids=["off", "elsewhere", "JAX has one", "not writable", "the user's threshold"],
+)
+def test_the_environment_decides(tmp_path, choice, expected):
+    assert python(PRINT.replace("jax, udkjax", "udkjax, jax"), HOME=tmp_path, **choice) == expected
+
+
+def test_a_cache_configured_before_stays():
+    code = "import jax; jax.config.update('jax_compilation_cache_dir', '/tmp/mine');" + PRINT
+    assert python(code, HOME="/tmp") == "/tmp/mine 1.0"
+
+
+@pytest.mark.parametrize(
+    ("platform", "expected"),
+    [("linux", ".cache/udkjax/jax"), ("darwin", "Library/Caches/udkjax/jax"), ("win32", "Local/udkjax/jax")],
+)
+def test_each_system_has_its_place_for_caches(monkeypatch, tmp_path, platform, expected):
+    monkeypatch.setattr(environment.sys, "platform", platform)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.delenv("UDKJAX_COMPILATION_CACHE")
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "Local"))
+    assert environment.cache_folder() == tmp_path / expected
+
+
+@pytest.mark.slow
+def test_the_second_process_compiles_nothing_and_finds_the_same(tmp_path):
+    first, second = (python(RUN, HOME=tmp_path).rsplit(maxsplit=2) for _ in range(2))
+    assert first[0] == second[0]
+    assert int(first[2]) > 0
+    assert (int(second[1]), int(second[2])) == (int(first[1]) + int(first[2]), 0)
+
+
+def test_what_was_not_used_for_longest_goes_first(monkeypatch, tmp_path):
+    now = time.time()
+    for k in range(4):
+        file = tmp_path / f"program{k}-cache"
+        file.write_bytes(bytes(100))
+        os.utime(file, (now - 1000 * k, now - 1000 * k))
+    (tmp_path / "something else").write_bytes(bytes(1000))
+    environment._bound(tmp_path, largest=250)
+    assert sorted(f.name for _, _, f in environment.programs_in(tmp_path)) == ["program0-cache", "program1-cache"]
+    assert (tmp_path / "something else").exists()
+    environment._bound(tmp_path, largest=0)  # it has only just looked
+    assert len(environment.programs_in(tmp_path)) == 2
+    environment._bound(tmp_path, largest=0, rarely=0)
+    assert environment.programs_in(tmp_path) == []
+    environment._bound(tmp_path / "not there")

@@ -1,0 +1,108 @@
+"""What importing this package sets up in JAX: float64, and a cache of compiled programs on disk.
+
+Only the standard library is imported, so that the command line answers at once: before JAX is, its environment variables are set;
+afterwards, its configuration.
+"""
+
+import atexit
+import os
+import sys
+import time
+from pathlib import Path
+
+FLOAT64 = "JAX_ENABLE_X64"
+CACHE = "UDKJAX_COMPILATION_CACHE"
+NO = ("0", "n", "no", "f", "false", "off")
+YES = ("", "1", "y", "yes", "t", "true", "on")
+
+# JAX can bound the cache itself only where the package filelock is installed, and then it looks at every file for each program.
+LARGEST = 512 * 2**20  # bytes; a simulation's program is about one megabyte
+RARELY = 24 * 3600  # s between two looks at how large it is
+
+
+def enable_float64() -> None:
+    """Turn float64 on, unless the environment says `JAX_ENABLE_X64=0`."""
+    os.environ[FLOAT64] = os.environ.get(FLOAT64) or "1"
+    if os.environ[FLOAT64].lower() not in NO and "jax" in sys.modules:  # it has read its environment already
+        sys.modules["jax"].config.update("jax_enable_x64", True)
+
+
+def enable_compilation_cache() -> None:
+    """Let JAX keep compiled programs on disk, so that the next process need not compile them again.
+
+    `UDKJAX_COMPILATION_CACHE` says where, or 0: nowhere; a cache that JAX was given already stays as it is. Programs are found by
+    their text, the versions of JAX's compiler, its flags and the processor's type and features, all of which JAX sees to. Where
+    nothing can be written, nothing is kept.
+    """
+    configured = sys.modules["jax"].config.jax_compilation_cache_dir if "jax" in sys.modules else None
+    folder = cache_folder()
+    if folder is None or configured is not None or "JAX_COMPILATION_CACHE_DIR" in os.environ or not _writable(folder):
+        return
+    # By default JAX keeps only what took a second to compile. The many small programs of a start take as long together.
+    settings = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    for name, value in settings.items():
+        os.environ.setdefault(name.upper(), str(value))
+        if "jax" in sys.modules:
+            sys.modules["jax"].config.update(name, value)
+    atexit.register(_bound, folder)
+
+
+def cache_folder() -> Path | None:
+    """Where compiled programs are kept if nothing else is configured: the user's cache folder, or what the environment says."""
+    choice = os.environ.get(CACHE, "").strip()
+    if choice.lower() in NO:
+        return None
+    if choice.lower() not in YES:
+        return Path(choice).expanduser()
+    try:
+        home = Path.home()
+    except RuntimeError:  # there is none
+        return None
+    if sys.platform == "darwin":
+        caches = home / "Library" / "Caches"
+    elif sys.platform == "win32":
+        caches = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
+    else:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
+    return caches / "udkjax" / "jax"
+
+
+def programs_in(folder: Path) -> list[tuple[float, int, Path]]:
+    """When each program in a cache was last used or made, its size in bytes, and its file."""
+    found = []
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if entry.name.endswith("-cache"):
+                    status = entry.stat()
+                    found.append((max(status.st_atime, status.st_mtime), status.st_size, Path(entry.path)))
+    except OSError:  # not there yet, or another process has just removed a file
+        pass
+    return found
+
+
+def _writable(folder: Path) -> bool:
+    there = next((f for f in (folder, *folder.absolute().parents) if f.exists()), None)
+    return there is not None and there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+
+
+def _bound(folder: Path, largest: int = LARGEST, rarely: float = RARELY) -> None:
+    """Remove what was not used for longest until the rest is small enough, now and then."""
+    looked = folder / ".looked-at"
+    try:
+        if "jax" not in sys.modules or (looked.exists() and time.time() - looked.stat().st_mtime < rarely):
+            return
+        looked.touch()
+        programs = sorted(programs_in(folder))
+        size = sum(s for _, s, _ in programs)
+        for _, s, file in programs:
+            if size <= largest:
+                break
+            file.unlink(missing_ok=True)
+            size -= s
+    except OSError:  # no such folder, or no longer writable
+        pass
