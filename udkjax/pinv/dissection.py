@@ -11,8 +11,6 @@ Separators are sought where the graphs of planar mechanisms have small ones: a s
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-# A part of at most so many rows is eliminated whole, as one dense front. Larger ones trade levels for arithmetic.
-WHOLE = 6
 # No side of a separator holds more than this share of a part: with 2/3, the depth grows like log n whatever the graph.
 BALANCE = 2 / 3
 
@@ -26,7 +24,7 @@ class Front(NamedTuple):
     depth: int  # 0 at a root
 
 
-def dissect(sizes: Sequence[int], pairs: Iterable[tuple[int, int]], whole: int = WHOLE) -> list[Front]:
+def dissect(sizes: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[Front]:
     """Return the elimination tree of a graph of blocks, children before their parents.
 
     Every front has at most two children (fronts that eliminate nothing join more), so that its sum of updates has a fixed form;
@@ -36,26 +34,23 @@ def dissect(sizes: Sequence[int], pairs: Iterable[tuple[int, int]], whole: int =
     for i, j in pairs:
         near[i].append(j)
         near[j].append(i)
-    tree = _Tree(sizes, near, whole)
+    tree = _Tree(sizes, near)
     roots = [tree.grow(part) for part in _components(near, range(len(sizes)))]
     return tree.fronts(roots)
 
 
 class _Tree:
-    def __init__(self, sizes: Sequence[int], near: list[list[int]], whole: int):
-        self.sizes, self.near, self.whole = sizes, near, whole
+    def __init__(self, sizes: Sequence[int], near: list[list[int]]):
+        self.sizes, self.near = sizes, near
         self.eliminated: list[list[int]] = []  # by node, children before their parents
         self.children: list[list[int]] = []
         self.height: list[int] = []
 
     def grow(self, part: list[int]) -> int:
         """Add the tree of a connected part, and return its root."""
-        rows = sum(self.sizes[i] for i in part)
-        if rows <= self.whole:
-            return self.add(part, [])
         separator = self.separator(part)
-        if 2 * sum(self.sizes[i] for i in separator) > rows:
-            return self.add(part, [])  # too tightly coupled to be worth two levels
+        if 2 * sum(self.sizes[i] for i in separator) > sum(self.sizes[i] for i in part):
+            return self.add(part, [])  # one block, or coupled too tightly to be worth two levels
         rest = set(part).difference(separator)
         below = [self.grow(p) for p in _components(self.near, rest)]
         while len(below) > 2:  # the two shallowest are joined, which adds least to the depth
@@ -101,7 +96,10 @@ class _Tree:
             later = {j for i in blocks for j in self.near[i] if place[j][0] > node}
             later.update(j for child in self.children[node] for j in boundary[child] if place[j][0] != node)
             boundary.append(sorted(later, key=lambda j: place[j]))
-        return [Front(e, b, c, depth[node]) for node, (e, b, c) in enumerate(zip(self.eliminated, boundary, self.children, strict=True))]
+        return [
+            Front(e, b, c, depth[node])
+            for node, (e, b, c) in enumerate(zip(self.eliminated, boundary, self.children, strict=True))
+        ]
 
 
 def _components(near: list[list[int]], part: Iterable[int]) -> list[list[int]]:

@@ -18,9 +18,9 @@ import numpy as np
 
 from udkjax.pinv.dissection import Front
 
-# What one more group on a level costs (some twenty kernels of 100 ns, and as many instructions to compile), counted in entries
-# gathered, of 0.8 ns each: shapes share a group where padding them costs less.
-GROUP = 4000
+# What one more group on a level costs, counted in entries gathered, of 0.8 ns each: about fifteen kernels of 100 ns, and a third of
+# a second to compile them. Shapes share a group where padding costs less.
+GROUP = 8000
 # So many multiply-adds along the fronts cost as much as one entry gathered.
 GATHER = 4.0
 
@@ -166,7 +166,9 @@ def _work(e: int, b: int) -> float:
     return (e + b) ** 2 + e * (e * (e + b) / 2 + b * b) / GATHER
 
 
-def _met(fronts: Sequence[Front], seats: dict[int, _Seat], eliminated: list[np.ndarray], boundary: list[np.ndarray]) -> dict[int, np.ndarray]:
+def _met(
+    fronts: Sequence[Front], seats: dict[int, _Seat], eliminated: list[np.ndarray], boundary: list[np.ndarray]
+) -> dict[int, np.ndarray]:
     """For every front with a parent: the places of its boundary's rows among those of its parent, padding counted."""
     local = np.zeros(sum(len(e) for e in eliminated), int)
     met = {}

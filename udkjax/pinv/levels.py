@@ -54,7 +54,9 @@ class Levels:
         if any(size < 1 for size in sizes):
             raise ValueError(f"every block needs a row at least, but the sizes are {[s for s in sizes if s < 1]}")
         if array.size and (array.min() < 0 or array.max() >= len(sizes)):
-            raise ValueError(f"pairs couple blocks 0 to {len(sizes) - 1}, but one is {array.min() if array.min() < 0 else array.max()}")
+            raise ValueError(
+                f"pairs couple blocks 0 to {len(sizes) - 1}, but one is {array.min() if array.min() < 0 else array.max()}"
+            )
         if (array[:, 0] == array[:, 1]).any() or len(np.unique(np.sort(array), axis=0)) < len(array):
             raise ValueError("a pair couples two different blocks, and each two are coupled by one pair only")
         return _analysed(tuple(int(s) for s in sizes), array.tobytes())
@@ -117,7 +119,9 @@ def _eliminate(group: Group, entries: Array, sent: Array | None, drop: Array | f
 def _pivot(j: int | Array, rows: Array) -> Array:
     """Take row j out of those after it; where that leaves zeros, keep L^-1 instead."""
     row = lax.dynamic_index_in_dim(rows, j, 0, keepdims=False)
-    multiplier = lax.dynamic_index_in_dim(rows, j, 1, keepdims=False) * cut(1 / lax.dynamic_index_in_dim(row, j, 0, keepdims=False))
+    multiplier = lax.dynamic_index_in_dim(rows, j, 1, keepdims=False) * cut(
+        1 / lax.dynamic_index_in_dim(row, j, 0, keepdims=False)
+    )
     later, own = (np.arange(rows.shape[0]) > j)[:, None, None], (np.arange(rows.shape[1]) == j)[:, None]
     return jnp.where(later, jnp.where(own, 0, rows) - multiplier[:, None] * jnp.where(own, 1, row), rows)
 
