@@ -69,12 +69,12 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Any) -> Float[
 
     `solution` is anything with ts (T,), q and v (T, bodies, 3).
     """
-    return _along(mechanism, solution, lambda equations, t, q, v: equations.violation(t, q, v)[0])
+    return _along(mechanism, solution, _psi)
 
 
 def energy(mechanism: Mechanism, solution: Any) -> Energy:
     """Return kinetic energy v^T M v / 2 and potential energy (J) at each output time."""
-    return _along(mechanism, solution, lambda equations, t, q, v: Energy(*equations.energy(t, q, v)))
+    return _along(mechanism, solution, _energy)
 
 
 def reactions(
@@ -89,12 +89,7 @@ def reactions(
     constraint's rows. Of redundant constraints it is the share of minimum norm; the accelerations do not depend on it.
     `method` (default `SVD`) decides the rank; give the run's `Baumgarte` to include what it adds.
     """
-
-    def loads(equations, t, q, v):
-        multipliers = equations.multipliers(t, q, v)
-        return -jnp.asarray(equations.jacobian(t, q)) * multipliers[:, None]
-
-    by_row = _along(mechanism, solution, loads, SVD() if method is None else method, stabilization)
+    by_row = _along(mechanism, solution, _loads, SVD() if method is None else method, stabilization)
     row_names = [name for name, _ in prepare(mechanism, SVD()).row_names]
     result: dict[str, dict[str, Array]] = {}
     for name, element in mechanism.constraints.items():
@@ -102,6 +97,23 @@ def reactions(
         places = {body: mechanism.body_names.index(body) for body in mechanism.frames_of(element) if body != GROUND}
         result[name] = {body: load[:, 3 * k : 3 * k + 3] for body, k in places.items()}
     return result
+
+
+# Functions of their own: what is compiled for one call serves the next.
+
+
+def _psi(equations: Any, t: Any, q: Any, v: Any) -> Array:
+    return equations.violation(t, q, v)[0]
+
+
+def _energy(equations: Any, t: Any, q: Any, v: Any) -> Energy:
+    return Energy(*equations.energy(t, q, v))
+
+
+def _loads(equations: Any, t: Any, q: Any, v: Any) -> Array:
+    """-Psi_q^T lambda, row by row."""
+    multipliers = equations.multipliers(t, q, v)
+    return -jnp.asarray(equations.jacobian(t, q)) * multipliers[:, None]
 
 
 def _along(mechanism: Any, solution: Any, quantity: Callable, method: Any = None, baumgarte: Any = None) -> Any:
