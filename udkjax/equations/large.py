@@ -12,6 +12,7 @@ from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -204,15 +205,17 @@ class LargeEquations(MechanismMotion):
     numbers: dict[str, Any]
     method: Pseudoinverse
     layout: Layout = eqx.field(static=True)
-    branch: bool = eqx.field(static=True, default=True)
     dense: bool = eqx.field(static=True, default=False)  # whether the method is applied to D of all rows as a matrix
 
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
         """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
-        return _accelerations(watch, self, t, q, v) if self.by_levels else plain_accelerations(self, t, q, v)
+        return _compiled(_accelerations if self.by_levels else _plainly, self, t, q, v, watch)
 
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         """lambda = -(D^+)^T D^+ b of all rows: by elimination where none is left out, else by singular values."""
+        return _compiled(LargeEquations._multipliers, self, t, q, v)
+
+    def _multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         if not self.layout.count:
             return jnp.zeros(0)
         if not self.by_levels or self.left_out:
@@ -231,13 +234,11 @@ class LargeEquations(MechanismMotion):
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
-        return _project(self, t, q, v)
+        return _compiled(_project, self, t, q, v)
 
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""
-        rows = self.layout.all
-        psi, rate = self._arrays(rows, ["psi", "psi_dot"], t, q, v)
-        return rows.listed(psi), rows.listed(rate)
+        return _compiled(_violation, self, t, q, v)
 
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
         """Whether everything that the equation is made of is a number."""
@@ -312,12 +313,12 @@ class LargeEquations(MechanismMotion):
 
     @property
     def branches(self) -> bool:
-        return self.branch and self.by_levels and self.constrained
+        """An evaluation is long beside the branch in it: there is no reason to do without it first."""
+        return False
 
     @property
     def quick(self) -> "LargeEquations":
-        """The same without a branch: what `Auto` cannot solve by elimination is not a number."""
-        return dataclasses.replace(self, branch=False)
+        return self
 
     def exact(self) -> "LargeEquations":
         """The same on all rows as a matrix: what to turn to where rows are not independent."""
@@ -382,6 +383,22 @@ def prepare_closing(mechanism: Mechanism) -> LargeEquations:
     return LargeEquations(found.numbers(mechanism, ()), BlockElimination(found.all.pattern, 0.0, DAMPING), found)
 
 
+def _violation(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+    rows = equations.layout.all
+    psi, rate = equations._arrays(rows, ["psi", "psi_dot"], t, q, v)
+    return rows.listed(psi), rows.listed(rate)
+
+
+def _compiled(function: Any, equations: LargeEquations, t: Any, q: Vector, v: Vector, *choices: bool) -> Any:
+    """As one program, also where it is not part of a larger one: else each of its operations would be compiled by itself."""
+    return _called(function, equations, jnp.asarray(t, jnp.result_type(float)), q, v, *choices)
+
+
+@eqx.filter_jit
+def _called(function: Any, *arguments: Any) -> Any:
+    return function(*arguments)
+
+
 # --- plain
 
 
@@ -433,9 +450,7 @@ def _by_method(equations: LargeEquations, use: Any, t: Any, q: Vector, v: Vector
         D = equations._arrays(layout.all, ["D"], t, q, v)[0]
         return use(equations.method.plus(layout.all.dense(D)), layout.all)
     plus = equations._elimination.plus(equations._arrays(layout.kept, ["D"], t, q, v)[0])
-    if not equations.branches:
-        return use(plus, layout.kept)
-    return jax.lax.cond(plus.rank > 0, lambda: use(plus, layout.kept), lambda: _by_method(equations.exact(), use, t, q, v))
+    return _branch(plus.rank > 0, lambda: use(plus, layout.kept), lambda: _by_method(equations.exact(), use, t, q, v))
 
 
 def _right(plus: Any, rows: Selection, values: Float[Array, "r blocks"]) -> Array:
@@ -450,11 +465,15 @@ class _Unconstrained:
         return 0.0
 
 
+def _plainly(equations: LargeEquations, t: Any, q: Vector, v: Vector, _: bool) -> Vector:
+    return plain_accelerations(equations, t, q, v)
+
+
 # --- fast
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _accelerations(watch: bool, equations: LargeEquations, t: Any, q: Vector, v: Vector) -> Vector:
+@partial(jax.custom_jvp, nondiff_argnums=(4,))
+def _accelerations(equations: LargeEquations, t: Any, q: Vector, v: Vector, watch: bool) -> Vector:
     layout, root = equations.layout, equations.numbers["root"]
     free = equations._free(t, q, v)
     if not len(layout.kept.rows):
@@ -464,7 +483,7 @@ def _accelerations(watch: bool, equations: LargeEquations, t: Any, q: Vector, v:
     factors, safe = factorized(pattern, D, equations.drop)
     x = pattern.rmatvec(D, pattern.levels.solve(factors, b.T).T)
     a = flat(free + root * x)
-    if watch and layout.left_out and equations.branches:
+    if watch and layout.left_out:
         safe = safe & _satisfied(equations, t, q, v, free, x)
     return _checked(equations, safe, a, plain_accelerations, t, q, v)
 
@@ -511,7 +530,11 @@ _accelerations.defjvp(lambda watch, primals, tangents: jax.jvp(plain_acceleratio
 
 
 def _checked(equations: LargeEquations, safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
-    """Take what elimination gave where its pivots are safe; else turn to singular values, or say that it is not a number."""
-    if not equations.branches:
-        return jax.tree.map(lambda x: jnp.where(safe, x, jnp.nan), fast)
-    return jax.lax.cond(safe, lambda: fast, lambda: plain(equations.exact(), *state))
+    """Take what elimination gave where its pivots are safe; else turn to the dense method."""
+    return _branch(safe, lambda: fast, lambda: plain(equations.exact(), *state))
+
+
+def _branch(safe: Bool[Array, ""], fast: Any, careful: Any) -> Any:
+    """One of two results; under vmap, `careful` is taken for all as soon as one is in need of it."""
+    where = lambda a, b: jnp.where(safe, a, b)  # noqa: E731
+    return jax.lax.cond(eqxi.unvmap_all(safe), fast, lambda: jax.tree.map(where, fast(), careful()))
