@@ -1,4 +1,4 @@
-"""Numba: the same equations compiled, in SciPy's LSODA (numbalsoda has no wheels for these Pythons), and in DOP853, compiled too."""
+"""Numba: the same equations compiled, in SciPy's LSODA (numbalsoda has no wheels for these Pythons)."""
 
 import numpy as np
 from scipy.integrate import odeint
@@ -12,7 +12,7 @@ ZERO = 1e-9  # the same: what dependent rows leave behind
 
 def right_hand_side():
     """y' (24,), compiled: pivoted Cholesky factors of D D^T where its rank is plain, eigenvalues near singular configurations."""
-    from numba import njit
+    from numba import njit  # pyright: ignore[reportMissingImports]
 
     @njit
     def matrices(y):

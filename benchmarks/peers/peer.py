@@ -16,9 +16,11 @@ from udkjax.study.exact import exact_coordinates
 STARTS = (-45.0, 60.0)  # degrees, at rest; from +60 it crosses singular configurations
 SPACING = 0.05  # s between outputs
 END = 20.0  # s
-CAP = 10.0  # s of CPU time: a curve ends with the first run that took longer
-ENOUGH = 3.0  # s of CPU time that a figure's runs take together, unless `ROUNDS` are done before
+CAP = 4.0  # s of CPU time: a curve ends with the first run that took longer
+ENOUGH = 1.0  # s of CPU time after which a figure needs no further run, nor after `ROUNDS`
 ROUNDS = 5
+COMPILE = 60.0  # s of CPU time for the run before all others
+SPREAD = 15.0  # degrees to both sides of the start, in a batch
 TICKS = 0.1  # s that a timing takes at least: some systems count CPU time in steps of 4 ms
 
 # The paper's linkage: links 1, 2, 3 and the coupler; each as x, y (m) of the centre of mass and the angle (rad).
@@ -67,6 +69,16 @@ def coordinates(links: np.ndarray, coupler: np.ndarray) -> Coordinates:
     return np.concatenate([bodies.reshape(len(links), 9), carried], axis=-1)
 
 
+class Batch(NamedTuple):
+    """The linkage released from several angles."""
+
+    problems: list[Problem]
+
+    def error(self, q: Any) -> float:
+        """The largest error of any; `q` (batch, outputs, 12)."""
+        return float("nan") if q is None else float(np.max([task.error(each) for task, each in zip(self.problems, q)]))
+
+
 Run = Callable[[float], Coordinates]  # from the knob
 
 
@@ -77,7 +89,10 @@ class Peer(NamedTuple):
     package: str  # as it is called where it is installed from
     knob: str  # what is turned for accuracy
     knobs: tuple[float, ...]  # from coarse to fine
-    setup: Callable[[Problem], Run]  # imports the package
+    setup: Callable[..., Run]  # from the Problem, or from the Batch; imports the package
+    batch: int = 1  # trajectories that run at once, from starts within `SPREAD`
+    end: float = END  # s
+    starts: tuple[float, ...] = STARTS
 
     def available(self) -> str | None:
         """The version that is installed, or None."""
@@ -86,39 +101,44 @@ class Peer(NamedTuple):
         except PackageNotFoundError:
             return None
 
-    def curve(self, start: float, knobs: tuple[float, ...] | None = None, end: float = END, cap: float = CAP) -> list[dict]:
-        """Rows of `knob`, `error` (m, rad) and `seconds`: the median CPU time of one run, the program being warm.
+    def curve(
+        self, start: float, knobs: tuple[float, ...] | None = None, end: float | None = None, cap: float = CAP
+    ) -> list[dict]:
+        """Rows of `knob`, `error` (m, rad) and `seconds`: the median CPU time of one trajectory, the program being warm.
 
         The curve ends early with a run that took longer than `cap` seconds.
         """
-        task = problem(start, end)
+        knobs, end = knobs or self.knobs, end or self.end
+        if self.batch == 1:
+            task = problem(start, end)
+        else:
+            task = Batch([problem(start + offset, end) for offset in np.linspace(-SPREAD, SPREAD, self.batch)])
         run = self.setup(task)
         rows: list[dict[str, Any]] = []
-        knobs = self.knobs if knobs is None else knobs
-        timed(run, knobs[0], 10 * cap)  # compiles, loads and allocates
+        timed(run, knobs[0], COMPILE)  # compiles, loads and allocates
         for knob in knobs:
             q, taken = timed(run, knob, 2 * cap)
             seconds = [taken]
-            if q is not None and taken < cap:
-                times = max(1, round(TICKS / taken))
-                while len(seconds) < ROUNDS and sum(seconds) * times < ENOUGH:
-                    seconds.append(timed(run, knob, 2 * cap, times)[1])
-            rows.append({"knob": knob, "error": task.error(q), "seconds": statistics.median(seconds)})
+            while q is not None and len(seconds) < ROUNDS and len(seconds) * max(seconds[-1], TICKS) < ENOUGH:
+                seconds.append(timed(run, knob, 2 * cap, TICKS)[1])
+            typical = statistics.median(seconds[1:] or seconds)  # the first one is too short to be timed well
+            rows.append({"knob": knob, "error": task.error(q), "seconds": typical / self.batch})
             if taken > cap:
                 break
         return rows
 
 
-def timed(run: Run, knob: float, limit: float, times: int = 1) -> tuple[Coordinates | None, float]:
-    """What a run returns and its CPU time, the mean of some `times`; None if it broke down, or had to be stopped at `limit` (s)."""
-    q, begun = None, time.process_time()
+def timed(run: Run, knob: float, limit: float, at_least: float = 0.0) -> tuple[Coordinates | None, float]:
+    """What a run returns, and its CPU time: the mean of as many as take `at_least` (s). None: broken down, or past `limit`."""
+    begun, runs, q = time.process_time(), 0, None
     try:
         with interrupted(limit):
-            for _ in range(times):
+            while runs == 0 or time.process_time() - begun < at_least:
                 q = run(knob)
-    except (ArithmeticError, RuntimeError, TimeoutError, ValueError, np.linalg.LinAlgError):
-        return None, (time.process_time() - begun) / times
-    return q, (time.process_time() - begun) / times
+                runs += 1
+    except (ArithmeticError, RuntimeError, SystemError, TimeoutError, ValueError, np.linalg.LinAlgError):
+        return None, (time.process_time() - begun) / (runs + 1)
+    return q, (time.process_time() - begun) / runs
 
 
 @contextmanager

@@ -14,7 +14,7 @@ ITERATIONS = 10
 
 def setup(problem: Problem) -> Run:
     """States are the angles of joints: links 1, 2, 3 on the ground, the coupler on link 1."""
-    import pinocchio as pin
+    import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
     def at(x: float):
         return pin.SE3(np.eye(3), np.array([x, 0.0, 0.0]))
