@@ -414,3 +414,90 @@ def test_numbers_that_change_do_not_compile_anew(linkage):
     assert not jnp.allclose(a(heavier), first)
     assert calls == 1
     assert prepare(heavier, ELIMINATION).code is prepare(linkage, ELIMINATION).code
+
+
+# --- derivatives
+
+
+def pushed(mechanism, directions=None) -> str:
+    """a and its tangents along q and v: in one direction, or in several at once."""
+    equations, at = prepare(mechanism, ELIMINATION), (mechanism.q0.ravel(), mechanism.v0.ravel())
+    push = lambda dots, *at: jax.jvp(lambda q, v: equations.accelerations(0.1, q, v), at, dots)  # noqa: E731
+    if directions is None:
+        return lowered(push, at, *at)
+    dots = tuple(jnp.ones((directions, *x.shape)) for x in at)
+    return lowered(jax.vmap(push, (0, None, None), (None, 0)), dots, *at)
+
+
+def sensitivity(mechanism, *names) -> int:
+    """How many operations the tangent of a along some parameters adds to those of a."""
+    q, v, parameters = mechanism.q0.ravel(), mechanism.v0.ravel(), {name: mechanism.parameters()[name] for name in names}
+    a = lambda p: prepare(mechanism.with_parameters(p), ELIMINATION).accelerations(0.1, q, v)  # noqa: E731
+    both = lowered(lambda p, dp: jax.jvp(a, (p,), (dp,)), parameters, parameters)
+    return arithmetic(both) - arithmetic(lowered(a, parameters))
+
+
+def pulled(mechanism) -> str:
+    """a and the cotangents of q and v."""
+    equations = prepare(mechanism, ELIMINATION)
+
+    def pull(w, q, v):
+        a, back = jax.vjp(lambda q, v: equations.accelerations(0.1, q, v), q, v)
+        return a, back(w)
+
+    return lowered(pull, mechanism.q0.ravel(), mechanism.q0.ravel(), mechanism.v0.ravel())
+
+
+def flops(text: str) -> int:
+    return arithmetic(text) + PAIR * operations(text)["sincos"]
+
+
+def test_a_tangent_takes_half_of_what_the_accelerations_take(linkage, plain):
+    assert flops(pushed(linkage)) <= 1.5 * flops(plain)
+
+
+def test_a_gradient_takes_half_of_what_the_accelerations_take(linkage, plain):
+    assert flops(pulled(linkage)) <= 1.6 * flops(plain)
+
+
+@pytest.mark.parametrize("text", [pushed, pulled], ids=["forward", "reverse"])
+def test_a_derivative_factorizes_nothing(linkage, text):
+    found = operations(text(linkage))
+    assert found["divide"] == 11 and found["sincos"] == 4 and found["sqrt"] == 0
+
+
+def test_further_directions_share_what_does_not_depend_on_them(linkage, plain):
+    """The accelerations, and the coefficients of their tangents, are evaluated once."""
+    found = {n: operations(pushed(linkage, n)) for n in (1, 2, 8)}
+    counts = {n: sum(c[name] for name in ARITHMETIC) for n, c in found.items()}
+    assert all(c["divide"] == 11 and c["sincos"] == 4 for c in found.values())
+    assert counts[8] - counts[2] == 6 * (counts[2] - counts[1])
+    assert counts[2] - counts[1] <= 0.4 * flops(plain)
+
+
+def test_only_what_moves_is_differentiated(linkage, plain):
+    one, two = (sensitivity(linkage, *names) for names in (["body.coupler.mass"], ["body.coupler.mass", "body.link2.inertia"]))
+    assert 0 < one < two < arithmetic(pushed(linkage)) - arithmetic(plain)
+    assert sensitivity(linkage, "body.link1.position") == 0  # of a guess, which the equations do not see
+
+
+def test_a_tangent_of_the_velocity_alone_is_cheaper(linkage):
+    equations, (q, v) = prepare(linkage, ELIMINATION), (linkage.q0.ravel(), linkage.v0.ravel())
+    of_v = lowered(lambda q, v, dv: jax.jvp(lambda v: equations.accelerations(0.1, q, v), (v,), (dv,)), q, v, v)
+    assert arithmetic(of_v) < 0.9 * arithmetic(pushed(linkage))
+
+
+def test_a_driver_that_is_not_differentiated_adds_only_its_row(rod):
+    """Along q and v, time does not move: of the motor's motion no derivative is taken beyond those in the accelerations."""
+    motor = joined(rod, drivers={"motor": udk.Driver((GROUND, "rod"), "angle", udk.Sine(1.0, 2.0))})
+    assert trigonometry(pushed(motor)) == trigonometry(right_hand_side(motor))
+
+
+def test_a_projection_is_differentiated_by_one_further_factorization(linkage):
+    """At the state that it returns."""
+    equations = prepare(linkage, ELIMINATION)
+    q, v = linkage.q0.ravel(), linkage.v0.ravel()
+    project = lambda q, v: equations.project(0.0, q, v)  # noqa: E731
+    value, both = lowered(project, q, v), lowered(lambda q, v: jax.jvp(project, (q, v), (v, q)), q, v)
+    assert operations(both)["divide"] == 22
+    assert arithmetic(both) <= 2 * arithmetic(value)

@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from udkjax.straightline import Differential, Program, Scalar, frontier
-from udkjax.straightline.derivative import Row, accumulate, product
+from udkjax.straightline.derivative import Row, accumulate, common_factors, product
 
 if TYPE_CHECKING:
     from udkjax.equations.code import Code
@@ -83,7 +83,9 @@ class _Accelerations:
         for residual, row, y in zip(self.residual, rows, code.y, strict=True):
             for k, entry in row.items():
                 accumulate(residual, d.row(entry), -x[k])
-                accumulate(self.turned[k], d.row(entry), code.root[k] * y)
+                accumulate(self.turned[k], d.row(entry), y)
+        self.turned = [{k: p * root for k, p in row.items()} for row, root in zip(self.turned, code.root, strict=True)]
+        self.residual, self.factors = common_factors(self.residual)
 
     def forward(self, tangents: Sequence[Scalar]) -> list[Scalar]:
         code, graph = self.code, self.code.graph
@@ -98,10 +100,12 @@ class _Accelerations:
         code, graph = self.code, self.code.graph
         moved = [c * s for c, s in zip(code.compliance, w, strict=True)]
         u = code.solved([_times(row, moved, graph) for row in self.rows])
-        found: Row = {}
-        for rows, seeds in ((self.residual, u), (self.turned, _less(w, code.pulled(u))), (self.direct, w)):
-            for row, seed in zip(rows, seeds, strict=True):
-                accumulate(found, row, seed)
+        scaled: Row = {}
+        for row, seed in zip(self.residual, u, strict=True):
+            accumulate(scaled, row, seed)
+        found = {k: c * self.factors.get(k, 1.0) for k, c in scaled.items()}
+        for row, seed in (*zip(self.turned, _less(w, code.pulled(u)), strict=True), *zip(self.direct, w, strict=True)):
+            accumulate(found, row, seed)
         return self.differential.back(found)
 
 

@@ -7,6 +7,7 @@ For a constraint with residual Psi(t, q) the graph gets, all by forward differen
 
     Psi_dot = Psi_q v + Psi_t        gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt
 
+(or, where that is shorter, gamma from derivatives of the entries of Psi_q, which often are other entries of it)
 and Psi_q one column at a time, each along a unit vector whose zeros the graph folds away: a row is {column: scalar}.
 """
 
@@ -21,7 +22,7 @@ import numpy as np
 
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Graph, Scalar, trace
+from udkjax.straightline import Differential, Graph, Scalar, operations, trace
 
 Row = dict[int, Scalar]
 
@@ -214,7 +215,34 @@ def differentiated(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scala
         for row, entry in zip(rows, derivative(along, zero, unit)[1], strict=True):
             if not entry.is_zero:
                 row[k] = entry
+    if not any("time" in s.node.depends for s in value):
+        acceleration = _shorter(graph, rows, acceleration, _quadratic(graph, rows, q, v))
     return value, rows, rate, [-s for s in acceleration]
+
+
+def _quadratic(graph: Graph, rows: list[Row], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
+    """(Psi_q v)_q v as the sum of (dPsi_q[k]/dq[j]) v[j] v[k]; None where an opaque expression is in the way."""
+    entries = Differential(graph, [entry for row in rows for entry in row.values()], q)
+    column = {s.index: j for j, s in enumerate(q)}
+    total = []
+    for row in rows:
+        terms: dict[tuple[int, int], Scalar] = {}
+        for k, entry in row.items():
+            for place, slope in entries.row(entry).items():
+                if place not in column:
+                    return None
+                pair = min(k, column[place]), max(k, column[place])
+                terms[pair] = terms[pair] + slope if pair in terms else slope
+        total.append(sum((slope * (v[j] * v[k]) for (j, k), slope in terms.items()), graph.constant(0.0)))
+    return total
+
+
+def _shorter(graph: Graph, known: list[Row], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
+    """The one of two ways to write the same that takes fewer operations, with the entries of the rows known."""
+    if other is None:
+        return one
+    given = [entry for row in known for entry in row.values()]
+    return other if operations(graph, given, other) < operations(graph, given, one) else one
 
 
 def applied(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):

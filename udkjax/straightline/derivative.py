@@ -32,7 +32,7 @@ class Differential:
         given = {s.index for s in (*self.inputs, *fixed)}
         self._rows: dict[int, Row] = {s.index: {s.index: graph.constant(1.0, s.node.dtype)} for s in self.inputs}
         self._stations: dict[int, list[int]] = {}  # opaque nodes that move, and their results
-        for index in _between(graph, given, [s.index for s in outputs]):
+        for index in graph.needed((s.index for s in outputs), given):
             row = self._differentiated(index)
             if row:
                 self._rows[index] = row
@@ -118,14 +118,28 @@ def accumulate(total: Row, row: Row, factor: Scalar) -> None:
         total[k] = total[k] + p * factor if k in total else p * factor
 
 
-def _between(graph: Graph, given: set[int], wanted: Sequence[int]) -> list[int]:
-    found, stack = set(), list(wanted)
-    while stack:
-        index = stack.pop()
-        if index not in found and index not in given:
-            found.add(index)
-            stack.extend(a.index for a in graph.nodes[index].arguments)
-    return sorted(found)
+def common_factors(rows: Sequence[Row]) -> tuple[list[Row], Row]:
+    """Divide each column of a matrix by a factor that all its entries hold; return the factors, by column, too.
+
+    A product for each entry becomes one for the whole column, which its tangent takes.
+    """
+    columns: dict[int, list[Scalar]] = {}
+    for row in rows:
+        for k, entry in row.items():
+            columns.setdefault(k, []).append(entry)
+    factors: Row = {}
+    for k, entries in columns.items():
+        held = [{a.index for a in e.node.arguments} if e.node.kind == "mul" else set() for e in entries]
+        common = set.intersection(*held) if len(entries) > 1 else None
+        if common:
+            factors[k] = Scalar(entries[0].graph, max(common))
+    return [{k: _without(e, factors[k]) if k in factors else e for k, e in row.items()} for row in rows], factors
+
+
+def _without(entry: Scalar, factor: Scalar) -> Scalar:
+    one, other = entry.node.arguments
+    rest = other if one.index == factor.index else one
+    return rest if entry.sign > 0 else -rest
 
 
 def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
@@ -220,7 +234,7 @@ def _outputs(graph: Graph, results: Sequence[int]) -> list[int]:
 
 def _picked(graph: Graph, k: int, found: Mapping[int, np.ndarray]) -> Scalar:
     output, flat = graph.nodes[k].detail
-    return found[output].flat[flat]
+    return found[output].flat[flat]  # pyright: ignore[reportReturnType]
 
 
 def _arrays(node: Node, scalars: Sequence[Any]) -> list[np.ndarray]:

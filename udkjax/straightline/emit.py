@@ -105,17 +105,17 @@ def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bo
     return [Scalar(graph, i) for i in sorted(used)]
 
 
+def operations(graph: Graph, given: Sequence[Scalar], outputs: Sequence[Scalar]) -> int:
+    """How many nodes outputs take, once `given` and whatever that is made of are known."""
+    return len({*graph.needed(s.index for s in outputs)}.difference(graph.needed(s.index for s in given)))
+
+
 def _needed(graph: Graph, given: set[int], wanted: Sequence[int]) -> list[int]:
-    needed, stack = set(), list(wanted)
-    while stack:
-        index = stack.pop()
-        if index not in needed and index not in given:
-            needed.add(index)
-            stack.extend(a.index for a in graph.nodes[index].arguments)
+    needed = graph.needed(wanted, given)
     missing = [graph.nodes[i].detail for i in needed if graph.nodes[i].kind == "input"]
     if missing:
         raise ValueError(f"the outputs need inputs that are not given: {missing}")
-    return sorted(needed)
+    return needed
 
 
 def _signed(known: dict[int, Any], scalar: Scalar) -> Any:

@@ -6,7 +6,7 @@ never emitted (emit.py), so a caller builds freely and chooses later.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -186,6 +186,16 @@ class Graph:
                 array[place] = Scalar(self, self._operation("pick", (Scalar(self, index),), (k, flat), np.dtype(dtype)))
             arrays.append(array)
         return arrays
+
+    def needed(self, wanted: Iterable[int], given: Collection[int] = ()) -> list[int]:
+        """The nodes that some nodes take, with themselves, in an order in which they can be evaluated; without those given."""
+        found, stack = set(), list(wanted)
+        while stack:
+            index = stack.pop()
+            if index not in found and index not in given:
+                found.add(index)
+                stack.extend(a.index for a in self.nodes[index].arguments)
+        return sorted(found)
 
     def _operation(self, kind, arguments, detail=None, dtype=None) -> int:
         depends = frozenset().union(*(a.node.depends for a in arguments)) if arguments else frozenset()

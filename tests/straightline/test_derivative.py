@@ -1,0 +1,117 @@
+"""Derivatives of graphs: those of JAX, forward and transposed, from expressions that are shared and hold nothing superfluous."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from udkjax.straightline import Differential, Graph, Program, cotangents, tangents, trace
+from udkjax.straightline.derivative import common_factors
+
+X, Y = np.array([0.3, -0.7, 1.1]), np.array([0.5, 0.9, -0.4])
+FUNCTIONS = {
+    "arithmetic": lambda x, y: (x[0] - y[0]) / (1.0 + x[1] ** 2) - (y[1] - x[0]) * -x[2] / y,
+    "powers": lambda x, y: jnp.stack([x[0] ** 3, y[0] ** -2, x[1] ** 0, jnp.square(x[1]), jnp.abs(y[2]) ** 1.5]),
+    "roots": lambda x, y: jnp.sqrt(1.0 + x * x) / lax.rsqrt(1.0 + y * y) + jnp.cbrt(y),
+    "trigonometry": lambda x, y: jnp.sin(x) * jnp.cos(y) + jnp.arctan2(x, y) + jnp.tanh(x - y),
+    "choice": lambda x, y: jnp.where(x > y, x * y, jnp.abs(x) - y) + jnp.clip(x, -0.5, 0.5) + jnp.maximum(x, y),
+    "constants": lambda x, y: jnp.ones(2) * 3.0,
+    # with opaque nodes, one behind the other
+    "branch": lambda x, y: lax.cond(x[0] > 0, lambda a, b: a * b, lambda a, b: a + b, jnp.sin(x), y) * x,
+    "loop": lambda x, y: lax.scan(lambda c, a: (c * a + 1.0, c - a), y[0] * y[1], jnp.sort(x)),
+    "indices": lambda x, y: x[jnp.where(y > 0, 2, 1)] * jnp.interp(x[0], jnp.array([-2.0, 0.0, 3.0]), y),
+    "system": lambda x, y: jnp.linalg.solve(jnp.diag(2.0 + x * x) + 0.1 * jnp.outer(x, y), y),
+    "scatter": lambda x, y: x.at[1].set(y[0]).at[jnp.array([0, 2])].add(y[1]),
+}  # fmt: skip
+
+
+@pytest.fixture(params=FUNCTIONS)
+def function(request):
+    return FUNCTIONS[request.param]
+
+
+def test_forward_and_reverse_are_those_of_jax(function):
+    graph = Graph()
+    x, y = (np.array([graph.input((name, k), "state") for k in range(3)], object) for name in "xy")
+    flat = lambda z: jnp.concatenate([jnp.ravel(o) for o in jax.tree.leaves(function(z[:3], z[3:]))])  # noqa: E731
+    outputs = list(trace(lambda x, y: flat(jnp.concatenate([x, y])), jnp.asarray(X), jnp.asarray(Y))(graph, x, y)[0])
+    inputs, at, random = [*x, *y], np.concatenate([X, Y]), np.random.default_rng(0)
+    dots, weights = random.standard_normal(6), random.standard_normal(len(outputs))
+    seeds = [graph.constant(d) for d in dots]
+    found = Program(graph, inputs, tangents(graph, outputs, dict(zip(inputs, seeds, strict=True))))([float(a) for a in at])
+    np.testing.assert_allclose(found, jax.jvp(flat, (jnp.asarray(at),), (jnp.asarray(dots),))[1], rtol=1e-12, atol=1e-13)
+    back = cotangents(graph, outputs, [graph.constant(w) for w in weights], inputs)
+    expected = jax.vjp(flat, jnp.asarray(at))[1](jnp.asarray(weights))[0]
+    np.testing.assert_allclose(Program(graph, inputs, back)([float(a) for a in at]), expected, rtol=1e-12, atol=1e-13)
+
+
+@pytest.fixture
+def graph():
+    return Graph()
+
+
+@pytest.fixture
+def xyz(graph):
+    return [graph.input(name, "state") for name in "xyz"]
+
+
+def traced(function, graph, *scalars):
+    (result,) = trace(function, *(0.0 for _ in scalars))(graph, *(np.asarray(s, object) for s in scalars))
+    return result.item()
+
+
+def test_what_has_no_seed_does_not_move(graph, xyz):
+    x, y, z = xyz
+    dx = graph.input("dx", "tangent")
+    f, g = traced(lambda x, y, z: jnp.sin(y) * x + jnp.cos(z), graph, x, y, z), y * z
+    df, dg = tangents(graph, [f, g], {x: dx})
+    assert dg.is_zero
+    assert Program(graph, [x, y, z, dx], [df]).count() == {"sincos": 1, "mul": 1}
+    assert tangents(graph, [f, g], {})[0].is_zero
+
+
+def test_derivatives_are_the_nodes_of_the_function_where_they_can_be(graph, xyz):
+    """A turned vector: the derivative of each component is the other one."""
+    angle, x, y = xyz
+    one = traced(lambda a, x, y: jnp.cos(a) * x - jnp.sin(a) * y, graph, angle, x, y)
+    other = traced(lambda a, x, y: jnp.sin(a) * x + jnp.cos(a) * y, graph, angle, x, y)
+    known = len(graph.nodes)
+    differential = Differential(graph, [one, other], [angle])
+    assert differential.row(one) == {angle.index: -other}
+    assert differential.row(other) == {angle.index: one}
+    new = {node.kind for node in graph.nodes[known:]} - {"constant"}
+    assert new <= {"add", "sub"}  # on the way: none of them is part of a result
+    assert not set(Program(graph, xyz, [one, other]).order) - set(range(known))
+
+
+def test_a_second_direction_takes_one_product_more(graph, xyz):
+    x, y, z = xyz
+    f = traced(lambda x, y, z: jnp.exp(jnp.sin(x * y) / z), graph, x, y, z)
+    dots = [graph.input(k, "tangent") for k in range(3)]
+    results = [tangents(graph, [f], {x: d})[0] for d in dots]
+    counts = [sum(Program(graph, [x, y, z, *dots], results[:k]).count().values()) for k in (1, 2, 3)]
+    assert counts[1] == counts[0] + 1 and counts[2] == counts[0] + 2
+
+
+def test_what_is_fixed_hides_what_it_is_made_of(graph, xyz):
+    x, y, _ = xyz
+    hidden = x * y
+    f = hidden * x
+    assert Differential(graph, [f], [x], fixed=[hidden]).row(f) == {x.index: hidden}
+    assert Differential(graph, [f], [hidden], fixed=[x]).row(-f) == {hidden.index: -x}
+
+
+def test_signs_of_seeds_and_inputs(graph, xyz):
+    x, y, _ = xyz
+    dx = graph.input("dx", "tangent")
+    assert tangents(graph, [x * y], {-x: dx}) == [-(dx * y)]
+    assert cotangents(graph, [-(x * y)], [dx], [-x]) == [dx * y]
+
+
+def test_a_factor_that_a_column_has_in_common_is_taken_out(graph, xyz):
+    x, y, z = xyz
+    rows, factors = common_factors([{0: x * y, 1: x}, {0: -(z * y), 2: y * z}, {1: y, 2: z * x}])
+    assert factors == {0: y, 2: z}
+    assert rows == [{0: x, 1: x}, {0: -z, 2: y}, {1: y, 2: x}]
+    assert common_factors([{0: x * y}]) == ([{0: x * y}], {})
