@@ -19,6 +19,7 @@ MECHANISMS = {
     "four_bar": (8, 8, {"angular_velocity": 1.3}),
     "simple_pendulum": (1, 1, {"velocity": (0.0, 1.0)}),
     "compound_pendulum": (2, 2, {"angular_velocity": 1.3}),
+    "chain": (20, 20, {"angular_velocity": 1.3}),
     "double_pendulum": (4, 4, {"angular_velocities": (1.0, -2.0)}),
     "elliptic_trammel": (2, 2, {"angular_velocity": 1.3}),
     "driven_pendulum": (3, 3, {}),

@@ -2,9 +2,10 @@
 
 from udkjax.scene.library.linkages import elliptic_trammel, four_bar, n_four_bar, parallelogram, slider_crank
 from udkjax.scene.library.machines import peaucellier, planetary_gear, scissor_lift
-from udkjax.scene.library.pendulums import compound_pendulum, double_pendulum, driven_pendulum, simple_pendulum
+from udkjax.scene.library.pendulums import chain, compound_pendulum, double_pendulum, driven_pendulum, simple_pendulum
 
 __all__ = [
+    "chain",
     "compound_pendulum",
     "double_pendulum",
     "driven_pendulum",

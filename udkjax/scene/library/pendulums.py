@@ -94,3 +94,32 @@ def driven_pendulum(
         gravity=down(gravity),
         name="driven pendulum",
     )
+
+
+def chain(
+    n: int = 10,
+    angle: ArrayLike = np.pi / 2,
+    angular_velocity: ArrayLike = 0.0,
+    length: ArrayLike = 1.0,
+    mass: ArrayLike = 1.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return n uniform rods in a chain of `length` and `mass`, hung up at one end: an n-fold pendulum.
+
+    Bodies link0, ... from the top, all at one `angle` from straight down; joints pin0 (on the ground), pin1, ...
+    """
+    half = 0.5 * number(length) / n
+
+    def pose(s):
+        along = jnp.stack([jnp.sin(s), -jnp.cos(s)])
+        return [((2 * i + 1) * half * along, s - np.pi / 2) for i in range(n)]
+
+    names = [f"link{i}" for i in range(n)]
+    ends = [((0.0, 0.0), (-half, 0.0))] + [((half, 0.0), (-half, 0.0))] * (n - 1)
+    attached = zip([GROUND, *names[:-1]], names, strict=True)
+    return Mechanism(
+        moving(names, [uniform_rod(number(mass) / n, 2 * half)] * n, pose, angle, angular_velocity),
+        {f"pin{i}": Revolute(bodies, end) for i, (bodies, end) in enumerate(zip(attached, ends, strict=True))},
+        gravity=down(gravity),
+        name=f"chain of {n} links",
+    )

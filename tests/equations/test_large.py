@@ -1,0 +1,313 @@
+"""The form for large scenes, on small ones: held against straight-line code and against the equation as it stands."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations import large, redundancy
+from udkjax.equations.udwadia_kalaba import prepare
+from udkjax.pinv.blocks import Sums
+
+
+def everything() -> udk.Mechanism:
+    """A scene with every type of joint, driver and force element, several of each kind, and a copy of a joint."""
+    random = np.random.default_rng(3)
+    places = random.uniform(-2, 2, (11, 2))
+    bodies = {
+        f"b{k}": udk.Body(1.0 + 0.1 * k, 0.2 + 0.05 * k, places[k], random.uniform(-1, 1), random.uniform(-1, 1, 2), 0.3 * k)
+        for k in range(11)
+    }
+    ends = lambda: random.uniform(-0.5, 0.5, (2, 2))  # noqa: E731
+    angles = np.linspace(0, 2 * np.pi, 9)[:-1]
+    profile = udk.Profile(angles, 1.0 + 0.2 * np.cos(angles))
+    joints = {
+        "pin": udk.Revolute(("ground", "b0"), ends()),
+        "pin2": udk.Revolute(("b0", "b1"), ends()),
+        "slide": udk.Prismatic(("b1", "b2"), ends(), 0.3),
+        "slot": udk.Slot(("b2", "b3"), ends(), 1.2),
+        "weld": udk.Weld(("b3", "b4"), ends()),
+        "rod": udk.Distance(("b4", "b5"), ends()),
+        "rod2": udk.Distance(("ground", "b5"), ends()),
+        "same": udk.Angle(("b5", "b6")),
+        "gear": udk.Gear(("b6", "b7"), (1.0, 2.0)),
+        "gear2": udk.Gear(("b7", "b8"), (1.0, 0.5), carrier="b6"),
+        "rack": udk.Rack(("ground", "b8"), 0.5, 0.1),
+        "cam": udk.Cam(("b9", "b10"), ends(), profile),
+        "again": udk.Angle(("b5", "b6")),
+    }
+    drivers = {
+        "turn": udk.Driver(("ground", "b9"), "angle", udk.Sine(1.0, 2.0)),
+        "push": udk.Driver(("b9", "b0"), "distance", udk.Polynomial([2.0, 0.5])),
+    }
+    forces = {
+        "spring": udk.Spring(("b0", "b3"), ends(), 5.0, 0.4, 0.3),
+        "spring2": udk.Spring(("b10", "b3"), ends(), 4.0, 0.6, 0.2),
+        "soft": udk.Spring(("ground", "b1"), ends(), 3.0, 0.3),
+        "twist": udk.TorsionSpring(("b1", "b2"), 2.0, 0.1),
+        "wind": udk.Force("b7", [1.0, -2.0], [0.1, 0.2]),
+        "jet": udk.Force("b8", [1.0, -2.0], [0.1, 0.2], frame="body"),
+        "rub": udk.Friction("pin2", 0.3, 0.05),
+        "motor": udk.Torque(("b3", "b4"), 0.7),
+    }
+    rows = 2 + 2 + 2 + 1 + 3 + 1 + 1 + 1 + 1 + 1 + 1 + 1
+    return udk.Mechanism(bodies, joints, drivers, forces, name="everything", left_out=(rows,))
+
+
+SCENES = {
+    "everything": everything,
+    "linkage": udk.library.parallelogram,
+    "planetary gear": udk.library.planetary_gear,
+    "driven": udk.library.slider_crank,
+}
+QUANTITIES = ("accelerations", "watched", "project", "violation", "multipliers", "matrices", "energy", "is_finite")
+
+
+def quantities(equations, t, q, v):
+    return {
+        "accelerations": equations.accelerations(t, q, v),
+        "watched": equations.accelerations(t, q, v, watch=True),
+        "project": equations.project(t, q, v),
+        "violation": equations.violation(t, q, v),
+        "multipliers": equations.multipliers(t, q, v),
+        "matrices": equations.matrices(t, q, v),
+        "energy": equations.energy(t, q, v),
+        "is_finite": equations.is_finite(t, q, v),
+    }
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def forms(request):
+    """All quantities of a scene near a closed position, by both forms; and gradients there, in its numbers and the state."""
+    mech = SCENES[request.param]()
+    random = np.random.default_rng(0)
+    q, v = mech.q0.ravel(), mech.v0.ravel() + 0.1 * random.standard_normal(mech.q0.size)
+    step = jax.jit(lambda q, v: prepare(mech, large=False).quick.project(0.3, q, v))
+    for _ in range(8):
+        q, v = step(q, v)
+    off = 1e-3 * random.standard_normal(len(q))
+    names = [name for name in mech.parameters() if name.split(".")[-1] in ("mass", "inertia", "points", "stiffness", "gravity")]
+    values = {name: mech.parameters()[name] for name in names}
+    weights = jnp.asarray(random.standard_normal(len(q)))
+
+    def of(large):
+        def value(values, q, v):
+            return quantities(prepare(mech.with_parameters(values), None, udk.Baumgarte(3.0, 2.0), large=large), 0.3, q + off, v)
+
+        def scalar(values, q, v):
+            equations = prepare(mech.with_parameters(values), None, udk.Baumgarte(3.0, 2.0), large=large).quick
+            moved = equations.project(0.3, q, v)
+            return weights @ equations.accelerations(0.3, q, v) + weights @ moved[0] + weights @ moved[1]
+
+        return jax.jit(lambda *x: (value(*x), jax.grad(scalar, (0, 1, 2))(*x)))(values, q, v)
+
+    return of(False), of(True)
+
+
+@pytest.mark.parametrize("name", QUANTITIES)
+def test_it_agrees_with_straight_line_code(forms, name):
+    (small, _), (big, _) = forms
+    for a, b in zip(jax.tree.leaves(small[name]), jax.tree.leaves(big[name]), strict=True):
+        assert_allclose(b, a, rtol=1e-10, atol=1e-11 * (1 + jnp.abs(a).max()))
+
+
+def test_its_derivatives_agree(forms):
+    """Of the accelerations and of the projection, in all masses, points, stiffnesses and the state."""
+    for a, b in zip(jax.tree.leaves(forms[0][1]), jax.tree.leaves(forms[1][1]), strict=True):
+        assert_allclose(b, a, rtol=1e-6, atol=1e-7 * (1 + jnp.abs(a).max()))
+
+
+def test_the_plain_form_is_the_equation_as_it_stands():
+    """By the dense method of each pseudoinverse."""
+    mech = udk.library.scissor_lift()
+    q, v = mech.q0.ravel(), mech.v0.ravel()
+    expected = prepare(mech, udk.Elimination(), large=True).accelerations(0.0, q, v)
+    for method in (udk.SVD(), udk.Householder()):
+        assert_allclose(prepare(mech, method, large=True).accelerations(0.0, q, v), expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_a_singular_configuration_takes_singular_values(large):
+    """All links of the paper's linkage in line: rank 10 of 12."""
+    mech = udk.library.parallelogram(0.0)
+    q, v = mech.q0.ravel(), mech.v0.ravel()
+    exact = prepare(mech, udk.SVD(), large=False).accelerations(0.0, q, v)
+    assert_allclose(prepare(mech, large=large).accelerations(0.0, q, v), exact, atol=1e-11)
+
+
+def test_a_scene_of_which_redundancy_is_not_known_is_solved_dense():
+    mech = udk.library.parallelogram().with_left_out(None)
+    q, v = mech.q0.ravel(), mech.v0.ravel()
+    expected = prepare(mech, large=False).accelerations(0.0, q, v)
+    for method in (udk.Auto(), udk.Elimination()):
+        assert_allclose(prepare(mech, method, large=True).accelerations(0.0, q, v), expected, atol=1e-10)
+
+
+def test_what_moves_without_constraints_falls():
+    mech = udk.Mechanism({"a": udk.Body(1.0, 0.1), "b": udk.Body(2.0, 0.1)}, forces=[udk.Torque(("a", "b"), 1.0)])
+    equations = prepare(mech, large=True)
+    a = equations.accelerations(0.0, mech.q0.ravel(), mech.v0.ravel())
+    assert_allclose(a, [0, -9.81, -10.0, 0, -9.81, 10.0], atol=1e-14)
+    assert not equations.constrained
+    assert equations.multipliers(0.0, mech.q0.ravel(), mech.v0.ravel()).shape == (0,)
+
+
+@pytest.mark.parametrize("degree", [2, 7])
+def test_sums_by_targets(degree):
+    """A target of many slots, some of few, one of none, slots without a target."""
+    targets = np.array([0] * degree + [1, 2, 2, -1])
+    values = np.random.default_rng(0).standard_normal((3, len(targets)))
+    expected = np.stack([values[:, targets == k].sum(1) for k in range(4)], 1)
+    assert_allclose(Sums(targets, 4)(jnp.asarray(values)), expected, atol=1e-15)
+
+
+# --- size
+
+
+def test_large_scenes_take_it_unasked():
+    small, big = udk.library.n_four_bar(2), udk.library.n_four_bar(40)
+    assert not isinstance(prepare(small), large.LargeEquations)
+    assert isinstance(prepare(big), large.LargeEquations)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_joints_that_are_alike_are_traced_once(large):
+    """However many there are, and whatever their bodies are called: with the ground, and without."""
+    calls = []
+
+    class Pin(udk.Revolute):
+        def residual(self, t, *frames):
+            calls.append(self)
+            return super().residual(t, *frames)
+
+    links = 60 if large else 12
+    names = [f"link{k}" for k in range(links)]
+    bodies = {name: udk.Body(1.0, 0.1, [k + 0.5, 0.0]) for k, name in enumerate(names)}
+    ends = [((0.0, 0.0), (-0.5, 0.0))] + [((0.5, 0.0), (-0.5, 0.0))] * (links - 1)
+    pairs = zip(["ground", *names[:-1]], names, strict=True)
+    mech = udk.Mechanism(bodies, {f"pin{k}": Pin(pair, end) for k, (pair, end) in enumerate(zip(pairs, ends, strict=True))})
+    jax.jit(lambda q, v: prepare(mech, large=large).accelerations(0.0, q, v)).lower(mech.q0.ravel(), mech.v0.ravel())
+    assert len(calls) == 2 * 2  # the first derivative and the second, of both
+
+
+def test_the_program_does_not_grow_with_the_scene():
+    def operations(n):
+        mech = udk.library.chain(n)
+        equations = prepare(mech, large=True)
+        text = jax.jit(lambda e, q, v: e._arrays(e.layout.kept, ["D", "b"], 0.0, q, v, e._free(0.0, q, v))).lower(
+            equations, mech.q0.ravel(), mech.v0.ravel()
+        )
+        return len(text.as_text().splitlines())
+
+    assert operations(30) == operations(60)
+
+
+def test_a_body_of_many_joints():
+    """Ten wheels on one carriage: each of them is coupled to all others."""
+    wheels = [f"wheel{k}" for k in range(10)]
+    bodies = {"carriage": udk.Body(5.0, 2.0)} | {w: udk.Body(1.0, 0.1, [k - 5.0, 0.0], 0.1 * k) for k, w in enumerate(wheels)}
+    joints = {w: udk.Revolute(("carriage", w), [[k - 5.0, 0.0], [0.0, 0.0]]) for k, w in enumerate(wheels)}
+    forces = {w: udk.Torque(("carriage", w), 1.0 + k) for k, w in enumerate(wheels)}
+    mech = udk.Mechanism(bodies, joints, forces=forces)
+    v = jnp.asarray(np.random.default_rng(1).standard_normal(mech.q0.size))
+    a, b = (prepare(mech, large=large).accelerations(0.0, mech.q0.ravel(), v) for large in (False, True))
+    assert_allclose(b, a, atol=1e-11 * jnp.abs(a).max())
+
+
+def test_a_long_chain_against_the_dense_equation():
+    mech = udk.library.chain(60, 0.4)
+    random = np.random.default_rng(2)
+    q, v = mech.q0.ravel() + 0.01 * random.standard_normal(180), random.standard_normal(180)
+    M, F, A, c = prepare(mech).matrices(0.0, q, v)
+    n, m = 180, 120
+    system = np.block([[np.asarray(M), np.asarray(A).T], [np.asarray(A), np.zeros((m, m))]])
+    expected = np.linalg.solve(system, np.concatenate([F, c]))
+    a = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3), multipliers=True)
+    assert_allclose(a[0].ravel(), expected[:n], rtol=0, atol=1e-10 * np.abs(expected).max())
+    assert_allclose(a[1], expected[n:], rtol=0, atol=1e-10 * np.abs(expected).max())
+
+
+# --- redundant rows
+
+
+def copied(mech, seed, copies=3):
+    random, joints = np.random.default_rng(seed), dict(mech.joints)
+    joints |= {f"copy{k}": joints[name] for k, name in enumerate(random.choice(list(joints), copies))}
+    return udk.Mechanism(mech.bodies, joints, mech.drivers, mech.forces, left_out=())
+
+
+REDUNDANT = {
+    "linkage": lambda: udk.library.parallelogram(),
+    "linkage in line": lambda: udk.library.parallelogram(0.0),
+    "scissor lift": lambda: udk.library.scissor_lift(),
+    "planetary gear": lambda: udk.library.planetary_gear(),
+    "slider crank": lambda: udk.library.slider_crank(),
+    "linkage, copied": lambda: copied(udk.library.parallelogram(), 0),
+    "gear, copied": lambda: copied(udk.library.planetary_gear(3), 3),
+    "pendulum, copied": lambda: copied(udk.library.double_pendulum(), 4),
+}
+
+
+@pytest.mark.parametrize("name", REDUNDANT)
+def test_sparse_analysis_finds_the_rows_that_singular_values_find(name, monkeypatch):
+    mech, choose = REDUNDANT[name](), redundancy.rows_of
+    found = []
+    for size in (False, True):
+        monkeypatch.setattr(redundancy, "rows_of", lambda mech, size=size: choose(mech, size))
+        found.append(redundancy.redundant_rows(mech))
+    assert found[0] == found[1] is not None
+
+
+def test_a_large_scene_is_closed_and_its_redundant_rows_are_found():
+    """Thirty linkages side by side, their guesses off: a row of each is left out, and all of them are closed."""
+    one, bodies, joints = udk.library.parallelogram(-0.6), {}, {}
+    random = np.random.default_rng(0)
+    for k in range(30):
+        off = lambda: 0.01 * random.standard_normal(2)  # noqa: E731
+        bodies |= {f"{k} {n}": udk.Body(b.mass, b.inertia, b.position + off(), b.angle) for n, b in one.bodies.items()}
+        joints |= {
+            f"{k} {n}": udk.Revolute([body if body == "ground" else f"{k} {body}" for body in j.bodies], j.points)
+            for n, j in one.joints.items()
+        }
+    mech = udk.Mechanism(bodies, joints)
+    assert mech.left_out is not None and len(mech.left_out) == 30
+    assert {row // 12 for row in mech.left_out} == set(range(30))
+    equations = prepare(mech)
+    assert isinstance(equations, large.LargeEquations)
+    state = udk.assemble(mech)
+    psi, psi_dot = equations.violation(0.0, state.q.ravel(), state.v.ravel())
+    assert jnp.abs(psi).max() < 1e-12 and jnp.abs(psi_dot).max() < 1e-12
+    a = udk.accelerations(mech, 0.0, state.q, state.v)
+    alone = udk.assemble(one)
+    for k in (0, 29):
+        part = slice(4 * k, 4 * k + 4)
+        expected = udk.accelerations(one, 0.0, state.q[part], state.v[part])
+        assert_allclose(a[part], expected, atol=1e-9)
+    assert alone.q.shape == (4, 3)
+
+
+# --- whole runs
+
+
+@pytest.mark.slow
+def test_a_chain_of_a_thousand_links_keeps_its_energy():
+    mech = udk.library.chain(1000, np.pi / 3)
+    sol = udk.simulate(mech, jnp.linspace(0.0, 0.05, 3))
+    energy = udk.energy(mech, sol)
+    assert jnp.abs(udk.violation(mech, sol)).max() < 1e-12
+    assert energy.kinetic[-1] > 0.05
+    assert jnp.abs(energy.total - energy.total[0]).max() < 1e-9 * energy.kinetic[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [200])
+def test_the_cost_of_a_right_hand_side_grows_with_the_scene(n):
+    def flops(n):
+        mech = udk.library.n_four_bar(n, 1.0)
+        rhs = jax.jit(lambda e, q, v: e.accelerations(0.0, q, v))
+        cost = rhs.lower(prepare(mech, large=True), mech.q0.ravel(), mech.v0.ravel()).compile().cost_analysis()
+        return cost["flops"]
+
+    assert np.log(flops(n) / flops(n // 10)) / np.log(10) < 1.1
