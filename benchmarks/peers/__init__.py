@@ -16,7 +16,7 @@ from tempfile import TemporaryFile
 from benchmarks.common import machine, report
 from benchmarks.peers.peer import Peer
 
-MODULES = ("scipy_numpy", "numba_lsoda", "pinocchio_scipy", "mujoco_rk4", "mjx_batch", "exudyn_alpha")
+MODULES = ("scipy_numpy", "numba_lsoda", "pinocchio_scipy", "mujoco_rk4", "mjx_batch", "exudyn_alpha", "drake_discrete")
 SMOKE = 0.5  # s of the trajectory
 LIMIT = 1200.0  # s on the clock for all runs of one module
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMBA")}
