@@ -37,7 +37,7 @@ def main(words: list[str] | None = None) -> None:
     if out:
         missing = [name for name in NAMES if name not in figures]
         missing += ["C++ (no compiler)"] if native.program() is None else []
-        missing += [f"{peer.name} (not installed)" for peer in getattr(peers, "PEERS", ()) if peer.available() is None]
+        missing += [f"{package} (not installed)" for package in peers.missing()]
         page.write(figures, judged, about, missing, out / "index.html")
 
 

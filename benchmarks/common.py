@@ -44,7 +44,7 @@ class Compiled:
         return time.perf_counter() - start
 
     def cpu_seconds(self, *arguments: Any, at_least: float = 0.02) -> float:
-        """CPU time of a run, of all threads: the mean of as many as take `at_least` seconds. What else runs matters less to it."""
+        """CPU time of a run, of all threads: the mean of as many as take `at_least` seconds. What else runs matters less."""
         start, runs = time.process_time(), 0
         while runs == 0 or time.process_time() - start < at_least:
             self(*arguments)

@@ -59,6 +59,8 @@ def _pictures(figures: Figures) -> Iterable[str]:
             "coordinate at any output, against the exact solution. Points along a line are tolerances or steps.",
         )
     if many := [row for row in figures.get("batch", []) if "error" in row]:
+        others = [row for row in figures.get("peers", []) if "trajectories_per_second" in row]
+        many += [row | {"per_second": row["trajectories_per_second"], "outputs": "201 outputs"} for row in others]
         yield embedded(
             lambda: batch(many),
             "Trajectories per second against error, one line for each program.",
@@ -103,7 +105,7 @@ def batch(rows: Rows) -> Figure:
         for place, name in enumerate(names):
             for kind, dashes in (("end only", "-"), ("201 outputs", "--")):
                 chosen = [row for row in rows if (row["name"], row["start"], row["outputs"]) == (name, start, kind)]
-                _line(axes, chosen, "per_second", 1.0, place, linestyle=dashes, label=name if dashes == "-" else None)
+                _line(axes, chosen, "per_second", 1.0, place, linestyle=dashes, label=f"{name}, {kind}")
         axes.set(xlabel="error (m, rad)", title=title)
         axes.invert_xaxis()
     panels[0].set_ylabel("trajectories per second of CPU time")

@@ -70,7 +70,10 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
 
         errors = {(name, tol): task.error(states(tol)) for name, (states, _) in candidates.items() for tol in tolerances}
         timers = {
-            (name, tol): lambda timer=timer, tol=tol: timer(tol) for tol in tolerances for name, (_, timer) in candidates.items()
+            (name, tol): lambda timer=timer, tol=tol: timer(tol)
+            for tol in tolerances
+            for name, (_, timer) in candidates.items()
+            if np.isfinite(errors[name, tol])  # not of what has come to no end
         }
         times = in_turn(timers, rounds)
         for (name, tol), seconds in times.items():
