@@ -1,18 +1,20 @@
 """Pinocchio's constrained forward dynamics in SciPy's DOP853: a tree of four revolute joints, two points that close its loops."""
 
+from functools import partial
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from benchmarks.peers.peer import GRAVITY, INERTIA, MASS, PINS, PIVOTS, Coordinates, Peer, Problem, Run, coordinates
 from benchmarks.peers.scipy_numpy import TOLERANCES
 
-BAUMGARTE = 30.0  # 1/s, both gains
+WEAK, STRONG = 5.0, 30.0  # 1/s, both gains: weak is less stiff, strong is what crosses singular configurations
 MU = 1e-4  # of the proximal iterations: less loses the branch where +60 degrees crosses singular configurations
 RESIDUAL = 1e-12  # at which they end
 ITERATIONS = 10
 
 
-def setup(problem: Problem) -> Run:
+def setup(problem: Problem, gain: float) -> Run:
     """States are the angles of joints: links 1, 2, 3 on the ground, the coupler on link 1."""
     import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
@@ -36,7 +38,7 @@ def setup(problem: Problem) -> Run:
     for i in (1, 2):
         kind, axes = pin.ContactType.CONTACT_3D, pin.ReferenceFrame.LOCAL
         loop = pin.RigidConstraintModel(kind, model, coupler, at(PINS[i] - PINS[0]), links[i], at(1.0), axes)
-        loop.setBaumgarteCorrectorParameters(pin.BaumgarteCorrectorParameters(BAUMGARTE**2, 2 * BAUMGARTE))
+        loop.setBaumgarteCorrectorParameters(pin.BaumgarteCorrectorParameters(gain**2, 2 * gain))
         loops.append(loop)
     loop_data = pin.StdVec_RigidConstraintData()
     for loop in loops:
@@ -60,4 +62,7 @@ def setup(problem: Problem) -> Run:
     return run
 
 
-PEERS = (Peer("Pinocchio, SciPy DOP853", "pin", "tolerance", TOLERANCES, setup),)
+PEERS = (
+    Peer("Pinocchio, SciPy DOP853", "pin", "tolerance", TOLERANCES, partial(setup, gain=WEAK)),
+    Peer("Pinocchio, SciPy DOP853, gain 30", "pin", "tolerance", TOLERANCES, partial(setup, gain=STRONG)),
+)
