@@ -16,6 +16,9 @@ TRAJECTORY = [
 AT_EQUAL_ERROR = [
     {"name": name, "start": -45.0, "target": 1e-6, "seconds": 1.0, "times_ours": times}
     for name, times in (("udkjax", 1.0), ("C++", 2.0), ("script, 1e-04", None), ("script, 1e-10", 10.0))
+] + [
+    {"name": name, "start": 60.0, "target": 1e-8, "seconds": 1.0, "times_ours": times}
+    for name, times in (("udkjax", 1.0), ("script, 1e-04", None), ("script, 1e-10", float("nan")))
 ]
 FIGURES = {
     "trajectory": TRAJECTORY + AT_EQUAL_ERROR,
@@ -30,6 +33,8 @@ def test_claims_are_judged():
     assert (against["figure"], against["holds"], against["target"]) == (0.5, True, "≤ 1")
     script = judged["20 s, hanging, error 1e-06: a script's time, in times ours"]
     assert (script["figure"], script["holds"], script["target"]) == (10.0, False, "≥ 20")
+    never = judged["20 s, crossing, error 1e-08: a script's time, in times ours"]
+    assert (never["figure"], never["holds"]) == (float("inf"), True)  # it does not get there at all
     assert judged["20 s, crossing, error 1e-06: time, in times C++"]["holds"] is None
     assert judged["gradient, 2 parameters, forward, in times the run"]["figure"] is None
     assert all(row["holds"] is None for row in judged.values() if row["benchmark"] not in FIGURES)
