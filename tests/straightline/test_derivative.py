@@ -114,4 +114,5 @@ def test_a_factor_that_a_column_has_in_common_is_taken_out(graph, xyz):
     rows, factors = common_factors([{0: x * y, 1: x}, {0: -(z * y), 2: y * z}, {1: y, 2: z * x}])
     assert factors == {0: y, 2: z}
     assert rows == [{0: x, 1: x}, {0: -z, 2: y}, {1: y, 2: x}]
+    assert common_factors([{0: x * y}, {0: y * z}], {(y * z).index}) == ([{0: x * y}, {0: y * z}], {})
     assert common_factors([{0: x * y}]) == ([{0: x * y}], {})

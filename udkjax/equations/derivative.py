@@ -85,14 +85,14 @@ class _Accelerations:
                 accumulate(residual, d.row(entry), -x[k])
                 accumulate(self.turned[k], d.row(entry), y)
         self.turned = [{k: p * root for k, p in row.items()} for row, root in zip(self.turned, code.root, strict=True)]
-        self.residual, self.factors = common_factors(self.residual)
+        self.residual, self.factors = common_factors(self.residual, {s.index for s in derivative.given})
 
     def forward(self, tangents: Sequence[Scalar]) -> list[Scalar]:
         code, graph = self.code, self.code.graph
         known = self.differential.along({s.index: t for s, t in zip(self.differential.inputs, tangents, strict=True)})
-        direct, turned, residual = (
-            [product(r, known, graph) for r in rows] for rows in (self.direct, self.turned, self.residual)
-        )
+        scaled = {k: t * self.factors.get(k, 1.0) for k, t in known.items()}
+        direct, turned = ([product(row, known, graph) for row in rows] for rows in (self.direct, self.turned))
+        residual = [product(row, scaled, graph) for row in self.residual]
         dy = code.solved([r - _times(row, turned, graph) for r, row in zip(residual, self.rows, strict=True)])
         return [sum(parts, graph.constant(0.0)) for parts in zip(direct, turned, code.spread(dy), strict=True)]
 

@@ -8,7 +8,7 @@ An opaque node (an array primitive) is a station on the way: what it returns cou
 follow from those of its arguments by JAX's own rule for the primitive, forward or transposed.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -118,10 +118,10 @@ def accumulate(total: Row, row: Row, factor: Scalar) -> None:
         total[k] = total[k] + p * factor if k in total else p * factor
 
 
-def common_factors(rows: Sequence[Row]) -> tuple[list[Row], Row]:
+def common_factors(rows: Sequence[Row], given: Collection[int] = ()) -> tuple[list[Row], Row]:
     """Divide each column of a matrix by a factor that all its entries hold; return the factors, by column, too.
 
-    A product for each entry becomes one for the whole column, which its tangent takes.
+    A product for each entry becomes one for the whole column, which its tangent takes. Nodes that are given are not taken apart.
     """
     columns: dict[int, list[Scalar]] = {}
     for row in rows:
@@ -129,7 +129,8 @@ def common_factors(rows: Sequence[Row]) -> tuple[list[Row], Row]:
             columns.setdefault(k, []).append(entry)
     factors: Row = {}
     for k, entries in columns.items():
-        held = [{a.index for a in e.node.arguments} if e.node.kind == "mul" else set() for e in entries]
+        splits = [e.node.kind == "mul" and e.index not in given for e in entries]
+        held = [{a.index for a in e.node.arguments} if split else set() for e, split in zip(entries, splits, strict=True)]
         common = set.intersection(*held) if len(entries) > 1 else None
         if common:
             factors[k] = Scalar(entries[0].graph, max(common))
