@@ -16,7 +16,6 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.interpreters import ad
 from jaxtyping import Array, Bool
 
 from udkjax.equations.code import scalars, stacked
@@ -35,11 +34,17 @@ def accelerations(program: str, equations: "Equations", t: Any, q: Vector, v: Ve
     return _checked(equations, safe, stacked(a), plain_accelerations, t, q, v)
 
 
-@jax.custom_jvp
 def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     """As the plain form, but with the factors of the first position kept: they differ by the residual, and so does the result."""
+    q, v, safe = _projected(equations, t, q, v)
+    return jnp.where(safe, q, jnp.nan), jnp.where(safe, v, jnp.nan)
+
+
+@jax.custom_jvp
+def _projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
+    """q and v, numbers in any case, and whether they can be trusted. Derivatives are taken where they are."""
     if not equations.code.elimination:
-        return plain_project(equations, t, q, v)
+        return *plain_project(equations, t, q, v), jnp.array(True)
     *factors, safe = equations.run("factor", t, q, v)
     step = equations.code.program("step")
 
@@ -49,16 +54,21 @@ def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vecto
 
     q1 = without(q, "psi_kept", q)
     q2 = without(q1, "psi_kept", q1)
-    return _checked(equations, safe, (q2, without(v, "psi_dot_kept", q2)), plain_project, t, q, v)
+    found = q2, without(v, "psi_dot_kept", q2)
+    if equations.branches:
+        return *_branched(equations, safe, found, plain_project, t, q, v), jnp.array(True)
+    return *found, safe if equations.code.elimination == "check" else jnp.array(True)
 
 
 def _checked(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
     """Take what elimination gave where its pivots are safe, or where it drops the others itself; else turn to singular values."""
-    if equations.code.elimination == "drop" or not equations.doubt:
-        return fast
     if equations.branches:
-        return jax.lax.cond(safe, lambda: fast, lambda: plain(equations.exact(), *state))
-    return jax.tree.map(lambda x: jnp.where(safe, x, jnp.nan), fast)
+        return _branched(equations, safe, fast, plain, *state)
+    return fast if equations.code.elimination == "drop" else jnp.where(safe, fast, jnp.nan)
+
+
+def _branched(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
+    return jax.lax.cond(safe, lambda: fast, lambda: plain(equations.exact(), *state))
 
 
 # --- derivatives
@@ -75,21 +85,21 @@ def _(program, primals, tangents):
     return a, _apply(Linear.at("accelerations", primals, moving, kept), _those(tangents, moving))[0]
 
 
-@partial(project.defjvp, symbolic_zeros=True)
+@partial(_projected.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
     """Where the residuals vanish the tangents of one Newton step are those of the projection."""
-    equations, t, *state = primals
-    projected = project(equations, t, *state)
-    primals, moving = (equations, t, *projected), _moving(tangents)
+    equations, t, q, v = primals
+    q, v, safe = _projected(equations, t, q, v)
+    primals, moving = (equations, t, q, v), _moving(tangents)
     if not any(moving):
-        return projected, (jnp.zeros_like(state[0]), jnp.zeros_like(state[1]))
-    if equations.branches or not equations.code.elimination:
+        dq, dv = jnp.zeros_like(q), jnp.zeros_like(v)
+    elif equations.branches or not equations.code.elimination:
         dq, dv = _by_plain_form("projection", primals, tangents)
-        return projected, (dq, dv)
-    program = equations.code.derivative("projection", moving).evaluation("projection")
-    kept = _run(program, *jax.lax.stop_gradient(primals))
-    dq, dv = _apply(Linear.at("projection", primals, moving, kept), _those(tangents, moving))
-    return projected, (dq, dv)
+    else:
+        program = equations.code.derivative("projection", moving).evaluation("projection")
+        kept = _run(program, *jax.lax.stop_gradient(primals))
+        dq, dv = _apply(Linear.at("projection", primals, moving, kept), _those(tangents, moving))
+    return (q, v, safe), (dq, dv, np.zeros(jnp.shape(safe), jax.dtypes.float0))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -142,46 +152,45 @@ class Linear(eqx.Module):
 # so that no derivative is ever taken of what is kept.
 
 
-def _linear(linear: Linear, vectors: list[Array]) -> list[Array]:
+def _linear(linear: Linear, vector: Array) -> Array:
     derivative = linear.equations.code.derivative(linear.name, linear.moving)
     program = derivative.reverse if linear.transposed else derivative.forward
-    values = [jnp.asarray(x) for x in _run(program, *linear.primals, [*linear.kept, *scalars(vectors)])]
-    if linear.transposed:
-        sizes = [np.shape(x) for x in _those(linear.primals, linear.moving)]
-    else:
-        sizes = [linear.q.shape] * (len(values) // len(linear.q))
-    return _shaped(values, sizes)
+    return stacked(_run(program, *linear.primals, [*linear.kept, *scalars([vector])]))
 
 
 @eqxi.filter_primitive_def
-def _shapes(linear, vectors):
-    structs = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), (linear, vectors))
-    return [jax.core.ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(_linear, *structs)]
+def _shape(linear, vector):
+    found = jax.eval_shape(_linear, *jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), (linear, vector)))
+    return jax.core.ShapedArray(found.shape, found.dtype)
 
 
 @eqxi.filter_primitive_jvp
 def _derivative(primals, tangents):
-    linear, vectors = primals
-    at, dots = tangents
-    result = _apply(linear, vectors)
+    linear, vector = primals
+    at, dot = tangents
+    result = _bind(linear, vector)
     if not jax.tree.leaves(at):
-        return result, _apply(linear, [jnp.zeros_like(x) if d is None else d for x, d in zip(vectors, dots, strict=True)])
+        return result, _bind(linear, dot)
     return result, eqx.filter_jvp(_by_plain_form_of, primals, tangents)[1]
 
 
 @eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
-def _transpose(inputs, cotangents):
-    linear, vectors = inputs
-    found = _apply(linear.T, cotangents)
-    found = [c if isinstance(x, ad.UndefinedPrimal) else None for x, c in zip(vectors, found, strict=True)]
-    return jax.tree.map(lambda _: None, linear), found
+def _transpose(inputs, cotangent):
+    linear, _ = inputs
+    return jax.tree.map(lambda _: None, linear), _bind(linear.T, cotangent)
 
 
-_apply_p = eqxi.create_vprim("derivative_of_elimination", eqxi.filter_primitive_def(_linear), _shapes, _derivative, _transpose)
+_linear_p = eqxi.create_vprim("derivative_of_elimination", eqxi.filter_primitive_def(_linear), _shape, _derivative, _transpose)
+
+
+def _bind(linear: Linear, vector: Array) -> Array:
+    return eqxi.filter_primitive_bind(_linear_p, linear, vector)
 
 
 def _apply(linear: Linear, vectors: list[Array]) -> list[Array]:
-    return eqxi.filter_primitive_bind(_apply_p, linear, vectors)
+    """Tangents of what is found. In one vector: where vmap batches only some inputs, their cotangents know what to sum over."""
+    found = _bind(linear, _flat(vectors))
+    return [found[k : k + len(linear.q)] for k in range(0, len(found), len(linear.q))]
 
 
 # --- the same by the plain form
@@ -193,9 +202,14 @@ def _by_plain_form(name: str, primals: Any, tangents: Any) -> list[Array]:
     return jax.jvp(function, at, _those(tangents, moving))[1]
 
 
-def _by_plain_form_of(linear: Linear, vectors: list[Array]) -> list[Array]:
+def _by_plain_form_of(linear: Linear, vector: Array) -> Array:
     function, at = _plain(linear.name, linear.primals, linear.moving)
-    return list(jax.vjp(function, *at)[1](vectors)) if linear.transposed else jax.jvp(function, at, vectors)[1]
+    if linear.transposed:
+        ends = np.cumsum([np.size(x) for x in jax.eval_shape(function, *at)])[:-1]
+        return _flat(jax.vjp(function, *at)[1](jnp.split(vector, ends)))
+    ends = np.cumsum([np.size(x) for x in at])[:-1]
+    parts = [part.reshape(np.shape(x)) for part, x in zip(jnp.split(vector, ends), at, strict=True)]
+    return _flat(jax.jvp(function, at, parts)[1])
 
 
 def _plain(name: str, primals: Any, moving: tuple[bool, ...]) -> tuple[Any, list[Array]]:
@@ -233,7 +247,6 @@ def _run(program: Program, equations: "Equations", t: Any, q: Any, v: Any, more:
     return program([*equations.constants, t, *scalars([q, v]), *more])
 
 
-def _shaped(values: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    """Scalars, gathered into numbers and vectors."""
-    rest = iter(values)
-    return [jnp.stack([next(rest) for _ in range(shape[0])]) if shape else next(rest) for shape in shapes]
+def _flat(values: Sequence[Any]) -> Array:
+    """Numbers and vectors in one vector."""
+    return jnp.concatenate([jnp.ravel(jnp.asarray(x, jnp.result_type(float))) for x in values])

@@ -1,26 +1,29 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
+from types import NoneType
 from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.assembly import Closure, State, close, is_closed, require_closed
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.motion import Motion
 from udkjax.equations.partitioning import Partitioned
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
+from udkjax.integrate.by_diffrax import by_diffrax
+from udkjax.integrate.lanes import serves, solve
 from udkjax.integrate.outcome import Run, counts, outcome
-from udkjax.integrate.projection import Constrained, Projection, project_all
+from udkjax.integrate.problem import DOUBTED, Problem
+from udkjax.integrate.projection import Projection
+from udkjax.integrate.reverse import reversible
 from udkjax.integrate.solution import Result, SimulationError, Solution
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.pinv import Auto, Pseudoinverse
@@ -73,15 +76,22 @@ def simulate(
         raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
     drift = number((DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE) if drift_tol is None else drift_tol)
     method = Auto() if method is None else method
-    numbers = (state, number(rtol), number(atol), method, stabilization, drift, _step(dt0), formulation)
-    choices = (solver or diffrax.Dopri8(), adjoint or diffrax.RecursiveCheckpointAdjoint(), max_steps, _meter(progress))
+    settings = (number(rtol), number(atol), method, stabilization, drift, _step(dt0), formulation)
+    choices = (solver or diffrax.Dopri8(), adjoint, max_steps, _meter(progress))
 
-    solution, closure, missed = _simulate(mechanism, ts, *numbers, *choices)
+    def run(mechanism: Any, careful: bool) -> tuple[Solution, Any, Any]:
+        return _simulate(mechanism, ts, state, closure, *settings, *choices, careful)
+
+    closure = close(mechanism, ts[0]) if state is None else None
+    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, ts, state, closure, settings)))
+    solution, missed, doubted = run(mechanism, careful=traced)
     if isinstance(solution.code, Tracer):
-        return solution
+        return solution if traced else run(mechanism, careful=True)[0]
+    if doubted:  # few runs meet what it takes singular values for: only these compile them
+        solution, missed, _ = run(mechanism, careful=True)
     if isinstance(mechanism, Mechanism) and missed:  # the numbers made rows independent that were left out: choose again
         mechanism = mechanism.with_left_out(redundant_rows(mechanism))
-        solution, closure, missed = _simulate(mechanism, ts, *numbers, *choices)
+        solution, *_ = run(mechanism, careful=True)
     if throw and isinstance(mechanism, Mechanism) and closure is not None:
         require_closed(mechanism, closure)
     if throw and solution.result != Result.successful:
@@ -91,43 +101,43 @@ def simulate(
 
 @eqx.filter_jit
 def _simulate(
-    mechanism, ts, state, rtol, atol, method, stabilization, drift_tol, dt0, formulation, solver, adjoint, max_steps, meter
+    mechanism,
+    ts,
+    state,
+    closure,
+    rtol,
+    atol,
+    method,
+    stabilization,
+    drift_tol,
+    dt0,
+    formulation,
+    solver,
+    adjoint,
+    max_steps,
+    meter,
+    careful,
 ):
-    """Return the solution, the closure that it starts from, and whether that closure needs rows which the method leaves out."""
+    """Return the solution; whether it takes rows that the method leaves out; whether it takes care that was not to be taken."""
     equations = equations_of(mechanism, method, stabilization if isinstance(stabilization, Baumgarte) else None, formulation)
     projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, Partitioned))
-    start, closure, closed, missed = _start(mechanism, equations, ts[0], state)
-    y0 = jnp.concatenate([start.q.ravel(), start.v.ravel()])
+    start, closed, missed = _start(equations, state, closure)
     # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
     loose_rtol, loose_atol = (jnp.where(closed, tol, 1e3) for tol in (rtol, atol))
-    run = diffrax.diffeqsolve(
-        diffrax.ODETerm(derivative),
-        Constrained(solver, projected),
-        t0=ts[0],
-        t1=ts[-1],
-        dt0=_first_step(equations, ts, y0, loose_rtol, loose_atol) if dt0 is None else dt0,
-        y0=y0,
-        args=equations,
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], controller_state=True),
-        stepsize_controller=Counting(_controller(loose_rtol, loose_atol, ts)),
-        adjoint=adjoint,
-        max_steps=max_steps,
-        progress_meter=meter,
-        throw=False,
-    )
-    saved: Any = (run.ys, run.ts)
-    (ys, end), (_, t_end) = saved
-    reached = ts <= t_end[0]
-    ys = jnp.where(reached[:, None], ys, y0).at[0].set(y0)  # a run without any accepted step has saved nothing
-    if projected:
-        ys = jnp.concatenate([ys[:1], project_all(equations, ts[1:], ys[1:])])
-    seen = undifferentiated(Run(equations, run.result, ts, ys, reached, t_end[0], end[0], closed, missed, drift_tol))
+    ulp = jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    q, v = start.q.ravel(), start.v.ravel()
+    numbers = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0)
+    problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, careful=careful)
+    if serves(problem) and type(adjoint) in (NoneType, diffrax.ForwardMode) and isinstance(meter, diffrax.NoProgressMeter):
+        raw = solve(problem) if adjoint else reversible(problem)
+    else:
+        raw = by_diffrax(problem, adjoint or diffrax.RecursiveCheckpointAdjoint(), meter)
+    ys = jnp.where(raw.reached[:, None], raw.ys, jnp.concatenate([q, v])).at[0].set(jnp.concatenate([q, v]))
+    seen = undifferentiated(Run(equations, raw, ts, ys, closed, missed, drift_tol))
     code, time, reached = outcome(seen)
     ys = jnp.where(reached[:, None], ys, jnp.nan)
     q, v = (y.reshape(len(ts), *start.q.shape) for y in jnp.split(ys, 2, axis=1))
-    found = evaluations(run.controller_state)
-    right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (dt0 is None))  # one chooses the first step
-    stats = counts(run.stats, right_hand_sides, projected, len(ts))
+    stats = counts(raw, projected, len(ts))
     settings = (
         ("method", type(method).__name__),
         ("formulation", "UdwadiaKalaba" if formulation is None else type(formulation).__name__),
@@ -137,40 +147,16 @@ def _simulate(
         ("first_step", "chosen" if dt0 is None else "given"),
     )
     names = getattr(mechanism, "body_names", ())
-    return Solution(ts, q, v, code, time, stats, rtol, atol, names, settings), closure, missed
+    return Solution(ts, q, v, code, time, stats, rtol, atol, names, settings), missed, raw.status == DOUBTED
 
 
-def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array, "2n"]:
-    """(v, a)."""
-    return jnp.concatenate(equations.rates(t, *jnp.split(y, 2)))
-
-
-def _start(mechanism: Any, equations: Any, t: Any, state: State | None) -> tuple[State, Closure | None, Any, Any]:
-    """The initial state; how it was closed, if it was; whether it is closed; whether that takes rows left out as redundant."""
+def _start(equations: Any, state: State | None, closure: Closure | None) -> tuple[State, Any, Any]:
+    """The initial state; whether it is closed; whether that takes rows left out as redundant."""
     if state is not None:
-        return state, None, jnp.array(True), jnp.array(False)
-    closure = close(mechanism, t)
-    closed, kept = is_closed(closure), len(closure.psi) - len(equations.left_out)
-    return closure.state, closure, closed, closed & (closure.rank > kept)
-
-
-def _first_step(equations: Any, ts: Array, y0: Array, rtol: Any, atol: Any) -> Array:
-    """A step over which the state changes by a small part of itself.
-
-    As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off.
-    """
-    equations, y0, rtol, atol = undifferentiated((equations.quick, y0, rtol, atol))
-    scale = atol + rtol * jnp.abs(y0)
-    size, slope = jnp.max(jnp.abs(y0) / scale), jnp.max(jnp.abs(derivative(ts[0], y0, equations)) / scale)
-    span = ts[-1] - ts[0]
-    ordinary = jnp.isfinite(slope) & (slope > 0) & (size > 0)
-    return jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, slope, 1.0), span), 1e-4 * span)
-
-
-def _controller(rtol: Any, atol: Any, ts: Array) -> diffrax.PIDController:
-    ulp = jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    # Every coordinate and velocity meets its tolerance: the mean over a large mechanism would hide one that does not.
-    return diffrax.PIDController(rtol=rtol, atol=atol, norm=optx.max_norm, dtmin=SMALLEST_STEP * ulp, force_dtmin=False)
+        return state, jnp.array(True), jnp.array(False)
+    assert closure is not None
+    closed, kept = jnp.asarray(is_closed(closure)), len(closure.psi) - len(equations.left_out)
+    return closure.state, closed, closed & (closure.rank > kept)
 
 
 def _times(ts: ArrayLike) -> Float[Array, "T"]:

@@ -1,0 +1,70 @@
+"""Integration by `diffrax.diffeqsolve`: for every solver, adjoint and progress meter that it knows."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from udkjax.equations.motion import Motion
+from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
+from udkjax.integrate.problem import DONE, STEP_LIMIT, STEP_TOO_SMALL, Problem, Raw
+from udkjax.integrate.projection import Constrained, project_all
+from udkjax.integrate.undifferentiated import undifferentiated
+
+
+def by_diffrax(problem: Problem, adjoint: diffrax.AbstractAdjoint, meter: diffrax.AbstractProgressMeter) -> Raw:
+    """Integrate one problem with any solver of diffrax."""
+    ts, y0 = problem.ts, jnp.concatenate([problem.q, problem.v])
+    run = diffrax.diffeqsolve(
+        diffrax.ODETerm(derivative),
+        Constrained(problem.solver, problem.projected),
+        t0=ts[0],
+        t1=ts[-1],
+        dt0=_first_step(problem, y0) if problem.h is None else problem.h,
+        y0=y0,
+        args=problem.equations,
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], controller_state=True),
+        stepsize_controller=Counting(_controller(problem)),
+        adjoint=adjoint,
+        max_steps=problem.max_steps,
+        progress_meter=meter,
+        throw=False,
+    )
+    saved: Any = (run.ys, run.ts)
+    (ys, end), (_, t_end) = saved
+    reached = ts <= t_end[0]
+    ys = jnp.where(reached[:, None], ys, y0)  # a run without any accepted step has saved nothing
+    if problem.projected:
+        ys = jnp.concatenate([ys[:1], project_all(problem.equations, ts[1:], ys[1:])])
+    status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, STEP_LIMIT, STEP_TOO_SMALL)
+    status = jnp.where(run.result == diffrax.RESULTS.successful, DONE, status)
+    found = evaluations(run.controller_state)
+    right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (problem.h is None))  # one chooses the first step
+    steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
+    return Raw(ys, reached, status, t_end[0], end[0], *steps, right_hand_sides)
+
+
+def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array, "2n"]:
+    """(v, a)."""
+    return jnp.concatenate(equations.rates(t, *jnp.split(y, 2)))
+
+
+def _first_step(problem: Problem, y0: Array) -> Array:
+    """A step over which the state changes by a small part of itself.
+
+    As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off.
+    """
+    equations, y0, rtol, atol = undifferentiated((problem.equations.quick, y0, problem.rtol, problem.atol))
+    scale = atol + rtol * jnp.abs(y0)
+    size, slope = jnp.max(jnp.abs(y0) / scale), jnp.max(jnp.abs(derivative(problem.ts[0], y0, equations)) / scale)
+    span = problem.ts[-1] - problem.ts[0]
+    ordinary = jnp.isfinite(slope) & (slope > 0) & (size > 0)
+    return jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, slope, 1.0), span), 1e-4 * span)
+
+
+def _controller(problem: Problem) -> diffrax.PIDController:
+    # Every coordinate and velocity meets its tolerance: the mean over a large mechanism would hide one that does not.
+    settings: dict[str, Any] = {"norm": optx.max_norm, "dtmin": problem.smallest, "force_dtmin": False}
+    return diffrax.PIDController(rtol=problem.rtol, atol=problem.atol, **settings)

@@ -1,0 +1,292 @@
+"""Explicit Runge-Kutta methods for q'' = a(t, q, v), many members at once, each with a time, a step and a result of its own.
+
+A method's tableau (A, b, c) is diffrax's. Since q' = v, its stages need the accelerations alone (Hairer, Norsett, Wanner, II.14):
+
+    q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j,        a_i = a(t + c_i h, q_i, v_i),
+
+half of what a general state would have to keep. Each accepted step is returned to the constraint manifold. Outputs lie on the
+polynomial that has the positions, velocities and accelerations of three consecutive accepted states (of degree 8: interpolated
+states are as exact as the states themselves, and cost no evaluation).
+
+Arrays are (n, *lanes): lanes are () for one run, or (L,), which fills the vector units. On the CPU, XLA compiles a loop into one
+function if it holds no branch; so the loop over the steps, `_march`, holds none: where the accelerations come out as not a
+number, because elimination met a pivot that it must not trust, a lane waits, and the loop around it takes that step again, by
+equations that may branch.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.integrate.undifferentiated import undifferentiated
+
+SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0  # of the step's size: diffrax's own, so that both take the same steps
+BLOCK = 4  # output times that are interpolated together
+
+
+class Method(NamedTuple):
+    """A tableau as q'' = a needs it, without stages that serve interpolation alone."""
+
+    nodes: np.ndarray  # c, and below it 1: the end of the step is one state more
+    v: np.ndarray  # A, and below it b
+    q: np.ndarray  # A A, and below it b A
+    error_v: np.ndarray  # (stages,)
+    error_q: np.ndarray
+    order: float
+    ends: bool  # whether the last stage is the next step's first
+
+    @property
+    def stages(self) -> int:
+        return len(self.error_v)
+
+
+def method_of(solver: diffrax.AbstractERK) -> Method:
+    """Read the tableau of a solver."""
+    tableau: Any = solver.tableau
+    s = tableau.num_stages
+    A = np.zeros((s, s))
+    for i, row in enumerate(tableau.a_lower):
+        A[i + 1, : i + 1] = row
+    b, error, c = (np.asarray(x, float) for x in (tableau.b_sol, tableau.b_error, np.append(0.0, tableau.c)))
+    error_q = error @ A
+    ends = bool(tableau.fsal and error[-1] != 0)
+    if tableau.fsal and not ends:  # the last stage is there for interpolation, or for the next step
+        A, b, error, error_q, c = A[:-1, :-1], b[:-1], error[:-1], error_q[:-1], c[:-1]
+    order: Any = solver.error_order(diffrax.ODETerm(lambda t, y, args: y))
+    return Method(np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error_q, float(order), ends)
+
+
+class Point(NamedTuple):
+    """An accepted state with its accelerations; of each lane."""
+
+    t: Array  # (*lanes,)
+    q: Array  # (n, *lanes)
+    v: Array
+    a: Array
+
+
+class March(NamedTuple):
+    """Where each lane stands."""
+
+    here: Point
+    back: Point  # the accepted state before: interpolation needs three
+    h: Array
+    code: Array  # RUNNING, DONE, ...
+    doubt: Array  # whether the step has to be taken again with care
+    tried: Array
+    accepted: Array
+    evaluations: Array
+    written: Array  # how many of the inner output times are behind
+    outputs: Array  # (T - 2 + BLOCK, 2n, *lanes): q and v at the output times between the first and the last
+
+
+class Trial(NamedTuple):
+    """A step that was tried."""
+
+    to: Point
+    error: Array  # the largest error of any coordinate or velocity, relative to its tolerance
+    evaluations: Array
+
+
+class Task(NamedTuple):
+    """What to march along. Numbers are one for each lane, or one for all."""
+
+    accelerations: Callable[..., Array]  # of lanes: (t, q, v) -> a
+    project: Callable[..., tuple[Array, Array]]
+    careful: Callable[..., Trial] | None  # takes a step again, by equations that may branch; None: the lane ends as `DOUBTED`
+    doubts: bool  # whether accelerations that are not a number mean that a step wants care
+    ts: Array  # (T, *lanes)
+    rtol: Array
+    atol: Array
+    smallest: Array  # step
+    h: Array | None  # the first step; None: chosen
+    max_steps: int
+    method: Method
+
+
+def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial:
+    """One step of all lanes; where they `begin`, only the accelerations at its end."""
+    last = task.method.stages
+
+    def stage(i, carry):
+        t, q, v = stage_state(task.method, here, h, carry[0][:last], i)
+        t, q, v = when(i == last, lambda x: (t1, *task.project(t1, *x[1:])), (t, q, v))
+        return jax.lax.dynamic_update_index_in_dim(carry[0], task.accelerations(t, q, v), i, 0), q, v
+
+    a = jnp.zeros((last + 1, *here.a.shape), here.a.dtype).at[0].set(here.a)
+    a, q1, v1 = jax.lax.fori_loop(jnp.where(jnp.all(begin), last, 1), last + 1, stage, (a, here.q, here.v))
+    return judged(task, here, Point(t1, q1, v1, a[last]), h, a[:last], jnp.where(begin, 1, last))
+
+
+def when(condition: Array, function: Callable, x: Any) -> Any:
+    """`function(x)` or x: a branch that does not keep XLA from compiling the loop that it is in into one function."""
+    return jax.lax.while_loop(lambda c: c[0], lambda c: (jnp.zeros_like(condition), function(c[1])), (condition, x))[1]
+
+
+def stage_state(method: Method, here: Point, h: Array, a: Array, i: Any) -> tuple[Array, Array, Array]:
+    """t, q and v of stage i, from the accelerations (stages, n, *lanes) of those before; the last is the end of the step."""
+    coefficients = (method.nodes, method.v, method.q)
+    node, row_v, row_q = (jax.lax.dynamic_index_in_dim(jnp.asarray(c), i, keepdims=False) for c in coefficients)
+    return here.t + node * h, here.q + h * (node * here.v + h * _combine(row_q, a)), here.v + h * _combine(row_v, a)
+
+
+def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: Any) -> Trial:
+    """A step with its error; of a method whose last stage is the next step's first, that is the one after projection."""
+    method = task.method
+    a = a.at[-1].set(to.a) if method.ends else a
+    error_v = h * _combine(jnp.asarray(method.error_v), a)
+    error_q = h * (h * _combine(jnp.asarray(method.error_q), a))
+    size = jnp.maximum(_relative(task, error_q, here.q, to.q), _relative(task, error_v, here.v, to.v))
+    size = jnp.where(jnp.all(jnp.isfinite(to.a), axis=0), size, jnp.nan)
+    return Trial(to, undifferentiated(size), jnp.broadcast_to(jnp.asarray(evaluations), size.shape))
+
+
+def _combine(weights: Array, a: Array) -> Array:
+    return jnp.tensordot(weights, a, 1)
+
+
+def _relative(task: Task, error: Array, y0: Array, y1: Array) -> Array:
+    scale = task.atol + task.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
+    return jnp.max(jnp.abs(error) / scale, axis=0)
+
+
+def march(task: Task, q: Array, v: Array) -> March:
+    """Integrate from ts[0] to ts[-1]."""
+    lanes = q.shape[1:]
+    start = Point(jnp.broadcast_to(task.ts[0], lanes), q, v, jnp.zeros_like(q))
+    none, inner = jnp.zeros(lanes, int), len(task.ts) - 2
+    outputs = jnp.zeros((inner + BLOCK if inner else 0, 2 * len(start.q), *lanes), start.q.dtype)
+    # The first round is no step: it finds the accelerations, and with them the first step, where the others have their code.
+    first = March(start, start, jnp.zeros(lanes), none, jnp.zeros(lanes, bool), none - 1, none - 1, none, none, outputs)
+
+    def running(m: March) -> Array:
+        return jnp.any(m.code == RUNNING)
+
+    def quick(m: March) -> March:
+        t1, last = _end(task, m)
+        trial = attempt(task, m.here, jnp.where(m.code == RUNNING, t1 - m.here.t, 0.0), t1, m.tried < 0)
+        doubt = (m.code == RUNNING) & ~jnp.isfinite(trial.error) & task.doubts
+        m = _decide(task, m, trial, last, (m.code == RUNNING) & ~doubt)
+        return m._replace(doubt=doubt) if task.careful else m._replace(code=jnp.where(doubt, DOUBTED, m.code))
+
+    careful = task.careful
+    if careful is None:
+        return jax.lax.while_loop(running, quick, first)
+
+    def again(m: March) -> March:
+        t1, last = _end(task, m)
+        trial = careful(m.doubt, m.here, t1 - m.here.t, t1, m.tried < 0)
+        return _decide(task, m, trial, last, m.doubt)._replace(doubt=jnp.zeros(lanes, bool))
+
+    def rounds(m: March) -> March:
+        return again(jax.lax.while_loop(lambda m: running(m) & ~jnp.any(m.doubt), quick, m))
+
+    return jax.lax.while_loop(running, rounds, first)
+
+
+def _end(task: Task, m: March) -> tuple[Array, Array]:
+    """Where the next step ends, and whether it is the last: that one is stretched a little, not followed by a tiny one."""
+    t1 = m.here.t + m.h
+    last = (t1 >= task.ts[-1] - task.smallest) & (m.tried >= 0)
+    return jnp.where(last, task.ts[-1], t1), last
+
+
+def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array) -> March:
+    """Accept or reject a step of the lanes that are `judged`, choose the next one, and write the outputs that are behind."""
+    accept = judged & (trial.error < 1.0)
+    error = jnp.where(jnp.isfinite(trial.error), jnp.maximum(trial.error, 1e-30), 1e30)
+    factor = SAFETY * jnp.exp(jnp.log(error) * (-1.0 / task.method.order))
+    factor = jnp.clip(factor, jnp.where(accept, 1.0, SHRINK), jnp.where(accept, GROW, SAFETY))
+    tried = m.tried + judged
+    h = jnp.where(judged, undifferentiated(trial.to.t - m.here.t) * factor, m.h)
+    h = jnp.where(judged & (tried == 0), _first_step(task, trial.to), h)
+    code = jnp.where(judged & (h < task.smallest), STEP_TOO_SMALL, m.code)
+    code = jnp.where((code == RUNNING) & (tried >= task.max_steps), STEP_LIMIT, code)
+    code = jnp.where(accept & last, DONE, code)
+
+    here, back = (jax.tree.map(lambda x, y: jnp.where(accept, x, y), *pair) for pair in ((trial.to, m.here), (m.here, m.back)))
+    m = m._replace(h=h, code=code, tried=tried, accepted=m.accepted + accept)
+    m = m._replace(evaluations=m.evaluations + jnp.where(judged, trial.evaluations, 0))
+    if len(task.ts) > 2:
+        until = jnp.where(accept & (m.accepted > 1), undifferentiated(trial.to.t), -jnp.inf)
+        m = _write(task, m, (m.back, m.here, here), until)
+    return m._replace(here=here, back=back)
+
+
+def _first_step(task: Task, start: Point) -> Array:
+    """The first step: as given, or one over which the state changes by a small part of itself.
+
+    As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off.
+    """
+    span = undifferentiated(task.ts[-1] - task.ts[0])
+    if task.h is not None:
+        return jnp.minimum(task.h, 0.5 * span)
+
+    def largest(q: Array, v: Array) -> Array:
+        relative = (jnp.abs(x) / (task.atol + task.rtol * jnp.abs(y)) for x, y in ((q, start.q), (v, start.v)))
+        return jnp.maximum(*(jnp.max(x, axis=0) for x in relative))
+
+    size, slope = largest(start.q, start.v), largest(start.v, start.a)
+    ordinary = jnp.isfinite(slope) & (slope > 0) & (size > 0)
+    step = jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, slope, 1.0), span), 1e-4 * span)
+    return jnp.minimum(undifferentiated(step), 0.5 * span)  # two steps at least: interpolation needs three states
+
+
+# --- outputs
+
+
+def _write(task: Task, m: March, points: tuple[Point, Point, Point], until: Array) -> March:
+    """Interpolate between three accepted states at the output times that are not yet written."""
+    inner, lanes = len(task.ts) - 2, m.code.shape
+    times = jnp.concatenate([task.ts[1:-1], jnp.broadcast_to(task.ts[-1], (BLOCK, *task.ts.shape[1:]))])
+
+    def block(m: March) -> Array:
+        if times.ndim == 1:
+            return times[m.written + jnp.arange(BLOCK).reshape(BLOCK, *[1] * len(lanes))]
+        return jnp.take_along_axis(times, m.written + jnp.arange(BLOCK)[:, None], axis=0)
+
+    def behind(m: March) -> Array:
+        number = m.written + jnp.arange(BLOCK).reshape(BLOCK, *[1] * len(lanes))
+        return jnp.sum((block(m) <= until) & (number < inner), axis=0)
+
+    def more(m: March) -> March:
+        states = _interpolated(points, block(m))
+        written = m.written + behind(m)
+        if not lanes:
+            return m._replace(written=written, outputs=jax.lax.dynamic_update_slice(m.outputs, states, (m.written, 0)))
+
+        def lane(k, outputs):
+            block = jax.lax.dynamic_slice_in_dim(states, k, 1, axis=-1)
+            return jax.lax.dynamic_update_slice(outputs, block, (m.written[k], 0, k))
+
+        return m._replace(written=written, outputs=jax.lax.fori_loop(0, lanes[0], lane, m.outputs))
+
+    return jax.lax.while_loop(lambda m: jnp.any(behind(m) > 0), more, m)
+
+
+def _interpolated(points: tuple[Point, Point, Point], times: Array) -> Array:
+    """q and v (BLOCK, 2n, *lanes) at times (BLOCK, *lanes): Hermite's polynomial by Newton's divided differences."""
+    nodes = [p.t for p in points for _ in range(3)]
+    column = [p.q for p in points for _ in range(3)]
+    coefficients = [column[0]]
+    for order in range(1, 9):
+        known = {1: [p.v for p in points], 2: [0.5 * p.a for p in points]}.get(order, [None] * 3)
+        following = []
+        for i in range(9 - order):
+            if i // 3 == (i + order) // 3:
+                following.append(known[i // 3])
+            else:
+                following.append((column[i + 1] - column[i]) / (nodes[i + order] - nodes[i]))
+        column = following
+        coefficients.append(column[0])
+    q, v = jnp.zeros((), column[0].dtype), jnp.zeros((), column[0].dtype)
+    for node, coefficient in zip(reversed(nodes), reversed(coefficients), strict=True):
+        ahead = (times - node)[:, None]
+        q, v = q * ahead + coefficient, v * ahead + q
+    return jnp.concatenate([q, v], axis=1)

@@ -1,0 +1,172 @@
+"""Which engine a run by an explicit Runge-Kutta method gets: one march, or, under vmap, marches in lanes.
+
+A batch is cut into chunks of lanes that fill the vector units and stay in the cache; chunk follows chunk, so that a member waits
+for the slowest of its own chunk alone. The rare step that needs care is taken by one lane at a time, behind a branch.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array
+
+from udkjax.equations.motion import Motion
+from udkjax.integrate.explicit import Point, Task, Trial, judged, march, method_of, stage_state, when
+from udkjax.integrate.problem import DONE, Problem, Raw
+from udkjax.integrate.projection import project
+
+ROUND = 8  # lanes: what the widest vector units hold
+FAR = 1e-5  # m, rad, m/s, rad/s: two Newton steps of a projection leave rounding errors of what is nearer to the manifold
+LANES = 64  # of 16, 32, 64 and 128 the fastest for the paper's linkage, with half the memory of 128
+
+
+def serves(problem: Problem) -> bool:
+    """Whether a problem can be integrated here: by an explicit Runge-Kutta method with an error estimate, all of q and v."""
+    explicit = isinstance(problem.solver, diffrax.AbstractERK) and isinstance(problem.solver.tableau, diffrax.ButcherTableau)
+    return explicit and type(problem.equations).rates is Motion.rates
+
+
+def solve(problem: Problem) -> Raw:
+    """Integrate one problem; under vmap, as many as there are."""
+    arrays, static = eqx.partition(problem, eqx.is_array)
+
+    @custom_vmap
+    def one(arrays):
+        return _single(eqx.combine(arrays, static))
+
+    @one.def_vmap
+    def _(size, batched, arrays):
+        if not any(jax.tree.leaves(batched)):
+            return _single(eqx.combine(arrays, static)), jax.tree.map(lambda _: False, Raw(*Raw._fields))
+        return _many(arrays, batched[0], static, size), jax.tree.map(lambda _: True, Raw(*Raw._fields))
+
+    return one(arrays)
+
+
+def _single(problem: Problem) -> Raw:
+    return _marched(problem, Lanes(problem.equations))
+
+
+def _many(arrays: Any, batched: Any, static: Any, size: int) -> Raw:
+    """Chunks of lanes, one after another; the last is filled up with copies of the last member."""
+    chunks = -(-size // LANES)
+    lanes = min(-(-size // (chunks * ROUND)) * ROUND, LANES)
+    places = jnp.minimum(jnp.arange(chunks * lanes), size - 1).reshape(chunks, lanes)
+    axes = jax.tree.map(lambda b: 0 if b else None, batched)
+
+    def chunk(places: Array) -> Raw:
+        members = jax.tree.map(lambda x, b: x[places] if b else x, arrays, batched)
+        return _in_lanes(eqx.combine(members, static), eqx.combine(axes, static), lanes)
+
+    raw = jax.lax.map(chunk, places)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:size], raw)
+
+
+def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
+    """A chunk: what differs from lane to lane has the lanes first, and so has the result."""
+
+    def last(x: Array, axis: int | None) -> Array:
+        return x if axis is None else jnp.moveaxis(x, 0, -1)
+
+    def every(x: Array, axis: int | None) -> Array:
+        return jnp.broadcast_to(x[..., None], (*x.shape, size)) if axis is None else last(x, axis)
+
+    lanes = Lanes(problem.equations, axes.equations, size)
+    problem = dataclasses.replace(problem, ts=last(problem.ts, axes.ts), q=every(problem.q, axes.q), v=every(problem.v, axes.v))
+    raw = _marched(problem, lanes)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), raw)
+
+
+class Lanes:
+    """Equations evaluated for one state, or for lanes of states, (n, L) each; with equations of their own where `axes` says so."""
+
+    def __init__(self, equations: Motion, axes: Any = None, size: int | None = None):
+        self.equations, self.size, self.shape = equations, size, () if size is None else (size,)
+        self._arrays, self._static = eqx.partition(equations, eqx.is_array)
+        self._axes = axes
+
+    def over(self, function: Callable, *states: Array) -> Any:
+        """`function(equations, t, q, v)` of each lane."""
+        if self.size is None:
+            return function(self.equations, *states)
+
+        def lane(arrays, *state):
+            return function(eqx.combine(arrays, self._static), *state)
+
+        return jax.vmap(lane, in_axes=(self._axes, *[-1] * len(states)), out_axes=-1)(self._arrays, *states)
+
+    def each(self, which: Array, function: Callable, otherwise: Any, *states: Any) -> Any:
+        """`function(equations, *states)` of the lanes in question, one at a time; the others get what is `otherwise`."""
+
+        def first(carry):
+            left, found = carry
+            if self.size is None:
+                return jnp.zeros_like(left), function(self.equations, *states)
+            k = jnp.argmax(left)
+            arrays = jax.tree.map(lambda x, axis: x if axis is None else x[k], self._arrays, self._axes)
+            mine = function(eqx.combine(arrays, self._static), *jax.tree.map(lambda x: x[..., k], states))
+            return left.at[k].set(False), jax.tree.map(lambda x, y: x.at[..., k].set(y), found, mine)
+
+        return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), first, (which, otherwise))[1]
+
+
+def _marched(problem: Problem, lanes: Lanes) -> Raw:
+    task = Task(
+        partial(lanes.over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
+        partial(lanes.over, lambda e, t, q, v: e.quick.project(t, q, v)) if problem.projected else lambda t, q, v: (q, v),
+        None,
+        problem.equations.branches,
+        *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
+    )
+    if problem.equations.branches and problem.careful:
+        task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
+    m = march(task, problem.q, problem.v)
+    inner, end = len(problem.ts) - 2, jnp.concatenate([m.here.q, m.here.v])
+    between = _projected(lanes, problem.ts[1:-1], m.outputs[:inner]) if problem.projected and inner else m.outputs[:inner]
+    ys = jnp.concatenate([jnp.concatenate([problem.q, problem.v])[None], between, end[None]])
+    number = jnp.arange(inner + 2).reshape(-1, *[1] * len(lanes.shape))
+    reached = (number <= m.written) & (number <= inner) | (m.code == DONE)
+    return Raw(ys, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
+
+
+# --- with care
+
+
+def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Point, h: Array, t1: Array, begin: Array) -> Trial:
+    """A step taken again, by equations that may branch, of the lanes in doubt."""
+    stages = task.method.stages
+
+    def one(equations: Motion, here: Point, h: Array, t1: Array, begin: Array, rtol: Array, atol: Array) -> Trial:
+        def stage(i, carry):
+            a, _, _ = carry
+            last = i == stages
+            t, q, v = stage_state(task.method, here, h, a[:stages], i)
+            t = jnp.where(last, t1, t)
+            if projected:  # one place for all evaluations: a branch to singular values takes long to compile
+                q, v = jax.lax.cond(last, lambda: equations.project(t, q, v), lambda: (q, v))
+            return a.at[i].set(equations.accelerations(t, q, v)), q, v
+
+        start, none = jnp.where(begin, stages, 0), jnp.zeros((stages + 1, *here.a.shape))
+        a, q1, v1 = jax.lax.fori_loop(start, stages + 1, stage, (none, here.q, here.v))
+        mine, evaluations = task._replace(rtol=rtol, atol=atol), jnp.where(begin, 2, 2 * stages + 1)
+        return judged(mine, here._replace(a=a[0]), Point(t1, q1, v1, a[stages]), h, a[:stages], evaluations)
+
+    tolerances = (jnp.broadcast_to(x, h.shape) for x in (task.rtol, task.atol))
+    nothing = Trial(here, jnp.full(h.shape, jnp.inf), jnp.zeros(h.shape, int))
+    return lanes.each(doubt, one, nothing, here, h, t1, begin, *tolerances)
+
+
+def _projected(lanes: Lanes, ts: Array, ys: Array) -> Array:
+    """Interpolated states (T, 2n, *lanes), each returned to the manifold."""
+    if ts.ndim <= len(lanes.shape):
+        ts = jnp.broadcast_to(ts[:, None], (len(ts), *lanes.shape))
+    over = partial(lanes.over, lambda e, t, y: project(e.forgiving, t, y))
+    every = lambda ys: jax.lax.map(lambda x: over(*x), (ts, ys))  # noqa: E731   one by one is faster than all at once
+    once = every(ys)
+    return when(jnp.any(jnp.abs(once - ys) > FAR), every, once)
