@@ -2,13 +2,13 @@
 
 The same equation as in udwadia_kalaba.py, on arrays over all elements of a kind (alike.py) in place of scalars, so that the
 program does not grow with the scene. D is kept in blocks, one for each constraint and body; D D^T is eliminated by the levels of
-its elimination tree (pinv/blocks.py). What dense methods need, and singular values, is dense here, too: of (rows, coordinates),
-for what that costs.
+its elimination tree (pinv/blocks.py). For dense methods, and for singular values, D of each part of a scene that touches no
+other is a matrix (rows, coordinates), for what that costs.
 """
 
 import dataclasses
 from collections.abc import Sequence
-from functools import cached_property, lru_cache, partial
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.alike import Fields, Group, constraint_kind, force_kind, groups, stack
+from udkjax.equations.alike import Fields
 from udkjax.equations.code import CONSISTENT, TINY, structure
+from udkjax.equations.layout import Layout, Selection, fields_of, layout
 from udkjax.equations.motion import MechanismMotion, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
-from udkjax.pinv.blocks import BlockElimination, BlockPattern, Sums, by_block, factorized, flat, take
+from udkjax.pinv.blocks import BlockElimination, DenseParts, by_block, factorized, flat
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline.trigonometry import sincos
 
 # The least share of a row's length that closing takes for granted: enough to tell redundant rows from rounding, too little to
 # slow down Newton's method where rows are independent.
@@ -32,166 +32,6 @@ DAMPING = 1e-10
 # Of a row left out, relative to its length: what of a motion that the rows kept allow shows that it is independent of them.
 INDEPENDENT = 1e-4
 _RESIDUALS = {"rows": "b", "closure": "psi", "rate": "psi_dot"}
-
-
-class Selection:
-    """Some rows of Psi, by blocks: a pattern for elimination, and their places among all rows in the user's order."""
-
-    def __init__(self, parts: Sequence[tuple[Group, Sequence[int]]], starts: np.ndarray, bodies: int):
-        self.parts = [(k, group, tuple(rows)) for k, (group, rows) in enumerate(parts) if rows]
-        members = [m for _, group, _ in self.parts for m in group.members]
-        sizes = [len(rows) for _, group, rows in self.parts for _ in group.members]
-        meets = [list(b) for _, group, _ in self.parts for b in group.bodies.T]
-        self.height, self.deep, self.blocks = max(sizes, default=0), max(map(len, meets), default=1) or 1, len(members)
-        self._sizes, self._meets, self._bodies = sizes, meets, bodies
-        rows = [rows for _, group, rows in self.parts for _ in group.members]
-        place = np.array([starts[m] + r for m, kept in zip(members, rows, strict=True) for r in kept], int)
-        self.order = np.argsort(place)  # of the rows of all blocks: the user's
-        self.rows = place[self.order]
-        block = np.repeat(np.arange(self.blocks), sizes)
-        within = np.arange(len(place)) - np.repeat(np.cumsum([0, *sizes[:-1]]) if sizes else np.zeros(0, int), sizes)
-        self.entry = (within[self.order], block[self.order])  # of every row in the user's order
-
-    @cached_property
-    def pattern(self) -> BlockPattern:
-        return BlockPattern(self._sizes, self._meets, 3, self._bodies)
-
-    def evaluate(self, names: Sequence[str], numbers: Sequence[Array], t: Any, fields: Fields) -> list[Array]:
-        """`D` as `BlockPattern` wants it, the others as (rows of a block, blocks)."""
-        found = [self._padded(name, []) for name in names] if not self.parts else None
-        if found is not None:
-            return found
-        by_group = [group.run(tuple(names), numbers[k], t, fields) for k, group, _ in self.parts]
-        return [self._padded(name, [outputs[i] for outputs in by_group]) for i, name in enumerate(names)]
-
-    def _padded(self, name: str, by_group: list[list[Any]]) -> Array:
-        """Put together what the groups say: zeros where a block has fewer rows, or fewer bodies."""
-        shape = (self.height, 3, self.deep) if name == "D" else (self.height,)
-        parts = []
-        for (_, group, rows), outputs in zip(self.parts, by_group, strict=True):
-            width, size = 3 * len(group.bodies), len(group.members)
-            entries: list[Any] = [0.0] * int(np.prod(shape))
-            for r, row in enumerate(rows):
-                if name != "D":
-                    entries[r] = outputs[row]
-                    continue
-                for k in range(width):
-                    body, c = divmod(k, 3)
-                    entries[(3 * r + c) * self.deep + body] = outputs[row * width + k]
-            parts.append([jnp.broadcast_to(jnp.asarray(e), (size,)) for e in entries])
-        if not parts:
-            return jnp.zeros((*shape[:-1], 0))
-        columns = [jnp.concatenate(column) for column in zip(*parts, strict=True)]
-        whole = jnp.stack(columns).reshape(*shape, self.blocks)
-        return whole.reshape(self.height, 3, -1) if name == "D" else whole
-
-    def listed(self, values: Float[Array, "r blocks"]) -> Float[Array, "rows"]:
-        """The rows of all blocks in the user's order."""
-        return values[self.entry]
-
-    def dense(self, D: Float[Array, "r 3 s"]) -> Float[Array, "rows n"]:
-        """D as a matrix, rows in the user's order."""
-        row, column, place = self.entries
-        return jnp.zeros((len(self.rows), 3 * self._bodies), D.dtype).at[row, column].set(take(D.ravel(), place))
-
-    @cached_property
-    def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of every entry of D: its row in the user's order, its column, and its place in `D.ravel()`."""
-        row_at = np.full((self.height, self.blocks), -1)
-        row_at[self.entry] = np.arange(len(self.rows))
-        body = np.full((self.deep, self.blocks), -1)
-        for i, met in enumerate(self._meets):
-            body[: len(met), i] = met
-        shape = (self.height, 3, self.deep, self.blocks)
-        there = (row_at[:, None, None] >= 0) & (body >= 0) & np.ones((3, 1, 1), bool)
-        r, c, k, block = np.nonzero(np.broadcast_to(there, shape))
-        place = np.ravel_multi_index((r, c, k, block), shape)
-        return row_at[r, block], 3 * body[k, block] + c, place
-
-
-class Layout:
-    """What is known of a scene from its structure: which elements are alike, and how its rows hang together."""
-
-    def __init__(self, mechanism: Mechanism, left_out: tuple[int, ...], baumgarte: bool):
-        constraints, forces = list(mechanism.constraints.values()), list(mechanism.forces.values())
-        loaded = bool(forces)
-        self.baumgarte, self.left_out, self.bodies = baumgarte, left_out, len(mechanism.body_names)
-        make = partial(_constraint_kind, baumgarte=baumgarte, loaded=loaded)
-        sizes = np.zeros(len(constraints), int)
-        for group in groups(mechanism, constraints, make):
-            sizes[group.members] = group.kind.rows
-        self.starts = np.cumsum([0, *sizes])
-        self.count = int(self.starts[-1])
-        dropped = np.isin(np.arange(self.count), left_out)
-        kept = [tuple(np.flatnonzero(~dropped[i:j]).tolist()) for i, j in zip(self.starts, self.starts[1:], strict=False)]
-        self.constraints = groups(mechanism, constraints, make, kept)
-        self.forces = groups(mechanism, forces, force_kind)
-        self.kept = Selection([(g, kept[g.members[0]]) for g in self.constraints], self.starts, self.bodies)
-        self.all = Selection([(g, range(g.kind.rows)) for g in self.constraints], self.starts, self.bodies)
-        if not left_out:
-            self.kept = self.all
-        self.loaded = Sums(np.concatenate([g.bodies.ravel() for g in self.forces]), self.bodies) if forces else None
-        names = list(mechanism.constraints)
-        self.row_names = [(name, k) for name, size in zip(names, sizes, strict=True) for k in range(size)]
-
-    def numbers(self, mechanism: Mechanism, gains: Sequence[Any]) -> dict[str, Any]:
-        """Everything that depends on parameters alone."""
-        bodies = list(mechanism.bodies.values())
-        constraints, forces = list(mechanism.constraints.values()), list(mechanism.forces.values())
-        return self._numbers(
-            stack([b.mass for b in bodies]),
-            stack([b.inertia for b in bodies]),
-            mechanism.gravity,
-            list(gains),
-            [g.stacked(constraints) for g in self.constraints],
-            [g.stacked(forces) for g in self.forces],
-        )
-
-    @cached_property
-    def position(self) -> Any:
-        """A program of the numbers, t (s) and q: Psi in the user's order, and D as its blocks hold it."""
-
-        def position(numbers, t, q):
-            q = jnp.asarray(q)
-            D, psi = self.all.evaluate(["D", "psi"], numbers["constraints"], t, fields_of(q, q))
-            return self.all.listed(psi), D
-
-        return jax.jit(position)
-
-    @cached_property
-    def _numbers(self) -> Any:
-        """One program for all of it: what is known is computed at once, without tracing as many arrays as there are elements."""
-
-        def numbers(mass, inertia, gravity, gains, constraints, forces):
-            root = jnp.sqrt(1 / jnp.stack([mass, mass, inertia], -1))
-            shared = [gravity[0], gravity[1], *gains]
-            return {
-                "root": root.T,
-                "mass": jnp.stack([mass, inertia]),
-                "gravity": jnp.append(gravity, 0.0),
-                "constraints": [g.constants(s, root, shared) for g, s in zip(self.constraints, constraints, strict=True)],
-                "forces": [g.constants(s, root, ()) for g, s in zip(self.forces, forces, strict=True)],
-            }
-
-        return jax.jit(numbers)
-
-
-def _constraint_kind(structure: Any, baumgarte: bool, loaded: bool) -> Any:
-    return constraint_kind(structure, baumgarte, loaded)
-
-
-@lru_cache(maxsize=16)
-def layout(tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool) -> Layout:
-    """Return the layout of the mechanisms with this tree and with numbers of these shapes and types."""
-    return Layout(jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes]), left_out, baumgarte)
-
-
-def fields_of(q: Vector, v: Vector) -> Fields:
-    """What elements see of the bodies."""
-    x, y, angle = by_block(q, 3)
-    vx, vy, omega = by_block(v, 3)
-    sin, cos = sincos(angle)
-    return {"x": x, "y": y, "angle": angle, "sin": sin, "cos": cos, "vx": vx, "vy": vy, "omega": omega}
 
 
 class LargeEquations(MechanismMotion):
@@ -218,19 +58,12 @@ class LargeEquations(MechanismMotion):
     def _multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         if not self.layout.count:
             return jnp.zeros(0)
-        if not self.by_levels or self.left_out:
-            equations = self.exact() if self.by_levels else self
-            plus, b, _ = equations.linearized("rows", t, q, v)
-            return -(plus.T @ (plus @ b))
 
         def solve(plus: Plus, rows: Selection) -> Vector:
-            free = self._free(t, q, v)
-            b = self._arrays(rows, ["b"], t, q, v, free)[0]
-            if isinstance(plus.method, BlockElimination):
-                return rows.listed(by_block(-(plus.T @ (plus @ flat(b))), rows.height))
-            return -(plus.T @ (plus @ rows.listed(b)))
+            b = self._arrays(rows, ["b"], t, q, v, self._free(t, q, v))[0]
+            return rows.listed(by_block(-(plus.T @ (plus @ flat(b))), rows.height))
 
-        return _by_method(self, solve, t, q, v)
+        return _by_method(self.exact() if self.by_levels and self.left_out else self, solve, t, q, v)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
@@ -289,7 +122,7 @@ class LargeEquations(MechanismMotion):
         if isinstance(self.method, BlockElimination):
             plus = self.method.plus(D)
             return eqx.tree_at(lambda p: p.factors.rank, plus, self._rank(D, t, q)), flat(residual), root
-        return self.method.plus(rows.dense(D)), rows.listed(residual), root
+        return DenseParts(rows.pattern, self.method).plus(D), flat(residual), root
 
     @property
     def row_names(self) -> list[tuple[str, int]]:
@@ -408,7 +241,7 @@ def plain_accelerations(equations: LargeEquations, t: Any, q: Vector, v: Vector)
 
     def solve(plus: Any, rows: Selection) -> Vector:
         b = equations._arrays(rows, ["b"], t, q, v, free)[0]
-        return flat(free) + root * (plus @ _right(plus, rows, b))
+        return flat(free) + root * (plus @ flat(b))
 
     return _by_method(equations, solve, t, q, v)
 
@@ -419,7 +252,7 @@ def plain_project(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tu
 
     def step(name: str, q: Vector) -> Vector:
         def solve(plus: Any, rows: Selection) -> Vector:
-            return -root * (plus @ _right(plus, rows, equations._arrays(rows, [name], t, q, v)[0]))
+            return -root * (plus @ flat(equations._arrays(rows, [name], t, q, v)[0]))
 
         return _by_method(equations, solve, t, q, v)
 
@@ -434,9 +267,9 @@ def _plain_correction(equations: LargeEquations, t: Any, q: Vector, v: Vector) -
 
     def step(plus: Any, rows: Selection) -> tuple[Vector, Vector]:
         psi = equations._arrays(rows, ["psi"], t, q, v)[0]
-        closed = q - root * (plus @ _right(plus, rows, psi))
+        closed = q - root * (plus @ flat(psi))
         rate = equations._arrays(rows, ["psi_dot"], t, closed, v)[0]
-        return closed, v - root * (plus @ _right(plus, rows, rate))
+        return closed, v - root * (plus @ flat(rate))
 
     return _by_method(equations, step, t, q, v)
 
@@ -448,14 +281,9 @@ def _by_method(equations: LargeEquations, use: Any, t: Any, q: Vector, v: Vector
         return use(_Unconstrained(), layout.kept)
     if not equations.by_levels:
         D = equations._arrays(layout.all, ["D"], t, q, v)[0]
-        return use(equations.method.plus(layout.all.dense(D)), layout.all)
+        return use(DenseParts(layout.all.pattern, equations.method).plus(D), layout.all)
     plus = equations._elimination.plus(equations._arrays(layout.kept, ["D"], t, q, v)[0])
     return _branch(plus.rank > 0, lambda: use(plus, layout.kept), lambda: _by_method(equations.exact(), use, t, q, v))
-
-
-def _right(plus: Any, rows: Selection, values: Float[Array, "r blocks"]) -> Array:
-    """A right-hand side as `plus` wants it."""
-    return rows.listed(values) if not isinstance(getattr(plus, "method", None), BlockElimination) else flat(values)
 
 
 class _Unconstrained:

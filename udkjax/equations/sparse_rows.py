@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from udkjax.equations.code import structure
-from udkjax.equations.large import layout
+from udkjax.equations.layout import layout
 from udkjax.pinv.sparse import minimum_degree
 from udkjax.scene.mechanism import Mechanism
 

@@ -6,13 +6,17 @@ zeros. A matrix is this one array, whatever its size.
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import combinations
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from udkjax.pinv.levels import Levels
 from udkjax.pinv.rule import Pseudoinverse, number
@@ -61,7 +65,33 @@ class BlockPattern:
         self.columns = self.columns.ravel()
         self.by_column = Sums(self.columns, count)
         self.pairs, self.shares = self._pairs()
-        self.levels = Levels.of(self.sizes.tolist(), self.pairs.tolist())
+
+    @cached_property
+    def levels(self) -> Levels:
+        """The elimination of D D^T."""
+        return Levels.of(self.sizes.tolist(), self.pairs.tolist())
+
+    @cached_property
+    def parts(self) -> list["Parts"]:
+        """The parts that do not touch each other, those of equal shape together."""
+        slot = np.arange(len(self.columns))
+        met = self.columns >= 0
+        links = coo_array(
+            (np.ones(met.sum()), (slot[met] % self.blocks, self.blocks + self.columns[met])),
+            shape=(self.blocks + self.count,) * 2,
+        )
+        label = connected_components(links, directed=False)[1]
+        within = np.arange(self.rows)[:, None] < self.sizes  # (rows, blocks)
+        place = np.arange(self.rows) + self.rows * np.arange(self.blocks)[:, None]  # (blocks, rows)
+        found: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = {}
+        order = np.argsort(label, kind="stable")
+        for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+            blocks, touched = members[members < self.blocks], members[members >= self.blocks] - self.blocks
+            rows = place[blocks][within.T[blocks]]
+            columns = (self.width * touched[:, None] + np.arange(self.width)).ravel()
+            if len(rows):
+                found.setdefault((len(rows), len(columns)), []).append((rows, columns))
+        return [Parts.of(self, np.stack([r for r, _ in same]), np.stack([c for _, c in same])) for same in found.values()]
 
     def _pairs(self) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
         """The pairs of blocks that meet the same columns; and in turns: pairs, and the slots of both in which they meet."""
@@ -101,6 +131,31 @@ class BlockPattern:
     def rmatvec(self, D: Float[Array, "r c s"], y: Float[Array, "r blocks"]) -> Float[Array, "c count"]:
         """D^T y."""
         return self.by_column(jnp.sum(D * jnp.tile(y, (1, self.deep))[:, None], 0))
+
+
+class Parts(NamedTuple):
+    """Parts of equal shape: the places of their rows and columns in flat vectors, and of their entries."""
+
+    rows: np.ndarray  # (parts, m)
+    columns: np.ndarray  # (parts, n)
+    entries: np.ndarray  # (3, .): part, row, column
+    places: np.ndarray  # (.,), in D.ravel()
+
+    @staticmethod
+    def of(pattern: BlockPattern, rows: np.ndarray, columns: np.ndarray) -> "Parts":
+        row_at, column_at = (np.full((2, size), -1) for size in (pattern.rows * pattern.blocks, pattern.width * pattern.count))
+        for at, places in ((row_at, rows), (column_at, columns)):
+            at[0, places], at[1, places] = np.arange(len(places))[:, None], np.arange(places.shape[1])
+        shape = (pattern.rows, pattern.width, pattern.deep * pattern.blocks)
+        r, c, s = np.unravel_index(np.arange(int(np.prod(shape))), shape)
+        row, column = row_at[:, pattern.rows * (s % pattern.blocks) + r], column_at[:, pattern.width * pattern.columns[s] + c]
+        mine = (pattern.columns[s] >= 0) & (row[0] >= 0)
+        return Parts(rows, columns, np.stack([row[0], row[1], column[1]])[:, mine], np.flatnonzero(mine))
+
+    def matrices(self, D: Float[Array, "r c s"]) -> Float[Array, "parts m n"]:
+        """D of each part, dense."""
+        empty = jnp.zeros((len(self.rows), self.rows.shape[1], self.columns.shape[1]), D.dtype)
+        return empty.at[tuple(self.entries)].set(take(D.ravel(), self.places))
 
 
 class BlockFactors(NamedTuple):
@@ -168,3 +223,53 @@ def by_block(x: Float[Array, "n"], size: int) -> Float[Array, "size count"]:
 def flat(x: Float[Array, "size count"]) -> Float[Array, "n"]:
     """Undo `by_block`."""
     return x.T.ravel()
+
+
+class PartFactors(NamedTuple):
+    """D, and what the method made of the parts of each shape."""
+
+    D: Float[Array, "r c s"]
+    factors: list[Any]
+    rank: Int[Array, ""]
+
+
+class DenseParts(Pseudoinverse):
+    """A dense method applied to each connected part of rows that come in blocks: operator, b and x as in `BlockElimination`.
+
+    Parts that do not touch make D block diagonal, and D^+ too: n parts cost n times one of them, and the rank of each is
+    decided by its own largest singular value.
+    """
+
+    method: Any = None
+    pattern: Any = eqx.field(static=True, default=None)
+
+    def __init__(self, pattern: BlockPattern, method: Any):
+        self.rank_tol, self.relative, self.method, self.pattern = method.rank_tol, method.relative, method, pattern
+
+    def admit(self, D: Any) -> Any:
+        return jnp.asarray(D)
+
+    def shape(self, D: Any) -> tuple[int, int]:
+        return self.pattern.rows * self.pattern.blocks, self.pattern.width * self.pattern.count
+
+    def matvec(self, D, x):
+        return flat(self.pattern.matvec(D, by_block(x, self.pattern.width)))
+
+    def rmatvec(self, D, y):
+        return flat(self.pattern.rmatvec(D, by_block(y, self.pattern.rows)))
+
+    def factor(self, D: Float[Array, "r c s"]) -> PartFactors:
+        factors = [jax.vmap(self.method.factor)(part.matrices(D)) for part in self.pattern.parts]
+        return PartFactors(D, factors, sum((f.rank.sum() for f in factors), jnp.array(0)))
+
+    def apply(self, factors: PartFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+        x = jnp.zeros(self.shape(factors.D)[1], b.dtype)
+        for part, found in zip(self.pattern.parts, factors.factors, strict=True):
+            x = x.at[part.columns].set(jax.vmap(self.method.apply)(found, take(b, part.rows)))
+        return x
+
+    def apply_transpose(self, factors: PartFactors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+        y = jnp.zeros(self.shape(factors.D)[0], c.dtype)
+        for part, found in zip(self.pattern.parts, factors.factors, strict=True):
+            y = y.at[part.rows].set(jax.vmap(self.method.apply_transpose)(found, take(c, part.columns)))
+        return y
