@@ -18,8 +18,8 @@ import numpy as np
 
 from udkjax.pinv.dissection import Front
 
-# What one more group on a level costs, counted in entries gathered, of 0.8 ns each: about fifteen kernels of 100 ns, and a third of
-# a second to compile them. Shapes share a group where padding costs less.
+# What one more group on a level costs, counted in entries gathered, of 0.8 ns each: about fifteen kernels of 100 ns, and a third
+# of a second to compile them. Shapes share a group where padding costs less.
 GROUP = 8000
 # So many multiply-adds along the fronts cost as much as one entry gathered.
 GATHER = 4.0

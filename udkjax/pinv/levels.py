@@ -46,9 +46,10 @@ class Levels:
 
     @staticmethod
     def of(sizes: Sequence[int], pairs: Sequence[tuple[int, int]]) -> "Levels":
-        """Analyse a structure: blocks of the given numbers of rows, coupled in pairs. Analysed once, however often it is asked for.
+        """Analyse a structure, once however often it is asked for: blocks of the given numbers of rows, coupled in pairs.
 
-        Raises ValueError where a size is not positive, a block does not exist, or a pair is given twice or couples a block with itself.
+        Raises:
+            ValueError: if a size is not positive, a block does not exist, a pair is given twice, or couples a block with itself.
         """
         array = np.asarray(pairs, int).reshape(-1, 2)
         if any(size < 1 for size in sizes):
