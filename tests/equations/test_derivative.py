@@ -1,0 +1,140 @@
+"""Derivatives of the fast form: those of the plain form, from the factors at hand, and nothing that is not asked for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax import GROUND
+from udkjax.equations import prepare
+from udkjax.equations.plain import plain_accelerations, plain_correction
+
+ELIMINATION = udk.Elimination()
+BAUMGARTE = udk.Baumgarte(2.0, 3.0)
+
+
+def driven():
+    """A crank that a motor turns, with a spring, a damper and a torque on what follows."""
+    linkage = udk.library.four_bar()
+    one, two, *_ = linkage.body_names
+    motor = udk.Driver((GROUND, one), "angle", udk.Sine(0.4, 2.0))
+    forces = {
+        "spring": udk.Spring((GROUND, two), [[0.0, 1.0], [0.1, 0.2]], 20.0, 0.5, 0.3),
+        "torque": udk.Torque((GROUND, two), 0.6),
+    }
+    return udk.Mechanism(dict(linkage.bodies), dict(linkage.joints), {"motor": motor}, forces, linkage.gravity)
+
+
+SCENES = "double_pendulum elliptic_trammel peaucellier planetary_gear scissor_lift slider_crank".split()
+
+
+def inner(a, b):
+    """The inner product of two trees."""
+    return sum(jax.tree.leaves(jax.tree.map(lambda x, y: jnp.sum(x * y), a, b)))
+
+
+@pytest.mark.parametrize(
+    ("scene", "method", "baumgarte"),
+    [
+        ("driven", ELIMINATION, BAUMGARTE),
+        pytest.param("parallelogram", udk.Auto(), None, marks=pytest.mark.slow),
+        *(pytest.param(scene, udk.Auto(), BAUMGARTE, marks=pytest.mark.slow) for scene in SCENES),
+    ],
+    ids=lambda x: x if isinstance(x, str) else type(x).__name__,
+)
+def test_first_derivatives_are_those_of_the_plain_form(scene, method, baumgarte):
+    """Along all numbers of the scene, t, q and v: of accelerations anywhere, of the projection where it is closed.
+
+    Reverse mode is the transpose of that: w (J d) = (w J) d.
+    """
+    mechanism = driven() if scene == "driven" else getattr(udk.library, scene)()
+    random = np.random.default_rng(1)
+    q, v = (x.ravel() + 0.05 * random.standard_normal(x.size) for x in (mechanism.q0, mechanism.v0))
+    inputs = (mechanism, jnp.array(0.3), q, v)
+    dots = jax.tree.map(lambda x: jnp.asarray(random.standard_normal(np.shape(x))), inputs)
+
+    def of(form):
+        return lambda mechanism, t, q, v: form(prepare(mechanism, method, baumgarte, large=False).quick, t, q, v)
+
+    def both(fast, plain, at, weights):
+        fast, plain = of(fast), of(plain)
+        return jax.jvp(fast, at, dots), jax.jvp(plain, at, dots), jax.vjp(fast, *at)[1](weights)
+
+    def project(equations, t, q, v):
+        return equations.project(t, q, v)
+
+    @jax.jit
+    def derivatives(mechanism, t, q, v):
+        close = lambda _, state: of(project)(mechanism, t, *state)  # noqa: E731
+        closed = (mechanism, t, *jax.lax.fori_loop(0, 6, close, (q, v)))
+        here, weights = (mechanism, t, q, v), (jnp.cos(jnp.arange(q.size)), jnp.sin(jnp.arange(q.size)))
+        a = both(lambda e, t, q, v: e.accelerations(t, q, v), plain_accelerations, here, weights[0])
+        return (*a, weights[0]), (*both(project, plain_correction, closed, weights), weights)
+
+    for fast, plain, back, weights in derivatives(*inputs):
+        size = max(float(jnp.abs(x).max()) for x in jax.tree.leaves(plain))
+        for f, p in zip(jax.tree.leaves(fast), jax.tree.leaves(plain), strict=True):
+            np.testing.assert_allclose(f, p, rtol=1e-10, atol=1e-10 * size)
+        terms = inner(jax.tree.map(jnp.abs, weights), jax.tree.map(jnp.abs, fast[1]))
+        np.testing.assert_allclose(inner(back, dots), inner(weights, fast[1]), rtol=0, atol=1e-11 * terms)
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    return udk.library.parallelogram()
+
+
+def test_a_state_that_elimination_cannot_solve_spoils_no_derivative(linkage, placed):
+    """In line the rank drops: no number, which the caller replaces, and a derivative that nothing times it leaves zero."""
+    equations = prepare(linkage, udk.Auto()).quick
+    q, v = (x.ravel() for x in placed(0.0, 1.0))
+
+    def chosen(q, v):
+        a = equations.accelerations(0.0, q, v)
+        projected = jnp.concatenate(equations.project(0.0, q, v))
+        found = jnp.concatenate([a, projected])
+        return jnp.where(jnp.all(jnp.isfinite(found)), found, 2.0 * jnp.tile(q, 3)), (a, projected)
+
+    @jax.jit
+    def both(q, v):
+        _, back, spoilt = jax.vjp(chosen, q, v, has_aux=True)
+        return spoilt, back(jnp.ones(36)), jax.jvp(chosen, (q, v), (v, q), has_aux=True)[1]
+
+    (a, projected), (of_q, of_v), tangent = both(q, v)
+    assert jnp.all(jnp.isnan(a)) and jnp.all(jnp.isnan(projected))
+    np.testing.assert_allclose(of_q, 6.0, rtol=1e-15)
+    np.testing.assert_allclose(of_v, 0.0, atol=1e-15)
+    np.testing.assert_allclose(tangent, 2.0 * jnp.tile(v, 3), rtol=1e-15)
+
+
+def test_batches_of_states_and_of_directions(linkage, placed):
+    """In any nesting, forward and reverse, the same numbers."""
+    equations = prepare(linkage, udk.Auto()).quick
+    q, v = (x.reshape(-1, 12) for x in jax.vmap(placed)(jnp.array([-0.7, 0.4, 1.9]), jnp.array([1.0, -2.0, 0.5])))
+    a = lambda q, v: equations.accelerations(0.0, q, v)  # noqa: E731
+
+    @jax.jit
+    def derivatives(q, v):
+        outside = jax.jacfwd(lambda z: jax.vmap(a)(q + z[0], v + z[1]))(jnp.zeros((2, 12)))
+        return jnp.moveaxis(outside, 2, 0), *(jnp.stack(jax.vmap(mode(a, (0, 1)))(q, v)) for mode in (jax.jacfwd, jax.jacrev))
+
+    outside, forward, reverse = derivatives(q, v)
+    np.testing.assert_allclose(forward, outside, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-11)
+
+
+def test_a_gradient_in_a_loop_keeps_few_numbers(linkage):
+    """What a step of a scan hands to its reverse pass: less than the accelerations have operations, a vector or a number each."""
+    equations = prepare(linkage, udk.Elimination())
+
+    def end(q, v):
+        step = lambda s, _: ((s[0] + 1e-3 * s[1], s[1] + 1e-3 * equations.accelerations(0.0, *s)), None)  # noqa: E731
+        return jnp.sum(jax.lax.scan(step, (q, v), None, length=7)[0][0])
+
+    back = jax.make_jaxpr(lambda q, v: jax.vjp(end, q, v)[1](1.0))(linkage.q0.ravel(), linkage.v0.ravel())
+    scans = [e for e in back.jaxpr.eqns if e.primitive.name == "scan"]
+    assert len(scans) == 2
+    kept = [x.aval.shape for x in scans[0].outvars if x.aval.shape[:1] == (7,)]  # pyright: ignore[reportAttributeAccessIssue]
+    assert 0 < len(kept) <= 100
+    assert sum(int(np.prod(shape[1:])) for shape in kept) <= 150
