@@ -9,7 +9,8 @@ import pytest
 
 benchmarks = pytest.importorskip("benchmarks", reason="not in a source tree")
 
-from benchmarks import batch, gradients, integrators, right_hand_side, startup, trajectory  # noqa: E402
+from benchmarks import batch, gradients, integrators, right_hand_side, trajectory  # noqa: E402
+from benchmarks.__main__ import main  # noqa: E402
 from benchmarks.common import Compiled, Work, alternate, at_equal_error, frontier, ratio  # noqa: E402
 from benchmarks.scripts import by_cholesky, by_pinv  # noqa: E402
 
@@ -46,9 +47,18 @@ def test_gradients():
     assert {"udkjax"} <= {row["name"] for row in figures if row["mode"] == "forward"}
 
 
-def test_startup():
-    names = {row["name"]: row["seconds"] for row in startup.main(smoke=True)}
-    assert 0 < names["python"] < names["import udkjax"]
+def test_the_command_writes_figures_table_and_page(tmp_path):
+    """With figures of an earlier run in the folder, which it does not repeat."""
+    earlier = [{"name": "udkjax", "start": -45.0, "outputs": "end only", "target": 1e-6, "per_second": 123.0}]
+    (tmp_path / "batch.json").write_text(json.dumps({"machine": {}, "figures": earlier}))
+    main(["startup", "--smoke", "--out", str(tmp_path)])
+    seconds = {row["name"]: row["seconds"] for row in json.loads((tmp_path / "startup.json").read_text())["figures"]}
+    assert 0 < seconds["python"] < seconds["import udkjax"]
+    table = {row["claim"]: row for row in json.loads((tmp_path / "table.json").read_text())["figures"]}
+    assert table["start: import udkjax, s"]["figure"] == seconds["import udkjax"]
+    assert table["batch, 10 s, hanging, error 1e-06: trajectories a second and core"]["holds"] is False
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "Not measured here: right_hand_side, integrators, trajectory" in page
 
 
 def test_integrators():
