@@ -57,14 +57,19 @@ def _projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Ve
     found = q2, without(v, "psi_dot_kept", q2)
     if equations.branches:
         return *_branched(equations, safe, found, plain_project, t, q, v), jnp.array(True)
-    return *found, safe if equations.code.elimination == "check" else jnp.array(True)
+    return *found, safe if _checks(equations) else jnp.array(True)
 
 
 def _checked(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
     """Take what elimination gave where its pivots are safe, or where it drops the others itself; else turn to singular values."""
     if equations.branches:
         return _branched(equations, safe, fast, plain, *state)
-    return fast if equations.code.elimination == "drop" else jnp.where(safe, fast, jnp.nan)
+    return jnp.where(safe, fast, jnp.nan) if _checks(equations) else fast
+
+
+def _checks(equations: "Equations") -> bool:
+    """Whether to mark what pivots that are not safe have to do with, instead of dropping their rows."""
+    return equations.doubt and equations.code.elimination == "check"
 
 
 def _branched(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:

@@ -35,6 +35,7 @@ RANK_TOL = 1e-4
 # Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
 # longer to trace and compile, the larger the scene (see the scaling benchmark).
 LARGE = 150
+NOTHING_LEFT = 1e-13  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
 ORDINARY = 100.0  # the ratio of masses up to which that holds: see `rank_tolerance`
 
 
@@ -158,8 +159,13 @@ class Equations(MechanismMotion):
 
     @property
     def forgiving(self) -> "Equations":
-        """The same without a branch: `Auto` drops rows that depend on others, as `Elimination` does."""
-        return dataclasses.replace(self, branch=False, doubt=False)
+        """The same without a branch: `Auto` drops rows that depend on others, but for rounding, as `Elimination` does."""
+        places = [s.index for s in self.code.constants]
+        if not self.branches or self.code.drop.index not in places:
+            return self.quick
+        drop = places.index(self.code.drop.index)
+        constants = [jnp.asarray(NOTHING_LEFT) if k == drop else c for k, c in enumerate(self.constants)]
+        return dataclasses.replace(self, constants=constants, branch=False, doubt=False)
 
     def exact(self) -> "Equations":
         """The same by singular values of all rows: what `Auto` turns to."""
