@@ -45,6 +45,7 @@ class LargeEquations(MechanismMotion):
     numbers: dict[str, Any]
     method: Pseudoinverse
     layout: Layout = eqx.field(static=True)
+    branch: bool = eqx.field(static=True, default=True)  # whether to turn to dense matrices, or to say NaN where that is needed
     dense: bool = eqx.field(static=True, default=False)  # whether the method is applied to D of all rows as a matrix
 
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
@@ -146,12 +147,12 @@ class LargeEquations(MechanismMotion):
 
     @property
     def branches(self) -> bool:
-        """An evaluation is long beside the branch in it: there is no reason to do without it first."""
-        return False
+        return self.branch and self.by_levels and self.constrained
 
     @property
     def quick(self) -> "LargeEquations":
-        return self
+        """The same without a branch: what cannot be solved by elimination is not a number."""
+        return dataclasses.replace(self, branch=False)
 
     def exact(self) -> "LargeEquations":
         """The same on all rows as a matrix: what to turn to where rows are not independent."""
@@ -283,6 +284,8 @@ def _by_method(equations: LargeEquations, use: Any, t: Any, q: Vector, v: Vector
         D = equations._arrays(layout.all, ["D"], t, q, v)[0]
         return use(DenseParts(layout.all.pattern, equations.method).plus(D), layout.all)
     plus = equations._elimination.plus(equations._arrays(layout.kept, ["D"], t, q, v)[0])
+    if not equations.branches:
+        return use(plus, layout.kept)
     return _branch(plus.rank > 0, lambda: use(plus, layout.kept), lambda: _by_method(equations.exact(), use, t, q, v))
 
 
@@ -358,7 +361,9 @@ _accelerations.defjvp(lambda watch, primals, tangents: jax.jvp(plain_acceleratio
 
 
 def _checked(equations: LargeEquations, safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
-    """Take what elimination gave where its pivots are safe; else turn to the dense method."""
+    """Take what elimination gave where its pivots are safe; else turn to the dense method, or say that it is not a number."""
+    if not equations.branches:
+        return jax.tree.map(lambda x: jnp.where(safe, x, jnp.nan), fast)
     return _branch(safe, lambda: fast, lambda: plain(equations.exact(), *state))
 
 
