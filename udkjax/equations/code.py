@@ -12,7 +12,7 @@ from udkjax.equations.derivative import Derivative
 from udkjax.equations.expressions import Expressions, expressions
 from udkjax.pinv.sparse import Row, absolute, all_of, factorize, greater, multipliers, pattern, transpose_times
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Program, Scalar, frontier
+from udkjax.straightline import Program, Scalar, frontier, vector
 
 # What a row left out may disagree by, relative to its terms, and still count as satisfied: far above rounding, and above what
 # states carry that are closed to the tolerances of an integration.
@@ -147,5 +147,4 @@ def scalars(leaves: Sequence[Any]) -> list[Any]:
 
 def stacked(values: Sequence[Any]) -> Array:
     """Some numbers as one vector."""
-    values = [jax.numpy.asarray(x, jax.numpy.result_type(float)) for x in values]
-    return jax.numpy.stack(values) if values else jax.numpy.zeros(0)
+    return vector(values)

@@ -10,3 +10,4 @@ from udkjax.straightline.graph import Graph as Graph
 from udkjax.straightline.graph import Scalar as Scalar
 from udkjax.straightline.read import read as read
 from udkjax.straightline.read import trace as trace
+from udkjax.straightline.vector import vector as vector
