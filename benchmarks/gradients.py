@@ -27,7 +27,7 @@ REGULARIZATION = 1e-10  # of the script: the gradients of more are not those of 
 ROUNDS = 7
 
 
-def ours(adjoint: Any) -> Callable:
+def ours(adjoint: Any = None) -> Callable:
     """The final angle from values of the first parameters."""
     mechanism = udk.library.parallelogram(np.deg2rad(START))
     ts, start = np.array([0.0, END]), udk.State(mechanism.q0, mechanism.v0)
@@ -41,7 +41,7 @@ def ours(adjoint: Any) -> Callable:
     return angle
 
 
-def script(adjoint: Any) -> Callable:
+def script(adjoint: Any = None) -> Callable:
     """The same by a user's script."""
     placed = udk.library.parallelogram(np.deg2rad(START))
     y0 = jnp.concatenate([placed.q0.ravel(), jnp.zeros(12)])
@@ -69,9 +69,9 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
         values = tuple(jnp.asarray(x) for x in list(PARAMETERS.values())[:count])
         timers: dict[Any, Callable[[], float]] = {}
         for name, make in makers.items():
-            modes = {"run": make(diffrax.RecursiveCheckpointAdjoint()), "forward": jax.jacfwd(make(diffrax.ForwardMode()))}
+            modes = {"run": make(), "forward": jax.jacfwd(make(diffrax.ForwardMode()))}
             if not smoke:
-                modes["reverse"] = jax.grad(make(diffrax.RecursiveCheckpointAdjoint()))
+                modes["reverse"] = jax.grad(make())
             for mode, function in modes.items():
                 jitted = Compiled(function, values)
                 gradients[name, mode, count] = np.ravel(jitted.result)
