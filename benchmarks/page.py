@@ -14,7 +14,7 @@ from benchmarks.table import VERDICT, Figures, Rows
 from udkjax.show.report import embedded
 
 WIDTH = 9.2  # inches
-MOTIONS = {-45.0: "released at −45°", 60.0: "released at +60°, through singular configurations"}
+MOTIONS = {-45.0: "released at −45°", 60.0: "released at +60°: singular configurations"}
 STYLES = {"udkjax": {"color": "black", "lw": 2.2}, "C++": {"color": "#c03030", "lw": 1.8}}
 
 
@@ -89,10 +89,10 @@ def work(rows: Rows) -> Figure:
     for axes, (start, title) in zip(panels, MOTIONS.items(), strict=True):
         for place, name in enumerate(names):
             _line(axes, [row for row in rows if row["name"] == name and row["start"] == start], "seconds", 1e3, place)
-        axes.set(xlabel="error (m, rad)", title=title, xlim=(3e-12, 1))
-        axes.invert_xaxis()
+        axes.set(xlabel="error (m, rad)", xlim=(1.0, 3e-12))
+        axes.set_title(title, fontsize="medium")
     panels[0].set_ylabel("CPU time (ms)")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize="small")
+    _legend(figure, panels)
     return figure
 
 
@@ -106,10 +106,10 @@ def batch(rows: Rows) -> Figure:
             for kind, dashes in (("end only", "-"), ("201 outputs", "--")):
                 chosen = [row for row in rows if (row["name"], row["start"], row["outputs"]) == (name, start, kind)]
                 _line(axes, chosen, "per_second", 1.0, place, linestyle=dashes, label=f"{name}, {kind}")
-        axes.set(xlabel="error (m, rad)", title=title)
-        axes.invert_xaxis()
+        axes.set(xlabel="error (m, rad)", xlim=(1.0, 1e-11))
+        axes.set_title(title, fontsize="medium")
     panels[0].set_ylabel("trajectories per second of CPU time")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize="small")
+    _legend(figure, panels)
     return figure
 
 
@@ -139,6 +139,11 @@ def scaling(rows: Rows) -> Figure:
     axes.set(xlabel="bodies", ylabel="one right-hand side (µs)")
     axes.legend(frameon=False, fontsize="small")
     return figure
+
+
+def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
+    lines = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(list(lines.values()), list(lines), loc="outside lower center", ncols=4, frameon=False, fontsize="small")
 
 
 def _line(axes: Axes, rows: Rows, key: str, scale: float, place: int, **options: Any) -> None:
