@@ -84,7 +84,7 @@ def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None) 
     with jax.ensure_compile_time_eval():
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
         q, v, psi, psi_dot, rank = assembled_by_numpy(mechanism, t, guess.q, guess.v)
-        return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), number(psi), number(psi_dot), jnp.asarray(rank))
+        return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), number(psi), number(psi_dot), jax.device_put(np.asarray(rank)))
 
 
 @eqx.filter_jit

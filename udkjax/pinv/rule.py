@@ -14,6 +14,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 # Accelerators round float32 products to ten bits unless told otherwise.
@@ -29,7 +30,10 @@ class LeastSquares(NamedTuple):
 
 def number(value: ArrayLike | None) -> Float[Array, ""] | None:
     """Make an array leaf of a number: a Python float as a field would be static, and each new value would compile anew."""
-    return None if value is None else jnp.asarray(value, dtype=jnp.result_type(float))
+    dtype = jnp.result_type(float)
+    if isinstance(value, float | int | np.number):
+        value = np.asarray(value, dtype)  # JAX would compile a program to convert it
+    return None if value is None else jnp.asarray(value, dtype=dtype)
 
 
 class Pseudoinverse(eqx.Module):
