@@ -4,7 +4,7 @@ from math import log2
 
 import hypothesis.strategies as st
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 
 from tests.pinv.structures import chain, clique, four_bars, grid, parts, star, touching, tree
 from udkjax.pinv.dissection import dissect
@@ -24,6 +24,7 @@ def below(fronts, k):
     return set(fronts[k].eliminated).union(*(below(fronts, c) for c in fronts[k].children))
 
 
+@settings(deadline=None)
 @given(graphs())
 def test_every_front_is_coupled_to_what_elimination_couples_it_to(graph):
     sizes, pairs = graph

@@ -69,6 +69,7 @@ def by_fronts(levels, diagonal, coupling, r):
     return found[levels.plan.solution]
 
 
+@settings(deadline=None)
 @given(graphs(most=30))
 def test_the_plan_solves_any_structure(structure):
     sizes, pairs = structure
@@ -96,7 +97,7 @@ def test_solution(name):
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(graphs())
 def test_solution_of_any_structure(structure):
     sizes, pairs = structure

@@ -102,7 +102,7 @@ class Levels:
 def _eliminate(group: Group, entries: Array, sent: Array | None, drop: Array | float) -> tuple[Factor, Array, Array]:
     """Return the factor of a group, its updates (b, b, fronts), and whether its pivots are safe."""
     e, b = group.eliminated, group.boundary
-    own = cut(_take(entries, group.entries))
+    own = _take(entries, group.entries)
     rows = cut(jnp.concatenate([_sum(sent, group.pivot, own[:, :e]), _sum(sent, group.side, own[:, e:])], axis=1))
     if e <= UNROLLED:
         for j in range(e - 1):
