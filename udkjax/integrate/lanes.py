@@ -35,18 +35,20 @@ def serves(problem: Problem) -> bool:
 def solve(problem: Problem) -> Raw:
     """Integrate one problem; under vmap, as many as there are."""
     arrays, static = eqx.partition(problem, eqx.is_array)
+    leaves, tree = jax.tree.flatten(arrays)
 
     @custom_vmap
-    def one(arrays):
-        return _single(eqx.combine(arrays, static))
+    def one(*leaves):
+        return _single(eqx.combine(tree.unflatten(leaves), static))
 
     @one.def_vmap
-    def _(size, batched, arrays):
-        if not any(jax.tree.leaves(batched)):
-            return _single(eqx.combine(arrays, static)), jax.tree.map(lambda _: False, Raw(*Raw._fields))
-        return _many(arrays, batched[0], static, size), jax.tree.map(lambda _: True, Raw(*Raw._fields))
+    def _(size, batched, *leaves):
+        every = jax.tree.map(lambda _: any(batched), Raw(*Raw._fields))
+        if not any(batched):  # only tangents are
+            return _single(eqx.combine(tree.unflatten(leaves), static)), every
+        return _many(tree.unflatten(leaves), tree.unflatten(batched), static, size), every
 
-    return one(arrays)
+    return one(*leaves)
 
 
 def _single(problem: Problem) -> Raw:
