@@ -107,10 +107,10 @@ class Factors(NamedTuple):
     kept: list[Scalar]  # booleans, in the order of elimination
 
 
-def factorize(rows: Sequence[Row], drop: Scalar, dropped: float = 0.0) -> Factors:
+def factorize(rows: Sequence[Row], drop: Scalar) -> Factors:
     """D D^T = L diag(p) L^T. A pivot is kept if it exceeds `drop` times its row's diagonal entry.
 
-    `dropped` stands for the reciprocal of the others: zero takes their rows out, NaN marks whatever depends on them.
+    Zero stands for the reciprocal of the others, which takes their rows out.
     """
     graph = drop.graph
     order = minimum_degree([set(row) for row in rows])
@@ -132,7 +132,7 @@ def factorize(rows: Sequence[Row], drop: Scalar, dropped: float = 0.0) -> Factor
     for j in range(len(rows)):
         d = column[j].get(j, zero)
         keep = greater(d, drop * diagonal[j])
-        inverse.append(where(keep, one / d, graph.constant(dropped)))
+        inverse.append(where(keep, one / d, zero))
         kept.append(keep)
         below = sorted(i for i in column[j] if i > j)
         lower = {i: column[j][i] * inverse[j] for i in below}
