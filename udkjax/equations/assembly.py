@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from udkjax.equations.closing import HALVINGS, ITERATIONS, assembled, assembled_by_numpy, direction, limited
+from udkjax.equations.closing import HALVINGS, ITERATIONS, assembled, assembled_by_numpy, assembled_by_scipy, direction, limited
 from udkjax.equations.motion import MechanismMotion
 from udkjax.equations.redundancy import dependent_constraints, redundant_rows
 from udkjax.equations.udwadia_kalaba import is_large, prepare_to_close
@@ -79,11 +79,12 @@ def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None) 
 
     Where all numbers are known the closure is, too, also while something else is traced.
     """
-    if is_large(mechanism) or not _known((mechanism, t, state)):
+    if not _known((mechanism, t, state)):
         return _close(mechanism, t, state)
     with jax.ensure_compile_time_eval():
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
-        q, v, psi, psi_dot, rank = assembled_by_numpy(mechanism, t, guess.q, guess.v)
+        by_numpy = assembled_by_scipy if is_large(mechanism) else assembled_by_numpy
+        q, v, psi, psi_dot, rank = by_numpy(mechanism, t, guess.q, guess.v)
         return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), number(psi), number(psi_dot), jax.device_put(np.asarray(rank)))
 
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from udkjax.equations.code import code, scalars
+from udkjax.equations.sparse_rows import SparseRows
 from udkjax.equations.udwadia_kalaba import rank_tolerance
 from udkjax.scene.mechanism import Mechanism
 
@@ -57,6 +58,12 @@ def assembled_by_numpy(mechanism: Mechanism, t: Any, q: Any, v: Any) -> tuple[An
     """As `assembled`, of a mechanism whose numbers are known."""
     q, v = (np.asarray(x, float).ravel() for x in (q, v))
     return assembled(Known(mechanism), closed_by_numpy, float(t), q, v)
+
+
+@np.errstate(all="ignore")
+def assembled_by_scipy(mechanism: Mechanism, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """As `assembled_by_numpy`, of a large mechanism: by sparse arithmetic, damped instead of truncated."""
+    return SparseRows(mechanism).assembled(float(t), np.asarray(q, float).ravel(), np.asarray(v, float).ravel())
 
 
 class Known:

@@ -134,12 +134,12 @@ class Layout:
 
     @cached_property
     def position(self) -> Any:
-        """A program of the numbers, t (s) and q: Psi in the user's order, and D as its blocks hold it."""
+        """A program of the numbers, t (s), q and v: Psi and Psi_dot in the user's order, and D as its blocks hold it."""
 
-        def position(numbers, t, q):
-            q = jnp.asarray(q)
-            D, psi = self.all.evaluate(["D", "psi"], numbers["constraints"], t, fields_of(q, q))
-            return self.all.listed(psi), D
+        def position(numbers, t, q, v):
+            fields = fields_of(jnp.asarray(q), jnp.asarray(v))
+            D, psi, rate = self.all.evaluate(["D", "psi", "psi_dot"], numbers["constraints"], t, fields)
+            return self.all.listed(psi), self.all.listed(rate), D
 
         return jax.jit(position)
 

@@ -91,6 +91,10 @@ def _beside(parts: list[Any], rows: int) -> Any:
     return coo_array((np.concatenate([p.data for p in parts]), place), shape=(rows, shift[-1]))
 
 
+def _limited(step: np.ndarray) -> np.ndarray:
+    return step * min(1.0, TURN / max(np.abs(step).max(), 1e-300))
+
+
 class SparseRows:
     """Psi and D of a mechanism with known numbers; D sparse. The interface is that of `redundancy.Rows`."""
 
@@ -100,7 +104,7 @@ class SparseRows:
         self.count, self.size = self._layout.count, 3 * self._layout.bodies
         self.names = self._layout.row_names
         self.root = np.asarray(numbers["root"]).T.ravel()
-        self._evaluate = lambda t, q: self._layout.position(numbers, t, q)
+        self._evaluate = lambda t, q, v: self._layout.position(numbers, t, q, v)
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -114,35 +118,59 @@ class SparseRows:
             rows[i].add(k // 3)
         return minimum_degree(rows)
 
-    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, csr_array]:
+    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
         """Psi, and Psi and D scaled to rows of D of length one (which changes no solution of a consistent system)."""
-        psi, values = (np.asarray(x) for x in self._evaluate(t, q))
+        psi, _, values = (np.asarray(x) for x in self._evaluate(t, q, q))
+        D, length = self._scaled(values)
+        return psi, psi / length, D
+
+    def _scaled(self, values: np.ndarray) -> tuple[Any, np.ndarray]:
         row, column, place = self._places
         D = csr_array((values.ravel()[place], (row, column)), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
         length[length == 0.0] = 1.0
-        return psi, psi / length, csr_array(D.multiply(1 / length[:, None]))
+        return csr_array(D.multiply(1 / length[:, None])), length
 
     def close(self, t: float, q: np.ndarray) -> SparsePosition | None:
-        """Levenberg-Marquardt in the mass metric, with steps of limited length; None where it does not close."""
+        """Return a closed position near q, or None."""
+        q, psi, D = self._settled(t, q, CLOSED)
+        return self._position(t, q, D) if np.abs(psi).max() <= CLOSED * (1.0 + np.abs(q).max()) else None
+
+    def _settled(self, t: float, q: np.ndarray, enough: float) -> tuple[np.ndarray, np.ndarray, Any]:
+        """Levenberg-Marquardt in the mass metric, with steps of limited length, until Psi is small enough or grows no smaller."""
         damping, least = DAMPING
         psi, scaled, D = self.at(t, q)
         for _ in range(ITERATIONS):
-            if not (np.all(np.isfinite(psi)) and np.all(np.isfinite(D.data))):
-                return None
-            if np.abs(psi).max() <= CLOSED * (1.0 + np.abs(q).max()):
-                return self._position(t, q, D)
-            system = csc_array(D @ D.T + damping * eye_array(self.count))
-            step = -self.root * (D.T @ splu(system, **_SYMMETRIC).solve(scaled))
-            ahead = q + step * min(1.0, TURN / max(np.abs(step).max(), 1e-300))
+            size = np.abs(psi).max()
+            if not (np.isfinite(size) and np.all(np.isfinite(D.data))) or size <= enough * (1.0 + np.abs(q).max()):
+                break
+            ahead = q + _limited(self._correction(D, scaled, damping))
             trial = self.at(t, ahead)
             if np.linalg.norm(trial[0]) < np.linalg.norm(psi):
                 q, (psi, scaled, D), damping = ahead, trial, max(0.1 * damping, least)
-            elif damping > 1e6:
-                return None
+            elif damping > 1e6 or size <= CLOSED * (1.0 + np.abs(q).max()):
+                break
             else:
                 damping = max(100.0 * damping, least)
-        return None
+        return q, psi, D
+
+    def _correction(self, D: Any, residual: np.ndarray, damping: float) -> np.ndarray:
+        """-M^(-1/2) D^T (D D^T + damping)^(-1) of a residual."""
+        system = csc_array(D @ D.T + damping * eye_array(self.count))
+        return -self.root * (D.T @ splu(system, **_SYMMETRIC).solve(residual))
+
+    def assembled(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
+        """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
+        if not self.count:
+            return q, v, np.zeros(0), np.zeros(0), 0
+        q, psi, D = self._settled(t, q, 0.0)
+        if not np.all(np.isfinite(D.data)):
+            return q, v, psi, psi, 0
+        rank = self._position(t, q, D).rank
+        for _ in range(3):  # what the first leaves because of its damping, and of rounding
+            _, rate, values = (np.asarray(x) for x in self._evaluate(t, q, v))
+            v = v + self._correction(D, rate / self._scaled(values)[1], DAMPING[1])
+        return q, v, psi, np.asarray(self._evaluate(t, q, v)[1]), rank
 
     def parts_of(self, positions: list[SparsePosition]) -> list[tuple[np.ndarray, list["Part"]]]:
         """Sets of rows that depend on each other, and how each stands in the positions."""
