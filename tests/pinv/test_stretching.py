@@ -2,10 +2,12 @@
 
 from itertools import pairwise
 
+import jax
 import numpy as np
 import pytest
 
 from tests.pinv.structures import four_bars, touching
+from udkjax.pinv.blocks import BlockElimination, BlockPattern
 from udkjax.pinv.dissection import dissect
 from udkjax.pinv.stretching import MANY, Stretched, stretch
 
@@ -70,3 +72,22 @@ def test_bodies_of_few_joints_stay_whole():
     assert stretched.meets == meets
     assert stretched.welds == 0
     assert stretched.scale.tolist() == [1] * MANY
+
+
+@pytest.mark.parametrize("damping", [None, 0.1])
+def test_elimination_of_blocks_cuts_bodies_of_many_joints(damping):
+    meets = wheel(20)
+    pattern = BlockPattern([2] * len(meets), meets, 3, 21)
+    assert pattern.copies is not None
+    D = np.random.default_rng(0).normal(size=(2, 3, 2 * len(meets))) * (pattern.columns >= 0)
+    dense = np.zeros((2 * len(meets), 3 * 21))
+    for s, column in enumerate(pattern.columns):
+        if column >= 0:
+            i = 2 * (s % len(meets))
+            dense[i : i + 2, 3 * column : 3 * column + 3] = D[:, :, s]
+    S = dense @ dense.T
+    if damping:
+        S += damping * np.diag(np.diag(S))
+    method, b = BlockElimination(pattern, damping=damping), np.random.default_rng(1).normal(size=2 * len(meets))
+    solution = jax.jit(lambda D, b: method.apply(method.factor(D), b))(D, b)
+    np.testing.assert_allclose(solution, dense.T @ np.linalg.solve(S, b), atol=1e-10)

@@ -5,6 +5,7 @@ Slot s = k blocks + i is the k-th block of columns that block i meets. Blocks of
 zeros. A matrix is this one array, whatever its size.
 """
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import combinations
@@ -20,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from udkjax.pinv.levels import Levels
 from udkjax.pinv.rule import Pseudoinverse, number
+from udkjax.pinv.stretching import MANY, Stretched, stretch
 
 GATHERED = 4  # terms of a sum that are fetched; what is beyond, in a few sums of many terms, is sent
 
@@ -55,7 +57,7 @@ def take(values: Float[Array, "*shape n"], places: np.ndarray) -> Array:
 class BlockPattern:
     """Which blocks of columns (of `width` columns each, `count` of them) each block of rows meets, and how many rows it has."""
 
-    def __init__(self, sizes: Sequence[int], meets: Sequence[Sequence[int]], width: int, count: int):
+    def __init__(self, sizes: Sequence[int], meets: Sequence[Sequence[int]], width: int, count: int, many: float = MANY):
         self.sizes, self.width, self.count = np.asarray(sizes, int), width, count
         self.blocks, self.rows = len(sizes), max(sizes, default=0)
         self.deep = max((len(m) for m in meets), default=1) or 1
@@ -64,12 +66,13 @@ class BlockPattern:
             self.columns[: len(met), i] = met
         self.columns = self.columns.ravel()
         self.by_column = Sums(self.columns, count)
-        self.pairs, self.shares = self._pairs()
+        cut = stretch(meets, many)
+        self.copies = Copies(self, cut) if cut.welds else None
 
     @cached_property
-    def levels(self) -> Levels:
+    def levels(self) -> "Levels | Copies":
         """The elimination of D D^T."""
-        return Levels.of(self.sizes.tolist(), self.pairs.tolist())
+        return Levels.of(self.sizes.tolist(), self.coupled[0].tolist()) if self.copies is None else self.copies
 
     @cached_property
     def parts(self) -> list["Parts"]:
@@ -93,7 +96,8 @@ class BlockPattern:
                 found.setdefault((len(rows), len(columns)), []).append((rows, columns))
         return [Parts.of(self, np.stack([r for r, _ in same]), np.stack([c for _, c in same])) for same in found.values()]
 
-    def _pairs(self) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+    @cached_property
+    def coupled(self) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
         """The pairs of blocks that meet the same columns; and in turns: pairs, and the slots of both in which they meet."""
         order = np.argsort(self.columns, kind="stable")
         order = order[self.columns[order] >= 0]
@@ -112,12 +116,13 @@ class BlockPattern:
 
     def gram(self, D: Float[Array, "r c s"]) -> tuple[Float[Array, "blocks r r"], Float[Array, "pairs r r"]]:
         """The blocks of D D^T: those on the diagonal, and [i, j] for each of the pairs (i, j)."""
+        pairs, shares = self.coupled
         r, c, _ = D.shape
         whole = D.reshape(r, c, self.deep, self.blocks)
         diagonal = [[jnp.sum(whole[i] * whole[j], (0, 1)) for j in range(i + 1)] for i in range(r)]
         filled = [[diagonal[max(i, j)][min(i, j)] for j in range(r)] for i in range(r)]
-        coupling = jnp.zeros((len(self.pairs), r, r), D.dtype)
-        for turn, (which, one, two) in enumerate(self.shares):
+        coupling = jnp.zeros((len(pairs), r, r), D.dtype)
+        for turn, (which, one, two) in enumerate(shares):
             left, right = take(D, one), take(D, two)
             product = jnp.stack([jnp.stack([jnp.sum(left[i] * right[j], 0) for j in range(r)], -1) for i in range(r)], -2)
             coupling = coupling.at[which].add(product) if turn else product
@@ -131,6 +136,34 @@ class BlockPattern:
     def rmatvec(self, D: Float[Array, "r c s"], y: Float[Array, "r blocks"]) -> Float[Array, "c count"]:
         """D^T y."""
         return self.by_column(jnp.sum(D * jnp.tile(y, (1, self.deep))[:, None], 0))
+
+
+class Copies:
+    """The elimination of D D^T where some blocks of columns are met by many blocks of rows: on copies of them (stretching.py)."""
+
+    def __init__(self, pattern: BlockPattern, cut: Stretched):
+        self.blocks, self.deep = pattern.blocks, pattern.deep
+        sizes = [*pattern.sizes.tolist(), *[pattern.width] * cut.welds]
+        self.pattern = BlockPattern(sizes, cut.meets, pattern.width, len(cut.original), math.inf)
+        self.scale = np.ones((pattern.deep, pattern.blocks))
+        for i, met in enumerate(cut.meets[: pattern.blocks]):
+            self.scale[: len(met), i] = cut.scale[list(met)]
+        self.welds = np.zeros((self.pattern.rows, pattern.width, self.pattern.deep, self.pattern.blocks))
+        for k, sign in enumerate((1, -1)):
+            self.welds[: pattern.width, :, k, pattern.blocks :] = sign * np.eye(pattern.width)[..., None]
+
+    def gram(self, D: Float[Array, "r c s"]) -> tuple[Array, Array]:
+        r, c, _ = D.shape
+        scaled = D.reshape(r, c, self.deep, self.blocks) * self.scale
+        rows = jnp.asarray(self.welds, D.dtype).at[:r, :, : self.deep, : self.blocks].set(scaled)
+        return self.pattern.gram(rows.reshape(*rows.shape[:2], -1))
+
+    def factor(self, diagonal: Array, coupling: Array, drop: Any) -> tuple[Any, Bool[Array, ""]]:
+        return self.pattern.levels.factor(diagonal, coupling, drop)
+
+    def solve(self, factors: Any, r: Float[Array, "blocks r"]) -> Float[Array, "blocks r"]:
+        welded = jnp.zeros((self.pattern.blocks, self.pattern.rows), r.dtype).at[: self.blocks, : r.shape[1]].set(r)
+        return self.pattern.levels.solve(factors, welded)[: self.blocks, : r.shape[1]]
 
 
 class Parts(NamedTuple):
@@ -209,9 +242,11 @@ class BlockElimination(Pseudoinverse):
 
 def factorized(pattern: BlockPattern, D: Float[Array, "r c s"], drop: Any, damping: Any = None) -> tuple[Any, Bool[Array, ""]]:
     """Factorize D D^T; return what `Levels.solve` takes, and whether every pivot exceeds `drop` times its row's diagonal."""
-    diagonal, coupling = pattern.gram(D)
-    if damping is not None:
-        diagonal = diagonal * (1 + damping * jnp.eye(pattern.rows))
+    diagonal, coupling = (pattern.copies or pattern).gram(D)
+    if damping is not None:  # of the rows themselves, not of welds
+        squares = jnp.sum(D**2, 1).reshape(pattern.rows, pattern.deep, pattern.blocks).sum(1).T
+        row = np.arange(pattern.rows)
+        diagonal = diagonal.at[: pattern.blocks, row, row].add(damping * squares)
     return pattern.levels.factor(diagonal, coupling, drop)
 
 
