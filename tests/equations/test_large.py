@@ -322,6 +322,7 @@ def test_two_of_them_take_twice_the_operations_of_one(name):
     }
 
 
+@pytest.mark.slow
 def test_dense_methods_see_each_of_them_by_itself():
     """Three linkages in line, each of rank 10 of 12: three matrices of 12 x 12, and no larger one."""
     mech = side_by_side(udk.library.parallelogram(0.0), 3)

@@ -39,7 +39,13 @@ class Selection:
 
     @cached_property
     def pattern(self) -> BlockPattern:
-        return BlockPattern(self._sizes, self._meets, 3, self._bodies)
+        present = np.zeros((self.height, 3), bool)
+        for _, group, rows in self.parts:
+            width, entries = 3 * len(group.bodies), group.kind.outputs["D"]
+            for r, row in enumerate(rows):
+                for k in range(width):
+                    present[r, k % 3] |= not entries[row * width + k].is_zero
+        return BlockPattern(self._sizes, self._meets, 3, self._bodies, present=present)
 
     def evaluate(self, names: Sequence[str], numbers: Sequence[Array], t: Any, fields: Fields) -> list[Array]:
         """`D` as `BlockPattern` wants it, the others as (rows of a block, blocks)."""

@@ -55,11 +55,23 @@ def take(values: Float[Array, "*shape n"], places: np.ndarray) -> Array:
 
 
 class BlockPattern:
-    """Which blocks of columns (of `width` columns each, `count` of them) each block of rows meets, and how many rows it has."""
+    """Which blocks of columns (of `width` columns each, `count` of them) each block of rows meets, and how many rows it has.
 
-    def __init__(self, sizes: Sequence[int], meets: Sequence[Sequence[int]], width: int, count: int, many: float = MANY):
+    `present` (rows of a block, width) says which places are not zero in all blocks: for the others nothing is computed.
+    """
+
+    def __init__(
+        self,
+        sizes: Sequence[int],
+        meets: Sequence[Sequence[int]],
+        width: int,
+        count: int,
+        many: float = MANY,
+        present: np.ndarray | None = None,
+    ):
         self.sizes, self.width, self.count = np.asarray(sizes, int), width, count
         self.blocks, self.rows = len(sizes), max(sizes, default=0)
+        self.present = np.ones((self.rows, width), bool) if present is None else present
         self.deep = max((len(m) for m in meets), default=1) or 1
         self.columns = np.full((self.deep, self.blocks), -1)  # of each slot: the block of columns, or -1
         for i, met in enumerate(meets):
@@ -119,23 +131,33 @@ class BlockPattern:
         pairs, shares = self.coupled
         r, c, _ = D.shape
         whole = D.reshape(r, c, self.deep, self.blocks)
-        diagonal = [[jnp.sum(whole[i] * whole[j], (0, 1)) for j in range(i + 1)] for i in range(r)]
-        filled = [[diagonal[max(i, j)][min(i, j)] for j in range(r)] for i in range(r)]
+
+        def product(i: int, j: int, left: Array, right: Array) -> Array:
+            """Row i of some blocks by row j of others."""
+            terms = (left[i, k] * right[j, k] for k in range(c) if self.present[i, k] and self.present[j, k])
+            return sum(terms, jnp.zeros(left.shape[2:], D.dtype))
+
+        half = [[jnp.sum(product(i, j, whole, whole), 0) for j in range(i + 1)] for i in range(r)]
+        diagonal = jnp.stack([jnp.stack([half[max(i, j)][min(i, j)] for j in range(r)], -1) for i in range(r)], -2)
         coupling = jnp.zeros((len(pairs), r, r), D.dtype)
         for turn, (which, one, two) in enumerate(shares):
             left, right = take(D, one), take(D, two)
-            product = jnp.stack([jnp.stack([jnp.sum(left[i] * right[j], 0) for j in range(r)], -1) for i in range(r)], -2)
-            coupling = coupling.at[which].add(product) if turn else product
-        return jnp.stack([jnp.stack(row, -1) for row in filled], -2), coupling
+            met = jnp.stack([jnp.stack([product(i, j, left, right) for j in range(r)], -1) for i in range(r)], -2)
+            coupling = coupling.at[which].add(met) if turn else met
+        return diagonal, coupling
 
     def matvec(self, D: Float[Array, "r c s"], x: Float[Array, "c count"]) -> Float[Array, "r blocks"]:
         """D x, with x by blocks of columns."""
-        product = jnp.sum(D * take(x, np.maximum(self.columns, 0)), 1)
+        fetched, none = take(x, np.maximum(self.columns, 0)), jnp.zeros(D.shape[-1], D.dtype)
+        rows = [[k for k in range(self.width) if self.present[i, k]] for i in range(self.rows)]
+        product = jnp.stack([sum((D[i, k] * fetched[k] for k in some), none) for i, some in enumerate(rows)])
         return jnp.sum(product.reshape(self.rows, self.deep, self.blocks), 1)
 
     def rmatvec(self, D: Float[Array, "r c s"], y: Float[Array, "r blocks"]) -> Float[Array, "c count"]:
         """D^T y."""
-        return self.by_column(jnp.sum(D * jnp.tile(y, (1, self.deep))[:, None], 0))
+        y, none = jnp.tile(y, (1, self.deep)), jnp.zeros(D.shape[-1], D.dtype)
+        columns = [[i for i in range(self.rows) if self.present[i, k]] for k in range(self.width)]
+        return self.by_column(jnp.stack([sum((D[i, k] * y[i] for i in some), none) for k, some in enumerate(columns)]))
 
 
 class Copies:
