@@ -201,7 +201,7 @@ def test_a_singular_configuration_takes_singular_values():
 
 
 @pytest.mark.slow
-def test_a_scene_of_which_redundancy_is_not_known_is_solved_dense():
+def test_a_scene_of_which_redundancy_is_not_known_finds_it_out():
     mech = udk.library.parallelogram().with_left_out(None)
     q, v = mech.q0.ravel(), mech.v0.ravel()
     expected = prepare(mech, large=False).accelerations(0.0, q, v)

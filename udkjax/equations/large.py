@@ -39,7 +39,7 @@ class LargeEquations(MechanismMotion):
 
     `Auto` eliminates the rows kept. Where a pivot is too small it takes singular values of all rows, of a dense matrix: one of
     thousands of rows takes minutes for that, and each of its singular configurations does it a few times. `Elimination` turns to
-    dense elimination, which drops what depends. Where it is not known which rows are redundant both are dense throughout.
+    dense elimination, which drops what depends. Where it is not known which rows are redundant all are eliminated.
     """
 
     numbers: dict[str, Any]
@@ -208,7 +208,7 @@ class LargeEquations(MechanismMotion):
 def prepare_large(mechanism: Mechanism, method: Pseudoinverse, gains: Sequence[Any]) -> LargeEquations:
     """As `prepare`, with the method's thresholds decided."""
     found = layout(*structure(mechanism), mechanism.left_out or (), bool(gains))
-    return LargeEquations(found.numbers(mechanism, gains), method, found, dense=mechanism.left_out is None)
+    return LargeEquations(found.numbers(mechanism, gains), method, found)
 
 
 def prepare_closing(mechanism: Mechanism) -> LargeEquations:

@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.equations.code import code, scalars
-from udkjax.equations.sparse_rows import SparseRows
+from udkjax.equations.sparse_rows import SAMPLES, SparseRows
 from udkjax.equations.udwadia_kalaba import is_large
 from udkjax.scene.mechanism import Mechanism
 
@@ -25,7 +25,6 @@ from udkjax.scene.mechanism import Mechanism
 RANK_TOL = 1e-8
 CLEAR = 1e-4
 CLOSED = 1e-11  # relative to the size of the coordinates: what closing attains in double precision
-SAMPLES = 24
 TICK = 0.05  # s: drivers move on from one position to the next
 ITERATIONS = 100
 DAMPING = 1e-3  # of rows of length one
@@ -82,7 +81,7 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     found = [first]
     random = np.random.default_rng(0)
     heading = random.standard_normal(rows.size)
-    for k in range(SAMPLES):
+    for k in range(rows.samples):
         if any(p.clear and p.rank == rows.count for p in found):
             return ()
         last = found[-1]
@@ -140,6 +139,8 @@ def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
 
 class Rows:
     """Psi and D of a mechanism with known numbers, evaluated by NumPy."""
+
+    samples = SAMPLES
 
     def __init__(self, mechanism: Mechanism):
         self._code = code(mechanism, (), False, None)

@@ -29,6 +29,8 @@ ITERATIONS = 100
 CLOSED = 1e-11  # as in redundancy.py
 TURN = 0.35
 COLUMNS = 64  # solved for at a time
+SAMPLES = 24  # positions to look at where the first shows rows that depend on each other
+MANY = 300  # rows: of larger scenes a third of the positions, since each of them takes the longer
 
 
 class SparsePosition(NamedTuple):
@@ -103,6 +105,7 @@ class SparseRows:
         numbers = self._layout.numbers(mechanism, ())
         self.count, self.size = self._layout.count, 3 * self._layout.bodies
         self.names = self._layout.row_names
+        self.samples = SAMPLES if self.count <= MANY else SAMPLES // 3
         self.root = np.asarray(numbers["root"]).T.ravel()
         self._evaluate = lambda t, q, v: self._layout.position(numbers, t, q, v)
 
