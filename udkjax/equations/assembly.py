@@ -10,6 +10,7 @@ motion of the guess as it is and satisfies the drivers. D^+ is truncated, so red
 one that all pseudoinverses share: gradients of the assembled state are right wherever the closed mechanism's rank is constant.
 """
 
+import weakref
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -81,11 +82,22 @@ def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None) 
     """
     if not _known((mechanism, t, state)):
         return _close(mechanism, t, state)
+    of, when, found = _latest.get(id(mechanism), (None, 0.0, None))
+    if found is not None and state is None and of is not None and of() is mechanism and when == float(t):
+        return found
     with jax.ensure_compile_time_eval():
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
         by_numpy = assembled_by_scipy if is_large(mechanism) else assembled_by_numpy
         q, v, psi, psi_dot, rank = by_numpy(mechanism, t, guess.q, guess.v)
-        return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), number(psi), number(psi_dot), jax.device_put(np.asarray(rank)))
+        found = Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), number(psi), number(psi_dot), jax.device_put(np.asarray(rank)))
+    if state is None:
+        key = id(mechanism)
+        _latest[key] = (weakref.ref(mechanism, lambda _: _latest.pop(key, None)), float(t), found)
+    return found
+
+
+# How each mechanism that still exists was last assembled: who simulates it again need not close it again.
+_latest: dict[int, tuple[Any, float, Closure | None]] = {}
 
 
 @eqx.filter_jit

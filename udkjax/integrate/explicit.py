@@ -25,6 +25,7 @@ from jaxtyping import Array
 
 from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.straightline.emit import cut
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0  # of the step's size: diffrax's own, so that both take the same steps
 BLOCK = 4  # output times that are interpolated together
@@ -148,7 +149,8 @@ def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: 
 
 
 def _combine(weights: Array, a: Array) -> Array:
-    return jnp.tensordot(weights, a, 1)
+    """sum_j weights_j a_j. Not a product of matrices, for which XLA writes a loop that does not vectorize."""
+    return cut([sum(w * x for w, x in zip(weights, a, strict=True))])[0]
 
 
 def _relative(task: Task, error: Array, y0: Array, y1: Array) -> Array:

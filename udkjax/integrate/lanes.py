@@ -22,7 +22,7 @@ from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import project
 
 ROUND = 8  # lanes: what the widest vector units hold
-FAR = 1e-5  # m, rad, m/s, rad/s: two Newton steps of a projection leave rounding errors of what is nearer to the manifold
+FAR = 1e-8  # m, rad, m/s, rad/s: a projection leaves rounding errors of what is nearer to the manifold
 LANES = 64  # of 16, 32, 64 and 128 the fastest for the paper's linkage, with half the memory of 128
 
 
@@ -86,7 +86,7 @@ def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
 
 
 class Lanes:
-    """Equations evaluated for one state, or for lanes of states, (n, L) each; with equations of their own where `axes` says so."""
+    """Equations evaluated for one state, or for lanes of states (n, L), with equations of their own where `axes` says so."""
 
     def __init__(self, equations: Motion, axes: Any = None, size: int | None = None):
         self.equations, self.size, self.shape = equations, size, () if size is None else (size,)
@@ -169,6 +169,10 @@ def _projected(lanes: Lanes, ts: Array, ys: Array) -> Array:
     if ts.ndim <= len(lanes.shape):
         ts = jnp.broadcast_to(ts[:, None], (len(ts), *lanes.shape))
     over = partial(lanes.over, lambda e, t, y: project(e.forgiving, t, y))
-    every = lambda ys: jax.lax.map(lambda x: over(*x), (ts, ys))  # noqa: E731   one by one is faster than all at once
-    once = every(ys)
-    return when(jnp.any(jnp.abs(once - ys) > FAR), every, once)
+
+    def one(x: tuple[Array, Array]) -> Array:
+        t, y = x
+        once = over(t, y)
+        return when(jnp.any(jnp.abs(once - y) > FAR), partial(over, t), once)
+
+    return jax.lax.map(one, (ts, ys))  # one time after another is faster, and compiles faster, than all at once
