@@ -282,11 +282,11 @@ def test_a_body_of_many_joints():
 
 @pytest.mark.slow
 def test_a_long_chain_against_the_dense_equation():
-    mech = udk.library.chain(60, 0.4)
+    mech = udk.library.chain(100, 0.4)
     random = np.random.default_rng(2)
-    q, v = mech.q0.ravel() + 0.01 * random.standard_normal(180), random.standard_normal(180)
+    q, v = mech.q0.ravel() + 0.01 * random.standard_normal(300), random.standard_normal(300)
     M, F, A, c = prepare(mech).matrices(0.0, q, v)
-    n, m = 180, 120
+    n, m = 300, 200
     system = np.block([[np.asarray(M), np.asarray(A).T], [np.asarray(A), np.zeros((m, m))]])
     expected = np.linalg.solve(system, np.concatenate([F, c]))
     a = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3), multipliers=True)
