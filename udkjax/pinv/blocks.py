@@ -51,7 +51,7 @@ class Sums:
 
 def take(values: Float[Array, "*shape n"], places: np.ndarray) -> Array:
     """values[..., places], for places that are known to exist."""
-    return values.at[..., places].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return jnp.asarray(values).at[..., places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 class BlockPattern:
