@@ -5,7 +5,7 @@ A method's tableau (A, b, c) is diffrax's. Since q' = v, its stages need the acc
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j,        a_i = a(t + c_i h, q_i, v_i),
 
 half of what a general state would have to keep. Each accepted step is returned to the constraint manifold. Outputs lie on the
-polynomial that has the positions, velocities and accelerations of three consecutive accepted states (of degree 8: interpolated
+polynomial that has the positions, velocities and accelerations of four consecutive accepted states (of degree 11: interpolated
 states are as exact as the states themselves, and cost no evaluation).
 
 Arrays are (n, *lanes): lanes are () for one run, or (L,), which fills the vector units. On the CPU, XLA compiles a loop into one
@@ -14,6 +14,7 @@ number, because elimination met a pivot that it must not trust, a lane waits, an
 equations that may branch.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -28,6 +29,8 @@ from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.straightline.emit import cut
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0  # of the step's size: diffrax's own, so that both take the same steps
+POINTS = 4  # states that an interpolating polynomial goes through: with three, velocities between steps are worse than at steps
+STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 BLOCK = 4  # output times that are interpolated together
 
 
@@ -76,7 +79,7 @@ class March(NamedTuple):
     """Where each lane stands."""
 
     here: Point
-    back: Point  # the accepted state before: interpolation needs three
+    back: tuple[Point, ...]  # the accepted states before, the latest last
     h: Array
     code: Array  # RUNNING, DONE, ...
     doubt: Array  # whether the step has to be taken again with care
@@ -165,7 +168,8 @@ def march(task: Task, q: Array, v: Array) -> March:
     none, inner = jnp.zeros(lanes, int), len(task.ts) - 2
     outputs = jnp.zeros((inner + BLOCK if inner else 0, 2 * len(start.q), *lanes), start.q.dtype)
     # The first round is no step: it finds the accelerations, and with them the first step, where the others have their code.
-    first = March(start, start, jnp.zeros(lanes), none, jnp.zeros(lanes, bool), none - 1, none - 1, none, none, outputs)
+    back, no = (start,) * (POINTS - 2), jnp.zeros(lanes, bool)
+    first = March(start, back, jnp.zeros(lanes), none, no, none - 1, none - 1, none, none, outputs)
 
     def running(m: March) -> Array:
         return jnp.any(m.code == RUNNING)
@@ -212,13 +216,14 @@ def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array) -> M
     code = jnp.where((code == RUNNING) & (tried >= task.max_steps), STEP_LIMIT, code)
     code = jnp.where(accept & last, DONE, code)
 
-    here, back = (jax.tree.map(lambda x, y: jnp.where(accept, x, y), *pair) for pair in ((trial.to, m.here), (m.here, m.back)))
+    old = (*m.back, m.here)
+    *back, here = jax.tree.map(lambda x, y: jnp.where(accept, x, y), (*old[1:], trial.to), old)
     m = m._replace(h=h, code=code, tried=tried, accepted=m.accepted + accept)
     m = m._replace(evaluations=m.evaluations + jnp.where(judged, trial.evaluations, 0))
     if len(task.ts) > 2:
-        until = jnp.where(accept & (m.accepted > 1), undifferentiated(trial.to.t), -jnp.inf)
-        m = _write(task, m, (m.back, m.here, here), until)
-    return m._replace(here=here, back=back)
+        until = jnp.where(accept & (m.accepted > 0), undifferentiated(trial.to.t), -jnp.inf)
+        m = _write(task, m, (*old, here), until)
+    return m._replace(here=here, back=tuple(back))
 
 
 def _first_step(task: Task, start: Point) -> Array:
@@ -228,7 +233,7 @@ def _first_step(task: Task, start: Point) -> Array:
     """
     span = undifferentiated(task.ts[-1] - task.ts[0])
     if task.h is not None:
-        return jnp.minimum(task.h, 0.5 * span)
+        return jnp.minimum(task.h, span)
 
     def largest(q: Array, v: Array) -> Array:
         relative = (jnp.abs(x) / (task.atol + task.rtol * jnp.abs(y)) for x, y in ((q, start.q), (v, start.v)))
@@ -237,14 +242,14 @@ def _first_step(task: Task, start: Point) -> Array:
     size, slope = largest(start.q, start.v), largest(start.v, start.a)
     ordinary = jnp.isfinite(slope) & (slope > 0) & (size > 0)
     step = jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, slope, 1.0), span), 1e-4 * span)
-    return jnp.minimum(undifferentiated(step), 0.5 * span)  # two steps at least: interpolation needs three states
+    return undifferentiated(step)
 
 
 # --- outputs
 
 
-def _write(task: Task, m: March, points: tuple[Point, Point, Point], until: Array) -> March:
-    """Interpolate between three accepted states at the output times that are not yet written."""
+def _write(task: Task, m: March, points: tuple[Point, ...], until: Array) -> March:
+    """Interpolate between accepted states at the output times that are not yet written."""
     inner, lanes = len(task.ts) - 2, m.code.shape
     times = jnp.concatenate([task.ts[1:-1], jnp.broadcast_to(task.ts[-1], (BLOCK, *task.ts.shape[1:]))])
 
@@ -272,21 +277,33 @@ def _write(task: Task, m: March, points: tuple[Point, Point, Point], until: Arra
     return jax.lax.while_loop(lambda m: jnp.any(behind(m) > 0), more, m)
 
 
-def _interpolated(points: tuple[Point, Point, Point], times: Array) -> Array:
-    """q and v (BLOCK, 2n, *lanes) at times (BLOCK, *lanes): Hermite's polynomial by Newton's divided differences."""
+def _interpolated(points: tuple[Point, ...], times: Array) -> Array:
+    """q and v (BLOCK, 2n, *lanes) at times (BLOCK, *lanes) between the last two points.
+
+    Hermite's polynomial by Newton's divided differences, the latest point first. Points that lie much closer together than the
+    last step is long, as where it grows at the start, or that are not there yet, are left out: they only add rounding errors.
+    """
+    points = points[::-1]
+    step = points[0].t - points[1].t
+    near = [p.t - q.t for p, q in itertools.pairwise(points)]
+    used, counts = [], jnp.ones(step.shape, bool)
+    for distance in near:
+        counts = counts & (STRETCH * distance >= step)
+        used.append(counts)
     nodes = [p.t for p in points for _ in range(3)]
     column = [p.q for p in points for _ in range(3)]
     coefficients = [column[0]]
-    for order in range(1, 9):
-        known = {1: [p.v for p in points], 2: [0.5 * p.a for p in points]}.get(order, [None] * 3)
+    known = {1: [p.v for p in points], 2: [0.5 * p.a for p in points]}
+    for order in range(1, len(nodes)):
         following = []
-        for i in range(9 - order):
+        for i in range(len(nodes) - order):
             if i // 3 == (i + order) // 3:
-                following.append(known[i // 3])
+                following.append(known[order][i // 3])
             else:
-                following.append((column[i + 1] - column[i]) / (nodes[i + order] - nodes[i]))
+                apart = nodes[i + order] - nodes[i]
+                following.append((column[i + 1] - column[i]) / jnp.where(apart == 0, 1.0, apart))
         column = following
-        coefficients.append(column[0])
+        coefficients.append(column[0] if order < 3 else jnp.where(used[order // 3 - 1], column[0], 0.0))
     q, v = jnp.zeros((), column[0].dtype), jnp.zeros((), column[0].dtype)
     for node, coefficient in zip(reversed(nodes), reversed(coefficients), strict=True):
         ahead = (times - node)[:, None]

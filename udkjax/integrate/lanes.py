@@ -21,6 +21,7 @@ from udkjax.integrate.explicit import Point, Task, Trial, judged, march, method_
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import project
 
+CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
 FAR = 1e-8  # m, rad, m/s, rad/s: a projection leaves rounding errors of what is nearer to the manifold
 LANES = 64  # of 16, 32, 64 and 128 the fastest for the paper's linkage, with half the memory of 128
@@ -46,7 +47,10 @@ def solve(problem: Problem) -> Raw:
         every = jax.tree.map(lambda _: any(batched), Raw(*Raw._fields))
         if not any(batched):  # only tangents are
             return _single(eqx.combine(tree.unflatten(leaves), static)), every
-        return _many(tree.unflatten(leaves), tree.unflatten(batched), static, size), every
+        if jax.default_backend() in CHUNKED:
+            return _many(tree.unflatten(leaves), tree.unflatten(batched), static, size), every
+        axes = [0 if b else None for b in batched]
+        return jax.vmap(lambda *leaves: _single(eqx.combine(tree.unflatten(leaves), static)), axes)(*leaves), every
 
     return one(*leaves)
 

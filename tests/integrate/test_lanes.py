@@ -1,0 +1,161 @@
+"""Batches of explicit Runge-Kutta runs: in lanes, each the same as alone, and as by diffrax."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.integrate import lanes
+from udkjax.integrate.explicit import method_of
+from udkjax.study.exact import exact_coordinates
+
+TS = np.linspace(0.0, 2.0, 21)
+SOLVERS = {s.__name__: s() for s in (diffrax.Dopri8, diffrax.Tsit5, diffrax.Dopri5, diffrax.Bosh3, udk.Verner65)}
+MEMBERS = lanes.LANES + 6  # more than a chunk holds, and no multiple of what is rounded up to
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return udk.library.compound_pendulum()
+
+
+def last(mechanism, **choices):
+    """The run as a function of the mass of the rod, the initial rate and the tolerance."""
+    name = mechanism.body_names[0]
+
+    def run(inertia, rate, tol):
+        changed = mechanism.with_parameters({f"body.{name}.inertia": inertia})
+        state = udk.assemble(changed)
+        v = jnp.asarray(state.v) * 0.0
+        q = jnp.asarray(state.q)
+        arm = q[:, :2]  # it hangs at the origin
+        v = jnp.concatenate([rate * jnp.stack([-arm[:, 1], arm[:, 0]], 1), jnp.full((1, 1), rate)], 1) + v
+        return udk.simulate(changed, TS, udk.State(q, v), rtol=tol, atol=tol, throw=False, **choices)
+
+    return run
+
+
+def members(size):
+    along = np.linspace(0.0, 1.0, size)
+    return 0.05 + 0.1 * along, -1.0 + 2.0 * along, 10.0 ** (-5 - 4 * along)
+
+
+@pytest.fixture(scope="module")
+def batch(pendulum):
+    return jax.jit(jax.vmap(last(pendulum)))(*members(MEMBERS))
+
+
+@pytest.fixture(scope="module")
+def alone(pendulum):
+    return jax.jit(last(pendulum))
+
+
+def test_members_are_what_they_are_alone(batch, alone):
+    for k in (0, 1, 33, MEMBERS - 1):
+        one = alone(*(x[k] for x in members(MEMBERS)))
+        assert_allclose(batch.q[k], one.q, rtol=0, atol=1e-12)
+        assert_allclose(batch.v[k], one.v, rtol=0, atol=1e-11)
+        assert {name: int(x[k]) for name, x in batch.stats.items()} == {name: int(x) for name, x in one.stats.items()}
+    assert np.all(np.asarray(batch.result) == udk.Result.successful)
+    assert len(np.unique(np.asarray(batch.stats["steps"]))) > 5  # each takes steps of its own
+
+
+def test_a_batch_of_batches(pendulum, batch):
+    run = jax.vmap(jax.vmap(last(pendulum), (0, 0, None)), (0, 0, 0))
+    inertia, rate, tol = (x[:4].reshape(2, 2) for x in members(MEMBERS))
+    found = jax.jit(run)(inertia, rate, tol[:, 0])
+    assert_allclose(found.q[0, 0], batch.q[0], rtol=0, atol=1e-12)
+    assert found.q.shape == (2, 2, len(TS), 1, 3)
+
+
+def test_the_form_for_other_devices(pendulum, batch, monkeypatch):
+    """A batch taken whole by vmap, as a GPU takes it."""
+    monkeypatch.setattr(lanes, "CHUNKED", ())
+    found = jax.jit(jax.vmap(last(pendulum)))(*members(MEMBERS))
+    assert_allclose(found.q, batch.q, rtol=0, atol=1e-12)
+    assert_allclose(found.stats["steps"], batch.stats["steps"])
+
+
+def test_a_member_that_fails_is_data(pendulum):
+    name = pendulum.body_names[0]
+
+    def run(mass, steps):
+        choices = {"rtol": 1e-9, "atol": 1e-9, "throw": False, "max_steps": steps}
+        return udk.simulate(pendulum.with_parameters({f"body.{name}.mass": mass}), TS, **choices)
+
+    found = jax.vmap(lambda mass: run(mass, 100_000))(jnp.array([1.0, np.nan, 2.0]))
+    assert [int(c) for c in found.result] == [0, int(udk.Result.not_finite), 0]
+    assert np.all(np.isfinite(found.q[0])) and np.all(np.isnan(found.q[1, 1:]))
+    short = jax.vmap(lambda mass: run(mass, 12))(jnp.array([1.0, 2.0]))
+    assert [int(c) for c in short.result] == [udk.Result.step_limit] * 2
+    assert int(short.stats["steps"][0]) == 12
+
+
+@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+def test_the_same_motion_as_by_diffrax(pendulum, solver):
+    ours = udk.simulate(pendulum, TS, solver=solver)
+    theirs = udk.simulate(pendulum, TS, solver=solver, adjoint=diffrax.DirectAdjoint(), max_steps=4096)
+    assert_allclose(ours.q[-1], theirs.q[-1], rtol=0, atol=2e-6 if isinstance(solver, diffrax.Bosh3) else 2e-7)
+    steps = int(theirs.stats["steps"])
+    assert abs(int(ours.stats["steps"]) - steps) <= 2 + 0.02 * steps  # the same step size control
+    assert int(ours.stats["right_hand_sides"]) <= int(theirs.stats["right_hand_sides"]) + 30
+
+
+@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+def test_the_stages_of_second_order_are_those_of_the_tableau(solver):
+    """A step of q'' = a(t, q, v) by the reduced tableau against the tableau itself, on (q, v)."""
+    method, tableau = method_of(solver), solver.tableau
+    f = lambda t, y: np.array([y[1], -np.sin(y[0]) - 0.3 * y[1] + np.cos(t)])  # noqa: E731
+    t, h, y = 0.2, 0.1, np.array([0.4, -0.7])
+    k = [f(t, y)]
+    for c, row in zip(tableau.c, tableau.a_lower, strict=True):
+        k.append(f(t + c * h, y + h * np.dot(row, k)))
+    expected, error = y + h * np.dot(tableau.b_sol, k), h * np.dot(tableau.b_error, k)
+    a = np.array([x[1] for x in k])[: method.stages]
+    assert_allclose(y[1] + h * method.v[-1] @ a, expected[1], rtol=1e-14)
+    assert_allclose(y[0] + h * (y[1] + h * method.q[-1] @ a), expected[0], rtol=1e-14)
+    assert_allclose([h * h * method.error_q @ a, h * method.error_v @ a], error, rtol=0, atol=1e-15)
+
+
+def test_outputs_are_as_exact_as_steps(pendulum):
+    """Positions and velocities between steps, against a run of steps that are much smaller."""
+    fine = np.linspace(0.0, 2.0, 301)
+    coarse = udk.simulate(pendulum, fine, rtol=1e-9, atol=1e-9)
+    exact = udk.simulate(pendulum, fine, rtol=1e-13, atol=1e-13)
+    error = np.abs(np.asarray(coarse.q - exact.q)).max(axis=(1, 2))
+    rates = np.abs(np.asarray(coarse.v - exact.v)).max(axis=(1, 2))
+    assert int(coarse.stats["accepted"]) < 60
+    assert error.max() < 5e-9 and rates.max() < 5e-8
+
+
+def test_forward_derivatives_in_lanes(pendulum, batch):
+    inertia, rate, tol = members(MEMBERS)
+    run = last(pendulum, adjoint=diffrax.ForwardMode())
+
+    def ends(shift):
+        return jax.vmap(run)(inertia[:10] + shift, rate[:10], np.full(10, 1e-10)).q[:, -1, 0, 2]
+
+    slope = jax.jit(jax.jacfwd(ends))(0.0)
+    change = 1e-5
+    by_differences = (ends(change) - ends(-change)) / (2 * change)
+    assert_allclose(slope, by_differences, rtol=0, atol=2e-5 * np.abs(by_differences).max())
+    single = jax.jacfwd(lambda x: run(x, rate[3], 1e-10).q[-1, 0, 2])(inertia[3])
+    assert_allclose(slope[3], single, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_no_start_is_lost_at_singular_configurations():
+    """128 starts that cross: all of them against the exact solution."""
+    angles = np.deg2rad(np.concatenate([np.linspace(55, 65, 64), np.linspace(-5, 5, 64)]))
+    ts = np.linspace(0.0, 10.0, 101)
+    scenes = [udk.library.parallelogram(angle) for angle in angles]
+    q0 = np.stack([np.asarray(udk.assemble(s).q) for s in scenes])
+    run = jax.jit(jax.vmap(lambda q: udk.simulate(scenes[0], ts, udk.State(q, 0 * q), throw=False)))
+    found = run(q0)
+    assert np.all(np.asarray(found.result) == udk.Result.successful)
+    for k, scene in enumerate(scenes):
+        exact = exact_coordinates(scene, ts, scene.q0, scene.v0)
+        assert np.abs(np.reshape(found.q[k], (len(ts), -1)) - np.reshape(exact, (len(ts), -1))).max() < 1e-5
