@@ -1,5 +1,7 @@
 """The form for large scenes, on small ones: held against straight-line code and against the equation as it stands."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,7 +103,7 @@ def forms(request):
 def test_it_agrees_with_straight_line_code(forms, name):
     small, big = (form[name] for form in forms)
     for a, b in zip(jax.tree.leaves(small), jax.tree.leaves(big), strict=True):
-        assert_allclose(b, a, rtol=1e-10, atol=1e-11 * (1 + jnp.abs(a).max()))
+        assert_allclose(b, a, rtol=1e-10, atol=1e-11 * (1 + float(jnp.abs(a).max())))
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +181,7 @@ def test_derivatives_agree_with_straight_line_code():
         return jax.jit(jax.grad(scalar, (0, 1, 2)))(values, q, v)
 
     for a, b in zip(jax.tree.leaves(gradient(False)), jax.tree.leaves(gradient(True)), strict=True):
-        assert_allclose(b, a, rtol=1e-8, atol=1e-9 * (1 + jnp.abs(a).max()))
+        assert_allclose(b, a, rtol=1e-8, atol=1e-9 * (1 + float(jnp.abs(a).max())))
 
 
 @pytest.mark.slow
@@ -277,7 +279,7 @@ def test_a_body_of_many_joints():
     mech = udk.Mechanism(bodies, joints, forces=forces)
     v = jnp.asarray(np.random.default_rng(1).standard_normal(mech.q0.size))
     a, b = (prepare(mech, large=large).accelerations(0.0, mech.q0.ravel(), v) for large in (False, True))
-    assert_allclose(b, a, atol=1e-11 * jnp.abs(a).max())
+    assert_allclose(b, a, atol=1e-11 * float(jnp.abs(a).max()))
 
 
 @pytest.mark.slow
@@ -402,7 +404,7 @@ def test_the_cost_of_a_right_hand_side_grows_with_the_scene(n):
     def flops(n):
         mech = udk.library.n_four_bar(n, 1.0)
         rhs = jax.jit(lambda e, q, v: e.accelerations(0.0, q, v))
-        cost = rhs.lower(prepare(mech, large=True), mech.q0.ravel(), mech.v0.ravel()).compile().cost_analysis()
+        cost: Any = rhs.lower(prepare(mech, large=True), mech.q0.ravel(), mech.v0.ravel()).compile().cost_analysis()
         return cost["flops"]
 
     assert np.log(flops(n) / flops(n // 10)) / np.log(10) < 1.1

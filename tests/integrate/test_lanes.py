@@ -63,6 +63,7 @@ def test_members_are_what_they_are_alone(batch, alone):
     assert len(np.unique(np.asarray(batch.stats["steps"]))) > 5  # each takes steps of its own
 
 
+@pytest.mark.slow
 def test_a_batch_of_batches(pendulum, batch):
     run = jax.vmap(jax.vmap(last(pendulum), (0, 0, None)), (0, 0, 0))
     inertia, rate, tol = (x[:4].reshape(2, 2) for x in members(MEMBERS))
@@ -87,14 +88,16 @@ def test_a_member_that_fails_is_data(pendulum):
         return udk.simulate(pendulum.with_parameters({f"body.{name}.mass": mass}), TS, **choices)
 
     found = jax.vmap(lambda mass: run(mass, 100_000))(jnp.array([1.0, np.nan, 2.0]))
-    assert [int(c) for c in found.result] == [0, int(udk.Result.not_finite), 0]
+    assert [int(c) for c in found.result] == [0, int(udk.Result.could_not_assemble), 0]
     assert np.all(np.isfinite(found.q[0])) and np.all(np.isnan(found.q[1, 1:]))
     short = jax.vmap(lambda mass: run(mass, 12))(jnp.array([1.0, 2.0]))
     assert [int(c) for c in short.result] == [udk.Result.step_limit] * 2
     assert int(short.stats["steps"][0]) == 12
 
 
-@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+@pytest.mark.parametrize(
+    "solver", [SOLVERS["Tsit5"], *(pytest.param(s, marks=pytest.mark.slow) for n, s in SOLVERS.items() if n != "Tsit5")]
+)
 def test_the_same_motion_as_by_diffrax(pendulum, solver):
     ours = udk.simulate(pendulum, TS, solver=solver)
     theirs = udk.simulate(pendulum, TS, solver=solver, adjoint=diffrax.DirectAdjoint(), max_steps=4096)
@@ -128,11 +131,12 @@ def test_outputs_are_as_exact_as_steps(pendulum):
     error = np.abs(np.asarray(coarse.q - exact.q)).max(axis=(1, 2))
     rates = np.abs(np.asarray(coarse.v - exact.v)).max(axis=(1, 2))
     assert int(coarse.stats["accepted"]) < 60
-    assert error.max() < 5e-9 and rates.max() < 5e-8
+    assert error.max() < 1e-9 and rates.max() < 1e-8
 
 
+@pytest.mark.slow
 def test_forward_derivatives_in_lanes(pendulum, batch):
-    inertia, rate, tol = members(MEMBERS)
+    inertia, rate, _ = members(MEMBERS)
     run = last(pendulum, adjoint=diffrax.ForwardMode())
 
     def ends(shift):

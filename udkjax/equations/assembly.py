@@ -83,7 +83,7 @@ def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None) 
     if not _known((mechanism, t, state)):
         return _close(mechanism, t, state)
     of, when, found = _latest.get(id(mechanism), (None, 0.0, None))
-    if found is not None and state is None and of is not None and of() is mechanism and when == float(t):
+    if found is not None and state is None and of is not None and of() is mechanism and when == np.asarray(t).item():
         return found
     with jax.ensure_compile_time_eval():
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
@@ -92,7 +92,7 @@ def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None) 
         found = Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), number(psi), number(psi_dot), jax.device_put(np.asarray(rank)))
     if state is None:
         key = id(mechanism)
-        _latest[key] = (weakref.ref(mechanism, lambda _: _latest.pop(key, None)), float(t), found)
+        _latest[key] = (weakref.ref(mechanism, lambda _: _latest.pop(key, None)), np.asarray(t).item(), found)
     return found
 
 

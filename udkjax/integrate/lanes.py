@@ -44,7 +44,7 @@ def solve(problem: Problem) -> Raw:
 
     @one.def_vmap
     def _(size, batched, *leaves):
-        every = jax.tree.map(lambda _: any(batched), Raw(*Raw._fields))
+        every = Raw(*[any(batched)] * len(Raw._fields))
         if not any(batched):  # only tangents are
             return _single(eqx.combine(tree.unflatten(leaves), static)), every
         if jax.default_backend() in CHUNKED:

@@ -30,11 +30,11 @@ class Problem(eqx.Module):
 class Raw(NamedTuple):
     """A run as an integrator leaves it: `status` is one of those above, from `DONE` on."""
 
-    ys: Array  # (T, 2n), not yet reached ones of any value
-    reached: Array  # (T,)
-    status: Array
-    t: Array
-    y: Array  # (2n,) at t
-    tried: Array
-    accepted: Array
-    evaluations: Array
+    ys: Any  # (T, 2n), not yet reached ones of any value
+    reached: Any  # (T,)
+    status: Any
+    t: Any
+    y: Any  # (2n,) at t
+    tried: Any
+    accepted: Any
+    evaluations: Any

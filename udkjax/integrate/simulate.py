@@ -82,7 +82,8 @@ def simulate(
     def run(mechanism: Any, careful: bool) -> tuple[Solution, Any, Any]:
         return _simulate(mechanism, ts, state, closure, *settings, *choices, careful)
 
-    closure = close(mechanism, ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]) if state is None else None
+    start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
+    closure = close(mechanism, start) if state is None and isinstance(mechanism, Mechanism) else None
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, ts, state, closure, settings)))
     solution, missed, doubted = run(mechanism, careful=traced)
     if isinstance(solution.code, Tracer):
