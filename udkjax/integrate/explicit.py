@@ -285,27 +285,26 @@ def _interpolated(points: tuple[Point, ...], times: Array) -> Array:
     """
     points = points[::-1]
     step = points[0].t - points[1].t
-    near = [p.t - q.t for p, q in itertools.pairwise(points)]
-    used, counts = [], jnp.ones(step.shape, bool)
-    for distance in near:
-        counts = counts & (STRETCH * distance >= step)
-        used.append(counts)
-    nodes = [p.t for p in points for _ in range(3)]
+    used = [jnp.ones(step.shape, bool)]
+    for p, q in itertools.pairwise(points[1:]):
+        used.append(used[-1] & (STRETCH * (p.t - q.t) >= step))
+    apart = {(i, j): points[j].t - points[i].t for i, j in itertools.combinations(range(len(points)), 2)}
+    inverse = {ij: 1.0 / jnp.where(d == 0, 1.0, d) for ij, d in apart.items()}
     column = [p.q for p in points for _ in range(3)]
     coefficients = [column[0]]
     known = {1: [p.v for p in points], 2: [0.5 * p.a for p in points]}
-    for order in range(1, len(nodes)):
+    for order in range(1, 3 * len(points)):
         following = []
-        for i in range(len(nodes) - order):
-            if i // 3 == (i + order) // 3:
-                following.append(known[order][i // 3])
+        for i in range(3 * len(points) - order):
+            first, last = i // 3, (i + order) // 3
+            if first == last:
+                following.append(known[order][first])
             else:
-                apart = nodes[i + order] - nodes[i]
-                following.append((column[i + 1] - column[i]) / jnp.where(apart == 0, 1.0, apart))
+                following.append((column[i + 1] - column[i]) * inverse[first, last])
         column = following
         coefficients.append(column[0] if order < 3 else jnp.where(used[order // 3 - 1], column[0], 0.0))
     q, v = jnp.zeros((), column[0].dtype), jnp.zeros((), column[0].dtype)
-    for node, coefficient in zip(reversed(nodes), reversed(coefficients), strict=True):
-        ahead = (times - node)[:, None]
+    for k, coefficient in reversed(list(enumerate(coefficients))):
+        ahead = (times - points[k // 3].t)[:, None]
         q, v = q * ahead + coefficient, v * ahead + q
     return jnp.concatenate([q, v], axis=1)

@@ -60,12 +60,14 @@ def simulate(
     (default `Auto`), `stabilization` is `Projection()`, a `Baumgarte` or None, `solver` any diffrax solver for ordinary
     differential equations (default Dopri8: of those measured in benchmarks/ the fastest at equal error, but for the tightest
     tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity. `dt0` is the first
-    step that is tried, in s; by default it is chosen, which takes one right-hand side. `formulation` finds the accelerations in
+    step that is tried, in s; by default it is chosen. `formulation` finds the accelerations in
     another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`, `NullSpaceSVD` or `CoordinatePartitioning`;
     `method` then serves projection and derivatives. `progress=True` prints how far the run is.
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
-    vmap as well. For forward mode give `adjoint=diffrax.ForwardMode()`; reverse mode works as it is.
+    vmap as well. For forward mode give `adjoint=diffrax.ForwardMode()`; reverse mode works as it is. Explicit Runge-Kutta methods
+    are integrated by an engine of our own, under vmap in lanes that step each on its own; every other solver, an adjoint other
+    than these two and a progress meter by `diffrax.diffeqsolve`.
 
     A run that does not reach its end raises `SimulationError`, which carries the solution; with `throw=False`, or when numbers
     are traced, `Solution.result` tells instead. A violation of Psi above `drift_tol` (m, rad) at an output time ends the
