@@ -35,22 +35,38 @@ def serves(problem: Problem) -> bool:
 
 def solve(problem: Problem) -> Raw:
     """Integrate one problem; under vmap, as many as there are."""
+    return _batched(problem, _single, _many)
+
+
+def one_by_one(problem: Problem, single: Callable[[Problem], Raw]) -> Raw:
+    """Integrate one problem by `single`; under vmap one after another, where no member waits and a branch is one."""
+
+    def many(arrays: Any, batched: Any, static: Any, size: int) -> Raw:
+        def member(k: Array) -> Raw:
+            return single(eqx.combine(jax.tree.map(lambda x, b: x[k] if b else x, arrays, batched), static))
+
+        return jax.lax.map(member, jnp.arange(size))
+
+    return _batched(problem, single, many)
+
+
+def _batched(problem: Problem, single: Callable[[Problem], Raw], many: Callable[..., Raw]) -> Raw:
     arrays, static = eqx.partition(problem, eqx.is_array)
     leaves, tree = jax.tree.flatten(arrays)
 
     @custom_vmap
     def one(*leaves):
-        return _single(eqx.combine(tree.unflatten(leaves), static))
+        return single(eqx.combine(tree.unflatten(leaves), static))
 
     @one.def_vmap
     def _(size, batched, *leaves):
         every = Raw(*[any(batched)] * len(Raw._fields))
         if not any(batched):  # only tangents are
-            return _single(eqx.combine(tree.unflatten(leaves), static)), every
+            return single(eqx.combine(tree.unflatten(leaves), static)), every
         if jax.default_backend() in CHUNKED:
-            return _many(tree.unflatten(leaves), tree.unflatten(batched), static, size), every
+            return many(tree.unflatten(leaves), tree.unflatten(batched), static, size), every
         axes = [0 if b else None for b in batched]
-        return jax.vmap(lambda *leaves: _single(eqx.combine(tree.unflatten(leaves), static)), axes)(*leaves), every
+        return jax.vmap(lambda *leaves: single(eqx.combine(tree.unflatten(leaves), static)), axes)(*leaves), every
 
     return one(*leaves)
 

@@ -1,5 +1,6 @@
-"""Reverse-mode derivatives of a march."""
+"""Reverse-mode derivatives, whatever integrated."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -7,17 +8,16 @@ import equinox as eqx
 import jax
 
 from udkjax.integrate.by_diffrax import by_diffrax
-from udkjax.integrate.lanes import solve
 from udkjax.integrate.problem import Problem, Raw
 
 
-def reversible(problem: Problem) -> Raw:
-    """As `solve`, with derivatives in reverse mode."""
+def reversible(problem: Problem, integrate: Callable[[Problem], Raw]) -> Raw:
+    """`integrate(problem)`, with derivatives in reverse mode: those of the same problem by diffrax, which keeps checkpoints."""
     arrays, static = eqx.partition(problem, eqx.is_inexact_array)
 
     @jax.custom_vjp
     def run(arrays: Any) -> Raw:
-        return solve(eqx.combine(arrays, static))
+        return integrate(eqx.combine(arrays, static))
 
     def again(arrays: Any) -> Any:
         raw = by_diffrax(eqx.combine(arrays, static), diffrax.RecursiveCheckpointAdjoint(), diffrax.NoProgressMeter())

@@ -1,5 +1,6 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
+from functools import partial
 from types import NoneType
 from typing import Any
 
@@ -19,7 +20,7 @@ from udkjax.equations.quantities import equations_of
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.by_diffrax import by_diffrax
-from udkjax.integrate.lanes import serves, solve
+from udkjax.integrate.lanes import one_by_one, serves, solve
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.problem import DOUBTED, Problem
 from udkjax.integrate.projection import Projection
@@ -131,8 +132,10 @@ def _simulate(
     q, v = start.q.ravel(), start.v.ravel()
     numbers = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0)
     problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, careful=careful)
-    if serves(problem) and type(adjoint) in (NoneType, diffrax.ForwardMode) and isinstance(meter, diffrax.NoProgressMeter):
-        raw = solve(problem) if adjoint else reversible(problem)
+    if type(adjoint) in (NoneType, diffrax.ForwardMode) and isinstance(meter, diffrax.NoProgressMeter):
+        single = partial(by_diffrax, adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(), meter=meter)
+        integrate = solve if serves(problem) else partial(one_by_one, single=single)
+        raw = integrate(problem) if adjoint else reversible(problem, integrate)
     else:
         raw = by_diffrax(problem, adjoint or diffrax.RecursiveCheckpointAdjoint(), meter)
     ys = jnp.where(raw.reached[:, None], raw.ys, jnp.concatenate([q, v])).at[0].set(jnp.concatenate([q, v]))
