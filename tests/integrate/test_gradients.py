@@ -91,7 +91,7 @@ def expected():
     return derivatives(closed_form)(POINTS)
 
 
-@pytest.mark.parametrize("method", fast("SVD", "Elimination", "Auto"))
+@pytest.mark.parametrize("method", fast("SVD", "Auto"))
 def test_derivatives_of_accelerations(method, expected):
     """Finite at all angles; equal to the closed form, and so among the methods, wherever the rank is constant nearby."""
     found = derivatives(partial(accelerations, LINKAGE, method))(POINTS)
@@ -192,7 +192,7 @@ def test_gradient_of_a_trajectory_forward(method):
     check(*forward(method=method))
 
 
-@pytest.mark.parametrize("method", fast("Auto"))
+@pytest.mark.parametrize("method", fast("Elimination"))
 def test_gradient_of_a_trajectory_reverse(method):
     check(*reverse(method=method))
 
