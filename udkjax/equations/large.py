@@ -46,6 +46,7 @@ class LargeEquations(MechanismMotion):
     method: Pseudoinverse
     layout: Layout = eqx.field(static=True)
     branch: bool = eqx.field(static=True, default=True)  # whether to turn to dense matrices, or to say NaN where that is needed
+    doubt: bool = eqx.field(static=True, default=True)  # whether to say anything of pivots that are small
     dense: bool = eqx.field(static=True, default=False)  # whether the method is applied to D of all rows as a matrix
 
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
@@ -153,6 +154,11 @@ class LargeEquations(MechanismMotion):
     def quick(self) -> "LargeEquations":
         """The same without a branch: what cannot be solved by elimination is not a number."""
         return dataclasses.replace(self, branch=False)
+
+    @property
+    def forgiving(self) -> "LargeEquations":
+        """The same without a branch: small pivots are taken for what they are."""
+        return dataclasses.replace(self, branch=False, doubt=False)
 
     def exact(self) -> "LargeEquations":
         """The same on all rows as a matrix: what to turn to where rows are not independent."""
@@ -362,6 +368,8 @@ _accelerations.defjvp(lambda watch, primals, tangents: jax.jvp(plain_acceleratio
 
 def _checked(equations: LargeEquations, safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
     """Take what elimination gave where its pivots are safe; else turn to the dense method, or say that it is not a number."""
+    if not equations.doubt:
+        return fast
     if not equations.branches:
         return jax.tree.map(lambda x: jnp.where(safe, x, jnp.nan), fast)
     return _branch(safe, lambda: fast, lambda: plain(equations.exact(), *state))

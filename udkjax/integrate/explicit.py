@@ -9,7 +9,7 @@ polynomial that has the positions, velocities and accelerations of four consecut
 states are as exact as the states themselves, and cost no evaluation).
 
 Arrays are (n, *lanes): lanes are () for one run, or (L,), which fills the vector units. On the CPU, XLA compiles a loop into one
-function if it holds no branch; so the loop over the steps, `_march`, holds none: where the accelerations come out as not a
+function if it holds no branch; so the loop over the steps, in `march`, holds none: where the accelerations come out as not a
 number, because elimination met a pivot that it must not trust, a lane waits, and the loop around it takes that step again, by
 equations that may branch.
 """
