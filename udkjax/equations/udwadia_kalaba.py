@@ -37,7 +37,7 @@ RANK_TOL = 1e-4
 # longer to trace and compile, the larger the scene (see the scaling benchmark), and where XLA ignores optimization barriers,
 # minutes from a few joints on.
 LARGE = 150 if jax.__version_info__ >= BARRIERS_HOLD else 32
-NOTHING_LEFT = 1e-13  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
+NOTHING_LEFT = 1e-14  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
 ORDINARY = 100.0  # the ratio of masses up to which that holds: see `rank_tolerance`
 
 

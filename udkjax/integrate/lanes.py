@@ -17,13 +17,14 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
 from udkjax.equations.motion import Motion
-from udkjax.integrate.explicit import Point, Task, Trial, judged, march, method_of, stage_state, when
+from udkjax.integrate.explicit import Point, Task, Trial, judged, march, method_of, stage_state
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import project
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
 FAR = 1e-8  # m, rad, m/s, rad/s: a projection leaves rounding errors of what is nearer to the manifold
+PASSES = 6  # projections of an output: where two branches of the manifold meet, Newton's method halves the distance in a step
 LANES = 64  # of 16, 32, 64 and 128 the fastest for the paper's linkage, with half the memory of 128
 
 
@@ -150,8 +151,9 @@ def _marched(problem: Problem, lanes: Lanes) -> Raw:
         task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
     m = march(task, problem.q, problem.v)
     inner, end = len(problem.ts) - 2, jnp.concatenate([m.here.q, m.here.v])
-    between = _projected(lanes, problem.ts[1:-1], m.outputs[:inner]) if problem.projected and inner else m.outputs[:inner]
-    ys = jnp.concatenate([jnp.concatenate([problem.q, problem.v])[None], between, end[None]])
+    ys = jnp.concatenate([m.outputs[:inner], end[None]])
+    ys = _projected(lanes, problem.ts[1:], ys) if problem.projected else ys
+    ys = jnp.concatenate([jnp.concatenate([problem.q, problem.v])[None], ys])
     number = jnp.arange(inner + 2).reshape(-1, *[1] * len(lanes.shape))
     reached = (number <= m.written) & (number <= inner) | (m.code == DONE)
     return Raw(ys, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
@@ -192,7 +194,12 @@ def _projected(lanes: Lanes, ts: Array, ys: Array) -> Array:
 
     def one(x: tuple[Array, Array]) -> Array:
         t, y = x
-        once = over(t, y)
-        return when(jnp.any(jnp.abs(once - y) > FAR), partial(over, t), once)
+
+        def again(carry: Any) -> Any:
+            k, y, _ = carry
+            nearer = over(t, y)
+            return k + 1, nearer, jnp.any(jnp.abs(nearer - y) > FAR)
+
+        return jax.lax.while_loop(lambda c: c[2] & (c[0] < PASSES), again, (0, y, jnp.array(True)))[1]
 
     return jax.lax.map(one, (ts, ys))  # one time after another is faster, and compiles faster, than all at once
