@@ -41,20 +41,22 @@ def test_the_cache_is_in_the_users_cache_folder(tmp_path, order):
     ("choice", "expected"),
     [
         ({"UDKJAX_COMPILATION_CACHE": "0"}, "None 1.0"),
-        ({"UDKJAX_COMPILATION_CACHE": "/tmp/elsewhere"}, "/tmp/elsewhere 0.0"),
-        ({"JAX_COMPILATION_CACHE_DIR": "/tmp/mine"}, "/tmp/mine 1.0"),
+        ({"UDKJAX_COMPILATION_CACHE": "{}/elsewhere"}, "{}/elsewhere 0.0"),
+        ({"JAX_COMPILATION_CACHE_DIR": "{}/mine"}, "{}/mine 1.0"),
         ({"XDG_CACHE_HOME": "/dev/null"}, "None 1.0"),  # in which nobody can make a folder
-        ({"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "5", "UDKJAX_COMPILATION_CACHE": "/tmp/here"}, "/tmp/here 5.0"),
+        ({"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "5", "UDKJAX_COMPILATION_CACHE": "{}/here"}, "{}/here 5.0"),
     ],
     ids=["off", "elsewhere", "JAX has one", "not writable", "the user's threshold"],
 )
 def test_the_environment_decides(tmp_path, choice, expected):
-    assert python(PRINT.replace("jax, udkjax", "udkjax, jax"), HOME=tmp_path, **choice) == expected
+    choice = {name: value.format(tmp_path) for name, value in choice.items()}
+    assert python(PRINT.replace("jax, udkjax", "udkjax, jax"), HOME=tmp_path, **choice) == expected.format(tmp_path)
 
 
-def test_a_cache_configured_before_stays():
-    code = "import jax; jax.config.update('jax_compilation_cache_dir', '/tmp/mine');" + PRINT
-    assert python(code, HOME="/tmp") == "/tmp/mine 1.0"
+def test_a_cache_configured_before_stays(tmp_path):
+    mine = str(tmp_path / "mine")
+    code = f"import jax; jax.config.update('jax_compilation_cache_dir', {mine!r});" + PRINT
+    assert python(code, HOME=tmp_path) == f"{mine} 1.0"
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
 FAR = 1e-8  # m, rad, m/s, rad/s: a projection leaves rounding errors of what is nearer to the manifold
 PASSES = 6  # projections of an output: where two branches of the manifold meet, Newton's method halves the distance in a step
-LANES = 64  # of 16, 32, 64 and 128 the fastest for the paper's linkage, with half the memory of 128
+LANES = 64  # with 16 or 32 a lane of the paper's linkage takes longer, with 128 no less
 
 
 def serves(problem: Problem) -> bool:
