@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.integrate import lanes
-from udkjax.integrate.explicit import method_of
+from udkjax.integrate.tableau import method_of
 from udkjax.study.exact import exact_coordinates
 
 TS = np.linspace(0.0, 2.0, 21)

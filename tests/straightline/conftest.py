@@ -51,3 +51,13 @@ def emit_function(function: Callable, *examples: Any, cut_every: int | None = No
 @pytest.fixture
 def emit() -> Callable[..., Emitted]:
     return emit_function
+
+
+@pytest.fixture
+def graph():
+    return Graph()
+
+
+@pytest.fixture
+def xyz(graph):
+    return [graph.input(name, "state") for name in "xyz"]

@@ -46,16 +46,6 @@ def test_forward_and_reverse_are_those_of_jax(function):
     np.testing.assert_allclose(Program(graph, inputs, back)([float(a) for a in at]), expected, rtol=1e-12, atol=1e-13)
 
 
-@pytest.fixture
-def graph():
-    return Graph()
-
-
-@pytest.fixture
-def xyz(graph):
-    return [graph.input(name, "state") for name in "xyz"]
-
-
 def traced(function, graph, *scalars):
     (result,) = trace(function, *(0.0 for _ in scalars))(graph, *(np.asarray(s, object) for s in scalars))
     return result.item()

@@ -11,16 +11,6 @@ from hypothesis import strategies as st
 from udkjax.straightline import Graph, Program, Scalar
 
 
-@pytest.fixture
-def graph():
-    return Graph()
-
-
-@pytest.fixture
-def xyz(graph):
-    return [graph.input(name, "state") for name in "xyz"]
-
-
 def operations(graph: Graph) -> list[str]:
     return [node.kind for node in graph.nodes if node.kind not in ("input", "constant")]
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
+from udkjax.integrate.first_step import first_step
 from udkjax.integrate.problem import DONE, STEP_LIMIT, STEP_TOO_SMALL, Problem, Raw
 from udkjax.integrate.projection import Constrained, project_all
 from udkjax.integrate.undifferentiated import undifferentiated
@@ -52,16 +53,8 @@ def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array,
 
 
 def _first_step(problem: Problem, y0: Array) -> Array:
-    """A step over which the state changes by a small part of itself.
-
-    As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off.
-    """
-    equations, y0, rtol, atol = undifferentiated((problem.equations.quick, y0, problem.rtol, problem.atol))
-    scale = atol + rtol * jnp.abs(y0)
-    size, slope = jnp.max(jnp.abs(y0) / scale), jnp.max(jnp.abs(derivative(problem.ts[0], y0, equations)) / scale)
-    span = problem.ts[-1] - problem.ts[0]
-    ordinary = jnp.isfinite(slope) & (slope > 0) & (size > 0)
-    return jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, slope, 1.0), span), 1e-4 * span)
+    ts, equations = problem.ts, undifferentiated(problem.equations.quick)
+    return first_step(y0, derivative(ts[0], undifferentiated(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol)
 
 
 def _controller(problem: Problem) -> diffrax.PIDController:

@@ -14,65 +14,22 @@ number, because elimination met a pivot that it must not trust, a lane waits, an
 equations that may branch.
 """
 
-import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
+from udkjax.integrate.first_step import first_step
+from udkjax.integrate.interpolation import POINTS, Point, interpolated
 from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.integrate.tableau import Method
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.straightline.emit import cut
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0  # of the step's size: diffrax's own, so that both take the same steps
-POINTS = 4  # states that an interpolating polynomial goes through: with three, velocities between steps are worse than at steps
-STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 BLOCK = 4  # output times that are interpolated together
-
-
-class Method(NamedTuple):
-    """A tableau as q'' = a needs it, without stages that serve interpolation alone."""
-
-    nodes: np.ndarray  # c, and below it 1: the end of the step is one state more
-    v: np.ndarray  # A, and below it b
-    q: np.ndarray  # A A, and below it b A
-    error_v: np.ndarray  # (stages,)
-    error_q: np.ndarray
-    order: float
-    ends: bool  # whether the last stage is the next step's first
-
-    @property
-    def stages(self) -> int:
-        return len(self.error_v)
-
-
-def method_of(solver: diffrax.AbstractERK) -> Method:
-    """Read the tableau of a solver."""
-    tableau: Any = solver.tableau
-    s = tableau.num_stages
-    A = np.zeros((s, s))
-    for i, row in enumerate(tableau.a_lower):
-        A[i + 1, : i + 1] = row
-    b, error, c = (np.asarray(x, float) for x in (tableau.b_sol, tableau.b_error, np.append(0.0, tableau.c)))
-    error_q = error @ A
-    ends = bool(tableau.fsal and error[-1] != 0)
-    if tableau.fsal and not ends:  # the last stage is there for interpolation, or for the next step
-        A, b, error, error_q, c = A[:-1, :-1], b[:-1], error[:-1], error_q[:-1], c[:-1]
-    order: Any = solver.error_order(diffrax.ODETerm(lambda t, y, args: y))
-    return Method(np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error_q, float(order), ends)
-
-
-class Point(NamedTuple):
-    """An accepted state with its accelerations; of each lane."""
-
-    t: Array  # (*lanes,)
-    q: Array  # (n, *lanes)
-    v: Array
-    a: Array
 
 
 class March(NamedTuple):
@@ -227,22 +184,12 @@ def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array) -> M
 
 
 def _first_step(task: Task, start: Point) -> Array:
-    """The first step: as given, or one over which the state changes by a small part of itself.
-
-    As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off.
-    """
-    span = undifferentiated(task.ts[-1] - task.ts[0])
+    """The first step: as given, or chosen."""
+    span = task.ts[-1] - task.ts[0]
     if task.h is not None:
-        return jnp.minimum(task.h, span)
-
-    def largest(q: Array, v: Array) -> Array:
-        relative = (jnp.abs(x) / (task.atol + task.rtol * jnp.abs(y)) for x, y in ((q, start.q), (v, start.v)))
-        return jnp.maximum(*(jnp.max(x, axis=0) for x in relative))
-
-    size, slope = largest(start.q, start.v), largest(start.v, start.a)
-    ordinary = jnp.isfinite(slope) & (slope > 0) & (size > 0)
-    step = jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, slope, 1.0), span), 1e-4 * span)
-    return undifferentiated(step)
+        return jnp.minimum(task.h, undifferentiated(span))
+    y, slope = jnp.concatenate([start.q, start.v]), jnp.concatenate([start.v, start.a])
+    return first_step(y, slope, span, task.rtol, task.atol)
 
 
 # --- outputs
@@ -263,7 +210,7 @@ def _write(task: Task, m: March, points: tuple[Point, ...], until: Array) -> Mar
         return jnp.sum((block(m) <= until) & (number < inner), axis=0)
 
     def more(m: March) -> March:
-        states = _interpolated(points, block(m))
+        states = interpolated(points, block(m))
         written = m.written + behind(m)
         if not lanes:
             return m._replace(written=written, outputs=jax.lax.dynamic_update_slice(m.outputs, states, (m.written, 0)))
@@ -275,36 +222,3 @@ def _write(task: Task, m: March, points: tuple[Point, ...], until: Array) -> Mar
         return m._replace(written=written, outputs=jax.lax.fori_loop(0, lanes[0], lane, m.outputs))
 
     return jax.lax.while_loop(lambda m: jnp.any(behind(m) > 0), more, m)
-
-
-def _interpolated(points: tuple[Point, ...], times: Array) -> Array:
-    """q and v (BLOCK, 2n, *lanes) at times (BLOCK, *lanes) between the last two points.
-
-    Hermite's polynomial by Newton's divided differences, the latest point first. Points that lie much closer together than the
-    last step is long, as where it grows at the start, or that are not there yet, are left out: they only add rounding errors.
-    """
-    points = points[::-1]
-    step = points[0].t - points[1].t
-    used = [jnp.ones(step.shape, bool)]
-    for p, q in itertools.pairwise(points[1:]):
-        used.append(used[-1] & (STRETCH * (p.t - q.t) >= step))
-    apart = {(i, j): points[j].t - points[i].t for i, j in itertools.combinations(range(len(points)), 2)}
-    inverse = {ij: 1.0 / jnp.where(d == 0, 1.0, d) for ij, d in apart.items()}
-    column = [p.q for p in points for _ in range(3)]
-    coefficients = [column[0]]
-    known = {1: [p.v for p in points], 2: [0.5 * p.a for p in points]}
-    for order in range(1, 3 * len(points)):
-        following = []
-        for i in range(3 * len(points) - order):
-            first, last = i // 3, (i + order) // 3
-            if first == last:
-                following.append(known[order][first])
-            else:
-                following.append((column[i + 1] - column[i]) * inverse[first, last])
-        column = following
-        coefficients.append(column[0] if order < 3 else jnp.where(used[order // 3 - 1], column[0], 0.0))
-    q, v = jnp.zeros((), column[0].dtype), jnp.zeros((), column[0].dtype)
-    for k, coefficient in reversed(list(enumerate(coefficients))):
-        ahead = (times - points[k // 3].t)[:, None]
-        q, v = q * ahead + coefficient, v * ahead + q
-    return jnp.concatenate([q, v], axis=1)

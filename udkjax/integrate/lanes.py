@@ -17,9 +17,11 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
 from udkjax.equations.motion import Motion
-from udkjax.integrate.explicit import Point, Task, Trial, judged, march, method_of, stage_state
+from udkjax.integrate.explicit import Task, Trial, judged, march, stage_state
+from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import project
+from udkjax.integrate.tableau import method_of
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
