@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from tests.pinv.structures import four_bars, touching
-from udkjax.pinv.blocks import BlockElimination, BlockPattern
+from udkjax.pinv.block_methods import BlockElimination
+from udkjax.pinv.blocks import BlockPattern
 from udkjax.pinv.dissection import dissect
 from udkjax.pinv.stretching import MANY, Stretched, stretch
 

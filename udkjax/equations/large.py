@@ -23,7 +23,8 @@ from udkjax.equations.code import CONSISTENT, TINY, structure
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
 from udkjax.equations.motion import MechanismMotion, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
-from udkjax.pinv.blocks import BlockElimination, DenseParts, by_block, factorized, flat
+from udkjax.pinv.block_methods import BlockElimination, DenseParts, factorized
+from udkjax.pinv.blocks import by_block, flat
 from udkjax.scene.mechanism import Mechanism
 
 # The least share of a row's length that closing takes for granted: enough to tell redundant rows from rounding, too little to
