@@ -81,11 +81,15 @@ def _pictures(figures: Figures) -> Iterable[str]:
         )
 
 
+def _panels(rows: Rows, height: float) -> tuple[Figure, Any, list[str]]:
+    """A figure with one panel a motion, and what is to be drawn in each, in the order of the rows."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    return figure, figure.subplots(1, len(MOTIONS), sharex=True, sharey=True), list(dict.fromkeys(row["name"] for row in rows))
+
+
 def work(rows: Rows) -> Figure:
     """Draw CPU time against error, one panel a motion."""
-    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
-    panels = figure.subplots(1, len(MOTIONS), sharex=True, sharey=True)
-    names = list(dict.fromkeys(row["name"] for row in rows))
+    figure, panels, names = _panels(rows, 4.6)
     for axes, (start, title) in zip(panels, MOTIONS.items(), strict=True):
         for place, name in enumerate(names):
             _line(axes, [row for row in rows if row["name"] == name and row["start"] == start], "seconds", 1e3, place)
@@ -98,9 +102,7 @@ def work(rows: Rows) -> Figure:
 
 def batch(rows: Rows) -> Figure:
     """Draw trajectories per second against error, one panel a motion."""
-    figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
-    panels = figure.subplots(1, len(MOTIONS), sharex=True, sharey=True)
-    names = list(dict.fromkeys(row["name"] for row in rows))
+    figure, panels, names = _panels(rows, 4.2)
     for axes, (start, title) in zip(panels, MOTIONS.items(), strict=True):
         for place, name in enumerate(names):
             for kind, dashes in (("end only", "-"), ("201 outputs", "--")):

@@ -44,10 +44,9 @@ class BlockFactors(NamedTuple):
 class BlockElimination(Blockwise):
     """Elimination of independent rows that come in blocks: operator, b and x as in `Blockwise`.
 
-    A pivot is safe if it exceeds
-    `rank_tol`^2 times its row's diagonal entry of D D^T: what remains of the row is longer than `rank_tol` of it. Rows that are
-    not independent have no place here: the rank is then counted as zero. `damping` d makes the diagonal of D D^T 1 + d times
-    as large.
+    A pivot is safe if it exceeds `rank_tol`^2 times its row's diagonal entry of D D^T: what remains of the row is longer than
+    `rank_tol` of it. Rows that are not independent have no place here: the rank is then counted as zero. `damping` d makes the
+    diagonal of D D^T 1 + d times as large.
     """
 
     damping: Float[Array, ""] | None = None
