@@ -178,10 +178,10 @@ def report(
     if not -180 < start < 0 or start == -90:
         _refuse(f"--start {start:g}: between -180 and 0 degrees the links swing without becoming collinear; at -90 they hang")
 
-    from udkjax.show.progress import Progress
     from udkjax.show.report import write
     from udkjax.study.cases import FULL, QUICK
     from udkjax.study.paper import study
+    from udkjax.study.progress import Progress
     from udkjax.study.record import read, save
 
     if from_file:

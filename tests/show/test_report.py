@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from udkjax.show import report, report_tables
-from udkjax.show.progress import Progress
 from udkjax.show.report_findings import findings, nfunc_note, psi2_note, repeat
 from udkjax.study.record import read, save
 
@@ -172,28 +171,3 @@ def test_settings_and_versions_are_on_the_page(study_data):
     assert shown["setting: start"] == "-45" and shown["setting: seed"] == "3"
     assert shown["machine"] == study_data.attrs["machine"] and "version: jax" in shown
     assert json.loads(study_data.attrs["published"])[0]["number"] == 2
-
-
-class Stream(list):
-    def __init__(self, terminal: bool):
-        self.terminal = terminal
-
-    def isatty(self) -> bool:
-        return self.terminal
-
-    def write(self, text: str) -> None:
-        self.append(text)
-
-    def flush(self) -> None:
-        pass
-
-
-def test_progress_writes_over_itself_on_a_terminal_and_is_sparing_elsewhere():
-    terminal, file = Stream(True), Stream(False)
-    for stream in (terminal, file):
-        tell = Progress(stream)  # pyright: ignore[reportArgumentType]
-        for k in range(11):
-            tell(f"run {k}", k / 10)
-    assert "".join(terminal).count("\r") == 11 and "".join(terminal).count("\n") == 1
-    assert "".join(file).count("\n") == 2  # the first and the last
-    assert "run 10 (100 %" in "".join(file) and "left" not in "".join(file).splitlines()[-1]

@@ -1,0 +1,189 @@
+"""What a sweep has written: whole, never twice, never mixed with another sweep."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from udkjax.study.sweep import store
+from udkjax.study.sweep.plan import Chunk
+from udkjax.study.sweep.store import Memory, Store, StoreError, opened, packed, unpacked, write_whole
+
+FINGERPRINT = {"settings": {"rtol": 1e-8}, "scene": "format = 1\nmass = 1.0\n", "axes": [1.0, 2.0, float("nan")]}
+
+
+def chunk(index, members):
+    return Chunk(index, 0, np.array(members))
+
+
+CHUNKS = [chunk(0, [4, 1]), chunk(1, [0, 5]), chunk(2, [3, 2])]
+
+
+def data(chunk):
+    return {"result": np.zeros(len(chunk.members), int), "q": np.sqrt(chunk.members[:, None] + np.arange(3.0))}
+
+
+def collected(kept):
+    """Everything that is finished, by member."""
+    return {int(m): d["q"][k].tolist() for members, d in kept.finished() for k, m in enumerate(members)}
+
+
+def files(folder):
+    return sorted((folder / "chunks").iterdir())
+
+
+@pytest.mark.parametrize("place", ["folder", None])
+def test_what_is_finished_is_left_out_and_given_back(tmp_path, place):
+    out = place and tmp_path / place
+    with opened(out, FINGERPRINT) as kept:
+        assert kept.left(CHUNKS) == CHUNKS
+        kept.write(CHUNKS[1], data(CHUNKS[1]))
+        assert kept.left(CHUNKS) == [CHUNKS[0], CHUNKS[2]]
+        ((members, found),) = kept.finished()
+        np.testing.assert_array_equal(members, [0, 5])
+        assert {name: values.dtype.kind for name, values in found.items()} == {"result": "i", "q": "f"}
+        np.testing.assert_array_equal(found["q"], data(CHUNKS[1])["q"])
+    assert isinstance(kept, Memory if place is None else Store)
+
+
+def test_a_sweep_goes_on_where_it_was_cut_into_other_chunks(tmp_path):
+    with Store(tmp_path, FINGERPRINT) as kept:
+        kept.write(CHUNKS[0], data(CHUNKS[0]))
+    with Store(tmp_path, FINGERPRINT) as kept:
+        left = kept.left([chunk(0, [0, 1, 2]), chunk(1, [3, 4]), chunk(2, [5])])
+        assert [c.members.tolist() for c in left] == [[0, 2], [3], [5]]
+        assert [c.index for c in left] == [0, 1, 2]
+        for c in left:
+            kept.write(c, data(c))
+        assert collected(kept) == {m: data(chunk(0, [m]))["q"][0].tolist() for m in range(6)}
+        assert kept.left(CHUNKS) == []
+
+
+def test_an_archive_with_any_bit_changed_or_cut_off_is_none(tmp_path):
+    content = packed({"q": np.arange(3.0)})
+    np.testing.assert_array_equal((unpacked(content) or {})["q"], np.arange(3.0))
+    for place in range(len(content)):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << place % 8
+        assert unpacked(bytes(damaged)) is None
+        assert unpacked(content[:place]) is None
+    (tmp_path / "chunk.npz").write_bytes(content)  # which anyone can read
+    np.testing.assert_array_equal(np.load(tmp_path / "chunk.npz")["q"], np.arange(3.0))
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda content: content[: len(content) // 2], lambda content: b"", lambda content: b"\0" * len(content)]
+)
+def test_a_damaged_chunk_is_computed_again_and_no_other(tmp_path, damage):
+    with Store(tmp_path, FINGERPRINT) as kept:
+        for c in CHUNKS:
+            kept.write(c, data(c))
+        whole = collected(kept)
+        broken = files(tmp_path)[1]
+        broken.write_bytes(damage(broken.read_bytes()))
+    with Store(tmp_path, FINGERPRINT) as kept:
+        with pytest.warns(UserWarning, match=f"{broken.name} is damaged"):
+            left = kept.left(CHUNKS)
+        assert left == [CHUNKS[1]]
+        kept.write(left[0], data(left[0]))
+        assert collected(kept) == whole
+
+
+def test_another_sweep_is_refused_and_the_difference_spelled_out(tmp_path):
+    with Store(tmp_path, FINGERPRINT):
+        pass
+    before = (tmp_path / "sweep.json").read_bytes()
+    other = {"settings": {"rtol": 1e-9}, "scene": "format = 1\nmass = 2.0\n", "axes": [1.0, 2.5, float("nan")]}
+    with pytest.raises(StoreError) as caught:
+        Store(tmp_path, other)
+    for line in (
+        "settings.rtol: was 1e-08, is 1e-09",
+        "scene: was mass = 1.0",
+        "scene: is mass = 2.0",
+        "axes[1]: was 2.0, is 2.5",
+    ):
+        assert line in str(caught.value)
+    assert "format = 1" not in str(caught.value) and "axes[2]" not in str(caught.value)
+    assert (tmp_path / "sweep.json").read_bytes() == before
+    with Store(tmp_path, FINGERPRINT):  # which gave the lock back
+        pass
+
+
+def test_a_folder_with_something_else_is_refused(tmp_path):
+    (tmp_path / "chunks").mkdir()
+    (tmp_path / "chunks" / "0.npz").write_bytes(b"")
+    with pytest.raises(StoreError, match=r"no sweep\.json that says of which sweep"):
+        Store(tmp_path, FINGERPRINT)
+    (tmp_path / "sweep.json").write_text("{")
+    with pytest.raises(StoreError, match="no description of a sweep"):
+        Store(tmp_path, FINGERPRINT)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot write to the folder"):
+        Store(tmp_path / "file", FINGERPRINT)
+
+
+def test_two_processes_do_not_write_the_same_sweep(tmp_path):
+    code = (
+        "import sys; from udkjax.study.sweep.locking import Lock; from pathlib import Path\n"
+        "lock = Lock(Path(sys.argv[1])); assert lock.take() is None; print('taken', flush=True); sys.stdin.read()"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path / "lock")]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout and other.stdout.readline() == "taken\n"
+        with pytest.raises(StoreError, match=f"is being written to by process {other.pid} on "):
+            Store(tmp_path, FINGERPRINT)
+        other.send_signal(signal.SIGKILL)
+    with Store(tmp_path, FINGERPRINT), pytest.raises(StoreError, match=f"by process {os.getpid()} on "):
+        Store(tmp_path, FINGERPRINT)
+
+
+def test_what_was_being_written_when_the_process_died_is_removed(tmp_path):
+    with Store(tmp_path, FINGERPRINT) as kept:
+        kept.write(CHUNKS[0], data(CHUNKS[0]))
+    torn = tmp_path / "chunks" / f"000001-abc.npz.123{store.UNFINISHED}"
+    torn.write_bytes(b"half")
+    with Store(tmp_path, FINGERPRINT) as kept:
+        assert not torn.exists()
+        assert kept.left(CHUNKS) == CHUNKS[1:]
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_full_disk_is_named_and_what_is_finished_stays_valid(tmp_path, monkeypatch, call):
+    with Store(tmp_path, FINGERPRINT) as kept:
+        kept.write(CHUNKS[0], data(CHUNKS[0]))
+
+        def full(*_):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        with monkeypatch.context() as patched:
+            patched.setattr(os, call, full)
+            with pytest.raises(StoreError, match=r"No space left on device; 1 chunks in .* stay valid.*run the same sweep again"):
+                kept.write(CHUNKS[1], data(CHUNKS[1]))
+        assert len(files(tmp_path)) == 1
+    with Store(tmp_path, FINGERPRINT) as kept:
+        assert kept.left(CHUNKS) == CHUNKS[1:]
+
+
+def test_a_file_that_cannot_be_written_to_its_end_is_not_there(tmp_path):
+    """With a limit on the size of files, which the system enforces in the middle of a write."""
+    write_whole(tmp_path / "a", b"before")
+    code = (
+        "import resource, signal, sys; from pathlib import Path; from udkjax.study.sweep.store import write_whole\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        "write_whole(Path(sys.argv[1]), b'x' * 5000)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a")], capture_output=True, text=True, check=False)
+    assert "File too large" in ran.stderr
+    assert [f.name for f in tmp_path.iterdir()] == ["a"] and (tmp_path / "a").read_bytes() == b"before"
+
+
+def test_the_manifest_says_what_the_sweep_is(tmp_path):
+    with Store(tmp_path, FINGERPRINT):
+        pass
+    said = json.loads((tmp_path / "sweep.json").read_text())
+    assert said["settings"] == {"rtol": 1e-8} and said["scene"] == FINGERPRINT["scene"]

@@ -1,0 +1,99 @@
+"""What is said of a sweep while it runs."""
+
+import numpy as np
+import pytest
+
+from udkjax.integrate import Result
+from udkjax.study.sweep import progress
+from udkjax.study.sweep.plan import Chunk
+from udkjax.study.sweep.progress import Status, Watch, duration, teller
+
+CHUNKS = [Chunk(k, 0, np.arange(4 * k, 4 * k + 4)) for k in range(5)]
+
+
+def result(*codes):
+    return {"result": np.array([*codes, *[0] * (4 - len(codes))])}
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that is put by hand."""
+
+    class Clock:
+        now = 100.0
+
+        def monotonic(self):
+            return self.now
+
+    clock = Clock()
+    monkeypatch.setattr(progress, "time", clock)
+    monkeypatch.setattr("udkjax.study.progress.time", clock)
+    return clock
+
+
+def test_a_sweep_is_followed(clock):
+    seen: list[Status] = []
+    watch = Watch(20, CHUNKS[1:], seen.append, [0, 0, Result.drift, 0])
+    assert seen[-1] == Status(20, 4, 0.0, None, None, {"drift": 1})
+    clock.now += 8  # of which most went into a compilation
+    watch(CHUNKS[2], {**result(Result.step_limit), "steps": np.array([3, 9, 7, 1])}, 7.5)
+    assert seen[-1] == Status(20, 8, 8.0, 0.5, None, {"drift": 1, "step_limit": 1}, (9, 9), (2, 7.5))
+    clock.now += 2
+    watch(CHUNKS[1], {**result(Result.drift), "steps": np.array([3, 9, 7, 1])}, 2.0)
+    assert seen[-1] == Status(20, 12, 10.0, 0.8, 4.0, {"drift": 2, "step_limit": 1}, (9, 9), (2, 7.5))
+    clock.now += 4
+    watch(CHUNKS[4], {**result(), "steps": np.array([3, 9, 7, 10])})
+    assert seen[-1].left == 3.0 and seen[-1].slowest == (19, 10) and seen[-1].slowest_chunk == (2, 7.5)
+    assert str(seen[-1]) == (
+        "16 of 20 members (80 %); 0.857 a second; 3 s left; failed: 2 drift, 1 step limit; slowest chunk 2: 7.5 s; "
+        "slowest member 19: 10 steps"
+    )
+    clock.now += 1
+    watch(CHUNKS[3], result())
+    assert str(seen[-1]).startswith("20 of 20 members (100 %); 1.07 a second; 15 s; failed")
+
+
+class Stream(list):
+    def __init__(self, terminal):
+        self.terminal = terminal
+
+    def isatty(self):
+        return self.terminal
+
+    def write(self, text):
+        self.append(text)
+
+    def flush(self):
+        pass
+
+
+@pytest.mark.parametrize(("terminal", "lines", "shown"), [(True, 1, 5), (False, 3, 3)])
+def test_it_is_shown_on_one_line_of_a_terminal_and_on_a_few_of_a_log(clock, terminal, lines, shown):
+    stream = Stream(terminal)
+    watch = Watch(20, CHUNKS, teller(None, stream))  # pyright: ignore[reportArgumentType]
+    for chunk in CHUNKS:
+        clock.now += 10
+        watch(chunk, result())
+    text = "".join(stream)
+    assert text.count("\n") == lines and text.count(" of 20 members") == shown
+    assert text.split("\r")[-1].splitlines()[-1].startswith("20 of 20 members")
+
+
+def test_nothing_is_said_where_it_is_asked_for_or_soon_over(clock, capsys):
+    for progress_, pause in ((False, 10.0), (None, 0.1)):
+        watch = Watch(20, CHUNKS, teller(progress_))
+        for chunk in CHUNKS:
+            clock.now += pause
+            watch(chunk, result())
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_duration_in_words():
+    assert [duration(x) for x in (0.4, 119, 121, 7000, 7300, 90000)] == [
+        "0 s",
+        "119 s",
+        "2 min",
+        "117 min",
+        "2 h 2 min",
+        "25 h 0 min",
+    ]

@@ -1,0 +1,201 @@
+"""What a sweep has finished, on disk: whatever ends the process, what is there is whole, and what is there is not computed again.
+
+A folder holds `sweep.json`, which says what the sweep is, and `chunks/`, one file for each chunk. A file comes into being under
+its name only when all of it is on the disk, and carries its SHA-256. No list says what is finished: the files are the list.
+"""
+
+import abc
+import dataclasses
+import hashlib
+import io
+import json
+import os
+import struct
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from udkjax.study.sweep.differences import differences
+from udkjax.study.sweep.locking import Lock
+from udkjax.study.sweep.plan import Chunk
+
+FORMAT = 1
+MANIFEST, CHUNKS, LOCK = "sweep.json", "chunks", "lock"
+UNFINISHED = ".unfinished"  # what a file's name ends with while it is written
+MEMBERS = "members"  # the name under which a file keeps whom its numbers belong to
+DIGEST = 64  # characters of a SHA-256
+
+Data = Mapping[str, np.ndarray]
+
+
+class StoreError(OSError):
+    """A sweep cannot be written where it should be, or is not the one that was begun there."""
+
+
+class Kept(abc.ABC):
+    """What a sweep has finished. A context manager: outside of it nothing is written."""
+
+    def __enter__(self) -> "Kept":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        return None
+
+    def left(self, chunks: Sequence[Chunk]) -> list[Chunk]:
+        """Return the chunks that are not finished, or the part of them that is not.
+
+        By member, since the chunks are not the same with another memory or another number of devices.
+        """
+        done = np.concatenate([np.empty(0, int), *[members for members, _ in self.finished()]])
+        kept = []
+        for chunk in chunks:
+            members = np.asarray(chunk.members)
+            new = ~np.isin(members, done)
+            if new.all():
+                kept.append(chunk)
+            elif new.any():
+                kept.append(dataclasses.replace(chunk, members=members[new]))
+        return kept
+
+    @abc.abstractmethod
+    def write(self, chunk: Chunk, data: Data) -> None:
+        """Keep what a chunk gave: one array for each name, whose first axis is the chunk's members."""
+
+    @abc.abstractmethod
+    def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
+        """Iterate over what is finished, one chunk at a time: members, and their data."""
+
+
+class Memory(Kept):
+    """What a sweep has finished, where nothing is to outlive the process."""
+
+    def __init__(self):
+        self._done: list[tuple[np.ndarray, Data]] = []
+
+    def write(self, chunk: Chunk, data: Data) -> None:
+        self._done.append((np.asarray(chunk.members), data))
+
+    def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
+        yield from self._done
+
+
+class Store(Kept):
+    """What a sweep has finished, in a folder that only one process may write to at a time.
+
+    `fingerprint` says what decides the result. A folder in which another sweep was begun is refused, and the difference spelled
+    out. Raises `StoreError`.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, Any]):
+        self.folder = Path(folder)
+        try:
+            (self.folder / CHUNKS).mkdir(parents=True, exist_ok=True)
+            self._lock = Lock(self.folder / LOCK)
+            other = self._lock.take()
+        except OSError as error:
+            raise StoreError(f"cannot write to the folder {self.folder}: {error.strerror or error}") from error
+        if other is not None:
+            raise StoreError(f"{self.folder} is being written to by {other}: wait for it, end it, or choose another folder")
+        try:
+            self._begin(json.loads(json.dumps({"format": FORMAT, **fingerprint})))
+        except BaseException:
+            self._lock.give_back()
+            raise
+
+    def __exit__(self, *_: Any) -> None:
+        self._lock.give_back()
+
+    def write(self, chunk: Chunk, data: Data) -> None:
+        """Write what a chunk gave, whole or not at all."""
+        members = np.asarray(chunk.members)
+        self._write(f"{CHUNKS}/{_name(chunk.index, members)}", packed({MEMBERS: members, **data}))
+
+    def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
+        """Iterate over what is finished, one file at a time: members, and their data. Damaged files are removed."""
+        for file in self._files():
+            data = unpacked(file.read_bytes())
+            if data is None:
+                warnings.warn(f"{file} is damaged: what it held is computed again", stacklevel=2)
+                file.unlink()
+            else:
+                yield data.pop(MEMBERS), data
+
+    def _begin(self, sweep: dict[str, Any]) -> None:
+        """Say what the sweep is; where something is there already, compare."""
+        for file in (*self.folder.glob(f"*{UNFINISHED}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED}")):
+            file.unlink(missing_ok=True)  # of a process that was killed while it wrote
+        manifest = self.folder / MANIFEST
+        if manifest.exists():
+            try:
+                begun = json.loads(manifest.read_text(encoding="utf-8"))
+            except ValueError as error:
+                raise StoreError(f"{manifest} is no description of a sweep ({error}): choose another folder") from None
+            if found := differences(begun, sweep):
+                lines = "\n  ".join(found)
+                advice = "choose another folder, or remove this one to begin anew"
+                raise StoreError(f"another sweep was begun in {self.folder}: {advice}. What differs:\n  {lines}")
+        elif any(self._files()):
+            raise StoreError(f"{self.folder} holds chunks, but no {MANIFEST} that says of which sweep: choose another folder")
+        else:
+            self._write(MANIFEST, json.dumps(sweep, indent=1).encode())
+
+    def _files(self) -> list[Path]:
+        return sorted((self.folder / CHUNKS).glob("*.npz"))
+
+    def _write(self, name: str, content: bytes) -> None:
+        try:
+            write_whole(self.folder / name, content)
+        except OSError as error:
+            kept = f"{len(self._files())} chunks in {self.folder} are finished and stay valid"
+            advice = "once it can be written to, run the same sweep again: it goes on from there"
+            raise StoreError(f"cannot write {name}: {error.strerror or error}; {kept}; {advice}") from error
+
+
+def opened(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Any]) -> Kept:
+    """Return what keeps the finished chunks: the folder `out`, or, without one, memory."""
+    return Memory() if out is None else Store(out, fingerprint)
+
+
+def _name(index: int, members: np.ndarray) -> str:
+    """Name a chunk's file by its place and by whom it holds, so that it replaces no other."""
+    return f"{index:06d}-{hashlib.sha256(members.astype('<i8').tobytes()).hexdigest()[:12]}.npz"
+
+
+def packed(arrays: Data) -> bytes:
+    """Return an NPZ archive of the arrays whose comment is the SHA-256 of everything before it."""
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **arrays)
+    body = stream.getvalue()[:-2]  # a ZIP archive ends with the length of its comment, and the comment
+    return body + struct.pack("<H", DIGEST) + hashlib.sha256(body).hexdigest().encode()
+
+
+def unpacked(content: bytes) -> dict[str, np.ndarray] | None:
+    """Return the arrays of an archive that `packed` made, or None where a bit of it is not as it was."""
+    body, length, digest = content[: -DIGEST - 2], content[-DIGEST - 2 : -DIGEST], content[-DIGEST:]
+    if length != struct.pack("<H", DIGEST) or digest != hashlib.sha256(body).hexdigest().encode():
+        return None
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        return dict(archive)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file so that, whenever the process or the machine stops, it is there as it was before, or all of it is."""
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
+    try:
+        with open(unfinished, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
+    if hasattr(os, "O_DIRECTORY"):  # where folders can be opened, their entries have to reach the disk too
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
