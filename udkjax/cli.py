@@ -125,7 +125,7 @@ def simulate(
         "atol": atol,
         "method": pseudoinverse() if rank_tol is None else pseudoinverse(rank_tol=rank_tol),
         "formulation": getattr(udk, FORMULATIONS[formulation])() if formulation in FORMULATIONS else None,
-        "solver": solver_named(SOLVERS[solver]),
+        "solver": None if solver == "dopri8" else solver_named(SOLVERS[solver]),  # the default
         "dt0": dt0,
         "stabilization": stabilizations[stabilization](),
         "throw": False,

@@ -14,9 +14,9 @@ import udkjax as udk
 from udkjax.equations import prepare
 from udkjax.integrate.bdf import BDF
 from udkjax.integrate.by_diffrax import derivative
+from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import Counting, evaluations
 from udkjax.integrate.multistep import Multistep, Tolerances
-from udkjax.integrate.projection import Constrained
 
 GROWTH = 1.1  # of the steps of the start; beyond 1.127 the formula of order five is unstable
 # The first step, relative to the steps to come: with order one it errs by 1e-12 of what a step of that size does.

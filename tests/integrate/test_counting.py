@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, count_evaluations, evaluations
 from udkjax.integrate.multistep import Multistep, from_controller
-from udkjax.integrate.projection import Constrained
 
 SAVE = diffrax.SaveAt(t1=True, controller_state=True)
 

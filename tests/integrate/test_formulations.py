@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax.equations import equations_of
 from udkjax.integrate.by_diffrax import derivative
-from udkjax.integrate.projection import Constrained
+from udkjax.integrate.constrained import Constrained
 from udkjax.study import exact_coordinates
 
 FORMULATIONS = {

@@ -8,19 +8,22 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion
+from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.problem import DONE, STEP_LIMIT, STEP_TOO_SMALL, Problem, Raw
-from udkjax.integrate.projection import Constrained, project_all
+from udkjax.integrate.projection import project_all
 from udkjax.integrate.undifferentiated import undifferentiated
 
 
-def by_diffrax(problem: Problem, adjoint: diffrax.AbstractAdjoint, meter: diffrax.AbstractProgressMeter) -> Raw:
-    """Integrate one problem with any solver of diffrax."""
+def by_diffrax(
+    problem: Problem, adjoint: diffrax.AbstractAdjoint | None = None, meter: diffrax.AbstractProgressMeter | None = None
+) -> Raw:
+    """Integrate one problem with any solver of diffrax (default Dopri8), in reverse mode by checkpoints unless said otherwise."""
     ts, y0 = problem.ts, jnp.concatenate([problem.q, problem.v])
     run = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
-        Constrained(problem.solver, problem.projected),
+        Constrained(problem.solver or diffrax.Dopri8(), problem.projected),
         t0=ts[0],
         t1=ts[-1],
         dt0=_first_step(problem, y0) if problem.h is None else problem.h,
@@ -28,9 +31,9 @@ def by_diffrax(problem: Problem, adjoint: diffrax.AbstractAdjoint, meter: diffra
         args=problem.equations,
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], controller_state=True),
         stepsize_controller=Counting(_controller(problem)),
-        adjoint=adjoint,
+        adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
         max_steps=problem.max_steps,
-        progress_meter=meter,
+        progress_meter=meter or diffrax.NoProgressMeter(),
         throw=False,
     )
     saved: Any = (run.ys, run.ts)

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ from udkjax.integrate.explicit import Task, Trial, judged, march, stage_state
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import project
-from udkjax.integrate.tableau import method_of
+from udkjax.integrate.tableau import is_explicit, method_of
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
@@ -32,8 +31,7 @@ LANES = 64  # with 16 or 32 a lane of the paper's linkage takes longer, with 128
 
 def serves(problem: Problem) -> bool:
     """Whether a problem can be integrated here: by an explicit Runge-Kutta method with an error estimate, all of q and v."""
-    explicit = isinstance(problem.solver, diffrax.AbstractERK) and isinstance(problem.solver.tableau, diffrax.ButcherTableau)
-    return explicit and type(problem.equations).rates is Motion.rates
+    return is_explicit(problem.solver) and type(problem.equations).rates is Motion.rates
 
 
 def solve(problem: Problem) -> Raw:

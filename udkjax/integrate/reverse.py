@@ -3,11 +3,9 @@
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 
-from udkjax.integrate.by_diffrax import by_diffrax
 from udkjax.integrate.problem import Problem, Raw
 
 
@@ -20,7 +18,9 @@ def reversible(problem: Problem, integrate: Callable[[Problem], Raw]) -> Raw:
         return integrate(eqx.combine(arrays, static))
 
     def again(arrays: Any) -> Any:
-        raw = by_diffrax(eqx.combine(arrays, static), diffrax.RecursiveCheckpointAdjoint(), diffrax.NoProgressMeter())
+        from udkjax.integrate.by_diffrax import by_diffrax
+
+        raw = by_diffrax(eqx.combine(arrays, static))
         return raw.ys, raw.y
 
     def backward(arrays: Any, cotangents: Raw) -> Any:

@@ -1,10 +1,8 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
 from functools import partial
-from types import NoneType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,10 +17,9 @@ from udkjax.equations.partitioning import Partitioned
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.by_diffrax import by_diffrax
 from udkjax.integrate.lanes import one_by_one, serves, solve
 from udkjax.integrate.outcome import Run, counts, outcome
-from udkjax.integrate.problem import DOUBTED, Problem
+from udkjax.integrate.problem import DOUBTED, Problem, Raw
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.reverse import reversible
 from udkjax.integrate.solution import Result, SimulationError, Solution
@@ -30,6 +27,9 @@ from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
+
+if TYPE_CHECKING:
+    import diffrax
 
 MAX_STEPS = 100_000
 # m and rad. Projection leaves rounding errors, unless the rows that it does not see drift. Without it drift is what one looks at,
@@ -46,8 +46,8 @@ def simulate(
     atol: ArrayLike = 1e-8,
     method: Pseudoinverse | None = None,
     stabilization: Projection | Baumgarte | None = Projection(),
-    solver: diffrax.AbstractSolver | None = None,
-    adjoint: diffrax.AbstractAdjoint | None = None,
+    solver: "diffrax.AbstractSolver | None" = None,
+    adjoint: "diffrax.AbstractAdjoint | None" = None,
     max_steps: int = MAX_STEPS,
     drift_tol: ArrayLike | None = None,
     dt0: ArrayLike | None = None,
@@ -80,7 +80,7 @@ def simulate(
     drift = number((DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE) if drift_tol is None else drift_tol)
     method = Auto() if method is None else method
     settings = (number(rtol), number(atol), method, stabilization, drift, _step(dt0), formulation)
-    choices = (solver or diffrax.Dopri8(), adjoint, max_steps, _meter(progress))
+    choices = (solver, adjoint, max_steps, _meter(progress))
 
     def run(mechanism: Any, careful: bool) -> tuple[Solution, Any, Any]:
         return _simulate(mechanism, ts, state, closure, *settings, *choices, careful)
@@ -132,12 +132,12 @@ def _simulate(
     q, v = start.q.ravel(), start.v.ravel()
     numbers = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0)
     problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, careful=careful)
-    if type(adjoint) in (NoneType, diffrax.ForwardMode) and isinstance(meter, diffrax.NoProgressMeter):
-        single = partial(by_diffrax, adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(), meter=meter)
+    if meter is None and _by_jax(adjoint):
+        single = partial(_by_diffrax, adjoint=adjoint, meter=None)
         integrate = solve if serves(problem) else partial(one_by_one, single=single)
         raw = integrate(problem) if adjoint else reversible(problem, integrate)
     else:
-        raw = by_diffrax(problem, adjoint or diffrax.RecursiveCheckpointAdjoint(), meter)
+        raw = _by_diffrax(problem, adjoint, meter)
     ys = jnp.where(raw.reached[:, None], raw.ys, jnp.concatenate([q, v])).at[0].set(jnp.concatenate([q, v]))
     seen = undifferentiated(Run(equations, raw, ts, ys, closed, missed, drift_tol))
     code, time, reached = outcome(seen)
@@ -148,7 +148,7 @@ def _simulate(
         ("method", type(method).__name__),
         ("formulation", "UdwadiaKalaba" if formulation is None else type(formulation).__name__),
         ("stabilization", type(stabilization).__name__),
-        ("solver", type(solver).__name__),
+        ("solver", "Dopri8" if solver is None else type(solver).__name__),
         ("max_steps", str(max_steps)),
         ("first_step", "chosen" if dt0 is None else "given"),
     )
@@ -185,7 +185,28 @@ def _step(dt0: ArrayLike | None) -> Array | None:
     return dt0
 
 
-def _meter(progress: Any) -> diffrax.AbstractProgressMeter:
+# diffrax is imported where it is asked for: it takes as long as all of JAX.
+
+
+def _by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Raw:
+    from udkjax.integrate.by_diffrax import by_diffrax
+
+    return by_diffrax(problem, adjoint, meter)
+
+
+def _by_jax(adjoint: Any) -> bool:
+    """Whether derivatives are taken by JAX, through any integrator, and not by an adjoint of diffrax, through its own."""
+    if adjoint is None:
+        return True
+    import diffrax
+
+    return type(adjoint) is diffrax.ForwardMode
+
+
+def _meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":
     if progress is None or progress is False:
-        return diffrax.NoProgressMeter()
-    return diffrax.TextProgressMeter() if progress is True else progress
+        return None
+    import diffrax
+
+    meter = diffrax.TextProgressMeter() if progress is True else progress
+    return None if isinstance(meter, diffrax.NoProgressMeter) else meter

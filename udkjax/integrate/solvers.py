@@ -1,16 +1,19 @@
 """Solvers by name: diffrax's own, and those that are written here."""
 
-from importlib import import_module
+from typing import TYPE_CHECKING
 
-import diffrax
+from udkjax import integrate
 
-HERE = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}
+if TYPE_CHECKING:
+    import diffrax
 
 
-def solver_named(name: str) -> diffrax.AbstractSolver:
+def solver_named(name: str) -> "diffrax.AbstractSolver":
     """Return the solver of this name: `Adams`, `BDF`, `Verner65`, or any solver of diffrax that needs no arguments."""
-    home = import_module(f"udkjax.integrate.{HERE[name]}") if name in HERE else diffrax
-    solver = getattr(home, name, None)
+    import diffrax
+
+    solver = getattr(integrate if name in integrate.SOLVERS else diffrax, name, None)
     if not (isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver)):
-        raise ValueError(f"{name!r} is no solver: it is none of {', '.join(HERE)}, nor a solver of diffrax such as 'Dopri8'")
+        here = ", ".join(integrate.SOLVERS)
+        raise ValueError(f"{name!r} is no solver: it is none of {here}, nor a solver of diffrax such as 'Dopri8'")
     return solver()

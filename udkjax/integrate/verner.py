@@ -1,7 +1,6 @@
 """Verner's pair of orders 6 and 5, the method of the codes DVERK and DIVPRK."""
 
 from collections.abc import Callable
-from fractions import Fraction
 from typing import Any, ClassVar
 
 import diffrax
@@ -9,24 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-
-def _row(text: str) -> np.ndarray:
-    return np.array([float(Fraction(x)) for x in text.split()])
-
+from udkjax.integrate.tableau import row
 
 TABLEAU = diffrax.ButcherTableau(
-    c=_row("1/6 4/15 2/3 5/6 1 1/15 1"),
+    c=row("1/6 4/15 2/3 5/6 1 1/15 1"),
     a_lower=(
-        _row("1/6"),
-        _row("4/75 16/75"),
-        _row("5/6 -8/3 5/2"),
-        _row("-165/64 55/6 -425/64 85/96"),
-        _row("12/5 -8 4015/612 -11/36 88/255"),
-        _row("-8263/15000 124/75 -643/680 -81/250 2484/10625 0"),
-        _row("3501/1720 -300/43 297275/52632 -319/2322 24068/84065 0 3850/26703"),
+        row("1/6"),
+        row("4/75 16/75"),
+        row("5/6 -8/3 5/2"),
+        row("-165/64 55/6 -425/64 85/96"),
+        row("12/5 -8 4015/612 -11/36 88/255"),
+        row("-8263/15000 124/75 -643/680 -81/250 2484/10625 0"),
+        row("3501/1720 -300/43 297275/52632 -319/2322 24068/84065 0 3850/26703"),
     ),
-    b_sol=_row("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616"),
-    b_error=_row("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616") - _row("13/160 0 2375/5984 5/16 12/85 3/44 0 0"),
+    b_sol=row("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616"),
+    b_error=row("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616") - row("13/160 0 2375/5984 5/16 12/85 3/44 0 0"),
 )
 
 # Column m: coefficients of s^(m + 1). Of the weights b(s) of the eight stages that meet the conditions of order 4 at every s,
