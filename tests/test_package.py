@@ -1,6 +1,7 @@
 """The house: floors import only from below, the public face is what it says, and importing it costs nothing."""
 
 import ast
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -127,6 +128,18 @@ def python(code: str, **environment: str) -> str:
 
 def test_importing_the_package_imports_nothing_else():
     assert python("import sys, udkjax; print({'jax', 'numpy', 'equinox', 'diffrax'} & set(sys.modules))") == "set()"
+
+
+DEFAULT = """
+import sys
+import udkjax as udk
+udk.simulate(udk.library.double_pendulum(), [0.0, 0.1])
+print({"jax", "diffrax", "optimistix", "lineax", "scipy", "xarray", "pandas", "matplotlib", "tyro"} & set(sys.modules))
+"""
+
+
+def test_a_run_by_default_imports_no_other_solvers():
+    assert python(DEFAULT, UDKJAX_COMPILATION_CACHE=os.environ["UDKJAX_COMPILATION_CACHE"]) == "{'jax'}"
 
 
 FLOAT = "print(jnp.result_type(float))"

@@ -10,7 +10,6 @@ import jax
 import numpy as np
 
 from udkjax.equations.code import code, scalars
-from udkjax.equations.sparse_rows import SparseRows
 from udkjax.equations.udwadia_kalaba import rank_tolerance
 from udkjax.scene.mechanism import Mechanism
 
@@ -63,6 +62,8 @@ def assembled_by_numpy(mechanism: Mechanism, t: Any, q: Any, v: Any) -> tuple[An
 @np.errstate(all="ignore")
 def assembled_by_scipy(mechanism: Mechanism, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
     """As `assembled_by_numpy`, of a large mechanism: by sparse arithmetic, damped instead of truncated."""
+    from udkjax.equations.sparse_rows import SparseRows
+
     return SparseRows(mechanism).assembled(float(t), np.asarray(q, float).ravel(), np.asarray(v, float).ravel())
 
 

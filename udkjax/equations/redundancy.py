@@ -9,16 +9,18 @@ compiled for it.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.core import Tracer
 
 from udkjax.equations.code import code, scalars
-from udkjax.equations.sparse_rows import SAMPLES, SparseRows
 from udkjax.equations.udwadia_kalaba import is_large
 from udkjax.scene.mechanism import Mechanism
+
+if TYPE_CHECKING:
+    from udkjax.equations.sparse_rows import SparseRows
 
 # Relative to the largest singular value, with rows scaled to length one, at a closed position: redundant rows leave rounding
 # errors (1e-13 of positions closed to 1e-12), rows that are merely close to a singular configuration leave more.
@@ -27,6 +29,7 @@ CLEAR = 1e-4
 CLOSED = 1e-11  # relative to the size of the coordinates: what closing attains in double precision
 TICK = 0.05  # s: drivers move on from one position to the next
 ITERATIONS = 100
+SAMPLES = 24  # positions to look at where the first shows rows that depend on each other
 DAMPING = 1e-3  # of rows of length one
 TURN = 0.35  # rad or m: the length of one step of the random motion, long enough to leave a singular configuration
 ORDINARY = 0.05  # a position counts as ordinary if its smallest singular value is this part of the largest
@@ -118,7 +121,11 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
 
 def rows_of(mechanism: Mechanism, large: bool | None = None) -> "Rows | SparseRows":
     """Psi and D of a mechanism with known numbers: dense, or for large scenes sparse."""
-    return SparseRows(mechanism) if (is_large(mechanism) if large is None else large) else Rows(mechanism)
+    if not (is_large(mechanism) if large is None else large):
+        return Rows(mechanism)
+    from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
+
+    return SparseRows(mechanism)
 
 
 def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:

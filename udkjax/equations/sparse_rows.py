@@ -17,6 +17,7 @@ from scipy.sparse.linalg import splu
 
 from udkjax.equations.code import structure
 from udkjax.equations.layout import layout
+from udkjax.equations.redundancy import SAMPLES
 from udkjax.pinv.sparse import minimum_degree
 from udkjax.scene.mechanism import Mechanism
 
@@ -29,7 +30,6 @@ ITERATIONS = 100
 CLOSED = 1e-11  # as in redundancy.py
 TURN = 0.35
 COLUMNS = 64  # solved for at a time
-SAMPLES = 24  # positions to look at where the first shows rows that depend on each other
 MANY = 300  # rows: of larger scenes a third of the positions, since each of them takes the longer
 
 

@@ -22,7 +22,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations import fast
 from udkjax.equations.code import Code, code, scalars, stacked
-from udkjax.equations.large import prepare_closing, prepare_large
 from udkjax.equations.motion import MechanismMotion, Vector
 from udkjax.equations.plain import plain_accelerations
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse
@@ -192,6 +191,8 @@ def prepare(
         raise ValueError("Elimination compares each row with what remains of it: here its rank_tol must be relative")
     gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
     if is_large(mechanism) if large is None else large:
+        from udkjax.equations.large import prepare_large  # and with it SciPy, which small scenes do without
+
         return prepare_large(mechanism, chosen, gains)
     left_out, elimination, drop = mechanism.left_out or (), None, number(0.0)
     if isinstance(chosen, Elimination):
@@ -213,8 +214,11 @@ def is_large(mechanism: Mechanism) -> bool:
 
 def prepare_to_close(mechanism: Mechanism, large: bool | None = None) -> Any:
     """As `prepare`, to close a mechanism: with all rows, by singular values, or in large scenes by elimination with damping."""
-    by_levels = is_large(mechanism) if large is None else large
-    return prepare_closing(mechanism) if by_levels else prepare(mechanism, SVD(), large=False)
+    if not (is_large(mechanism) if large is None else large):
+        return prepare(mechanism, SVD(), large=False)
+    from udkjax.equations.large import prepare_closing
+
+    return prepare_closing(mechanism)
 
 
 def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:

@@ -1,0 +1,18 @@
+"""The default's tableau, which stands here so that a run need not import diffrax, is diffrax's."""
+
+import diffrax
+import numpy as np
+
+from udkjax.integrate.tableau import is_explicit, method_of
+
+
+def test_the_default_is_dopri8():
+    ours, theirs = method_of(None), method_of(diffrax.Dopri8())
+    for name in ours._fields:
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
+    assert ours.stages == 13 and ours.order == 8.0
+
+
+def test_what_is_explicit():
+    assert is_explicit(None) and is_explicit(diffrax.Tsit5())
+    assert not is_explicit(diffrax.Kvaerno5()) and not is_explicit(diffrax.KenCarp4())
