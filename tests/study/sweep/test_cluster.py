@@ -1,0 +1,117 @@
+"""Sweeps on the workers of a cluster, some of which are lost."""
+
+import sys
+import threading
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from udkjax.study.sweep import cluster
+from udkjax.study.sweep.cluster import ClusterError, dask
+from udkjax.study.sweep.plan import Chunk
+
+distributed = pytest.importorskip("distributed", reason="dask is not installed: pip install 'udkjax[dask]'")
+
+CHUNKS = [Chunk(k, 0, np.arange(3 * k, 3 * k + 3)) for k in range(40)]
+PLAN: Any = SimpleNamespace(factor=2.0)
+
+
+@pytest.fixture(scope="module")
+def client():
+    """Workers that are threads of this process."""
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield client
+
+
+def compute(monkeypatch, run):
+    monkeypatch.setattr(cluster.computing, "run", run)
+
+
+def squares(plan, chunk):
+    return {"result": np.zeros(3, int), "square": plan.factor * chunk.members**2.0}
+
+
+def test_every_chunk_is_computed_once_and_few_are_under_way(client, monkeypatch):
+    lock, computed, most = threading.Lock(), [], 0
+    handed = 0
+
+    def run(plan, chunk):
+        nonlocal most
+        with lock:
+            computed.append(chunk.index)
+            most = max(most, len(computed) - handed)
+        return squares(plan, chunk)
+
+    compute(monkeypatch, run)
+    found = {}
+    for chunk, data, seconds in dask(client)(PLAN, CHUNKS):
+        handed += 1
+        found[chunk.index] = data["square"]
+        assert 0 <= seconds < 10
+    assert sorted(computed) == list(range(40)) and most <= cluster.AT_LEAST + 1
+    for chunk in CHUNKS:
+        np.testing.assert_array_equal(found[chunk.index], 2.0 * chunk.members**2.0)
+
+
+def test_what_raises_once_is_tried_again_and_what_always_does_is_told(client, monkeypatch):
+    tried = []
+
+    def run(plan, chunk):
+        tried.append(chunk.index)
+        if chunk.index == 3 and tried.count(3) < failures:
+            raise OSError("no space left")
+        return squares(plan, chunk)
+
+    compute(monkeypatch, run)
+    failures = cluster.RETRIES + 1
+    assert len(list(dask(client)(PLAN, CHUNKS[:5]))) == 5
+    assert tried.count(3) == failures and tried.count(2) == 1
+    failures, tried = 10**6, []
+    with pytest.raises(OSError, match="no space left"):
+        list(dask(client)(PLAN, CHUNKS))
+
+
+def test_a_sweep_that_is_given_up_leaves_nothing_on_the_cluster(client, monkeypatch):
+    gate, first = threading.Event(), threading.Lock()
+
+    def run(plan, chunk):
+        if plan.factor == 3.0 and not first.acquire(blocking=False):  # not what an earlier test has left
+            gate.wait(10)
+        return squares(plan, chunk)
+
+    compute(monkeypatch, run)
+    mine: Any = SimpleNamespace(factor=3.0)
+    results = dask(client)(mine, CHUNKS)
+    next(results)
+    results.close()
+    gate.set()
+    deadline = time.monotonic() + 5
+    while client.cluster.scheduler.tasks and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert client.cluster.scheduler.tasks == {}
+
+
+def test_workers_with_other_versions_are_refused(client, monkeypatch):
+    compute(monkeypatch, squares)
+    engine = dask(client)
+    mine, main = cluster._deciding(), threading.current_thread()
+    other = mine | {"jax": "0.1"}
+    monkeypatch.setattr(cluster, "_deciding", lambda: mine if threading.current_thread() is main else other)
+    with pytest.raises(ClusterError, match=rf"jax 0\.1 instead of {mine['jax']}$"):
+        list(engine(PLAN, CHUNKS))
+
+
+def test_without_dask_or_a_client_the_cure_is_told(monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(distributed, "default_client", lambda: (_ for _ in ()).throw(ValueError))
+        with pytest.raises(ClusterError, match=r"client=distributed\.Client"):
+            dask()
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ClusterError, match=r"pip install 'udkjax\[dask\]'"):
+        dask()

@@ -1,0 +1,100 @@
+"""Chunks of a sweep as tasks of dask.distributed: on as many workers as there are, whichever of them are lost."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from typing import Any
+
+import numpy as np
+
+from udkjax.integrate.solution import versions
+from udkjax.study.sweep import chunk as computing
+from udkjax.study.sweep.plan import Chunk, Plan
+
+Done = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, what it gave, and how long it took (s)
+
+RETRIES = 2  # of a chunk that raised: on another worker there may be memory, or room on the disk
+AHEAD = 2  # tasks for each thread of the cluster, so that none waits for the next; more would only fill the workers' memory
+AT_LEAST = 16  # tasks, so that a cluster that grows by what is asked of it sees that something is
+
+
+class ClusterError(RuntimeError):
+    """A cluster cannot do a sweep."""
+
+
+def dask(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]:
+    """Return the engine on the workers of a `distributed.Client`; without one, the client that was made last.
+
+    Workers may come and go: what a lost one had not delivered is computed by another. Each result is handed over when it
+    arrives, and kept nowhere else. Raises `ClusterError` where dask is missing, where there is no client, where a worker has
+    other versions of the packages that decide the results, and where workers die time and again over one chunk.
+    """
+    distributed = _distributed()
+    if client is None:
+        try:
+            client = distributed.default_client()
+        except ValueError:
+            raise ClusterError(
+                "the engine 'dask' needs a client: client=distributed.Client(address), or a Client() made before, whose worker "
+                'processes are on this machine (in a script: below `if __name__ == "__main__":`)'
+            ) from None
+
+    def engine(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
+        wanted = _deciding()
+        # Not scattered: data that was scattered is gone with the worker that held it, what a task returned is made again.
+        shared = client.submit(_same, plan, pure=False)
+        waiting, running, results = deque(chunks), {}, distributed.as_completed()
+
+        def fill() -> None:
+            room = max(AT_LEAST, AHEAD * sum(client.nthreads().values())) - len(running)
+            for _ in range(min(room, len(waiting))):
+                chunk = waiting.popleft()
+                future = client.submit(_run, shared, chunk, wanted, pure=False, retries=RETRIES, priority=-chunk.index)
+                running[future.key] = chunk, future
+                results.add(future)
+
+        try:
+            fill()
+            for future in results:
+                chunk, _ = running[future.key]
+                try:
+                    data, seconds = future.result()
+                except distributed.KilledWorker as error:
+                    raise ClusterError(
+                        f"chunk {chunk.index} ({len(chunk.members)} members) was being computed by several workers that died; "
+                        f"they may be short of memory: give them more, or a smaller `memory` to the sweep ({error})"
+                    ) from error
+                del running[future.key]
+                future.release()
+                fill()
+                yield chunk, data, seconds
+        finally:
+            client.cancel([shared, *(future for _, future in running.values())])
+
+    return engine
+
+
+def _same(plan: Plan) -> Plan:
+    return plan
+
+
+def _run(plan: Plan, chunk: Chunk, wanted: dict[str, str]) -> tuple[dict[str, np.ndarray], float]:
+    """On a worker: compute a chunk; how long it took (s) comes with it."""
+    if (found := _deciding()) != wanted:
+        differing = ", ".join(f"{name} {found[name]} instead of {wanted[name]}" for name in wanted if found[name] != wanted[name])
+        raise ClusterError(f"a worker has other versions of what decides the results: {differing}")
+    begun = time.perf_counter()
+    data = computing.run(plan, chunk)
+    return data, time.perf_counter() - begun
+
+
+def _deciding() -> dict[str, str]:
+    return {name: version for name, version in versions().items() if name != "python"}
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise ClusterError("the engine 'dask' needs dask.distributed: pip install 'udkjax[dask]'") from None
+    return distributed
