@@ -24,6 +24,7 @@ from jaxtyping import Array
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
 from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.integrate.record import Record, blank, noted
 from udkjax.integrate.tableau import Method
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.straightline.emit import cut
@@ -45,6 +46,7 @@ class March(NamedTuple):
     evaluations: Array
     written: Array  # how many of the inner output times are behind
     outputs: Array  # (T - 2 + BLOCK, 2n, *lanes): q and v at the output times between the first and the last
+    record: Record | None  # of one run alone
 
 
 class Trial(NamedTuple):
@@ -53,6 +55,7 @@ class Trial(NamedTuple):
     to: Point
     error: Array  # the largest error of any coordinate or velocity, relative to its tolerance
     evaluations: Array
+    stages: Array | None = None  # accelerations (stages, n) of its stages, for the record
 
 
 class Task(NamedTuple):
@@ -69,6 +72,7 @@ class Task(NamedTuple):
     h: Array | None  # the first step; None: chosen
     max_steps: int
     method: Method
+    recorded: bool = False  # whether the steps are kept, of a run that is not one of several lanes
 
 
 def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial:
@@ -105,7 +109,8 @@ def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: 
     error_q = h * (h * _combine(jnp.asarray(method.error_q), a))
     size = jnp.maximum(_relative(task, error_q, here.q, to.q), _relative(task, error_v, here.v, to.v))
     size = jnp.where(jnp.all(jnp.isfinite(to.a), axis=0), size, jnp.nan)
-    return Trial(to, undifferentiated(size), jnp.broadcast_to(jnp.asarray(evaluations), size.shape))
+    evaluations = jnp.broadcast_to(jnp.asarray(evaluations), size.shape)
+    return Trial(to, undifferentiated(size), evaluations, a if task.recorded else None)
 
 
 def _combine(weights: Array, a: Array) -> Array:
@@ -126,7 +131,8 @@ def march(task: Task, q: Array, v: Array) -> March:
     outputs = jnp.zeros((inner + BLOCK if inner else 0, 2 * len(start.q), *lanes), start.q.dtype)
     # The first round is no step: it finds the accelerations, and with them the first step, where the others have their code.
     back, no = (start,) * (POINTS - 2), jnp.zeros(lanes, bool)
-    first = March(start, back, jnp.zeros(lanes), none, no, none - 1, none - 1, none, none, outputs)
+    record = blank(start, task.method.stages, task.max_steps) if task.recorded else None
+    first = March(start, back, jnp.zeros(lanes), none, no, none - 1, none - 1, none, none, outputs, record)
 
     def running(m: March) -> Array:
         return jnp.any(m.code == RUNNING)
@@ -135,7 +141,7 @@ def march(task: Task, q: Array, v: Array) -> March:
         t1, last = _end(task, m)
         trial = attempt(task, m.here, jnp.where(m.code == RUNNING, t1 - m.here.t, 0.0), t1, m.tried < 0)
         doubt = (m.code == RUNNING) & ~jnp.isfinite(trial.error) & task.doubts
-        m = _decide(task, m, trial, last, (m.code == RUNNING) & ~doubt)
+        m = _decide(task, m, trial, last, (m.code == RUNNING) & ~doubt, careful=False)
         return m._replace(doubt=doubt) if task.careful else m._replace(code=jnp.where(doubt, DOUBTED, m.code))
 
     careful = task.careful
@@ -145,7 +151,7 @@ def march(task: Task, q: Array, v: Array) -> March:
     def again(m: March) -> March:
         t1, last = _end(task, m)
         trial = careful(m.doubt, m.here, t1 - m.here.t, t1, m.tried < 0)
-        return _decide(task, m, trial, last, m.doubt)._replace(doubt=jnp.zeros(lanes, bool))
+        return _decide(task, m, trial, last, m.doubt, careful=True)._replace(doubt=jnp.zeros(lanes, bool))
 
     def rounds(m: March) -> March:
         return again(jax.lax.while_loop(lambda m: running(m) & ~jnp.any(m.doubt), quick, m))
@@ -160,7 +166,7 @@ def _end(task: Task, m: March) -> tuple[Array, Array]:
     return jnp.where(last, task.ts[-1], t1), last
 
 
-def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array) -> March:
+def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array, careful: bool) -> March:
     """Accept or reject a step of the lanes that are `judged`, choose the next one, and write the outputs that are behind."""
     accept = judged & (trial.error < 1.0)
     error = jnp.where(jnp.isfinite(trial.error), jnp.maximum(trial.error, 1e-30), 1e30)
@@ -174,6 +180,8 @@ def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array) -> M
     code = jnp.where(accept & last, DONE, code)
 
     old = (*m.back, m.here)
+    if m.record is not None and trial.stages is not None:
+        m = m._replace(record=noted(m.record, m.accepted + 2, (*old, trial.to), trial.stages, careful))
     *back, here = jax.tree.map(lambda x, y: jnp.where(accept, x, y), (*old[1:], trial.to), old)
     m = m._replace(h=h, code=code, tried=tried, accepted=m.accepted + accept)
     m = m._replace(evaluations=m.evaluations + jnp.where(judged, trial.evaluations, 0))

@@ -16,7 +16,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
 from udkjax.equations.motion import Motion
-from udkjax.integrate.explicit import Task, Trial, judged, march, stage_state
+from udkjax.integrate.explicit import March, Task, Trial, judged, march, stage_state
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import project
@@ -140,16 +140,26 @@ class Lanes:
 
 
 def _marched(problem: Problem, lanes: Lanes) -> Raw:
+    return raw_of(problem, lanes, march(task_of(problem, lanes), problem.q, problem.v))
+
+
+def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
+    """What to march along."""
     task = Task(
         partial(lanes.over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
         partial(lanes.over, lambda e, t, q, v: e.quick.project(t, q, v)) if problem.projected else lambda t, q, v: (q, v),
         None,
         problem.equations.branches,
         *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
+        recorded,
     )
     if problem.equations.branches and problem.careful:
         task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
-    m = march(task, problem.q, problem.v)
+    return task
+
+
+def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
+    """What a march leaves behind, with the outputs on the manifold."""
     inner, end = len(problem.ts) - 2, jnp.concatenate([m.here.q, m.here.v])
     ys = jnp.concatenate([m.outputs[:inner], end[None]])
     ys = _projected(lanes, problem.ts[1:], ys) if problem.projected else ys
@@ -182,7 +192,8 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
         return judged(mine, here._replace(a=a[0]), Point(t1, q1, v1, a[stages]), h, a[:stages], evaluations)
 
     tolerances = (jnp.broadcast_to(x, h.shape) for x in (task.rtol, task.atol))
-    nothing = Trial(here, jnp.full(h.shape, jnp.inf), jnp.zeros(h.shape, int))
+    unknown = jnp.zeros((stages, *here.a.shape)) if task.recorded else None
+    nothing = Trial(here, jnp.full(h.shape, jnp.inf), jnp.zeros(h.shape, int), unknown)
     return lanes.each(doubt, one, nothing, here, h, t1, begin, *tolerances)
 
 
