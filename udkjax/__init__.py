@@ -76,11 +76,13 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import load as load
     from udkjax.scene import loads as loads
     from udkjax.scene import save as save
+    from udkjax.scene import with_angle as with_angle
+    from udkjax.scene import with_length as with_length
 
 _MODULES = {"pinv": "udkjax.pinv", "equations": "udkjax.equations", "library": "udkjax.scene.library"}
 _NAMES = {
     "udkjax.scene": """
-        load loads save dumps SceneError
+        load loads save dumps with_length with_angle SceneError
         Mechanism Body GROUND Frame Point Constraint Joint Driver Motion ForceElement
         Revolute Prismatic Slot Weld Distance Angle Gear Rack Cam
         Polynomial Sine Spline Profile

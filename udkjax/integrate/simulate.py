@@ -41,7 +41,7 @@ SMALLEST_STEP = 100.0  # ulps of the end time: below it time does not advance
 def simulate(
     mechanism: Mechanism | ConstrainedSystem,
     ts: ArrayLike,
-    state: State | None = None,
+    state: State | Closure | None = None,
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike = 1e-8,
     method: Pseudoinverse | None = None,
@@ -57,7 +57,8 @@ def simulate(
 ) -> Solution:
     """Integrate the motion of a mechanism; return its states at the times `ts` (T,), in s. The motion starts at ts[0].
 
-    Without `state` the scene's initial guess is assembled; a given state is taken as it is. `method` is any pseudoinverse
+    Without `state` the scene's initial guess is assembled; a given state is taken as it is, and a `Closure` that assembly gave
+    before as one that was found here. `method` is any pseudoinverse
     (default `Auto`), `stabilization` is `Projection()`, a `Baumgarte` or None, `solver` any diffrax solver for ordinary
     differential equations (default Dopri8: of those measured in benchmarks/ the fastest at equal error, but for the tightest
     tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity. `dt0` is the first
@@ -86,7 +87,9 @@ def simulate(
         return _simulate(mechanism, ts, state, closure, *settings, *choices, careful)
 
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
-    closure = close(mechanism, start) if state is None and isinstance(mechanism, Mechanism) else None
+    state, closure = (None, state) if isinstance(state, Closure) else (state, None)
+    if state is None and closure is None and isinstance(mechanism, Mechanism):
+        closure = close(mechanism, start)
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, ts, state, closure, settings)))
     solution, missed, doubted = run(mechanism, careful=traced)
     if isinstance(solution.code, Tracer):

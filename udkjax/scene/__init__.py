@@ -8,6 +8,7 @@ from udkjax.scene.files import dumps, load, loads, save
 from udkjax.scene.forces import Force, ForceElement, Friction, Spring, Torque, TorsionSpring
 from udkjax.scene.joints import Angle, Cam, Constraint, Distance, Gear, Joint, Prismatic, Profile, Rack, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.reshaping import with_angle, with_length
 
 __all__ = [
     "GROUND",
@@ -45,4 +46,6 @@ __all__ = [
     "load",
     "loads",
     "save",
+    "with_angle",
+    "with_length",
 ]

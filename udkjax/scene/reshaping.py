@@ -1,0 +1,143 @@
+"""Mechanisms with other lengths and starts, whose initial guess stays as closed as it was.
+
+A length is not one number of a scene: a link that gets longer moves its attachments, and with them the bodies that hang on it. So
+does an initial angle. What is changed here is passed on along the pins, body after body from the ground on, each turned as its
+guess has it: along a tree of pins, which holds each body once, no pin opens. The rest is for `assemble` to close.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.scene.bodies import GROUND, Body, Frame
+from udkjax.scene.checks import SceneError, quoted, suggestion
+from udkjax.scene.fields import number
+from udkjax.scene.joints import Revolute, Weld
+from udkjax.scene.mechanism import Mechanism
+
+PINS = (Revolute, Weld)  # joints that hold two points together
+
+
+def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: ArrayLike, as_rod: bool = False) -> Mechanism:
+    """Return the mechanism with bodies of another length (m): the largest distance between two points where a body is attached.
+
+    All attachments of these bodies, to joints, drivers and forces, are scaled about their centres of mass, so that these stay in
+    their places between them. Mass and inertia stay; with `as_rod` they become those of a rod of the same mass per metre, in
+    proportion to the length and to its third power. Angles stay, and positions and velocities of the initial guess follow along
+    the pins. Pure and differentiable; the length may be traced. Raises `SceneError`.
+    """
+    names = _known(mechanism, bodies)
+    values: dict[str, Any] = {}
+    for body in names:
+        points = dict(_attachments(mechanism, body))
+        here = _extent(list(points.values()))
+        if here is None:
+            raise SceneError([f"body {quoted(body)} has no length: it is attached at fewer than two points"], mechanism.name)
+        scale = number(length) / here
+        values |= {name: scale * point for name, point in points.items()}
+        if as_rod:
+            element = mechanism.bodies[body]
+            values |= {f"body.{body}.mass": scale * element.mass, f"body.{body}.inertia": scale**3 * element.inertia}
+    return _followed(mechanism, mechanism.with_parameters(values))
+
+
+def with_angle(
+    mechanism: Mechanism, bodies: Sequence[str] | str, angle: ArrayLike, angular_velocity: ArrayLike | None = None
+) -> Mechanism:
+    """Return the mechanism with another initial angle (rad), and angular velocity (rad/s), of all of some bodies.
+
+    Positions and velocities of the initial guess follow along the pins: a parallelogram stays closed where all links are given.
+    Pure and differentiable; the angle may be traced. Raises `SceneError`.
+    """
+    names = _known(mechanism, bodies)
+    values: dict[str, Any] = {f"body.{body}.angle": angle for body in names}
+    if angular_velocity is not None:
+        values |= {f"body.{body}.angular_velocity": angular_velocity for body in names}
+    return _followed(mechanism, mechanism.with_parameters(values))
+
+
+def _known(mechanism: Mechanism, bodies: Sequence[str] | str) -> tuple[str, ...]:
+    names = (bodies,) if isinstance(bodies, str) else tuple(bodies)
+    known = mechanism.body_names
+    problems = [f"no body named {quoted(name)}{suggestion(name, known)}" for name in names if name not in known]
+    if problems:
+        raise SceneError(problems, mechanism.name)
+    return names
+
+
+def _attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[Array, "2"]]]:
+    """The points of a body, under their names as parameters."""
+    groups = {"joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
+    for section, elements in groups.items():
+        for name, element in elements.items():
+            points = getattr(element, "points", None)
+            if points is not None:
+                yield from ((f"{section}.{name}.points[{k}]", points[k]) for k, b in enumerate(element.bodies) if b == body)
+            if getattr(element, "body", None) == body and hasattr(element, "point"):
+                yield f"{section}.{name}.point", element.point
+
+
+def _extent(points: Sequence[Array]) -> Array | None:
+    if len(points) < 2:
+        return None
+    stacked = jnp.stack(points)
+    square = jnp.sum((stacked[:, None] - stacked[None]) ** 2, axis=-1)
+    return jnp.sqrt(jnp.max(square))
+
+
+def _followed(before: Mechanism, after: Mechanism) -> Mechanism:
+    """Move bodies by as much as the pins that hold them have moved: a guess in which nothing has changed stays as it is."""
+    bodies: dict[str, Body] = dict(after.bodies)
+    old = {GROUND: _still()} | {name: _moving(body) for name, body in before.bodies.items()}
+    new = {GROUND: _still()} | {name: _moving(body) for name, body in bodies.items()}
+    values: dict[str, Any] = {}
+    for joint, held, body in _tree(before):
+        was, now = before.joints[joint], after.joints[joint]
+        one, two = (0, 1) if was.bodies[1] == body else (1, 0)
+        frame = new[body]
+        # Of the holder and of the body itself, how the pin has moved; then the body makes up for the difference.
+        shift = _minus(_pin(new[held], now.points[one]), _pin(old[held], was.points[one]))
+        own = _minus(_pin(frame, now.points[two]), _pin(old[body], was.points[two]))
+        x, y, vx, vy = (a - b for a, b in zip(shift, own, strict=True))
+        frame = frame._replace(x=frame.x + x, y=frame.y + y, vx=frame.vx + vx, vy=frame.vy + vy)
+        new[body] = frame
+        values[f"body.{body}.position"] = jnp.stack([frame.x, frame.y])
+        values[f"body.{body}.velocity"] = jnp.stack([frame.vx, frame.vy])
+    return after.with_parameters(values) if values else after
+
+
+def _tree(mechanism: Mechanism) -> Iterator[tuple[str, str, str]]:
+    """Pins by which each body is reached: the joint, the body that holds it, and the body that it reaches.
+
+    From the ground on; of bodies that no pin joins to it, from the first of them, which stays.
+    """
+    pins = {name: joint.bodies for name, joint in mechanism.joints.items() if isinstance(joint, PINS)}
+    seen: set[str] = set()
+    for root in (GROUND, *mechanism.body_names):
+        reached = [] if root in seen else [root]
+        for held in reached:  # grows while it is gone through: the nearest to the root first
+            seen.add(held)
+            for joint, pair in pins.items():
+                body = pair[0] if pair[1] == held else pair[1]
+                if held in pair and body not in seen and body not in reached:
+                    reached.append(body)
+                    yield joint, held, body
+
+
+def _still() -> Frame:
+    return Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def _moving(body: Body) -> Frame:
+    return body.frame()._replace(vx=body.velocity[0], vy=body.velocity[1], omega=body.angular_velocity)
+
+
+def _pin(frame: Frame, local: Any) -> tuple[Any, Any, Any, Any]:
+    """Where a point of a body is (m) and how it moves (m/s)."""
+    return *frame.point(local), *frame.velocity(local)
+
+
+def _minus(one: tuple, two: tuple) -> tuple:
+    return tuple(a - b for a, b in zip(one, two, strict=True))
