@@ -1,12 +1,13 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 import xarray
 
-from udkjax.cli import FORMULATIONS, METHODS, SOLVERS, main
+from udkjax.cli import main
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PARALLELOGRAM = EXAMPLES / "parallelogram.toml"
@@ -85,13 +86,14 @@ def test_choices_reach_the_simulation(tmp_path, choice):
     assert choice[1] in settings
 
 
-def test_every_method_and_solver_exists():
-    import udkjax as udk
-    from udkjax.integrate.solvers import solver_named
+def test_the_choices_of_the_command_line_are_those_of_files():
+    from udkjax.study.choices import CHOICES, choice
 
-    assert all(hasattr(udk, name) for name in METHODS.values())
-    assert all(solver_named(name) for name in SOLVERS.values())
-    assert all(hasattr(udk, name) for name in FORMULATIONS.values())
+    simulate = sys.modules["udkjax.cli.simulate"]
+    for setting, table in CHOICES.items():
+        assert list(table) == list(get_args(getattr(simulate, setting.capitalize())))
+        for name in table:
+            choice(setting, name)
 
 
 @pytest.mark.parametrize(

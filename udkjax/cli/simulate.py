@@ -1,0 +1,129 @@
+"""`udkjax simulate`."""
+
+import math
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from udkjax.cli.common import BAD_RUN, Scene, load, refuse
+
+# The names of udkjax.study.choices, which cannot be imported before a command is known: it imports JAX.
+Method = Literal["auto", "elimination", "svd", "varga", "greville", "householder", "gram-schmidt"]
+Formulation = Literal["udwadia-kalaba", "augmented", "null-space-qr", "null-space-svd", "partitioning"]
+Solver = Literal["dopri8", "dopri5", "tsit5", "bosh3", "heun", "kvaerno5", "verner65", "adams", "bdf"]
+Stabilization = Literal["projection", "baumgarte", "none"]
+
+
+def simulate(
+    scene: Scene,
+    /,
+    t1: float,
+    out: Path,
+    dt: float = 0.05,
+    t0: float = 0.0,
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    method: Method = "auto",
+    rank_tol: float | None = None,
+    formulation: Formulation = "udwadia-kalaba",
+    solver: Solver = "dopri8",
+    stabilization: Stabilization = "projection",
+    alpha: float = 5.0,
+    beta: float = 5.0,
+    dt0: float | None = None,
+    max_steps: int | None = None,
+    plot: Path | None = None,
+) -> None:
+    """Simulate a scene: write its motion (NetCDF) and a picture of it, and say how far both can be trusted.
+
+    Args:
+        scene: the mechanism.
+        t1: end of the run (s).
+        out: NetCDF file to write: time, q and v (time, body, coordinate), settings, statistics and the scene itself.
+        dt: time between two instants that are kept (s); the steps of the solver are its own.
+        t0: start of the run (s).
+        rtol: relative tolerance of a step.
+        atol: absolute tolerance of a step.
+        method: pseudoinverse of the weighted constraint Jacobian.
+        rank_tol: what this method counts as rank deficient; by default, what suits the method.
+        formulation: how accelerations are found; partitioning integrates independent coordinates only, without Baumgarte.
+        solver: integrator, by its name in diffrax or, verner65, adams and bdf, here.
+        stabilization: what keeps the constraints: a projection of each step, Baumgarte's terms, or nothing.
+        alpha: Baumgarte's gain on the rate of the constraints (1/s).
+        beta: Baumgarte's gain on the constraints (1/s).
+        dt0: first step to try (s); by default it is chosen.
+        max_steps: give up after so many steps.
+        plot: picture to write; by default beside the NetCDF file.
+    """
+    if not 0 < dt <= t1 - t0 < math.inf:
+        refuse(f"from --t0 {t0:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
+    plot = plot or out.with_suffix(".png")
+    if dt0 is not None and not 0 < dt0 < math.inf:
+        refuse(f"the first step --dt0 {dt0:g} must be positive")
+    if formulation == "partitioning" and stabilization == "baumgarte":
+        refuse("--formulation partitioning keeps the constraints itself: take --stabilization projection or none")
+    if plot == out:
+        refuse(f"--out {out} and --plot {plot} are the same file")
+    for target in (out, plot):
+        if not target.parent.is_dir():
+            refuse(f"there is no folder {target.parent} to write {target.name} to")
+    mech, text = load(scene)
+
+    import numpy as np
+
+    import udkjax as udk
+    from udkjax.show.plots import trajectory
+    from udkjax.show.summary import run_summary
+    from udkjax.study.choices import choice
+
+    gains = {"alpha": alpha, "beta": beta} if stabilization == "baumgarte" else {}
+    choices: dict[str, Any] = {
+        "rtol": rtol,
+        "atol": atol,
+        "method": choice("method", {"type": method, **({} if rank_tol is None else {"rank_tol": rank_tol})}),
+        "formulation": choice("formulation", formulation),
+        "solver": None if solver == "dopri8" else choice("solver", solver),  # the default
+        "dt0": dt0,
+        "stabilization": choice("stabilization", {"type": stabilization, **gains}),
+        "throw": False,
+    }
+    if max_steps is not None:
+        choices["max_steps"] = max_steps
+    ts = t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # t1 itself too, where it is a multiple of dt up to rounding
+    with _stopwatch() as seconds:
+        sol = udk.simulate(mech, ts, **choices)
+        np.asarray(sol.q)  # JAX runs ahead: wait for it
+
+    data = sol.to_xarray(mech)
+    data.attrs |= {"scene": text, "scene_file": scene.name}
+    data.to_netcdf(out, engine="h5netcdf")
+    trajectory(mech, sol).savefig(plot, dpi=150)
+    print(run_summary(mech, sol, seconds["all"], seconds["compiling"]))
+    print(f"wrote {out} and {plot}")
+    if sol.result:
+        print(f"udkjax: {sol.cause}", file=sys.stderr)
+        sys.exit(BAD_RUN)
+
+
+@contextmanager
+def _stopwatch() -> Iterator[dict[str, float]]:
+    """Measure wall time (s), and how much of it went into tracing and compiling."""
+    import jax
+
+    seconds, spans = {"all": 0.0, "compiling": 0.0}, []
+
+    def listen(event: str, duration_secs: float, **_: Any) -> None:
+        if event.startswith("/jax/core/compile/"):
+            end = time.perf_counter()
+            while spans and spans[-1][0] > end - duration_secs:  # what is traced inside this is a part of it
+                spans.pop()
+            spans.append((end - duration_secs, end))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    start = time.perf_counter()
+    yield seconds
+    seconds["all"] = time.perf_counter() - start
+    seconds["compiling"] = sum(end - begin for begin, end in spans)

@@ -1,0 +1,60 @@
+"""Choices of a run by the names that files and the command line have for them."""
+
+import inspect
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from udkjax.equations import Augmented, Baumgarte, CoordinatePartitioning, NullSpaceQR, NullSpaceSVD
+from udkjax.integrate import Projection
+from udkjax.integrate.solvers import solver_named
+from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Varga
+from udkjax.scene.checks import quoted, shown, suggestion
+
+Table = dict[str, Callable[..., Any]]
+
+
+def _none() -> None:
+    return None
+
+
+METHODS: Table = {
+    "auto": Auto,
+    "elimination": Elimination,
+    "svd": SVD,
+    "varga": Varga,
+    "greville": Greville,
+    "householder": Householder,
+    "gram-schmidt": GramSchmidt,
+}
+FORMULATIONS: Table = {
+    "udwadia-kalaba": _none,
+    "augmented": Augmented,
+    "null-space-qr": NullSpaceQR,
+    "null-space-svd": NullSpaceSVD,
+    "partitioning": CoordinatePartitioning,
+}
+STABILIZATIONS: Table = {"projection": Projection, "baumgarte": Baumgarte, "none": _none}
+SOLVERS: Table = {
+    name.lower(): partial(solver_named, name)
+    for name in ("Dopri8", "Dopri5", "Tsit5", "Bosh3", "Heun", "Kvaerno5", "Verner65", "Adams", "BDF")
+}
+CHOICES = {"method": METHODS, "formulation": FORMULATIONS, "stabilization": STABILIZATIONS, "solver": SOLVERS}
+
+
+def choice(setting: str, given: Any) -> Any:
+    """Return what a name stands for in a setting ("method": "svd"), or a table of its `type` and its numbers.
+
+    Raises ValueError, which says what there is.
+    """
+    known = CHOICES[setting]
+    table = given if isinstance(given, dict) else {"type": given}
+    name, numbers = table.get("type"), {key: value for key, value in table.items() if key != "type"}
+    if not isinstance(name, str) or name not in known:
+        raise ValueError(f"no {setting} {shown(name)}{suggestion(name, known) or '; one of ' + ', '.join(known)}")
+    make = known[name]
+    expected = [] if setting == "solver" else list(inspect.signature(make).parameters)
+    for key in numbers:
+        if key not in expected:
+            raise ValueError(f"{quoted(name)} has no {quoted(key)}{suggestion(key, expected)}")
+    return make(**numbers)
