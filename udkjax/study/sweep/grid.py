@@ -1,0 +1,192 @@
+"""Sweeps as TOML files: which values every axis takes, and what is kept. Read into the arguments of `udkjax.sweep`."""
+
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from udkjax.scene.checks import quoted, shown, suggestion
+from udkjax.study.choices import CHOICES
+from udkjax.study.sweep.axes import Axis, Zipped
+from udkjax.study.sweep.designs import LatinHypercube, Random, Sobol
+from udkjax.study.sweep.quantities import Angle, Length, Scaled
+from udkjax.study.sweep.reading import GridError, Reader, key_of
+
+TOP = ("t0", "t1", "dt", "ts", "measures", "derivatives", "reference", "axes", "settings", "design")
+SETTINGS = ("rtol", "atol", *CHOICES, "max_steps", "drift_tol", "dt0")
+DESIGNS = {"sobol": Sobol, "latin-hypercube": LatinHypercube, "random": Random}
+SCALES = {"linear": np.linspace, "log": np.geomspace}
+
+
+def load_grid(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read the arguments of `udkjax.sweep`, but for the mechanism, from a TOML file. Raises `GridError` or `OSError`."""
+    try:
+        return loads_grid(Path(path).read_text(encoding="utf-8"), os.fspath(path))
+    except UnicodeDecodeError as error:
+        raise GridError([f"not a text file in UTF-8 ({error})"], os.fspath(path)) from None
+
+
+def loads_grid(text: str, source: str = "") -> dict[str, Any]:
+    """Read the arguments of `udkjax.sweep` from the text of a TOML file, as `load_grid` does."""
+    try:
+        given = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise GridError([f"not valid TOML: {error}"], source) from None
+    reader = _GridReader("design" in given)
+    arguments = reader.sweep(given)
+    if reader.problems:
+        raise GridError(reader.problems, source)
+    return arguments
+
+
+class _GridReader(Reader):
+    """Reads the file of a sweep; `drawn`: by a design, from ranges and distributions, instead of from lists of values."""
+
+    def __init__(self, drawn: bool):
+        super().__init__()
+        self.drawn = drawn
+
+    def sweep(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        self.known("", given, TOP)
+        axes = self.table("axes", given.get("axes", {}))
+        if given.get("axes", {}) == {}:
+            self.wrong("axes", 'missing; write [axes], and below it such as "body.link1.mass" = [1.0, 2.0]')
+        arguments: dict[str, Any] = {
+            "axes": {name: self.axis(f"axes.{key_of(name)}", name, axis) for name, axis in axes.items()},
+            "ts": self.times(given),
+            **self.settings(self.table("settings", given.get("settings", {}))),
+        }
+        if "design" in given:
+            arguments["design"] = self.design(self.table("design", given["design"]))
+        if "measures" in given:
+            arguments["measure"] = {name: name for name in self.names("measures", given["measures"])}
+        if "derivatives" in given:
+            arguments["derivatives"] = self.names("derivatives", given["derivatives"])
+        if "reference" in given:
+            arguments["reference"] = given["reference"]
+        return arguments
+
+    def times(self, given: Mapping[str, Any]) -> np.ndarray | None:
+        """Output times: `ts`, or from `t0` (0) to `t1` in steps of `dt`, or the start and the end alone."""
+        if "ts" in given:
+            for key in ("t0", "t1", "dt"):
+                if key in given:
+                    self.wrong(key, "ts is given: leave one of them out")
+            ts = self.numbers("ts", given["ts"])
+            if ts is not None and (ts.ndim != 1 or len(ts) < 2 or not np.all(np.diff(ts) > 0)):
+                self.wrong("ts", f"must be at least two times (s), each later than the one before, is {shown(given['ts'])}")
+            return ts
+        if "t1" not in given:
+            return self.wrong("t1", "missing; write t1 = 10.0 (s), or ts = [...]")
+        t0, t1 = self.number("t0", given.get("t0", 0.0)), self.number("t1", given["t1"])
+        if t0 is None or t1 is None:
+            return None
+        if not t0 < t1:
+            return self.wrong("t1", f"must be later than t0 = {t0:g}, is {t1:g}")
+        if "dt" not in given:
+            return np.array([t0, t1])
+        dt = self.number("dt", given["dt"])
+        if dt is None:
+            return None
+        if not 0 < dt <= t1 - t0:
+            return self.wrong("dt", f"must be positive and at most t1 - t0 = {t1 - t0:g}, is {dt:g}")
+        return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # t1 itself too, where it is a multiple of dt up to rounding
+
+    def axis(self, place: str, name: str, given: Any) -> Any:
+        """One axis: a list of values, or a table that says more."""
+        if not isinstance(given, dict):
+            return Axis(self.values(place, name, given))
+        if "zipped" in given:
+            self.known(place, given, ("zipped",))
+            axes = self.table(f"{place}.zipped", given["zipped"])
+            return Zipped({k: self.axis(f"{place}.zipped.{key_of(k)}", k, v) for k, v in axes.items()})
+        of, units = self.of(f"{place}.of", given.get("of")), given.get("units")
+        rest = {key: value for key, value in given.items() if key not in ("of", "units")}
+        if "distribution" in rest:
+            return Axis(self.distribution(place, rest), of, units)
+        if "values" in rest:
+            self.known(place, rest, ("values",))
+            return Axis(self.values(f"{place}.values", name, rest["values"]), of, units)
+        return Axis(self.range(place, rest), of, units)
+
+    def values(self, place: str, name: str, given: Any) -> Any:
+        if not isinstance(given, list) or not given:
+            return self.wrong(place, f"must be a list of values, or a table of from, to and num, is {shown(given)}")
+        if name not in CHOICES:
+            return self.numbers(place, given)
+        return [self.choice(f"{place}[{k}]", name, value) for k, value in enumerate(given)]
+
+    def range(self, place: str, given: Mapping[str, Any]) -> Any:
+        """From one number to another: with a design all that is between them, else so many numbers."""
+        needed = ("from", "to") if self.drawn else ("from", "to", "num")
+        self.known(place, given, (*needed, "scale"))
+        for key in needed:
+            if key not in given:
+                self.wrong(f"{place}.{key}", "missing")
+        low, high = (self.number(f"{place}.{key}", given[key]) if key in given else None for key in ("from", "to"))
+        num = self.whole(f"{place}.num", given.get("num", 2), 1)
+        scale = given.get("scale", "linear")
+        if scale not in SCALES:
+            return self.wrong(f"{place}.scale", f"must be one of {', '.join(map(quoted, SCALES))}, is {shown(scale)}")
+        if low is None or high is None or num is None:
+            return None
+        if scale == "log" and min(low, high) <= 0:
+            return self.wrong(place, "from and to must be positive where scale is log")
+        if not self.drawn:
+            return SCALES[scale](low, high, num)
+        return (low, high) if scale == "linear" else stats.loguniform(low, high)
+
+    def distribution(self, place: str, given: Mapping[str, Any]) -> Any:
+        """A distribution of scipy.stats by its name and its numbers."""
+        name, numbers = given["distribution"], {key: value for key, value in given.items() if key != "distribution"}
+        known = [key for key, value in vars(stats).items() if isinstance(value, stats.rv_continuous)]
+        if not self.drawn:
+            return self.wrong(f"{place}.distribution", "needs a [design] that draws from it")
+        if name not in known:
+            return self.wrong(f"{place}.distribution", f"scipy.stats has no {shown(name)}{suggestion(name, known)}")
+        try:
+            return getattr(stats, name)(**numbers)
+        except TypeError as error:
+            return self.wrong(place, str(error).replace("_parse_args()", name))
+
+    def of(self, place: str, given: Any) -> Any:
+        """What an axis is the quantity of: names, the length or the initial angle of bodies, or names with factors."""
+        if given is None or isinstance(given, str):
+            return given
+        if isinstance(given, list):
+            return self.names(place, given)
+        if not isinstance(given, dict) or not given:
+            return self.wrong(place, f"must be a name, a list of names or a table, is {shown(given)}")
+        if "length" in given:
+            self.known(place, given, ("length", "as_rod"))
+            return Length(self.names(f"{place}.length", given["length"]), given.get("as_rod", False) is True)
+        if "angle" in given:
+            self.known(place, given, ("angle",))
+            return Angle(self.names(f"{place}.angle", given["angle"]))
+        return Scaled({name: self.number(f"{place}.{key_of(name)}", factor) or 0.0 for name, factor in given.items()})
+
+    def settings(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        self.known("settings", given, SETTINGS)
+        found: dict[str, Any] = {}
+        for name, value in given.items():
+            place = f"settings.{name}"
+            if name in CHOICES:
+                found[name] = self.choice(place, name, value)
+            elif name == "max_steps":
+                found[name] = self.whole(place, value, 1)
+            elif name in SETTINGS:
+                found[name] = self.number(place, value)
+        return found
+
+    def design(self, given: Mapping[str, Any]) -> Any:
+        self.known("design", given, ("type", "members", "seed"))
+        kind = given.get("type")
+        members, seed = self.whole("design.members", given.get("members"), 1), self.whole("design.seed", given.get("seed", 0), 0)
+        if kind not in DESIGNS:
+            there = f"must be one of {', '.join(map(quoted, DESIGNS))}"
+            return self.wrong("design.type", f"{there}, is {shown(kind)}{suggestion(kind, DESIGNS)}")
+        return None if members is None or seed is None else DESIGNS[kind](members, seed)
