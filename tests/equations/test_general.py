@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
+from udkjax.equations.quantities import equations_of
 
 G = 9.81
 STABILIZATIONS = {"projection": udk.Projection(), "Baumgarte": udk.Baumgarte(5.0, 5.0), "none": None}
@@ -85,6 +86,16 @@ def test_every_method_and_redundancy(method):
     assert_allclose(force, pull, atol=1e-13)
     assert_allclose(three, one, atol=1e-13)
     assert_allclose(forces, pull / 3, atol=1e-13)
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_the_tangential_part_is_what_projection_leaves(copies):
+    """On a sphere: of changes of position and velocity what is orthogonal to the radius."""
+    equations = equations_of(Ball(BALL.weight, BALL.radius, copies).system())
+    q, v = BALL_START
+    dq, dv = jnp.array([0.3, -0.2, 0.5]), jnp.array([1.0, 2.0, -1.0])
+    for left, change in zip(equations.tangential(0.0, q, v, dq, dv), (dq, dv), strict=True):
+        assert_allclose(left, change - q * (q @ change) / (q @ q), atol=1e-15)
 
 
 @pytest.mark.slow

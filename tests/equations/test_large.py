@@ -63,7 +63,7 @@ SCENES = {
     "planetary gear": udk.library.planetary_gear,
     "driven": udk.library.slider_crank,
 }
-QUANTITIES = ("accelerations", "watched", "project", "violation", "multipliers", "matrices", "energy", "is_finite")
+QUANTITIES = ("accelerations", "watched", "project", "tangential", "violation", "multipliers", "matrices", "energy", "is_finite")
 
 
 def quantities(equations, t, q, v):
@@ -71,6 +71,7 @@ def quantities(equations, t, q, v):
         "accelerations": equations.accelerations(t, q, v),
         "watched": equations.accelerations(t, q, v, watch=True),
         "project": equations.project(t, q, v),
+        "tangential": equations.tangential(t, q, v, jnp.sin(q), jnp.cos(q)),
         "violation": equations.violation(t, q, v),
         "multipliers": equations.multipliers(t, q, v),
         "matrices": equations.matrices(t, q, v),

@@ -240,6 +240,28 @@ def test_projection_is_the_smallest_change(nearby, twin, name):
         assert_allclose(vt[np.sum(sigma > 1e-6) :] @ (mass * moved), 0.0, atol=1e-11)
 
 
+@pytest.mark.parametrize("method", [udk.Auto(), udk.SVD()], ids=["Auto", "SVD"])
+@pytest.mark.parametrize("name", ["parallelogram", "slider_crank"])
+def test_the_tangential_part_is_what_projection_leaves(mechanisms, nearby, method, name):
+    """Of small changes of a closed state; against the projection itself, which is linear in velocities."""
+    mech, (q, *_), (v, *_) = nearby(name)
+    dq, dv = 1e-7 * np.random.default_rng(3).standard_normal((2, len(q)))
+
+    @eqx.filter_jit
+    def parts(mech, q, v, dq, dv):
+        equations, t = prepare(mech, method).quick, 0.0
+        q, v = equations.project(t, *equations.project(t, q, v))
+        left = equations.tangential(t, q, v, dq, dv)
+        moved = equations.project(t, q + dq, v)[0] - q, equations.project(t, q, v + 1e7 * dv)[1] - v
+        return left, moved, equations.tangential(t, q, v, *left)
+
+    (left_q, left_v), (moved_q, moved_v), again = parts(mech, q, v, dq, dv)
+    assert_allclose(left_q, moved_q, atol=1e-12)
+    assert_allclose(1e7 * left_v, moved_v, atol=1e-11)
+    assert_allclose(again, (left_q, left_v), atol=1e-18)
+    assert jnp.abs(left_q - dq).max() > 1e-8  # something is taken back
+
+
 # --- few constraints, and more than there seemed
 
 

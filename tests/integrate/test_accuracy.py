@@ -55,6 +55,16 @@ def test_linkage(angle, rate, bound):
     assert_allclose(energy, energy[0], atol=20 * bound)
 
 
+@pytest.mark.parametrize("angle", [45, 60])
+def test_singular_configurations_cost_few_steps(angle):
+    """Against a run that meets none, which takes 425 at this tolerance; without care for what projection takes back 1,600."""
+    mech = udk.library.parallelogram(np.deg2rad(angle))
+    sol = udk.simulate(mech, TS, rtol=1e-11, atol=1e-11)
+    assert error(mech, sol) <= 2e-9
+    assert sol.stats["steps"] < 900
+    assert sol.stats["right_hand_sides"] < 13.5 * sol.stats["steps"]  # hardly one was taken again with care
+
+
 def test_many_starts_cross_singular_configurations(linkage, placed):
     """One start flatters: 64 spread by 5 degrees about each of three, every one of which crosses."""
 

@@ -28,7 +28,8 @@ class Code:
     rows       D, b, a_F, M^(-1/2)        closure    D, Psi, M^(-1/2)        rate    D, Psi_dot, M^(-1/2)
 
     and for elimination: `accelerations` (a, whether all pivots are safe), `factor` (the factors at (t, q), whether safe), `step`
-    (the change of q or v that removes a residual, given the factors), `psi` and `psi_dot` (of the rows kept).
+    (the change of q or v that removes a residual, given the factors), `psi` and `psi_dot` (of the rows kept), `tangential` (of
+    changes of q and v, given after q in place of v, what projection leaves; whether safe).
     """
 
     def __init__(self, equations: Expressions, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None):
@@ -77,6 +78,8 @@ class Code:
         self.outputs["accelerations_watched"] = [*self.a, watched]
         self.residual = [graph.input(f"r{k}", "residual") for k in range(len(self.kept))]
         self.outputs["step"] = self.spread(self.solved(self.residual))
+        self.changes = [graph.input(f"d{k}", "change") for k in range(2 * self.n)]
+        self.outputs["tangential"] = [*self._tangential(self.changes[: self.n]), *self._tangential(self.changes[self.n :]), safe]
         early = frontier(graph, self.outputs["step"], lambda node: "residual" not in node.depends)
         self.factors = [s for s in early if not s.node.depends <= {"parameter"}]
         self.outputs["factor"] = [*self.factors, safe]
@@ -92,6 +95,11 @@ class Code:
     def spread(self, y: Sequence[Scalar]) -> list[Scalar]:
         """M^(-1) Psi_q^T y, of the rows kept."""
         return [c * s for c, s in zip(self.compliance, self.pulled(y), strict=True)]
+
+    def _tangential(self, change: Sequence[Scalar]) -> list[Scalar]:
+        rows, zero = (self.equations.psi_q[i] for i in self.kept), self.graph.constant(0.0)
+        residual = [sum((entry * change[k] for k, entry in row.items()), zero) for row in rows]
+        return [c - s for c, s in zip(change, self.spread(self.solved(residual)), strict=True)]
 
     def b(self, i: int) -> Scalar:
         """gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F of one row."""
@@ -113,7 +121,10 @@ class Code:
     def program(self, name: str) -> Program:
         if name not in self._programs:
             e = self.equations
-            state = [*self.factors, *self.residual] if name == "step" else [e.t, *e.q, *e.v]
+            given = (
+                {"step": [*self.factors, *self.residual], "tangential": [e.t, *e.q, *self.changes]} if self.elimination else {}
+            )
+            state = given.get(name, [e.t, *e.q, *e.v])
             self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name])
         return self._programs[name]
 

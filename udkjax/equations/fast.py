@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool
 
 from udkjax.equations.code import scalars, stacked
 from udkjax.equations.motion import Vector
-from udkjax.equations.plain import plain_accelerations, plain_correction, plain_project
+from udkjax.equations.plain import plain_accelerations, plain_correction, plain_project, plain_tangential
 from udkjax.straightline import Program
 
 if TYPE_CHECKING:
@@ -58,6 +58,18 @@ def _projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Ve
     if equations.branches:
         return *_branched(equations, safe, found, plain_project, t, q, v), jnp.array(True)
     return *found, safe if _checks(equations) else jnp.array(True)
+
+
+def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+    """What projection at q leaves of small changes: for estimates of errors, which nobody differentiates."""
+    if not equations.code.elimination:
+        return plain_tangential(equations, t, q, v, dq, dv)
+    program = equations.code.program("tangential")
+    *changes, safe = program([*equations.constants, t, *scalars([q, dq, dv])])
+    left = stacked(changes[: len(q)]), stacked(changes[len(q) :])
+    if equations.branches:
+        return _branched(equations, safe, left, plain_tangential, t, q, v, dq, dv)
+    return left
 
 
 def _checked(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:

@@ -70,6 +70,18 @@ class GeneralEquations(Motion):
             v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
         return q, v
 
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+        """(I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq."""
+        if self.system.constraint is not None:
+            slopes = jax.jacfwd(self._psi, 1)(t, q)
+            plus, weight = self._plus(q, slopes)
+            dq = dq - weight(plus @ (slopes @ dq))
+        if self.constrained:
+            slopes = self._slopes(t, q, v)
+            plus, weight = self._plus(q, slopes)
+            dv = dv - weight(plus @ (slopes @ dv))
+        return dq, dv
+
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Any:
         return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
 

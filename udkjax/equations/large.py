@@ -72,6 +72,10 @@ class LargeEquations(MechanismMotion):
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
         return _compiled(_project, self, t, q, v)
 
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+        """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
+        return _compiled(_tangential, self, t, q, v, dq, dv)
+
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""
         return _compiled(_violation, self, t, q, v)
@@ -230,9 +234,9 @@ def _violation(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple
     return rows.listed(psi), rows.listed(rate)
 
 
-def _compiled(function: Any, equations: LargeEquations, t: Any, q: Vector, v: Vector, *choices: bool) -> Any:
+def _compiled(function: Any, equations: LargeEquations, t: Any, q: Vector, v: Vector, *rest: Any) -> Any:
     """As one program, also where it is not part of a larger one: else each of its operations would be compiled by itself."""
-    return _called(function, equations, jnp.asarray(t, jnp.result_type(float)), q, v, *choices)
+    return _called(function, equations, jnp.asarray(t, jnp.result_type(float)), q, v, *rest)
 
 
 @eqx.filter_jit
@@ -280,6 +284,16 @@ def _plain_correction(equations: LargeEquations, t: Any, q: Vector, v: Vector) -
         return closed, v - root * (plus @ flat(rate))
 
     return _by_method(equations, step, t, q, v)
+
+
+def _tangential(equations: LargeEquations, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+    root = flat(equations.numbers["root"])
+
+    def left(plus: Any, rows: Selection) -> tuple[Vector, Vector]:
+        first, second = (x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv))
+        return first, second
+
+    return _by_method(equations, left, t, q, v) if len(equations.layout.kept.rows) else (dq, dv)
 
 
 def _by_method(equations: LargeEquations, use: Any, t: Any, q: Vector, v: Vector) -> Any:

@@ -53,6 +53,10 @@ class Motion(eqx.Module):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """q and v returned to the constraint manifold."""
 
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+        """What projection at q leaves of small changes of positions and velocities. By default: all of them."""
+        return dq, dv
+
     @abstractmethod
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and the residuals of the velocities, of all rows."""

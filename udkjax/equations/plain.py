@@ -46,6 +46,19 @@ def plain_correction(equations: "Equations", t: Any, q: Vector, v: Vector) -> tu
     return _by_method(equations, step, "closure", t, q, v)
 
 
+def plain_tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+    """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors."""
+    if not equations.code.kept:
+        return dq, dv
+
+    def left(plus: Plus, name: str) -> tuple[Vector, Vector]:
+        root = equations.arrays(name, t, q, v)[-1]
+        first, second = (x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv))
+        return first, second
+
+    return _by_method(equations, left, "closure", t, q, v)
+
+
 def _by_method(equations: "Equations", use: Any, name: str, t: Any, q: Vector, v: Vector) -> Any:
     """Call `use` with D^+ by the equations' method, and the name of the program whose rows it is for."""
     programs, method = equations.code, equations.method

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.integrate.counting import again, tally
 from udkjax.integrate.multistep import Multistep
-from udkjax.integrate.projection import project
+from udkjax.integrate.projection import lasting, project
 from udkjax.integrate.wrapper import Wrapper
 
 
@@ -22,8 +22,9 @@ class Constrained(Wrapper):
     finite: a branch a step instead of one a stage, and a real one under vmap too as long as no member needs it. With `projected`
     the step ends on the constraint manifold. A derivative at its end that the solver would keep for the next step (FSAL) belongs
     to the state before projection; told that the state has jumped, the solver takes a new one. (Not so a multistep method, which
-    would forget its whole history: it sees for itself that its newest point was moved.) Where the equations integrate only some
-    coordinates, errors are those of these alone. Error estimates, with their counts, and interpolation are the wrapped solver's.
+    would forget its whole history: it sees for itself that its newest point was moved.) What projection takes back of an error
+    hardly counts. Where the equations integrate only some coordinates, errors are those of these alone. Error estimates, with
+    their counts, and interpolation are the wrapped solver's.
     """
 
     solver: diffrax.AbstractSolver
@@ -50,7 +51,10 @@ class Constrained(Wrapper):
         if judged is not None:
             solver = _judging(solver, judged)
         y1, error, dense, state, result = solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
-        y1 = project(equations, t1, y1) if self.projected else y1
+        if self.projected:
+            y1 = project(equations, t1, y1)
+            if error is not None and not isinstance(self.solver, Multistep):
+                error = jnp.concatenate(lasting(equations, t1, *jnp.split(y1, 2), *jnp.split(error, 2)))
         if judged is not None:
             error = jnp.where(judged, jnp.asarray(error), jnp.where(jnp.isfinite(y1), 0.0, jnp.nan))
         return y1, tally(self.solver, error, solver_state, state, made_jump), dense, state, result

@@ -19,7 +19,7 @@ from udkjax.equations.motion import Motion
 from udkjax.integrate.explicit import March, Task, Trial, judged, march, stage_state
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
-from udkjax.integrate.projection import project
+from udkjax.integrate.projection import lasting, project
 from udkjax.integrate.tableau import is_explicit, method_of
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
@@ -148,6 +148,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     task = Task(
         partial(lanes.over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
         partial(lanes.over, lambda e, t, q, v: e.quick.project(t, q, v)) if problem.projected else lambda t, q, v: (q, v),
+        partial(lanes.over, lasting) if problem.projected else lambda t, q, v, dq, dv: (dq, dv),
         None,
         problem.equations.branches,
         *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
@@ -189,6 +190,7 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
         start, none = jnp.where(begin, stages, 0), jnp.zeros((stages + 1, *here.a.shape))
         a, q1, v1 = jax.lax.fori_loop(start, stages + 1, stage, (none, here.q, here.v))
         mine, evaluations = task._replace(rtol=rtol, atol=atol), jnp.where(begin, 2, 2 * stages + 1)
+        mine = mine._replace(lasting=partial(lasting, equations)) if projected else mine
         return judged(mine, here._replace(a=a[0]), Point(t1, q1, v1, a[stages]), h, a[:stages], evaluations)
 
     tolerances = (jnp.broadcast_to(x, h.shape) for x in (task.rtol, task.atol))
