@@ -1,0 +1,227 @@
+"""Pictures of a sweep, from its dataset alone: a map of each number that is kept of a member, and one of how members ended."""
+
+from collections.abc import Iterator, Sequence
+from itertools import islice, product
+from math import prod
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+
+from udkjax.integrate import Result
+from udkjax.show.plots import COLOURS, legend
+
+RESULT = "result"
+OTHER = "not computed"  # what has a code of no `Result`
+SHADES = ("#d9d9d9", *COLOURS[1:6], "white")  # of the results in their order, successes in grey, and of the others
+FAILED = "0.75"  # where there is no value
+DECADES = 1e2  # from this ratio of the largest to the smallest value on, colours and axes are logarithmic
+COLUMNS = 4  # of panels
+PANELS = 12  # of one picture; of the dimensions that these cannot show, the first values are drawn
+
+
+def pictures(data: Any) -> dict[str, Figure]:
+    """Draw the dataset of a sweep: `result`, and every variable with one number a member, each as a figure of its own.
+
+    Two dimensions are the axes of a map, those with most values; each combination of the others has a panel. One dimension is a
+    line. Members of a design, which has no grid, are points over its first two axes.
+    """
+    return {name: _picture(data, name) for name in (RESULT, *scalars(data))}
+
+
+def scalars(data: Any) -> list[str]:
+    """The variables with one number for each member."""
+    return [n for n in data.data_vars if n != RESULT and data[n].dims == data[RESULT].dims and data[n].dtype.kind in "iuf"]
+
+
+def _picture(data: Any, name: str) -> Figure:
+    across, panels = _layout(data)
+    count, others = len(panels), [d for d in data[RESULT].dims if d not in across]
+    columns = min(count, COLUMNS, data.sizes[others[-1]] if others else 1)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(1.2 + 3.4 * columns, 0.8 + 2.9 * rows), layout="constrained")
+    grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)).ravel()
+    colours = _codes() if name == RESULT else _scale(data[name].values)
+    drawn = None
+    for axes, (chosen, words) in zip(grid, panels, strict=False):
+        part = data.isel(chosen)
+        if "member" in across:
+            drawn = _points(axes, part, name, *colours)
+        elif len(across) == 1:
+            _line(axes, part, name, across[0])
+        else:
+            drawn = _map(axes, part, name, across, *colours)
+        axes.set_title(words, fontsize="small")
+    for axes in grid[:count][-columns:]:  # below which there is none
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel(_words(data, across[-1]) if len(across) == 2 else axes.get_xlabel())
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    if drawn is not None:
+        _key(figure, drawn, data, name)
+    whole = prod(data.sizes[d] for d in others)
+    remarks = [f"the first {count} of {whole} panels"] if count < whole else []
+    remarks += ["grey: no value"] if drawn is not None and not np.isfinite(data[name].values).all() else []
+    figure.suptitle("; ".join([_words(data, name), *remarks]))
+    return figure
+
+
+def _layout(data: Any) -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
+    """The dimensions that are drawn across, and for each panel which values of the others it has, and what is said of them."""
+    dims = data[RESULT].dims
+    if "member" in dims:
+        return ("member",), [({}, "")]
+    longest = sorted(dims, key=lambda d: (_numeric(data, d), data.sizes[d]), reverse=True)[:2]
+    across = tuple(d for d in dims if d in longest)
+    others = [d for d in dims if d not in longest]
+    indices = islice(product(*(range(data.sizes[d]) for d in others)), PANELS)
+    return across, [
+        (dict(zip(others, k, strict=True)), ", ".join(_value(data, d, i) for d, i in zip(others, k))) for k in indices
+    ]
+
+
+def _map(axes: Axes, part: Any, name: str, across: Sequence[str], cmap: Any, norm: Any) -> Any:
+    """A heatmap: the first dimension upwards, the second to the right."""
+    up, right = across
+    values = np.ma.masked_invalid(_drawable(part[name], name).transpose(up, right).values)
+    axes.set_facecolor(FAILED)
+    drawn = axes.pcolormesh(_edges(part, right, axes.set_xscale), _edges(part, up, axes.set_yscale), values, cmap=cmap, norm=norm)
+    for dim, ticks in ((right, axes.set_xticks), (up, axes.set_yticks)):
+        if not _numeric(part, dim):
+            ticks(np.arange(part.sizes[dim]), [str(v) for v in part[dim].values], rotation=30 if dim == right else 0)
+    if not _numeric(part, up):
+        axes.set_ylim(part.sizes[up] - 0.5, -0.5)  # as one reads
+    _label(axes, _words(part, right), _words(part, up))
+    return drawn
+
+
+def _line(axes: Axes, part: Any, name: str, dim: str) -> None:
+    """A value over one axis; where a member failed, a cross at the lower edge."""
+    codes, values = part[RESULT].values, _drawable(part[name], name).values
+    numeric = _numeric(part, dim)
+    x = part[dim].values if numeric else np.arange(part.sizes[dim])
+    if name == RESULT:
+        for code in np.unique(codes):
+            axes.plot(x[codes == code], values[codes == code], "o", color=COLOURS[int(code) % len(COLOURS)])
+        shown = sorted({int(v) for v in values})
+        axes.set_yticks(shown, [_result(code) for code in shown])
+    else:
+        axes.plot(x, values, "o-", ms=3.5, color=COLOURS[0], lw=1.2)
+        failed = codes != Result.successful
+        if failed.any():
+            axes.plot(
+                x[failed], np.zeros(failed.sum()), "x", color=COLOURS[1], transform=axes.get_xaxis_transform(), label="failed"
+            )
+            axes.lines[-1].set_clip_on(False)
+            legend(axes)
+        if _decades(values):
+            axes.set_yscale("log")
+    if numeric and _decades(x):
+        axes.set_xscale("log")
+    elif not numeric:
+        axes.set_xticks(x, [str(v) for v in part[dim].values], rotation=30)
+    _label(axes, _words(part, dim), "" if name == RESULT else _words(part, name))
+
+
+def _points(axes: Axes, part: Any, name: str, cmap: Any, norm: Any) -> Any:
+    """Members of a design over its first two axes, or its only one."""
+    names = [c for c in part.coords if part[c].dims == ("member",) and part[c].dtype.kind in "iuf" and c != "member"][:2]
+    values = _drawable(part[name], name).values
+    x = part[names[0]].values if names else np.arange(len(values))
+    y = part[names[1]].values if len(names) > 1 else values
+    missing = ~np.isfinite(values)
+    if len(names) > 1:
+        axes.plot(x[missing], y[missing], "x", color=FAILED, ms=3)
+    drawn = axes.scatter(x[~missing], y[~missing], c=values[~missing], s=9, cmap=cmap, norm=norm, lw=0)
+    for values_, scale in ((x, axes.set_xscale), (y, axes.set_yscale)):
+        if _decades(values_):
+            scale("log")
+    _label(axes, _words(part, names[0]) if names else "member", _words(part, names[1] if len(names) > 1 else name))
+    return drawn
+
+
+def _key(figure: Figure, drawn: Any, data: Any, name: str) -> None:
+    """What the colours mean."""
+    bar = figure.colorbar(drawn, ax=figure.axes, aspect=30)
+    if name == RESULT:
+        bar.set_ticks(range(len(Result) + 1), labels=[_result(code) for code in range(len(Result) + 1)])
+        bar.ax.tick_params(length=0)
+
+
+def _codes() -> tuple[Any, Any]:
+    """A colour for each result, and one for what is none."""
+    count = len(Result) + 1
+    return ListedColormap(SHADES[:count]), BoundaryNorm(np.arange(count + 1) - 0.5, count)
+
+
+def _scale(values: np.ndarray) -> tuple[Any, Any]:
+    """Colours from the smallest to the largest value, logarithmic where these are far apart."""
+    finite = values[np.isfinite(values)]
+    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+    return "viridis", LogNorm(low, high) if _decades(finite) else Normalize(low, high)
+
+
+def _drawable(values: Any, name: str) -> Any:
+    """Codes of no `Result` are drawn as one."""
+    return values.where(values.isin([int(r) for r in Result]), len(Result)) if name == RESULT else values
+
+
+def _edges(part: Any, dim: str, scale: Any) -> np.ndarray:
+    """Where the cells of a map begin and end: half way between the values, of labels between their places."""
+    if not _numeric(part, dim):
+        return np.arange(part.sizes[dim] + 1) - 0.5
+    values = part[dim].values.astype(float)
+    if _decades(values):
+        scale("log")
+        return np.exp(_between(np.log(values)))
+    return _between(values)
+
+
+def _between(values: np.ndarray) -> np.ndarray:
+    if len(values) == 1:
+        return values[0] + np.array([-0.5, 0.5])
+    middle = (values[1:] + values[:-1]) / 2
+    return np.concatenate([[2 * values[0] - middle[0]], middle, [2 * values[-1] - middle[-1]]])
+
+
+def _decades(values: np.ndarray) -> bool:
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    return values.size > 0 and values.min() > 0 and values.max() >= DECADES * values.min()
+
+
+def _numeric(data: Any, dim: str) -> bool:
+    """Whether a dimension has numbers on it that are apart, in order."""
+    values = data[dim].values
+    return values.dtype.kind in "iuf" and (len(values) < 2 or bool(np.all(np.diff(values) > 0) or np.all(np.diff(values) < 0)))
+
+
+def _words(data: Any, name: str) -> str:
+    """A variable or an axis, with its unit."""
+    units = data[name].attrs.get("units", "")
+    return f"{name.replace('_', ' ')} ({units})" if units not in ("", "1") else name.replace("_", " ")
+
+
+def _value(data: Any, dim: str, index: int) -> str:
+    value = data[dim].values[index]
+    return f"{dim} {value:g}" if data[dim].dtype.kind in "iuf" else str(value)
+
+
+def _label(axes: Axes, right: str, up: str) -> None:
+    if axes.get_subplotspec() is None or axes.get_subplotspec().is_last_row():  # pyright: ignore[reportOptionalMemberAccess]
+        axes.set_xlabel(right)
+    if axes.get_subplotspec() is None or axes.get_subplotspec().is_first_col():  # pyright: ignore[reportOptionalMemberAccess]
+        axes.set_ylabel(up)
+
+
+def _result(code: int) -> str:
+    return Result(code).name.replace("_", " ") if code in list(Result) else OTHER
+
+
+def save_pictures(data: Any, folder: Any) -> Iterator[str]:
+    """Write each picture to the folder, and iterate over the names of the files."""
+    for name, figure in pictures(data).items():
+        figure.savefig(folder / f"{name}.png", dpi=150)
+        yield f"{name}.png"
