@@ -104,11 +104,12 @@ class Solution(eqx.Module):
         }
         if mechanism is not None:
             data.attrs["parameters"] = json.dumps({k: np.asarray(v).tolist() for k, v in mechanism.parameters().items()})
-            data.attrs["scene"] = _text(mechanism)
+            data.attrs["scene"] = scene_text(mechanism)
         return data
 
 
-def _text(mechanism: Mechanism) -> str:
+def scene_text(mechanism: Mechanism) -> str:
+    """Return a mechanism as the text of a scene file, or why it has none."""
     from udkjax.scene import SceneError, dumps
 
     try:

@@ -17,3 +17,10 @@ def solver_named(name: str) -> "diffrax.AbstractSolver":
         here = ", ".join(integrate.SOLVERS)
         raise ValueError(f"{name!r} is no solver: it is none of {here}, nor a solver of diffrax such as 'Dopri8'")
     return solver()
+
+
+def forward_mode() -> "diffrax.AbstractAdjoint":
+    """Return the adjoint with which `simulate` is differentiated forward."""
+    import diffrax
+
+    return diffrax.ForwardMode()

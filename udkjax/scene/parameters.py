@@ -40,7 +40,7 @@ def replaced(mechanism: Any, values: Mapping[str, Any]) -> tuple[dict[str, dict[
     groups, gravity = {section: dict(getattr(mechanism, plural)) for section, plural in _SECTIONS.items()}, mechanism.gravity
     # Whole arrays before their entries, whatever the order of the keys: jit sorts them.
     for given in sorted(values, key=lambda name: name not in known and name.count("[")):
-        name, index = _split(given, known)
+        name, index = split(given, known)
         if name not in known:
             problems.append(f"no parameter {quoted(given)}{suggestion(given, known)}")
             continue
@@ -75,7 +75,7 @@ def _fitting(given: str, value: Any, name: str, index: tuple[int, ...], shape: t
     return (new if old is None or not index else old.at[index].set(new)), ""
 
 
-def _split(given: str, known: Mapping[str, Any]) -> tuple[str, tuple[int, ...]]:
+def split(given: str, known: Mapping[str, Any]) -> tuple[str, tuple[int, ...]]:
     """Split `joint.A.points[1][0]` into the parameter and the index of one of its entries."""
     match = None if given in known else re.fullmatch(r"(.*?)((?:\[\d+\])+)", given)
     return (given, ()) if match is None else (match[1], tuple(int(i) for i in re.findall(r"\d+", match[2])))

@@ -1,38 +1,37 @@
 """Axes: what a sweep varies, each under a name.
 
-An axis of numbers (parameters, tolerances, gains, initial states) is batched in one compiled program. An axis of choices (methods,
-solvers, mechanisms) divides the members into groups, one program each: no member executes a branch that it did not choose.
+An axis of numbers (parameters, tolerances, gains) is batched in one compiled program. An axis of choices (methods, solvers,
+mechanisms, initial states) divides the members into groups by the structure of what they chose, one program each: no member
+executes a branch that it did not choose, and choices that differ by numbers alone share a program.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import numpy as np
 
-# The settings of a run that are numbers, with their units: one program serves all their values.
-NUMBERS = {
-    "rtol": "1",
-    "atol": "1",
-    "rank_tol": "1",  # relative; in the units of D where the method is absolute
-    "branch_tol": "1",
-    "alpha": "1/s",
-    "beta": "1/s",
-    "t1": "s",
-    "drift_tol": "m, rad",
-    "dt0": "s",
-    "state": "m, rad",
+# The settings of a run that are choices; what each is where none is given, or given as None.
+CHOICES = {
+    "mechanism": "",
+    "state": "assembled",
+    "method": "Auto",
+    "solver": "Dopri8",
+    "stabilization": "none",
+    "formulation": "UdwadiaKalaba",
+    "max_steps": "",
 }
-CHOICES = ("mechanism", "method", "solver", "stabilization", "formulation", "max_steps")  # those that are types
 
 
 class Axis:
     """The values of one quantity, and what it is the quantity of.
 
-    `values` are numbers (n, ...), one entry a value, or instances such as `[SVD(), Varga()]`; with a design a range (low, high) or
-    a frozen distribution of scipy.stats. `of` is the name of a parameter or of a setting, several names that all take the value
-    (tied), or a pure function (mechanism, value) -> mechanism; by default the axis's own name. Functions and parameters are
-    applied in the order of the axes.
+    `values` are numbers (n, ...), one entry a value, or instances such as `[SVD(), Varga()]`; with a design a range (low, high)
+    or a frozen distribution of scipy.stats. `of` is the name of a parameter or of a setting, several names that all take the
+    value (tied), or a pure function (mechanism, value) -> mechanism; by default the axis's own name. Functions and parameters
+    are applied in the order of the axes. `units` are those of the value, where its name does not tell.
     """
 
     def __init__(self, values: Any, of: str | Sequence[str] | Callable[[Any, Any], Any] | None = None, units: str | None = None):
@@ -54,15 +53,30 @@ class Column:
     """An axis with its values laid out along a dimension."""
 
     name: str
-    values: Any  # numbers (n, ...), a State of such, or a tuple of choices
+    values: Any  # numbers (n, ...), or a tuple of choices
     of: tuple[str, ...] | Callable[[Any, Any], Any]
-    units: str
+    units: str = ""
     labels: tuple[str, ...] = ()  # of choices, unique
 
     @property
     def chosen(self) -> bool:
         """Whether its values are choices, not numbers."""
         return bool(self.labels)
+
+    @property
+    def setting(self) -> str:
+        """What its choices are of."""
+        assert self.chosen and not callable(self.of)
+        return self.of[0]
+
+    @property
+    def coordinate(self) -> np.ndarray:
+        """The values as a dataset shows them: numbers, or labels."""
+        if not self.chosen:
+            return self.values
+        if self.of == ("max_steps",):
+            return np.array(self.values)
+        return np.array(self.labels, dtype=object)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,3 +86,29 @@ class Dimension:
     name: str
     size: int
     columns: tuple[Column, ...]
+
+
+def labels_of(setting: str, choices: Sequence[Any]) -> tuple[str, ...]:
+    """Readable, unique names of choices: their types, where these are the same with their numbers."""
+    plain = [_plain(setting, choice) for choice in choices]
+    names = [name if plain.count(name) == 1 else _full(name, choice) for name, choice in zip(plain, choices, strict=True)]
+    return tuple(name if name not in names[:k] else f"{name} #{names[:k].count(name) + 1}" for k, name in enumerate(names))
+
+
+def _plain(setting: str, choice: Any) -> str:
+    if choice is None:
+        return CHOICES[setting]
+    return choice.name if setting == "mechanism" else str(choice) if isinstance(choice, int) else type(choice).__name__
+
+
+def _full(name: str, choice: Any) -> str:
+    """The type with its numbers, where they are few."""
+    numbers = {key: value for key, value in getattr(choice, "__dict__", {}).items() if eqx.is_array(value) and value.ndim == 0}
+    return f"{name}({', '.join(f'{key}={float(value):g}' for key, value in numbers.items())})" if numbers else name
+
+
+def structure_of(choice: Any) -> Any:
+    """Everything of a choice but the values of its numbers: choices of one structure share a program."""
+    arrays, rest = eqx.partition(choice, eqx.is_array)
+    leaves, tree = jax.tree.flatten(rest)
+    return jax.tree.structure(arrays), tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(arrays)), tree, tuple(leaves)

@@ -1,10 +1,186 @@
-"""Compute a chunk of a plan."""
+"""Compute a chunk of a plan, by one compiled program for each group.
 
+A program computes pieces of a fixed size on each device: as many members as fill the vector units, or one, where members had
+better be computed one after another. The last piece is filled up with copies. So results do not depend on how many devices there
+are, nor on how a sweep is cut into chunks.
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
-from udkjax.study.sweep.plan import Chunk, Plan
+from udkjax.equations.redundancy import redundant_rows
+from udkjax.integrate.lanes import CHUNKED, LANES, ROUND
+from udkjax.integrate.solution import Result
+from udkjax.study.sweep.measures import Named, guessed
+from udkjax.study.sweep.member import END, RESULT, STEPS, Kept, Recipe
+from udkjax.study.sweep.plan import Chunk, Group, Plan, Variable
+from udkjax.study.sweep.units import units_of
+
+WIDE = 4096  # members of a piece where a device takes them all at once
+PROGRAMS = 64  # that are kept: a program holds its plan
+LABELS = {
+    RESULT: Named((), "1", "how the run ended"),
+    END: Named((), "s", "time that was reached"),
+    STEPS: Named((), "1", "steps tried"),
+}
+_programs: OrderedDict[Any, "Program"] = OrderedDict()
+_lock = threading.Lock()
+
+
+class Program:
+    """The compiled program of a group, on one or several devices of a kind."""
+
+    def __init__(self, recipe: Recipe, devices: Sequence[Any]):
+        self.recipe, self.devices = recipe, tuple(devices)
+        self.piece = self._piece(len(recipe.group.members))
+        self._lock = threading.Lock()
+        self._lowered: Any = None
+        self._compiled: Any = None
+
+    def _piece(self, members: int) -> int:
+        if self.devices[0].platform not in CHUNKED:
+            return min(WIDE, -(-members // ROUND) * ROUND)
+        return min(LANES, -(-members // ROUND) * ROUND) if self.recipe.in_lanes else 1
+
+    def _computed(self, shared: Any, own: Any) -> tuple[Kept, Kept]:
+        """What is kept, and the derivatives of it by each name, last."""
+        one = self.recipe.single if self.piece == 1 else self.recipe.batch
+        names = self.recipe.names
+        if not names:
+            return one(shared, own, {}), {}
+
+        def shifted(shift: Any) -> tuple[Kept, Kept]:
+            kept = one(shared, own, dict(zip(names, shift, strict=True)))
+            return {k: x for k, x in kept.items() if jnp.issubdtype(x.dtype, jnp.floating) and k != END}, kept
+
+        slopes, kept = jax.jacfwd(shifted, has_aux=True)(jnp.zeros(len(names)))
+        return kept, slopes
+
+    def _lower(self) -> Any:
+        if self._lowered is None:
+            function = self._computed
+            if len(self.devices) > 1:
+                from jax.sharding import AxisType, Mesh, PartitionSpec
+
+                mesh = Mesh(np.array(self.devices), ("members",), axis_types=(AxisType.Auto,))
+                same, spread = PartitionSpec(), PartitionSpec("members")
+                function = jax.shard_map(function, mesh=mesh, in_specs=(same, spread), out_specs=spread, check_vma=False)
+            first = np.repeat(self.recipe.group.members[:1], self.piece * len(self.devices))
+            self._lowered = jax.jit(function).lower(self.recipe.shared, self.recipe.own(first))
+        return self._lowered
+
+    @property
+    def outputs(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """What is kept of one member: shapes and types."""
+        with self._lock:
+            kept, slopes = self._lower().out_info
+        return {k: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for k, x in _named(self.recipe.names, kept, slopes).items()}
+
+    @property
+    def compiled(self) -> Any:
+        """The executable."""
+        with self._lock:
+            if self._compiled is None:
+                self._compiled = self._lower().compile()
+        return self._compiled
+
+    def __call__(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
+        """Compute members, in this order."""
+        size, n = self.piece * len(self.devices), len(members)
+        full = members[np.minimum(np.arange(-(-n // size) * size), n - 1)]
+        own = self.recipe.own(full)
+        started = [
+            self.compiled(self.recipe.shared, jax.tree.map(lambda x, k=k: x[k : k + size], own))
+            for k in range(0, len(full), size)
+        ]
+        parts = [jax.tree.map(np.asarray, part) for part in started]
+        joined = jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
+        return _named(self.recipe.names, *joined)
+
+
+def _named(names: Sequence[str], kept: Any, slopes: Any) -> dict[str, Any]:
+    """Derivatives under names of their own."""
+    found = dict(kept)
+    for name, slope in slopes.items():
+        for k, by in enumerate(names):
+            if isinstance(slope, np.ndarray):
+                found[f"d_{name}_d_{by}"] = slope[..., k]
+            else:
+                found[f"d_{name}_d_{by}"] = jax.ShapeDtypeStruct(slope.shape[:-1], slope.dtype)
+    return found
+
+
+def program(plan: Plan, group: Group, left_out: tuple[int, ...] | None = None) -> Program:
+    """The program of a group: made once for each process."""
+    key = plan.token, group.index, left_out
+    with _lock:
+        if key not in _programs:
+            _programs[key] = Program(Recipe(plan, group, left_out), jax.local_devices())
+            while len(_programs) > PROGRAMS:
+                _programs.popitem(last=False)
+        _programs.move_to_end(key)
+        return _programs[key]
 
 
 def run(plan: Plan, chunk: Chunk) -> dict[str, np.ndarray]:
-    """Compute the members of a chunk: each kept variable (members, ...), with "result". A failing member has a code, and NaN."""
-    raise NotImplementedError
+    """Compute the members of a chunk: each kept variable (members, ...), with "result". A failing member has a code, and NaN.
+
+    Where a member's numbers made rows independent that the mechanism leaves out as redundant, it is run again without them.
+    """
+    group = plan.groups[chunk.group]
+    mine = program(plan, group)
+    found = mine(chunk.members)
+    if mine.recipe.left_out and mine.recipe.varied:
+        for rows, which in _others(mine.recipe, chunk.members, found[RESULT]).items():
+            again = program(plan, group, rows)(chunk.members[which])
+            for name, values in again.items():
+                found[name][which] = values
+    return found
+
+
+def _others(recipe: Recipe, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
+    """Which of those that drifted, although they were projected, have other redundant rows; by these."""
+    drifted = np.flatnonzero(result == Result.drift)
+    found: dict[tuple[int, ...], list[int]] = {}
+    if len(drifted):
+        mechanisms = _mechanisms(recipe, members[drifted])
+        for k, mechanism in zip(drifted.tolist(), mechanisms, strict=True):
+            rows = redundant_rows(mechanism)
+            if rows is not None and rows != recipe.left_out:
+                found.setdefault(rows, []).append(k)
+    return {rows: np.array(which) for rows, which in found.items()}
+
+
+def _mechanisms(recipe: Recipe, members: np.ndarray) -> list[Any]:
+    own = recipe.own(members)
+    return [recipe.mechanism(recipe.shared, jax.tree.map(lambda x, k=k: x[k], own), {}) for k in range(len(members))]
+
+
+def described(plan: Plan, group: Group) -> dict[str, Variable]:
+    """What is kept of each member of a group."""
+    bodies, found = len(plan.choice(group, "mechanism").body_names), {}
+    known = {name: label for measure in plan.measures for name, label in measure.variables.items()} | LABELS
+    outputs = program(plan, group).outputs
+    slopes = {f"d_{of}_d_{by}": (of, by) for of in outputs for by in plan.derivatives}
+    for name, info in outputs.items():
+        if name in slopes:
+            of, by = slopes[name]
+            label = Named(found[of].dims, _per(found[of].units, by, plan), f"derivative of {of} by {by}")
+        else:
+            label = known.get(name) or guessed(name, info.shape, len(plan.ts), bodies)
+        found[name] = Variable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
+    return found
+
+
+def _per(units: str, by: str, plan: Plan) -> str:
+    """The unit of a derivative, where it is one."""
+    below = next((column.units for column in plan.columns if column.name == by), None)
+    below = units_of(plan.mechanism, by) if below is None else below
+    return "" if not units or not below or "," in units else f"{units}/({below})"

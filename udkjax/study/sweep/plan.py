@@ -1,14 +1,24 @@
 """A plan: what a sweep is, before anything is computed. Its members, their groups and the chunks in which they are computed."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
+import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Int
 
+from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.sweep.axes import Dimension
+from udkjax.study.sweep.axes import Column, Dimension, structure_of
+from udkjax.study.sweep.designs import Design
+from udkjax.study.sweep.layout import SweepError, check_settings, check_tangents, laid_out
+from udkjax.study.sweep.measures import Measure, measures_of
+
+OUTSIDE = ("throw", "progress", "adjoint")  # arguments of simulate that a sweep decides about
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +34,10 @@ class Variable:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Members that share all choices, and so one compiled program."""
+    """Members whose choices have one structure, and so one compiled program."""
 
     index: int
-    choices: Mapping[str, Any]  # "method": SVD(), ...; only those that are axes
+    choices: Mapping[str, tuple[int, ...]]  # for each axis of choices, the places of those that occur
     labels: Mapping[str, str]  # the same, readable
     members: Int[np.ndarray, "n"]  # places in the flattened grid, row-major over the dimensions in their order
 
@@ -43,15 +53,16 @@ class Chunk:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a sweep is. Immutable; it pickles, so that other processes can compute parts of it."""
+    """What a sweep is. Immutable; it pickles, so that other processes can compute parts of it. Made by `planned`."""
 
     mechanism: Mechanism
     dimensions: tuple[Dimension, ...]
     ts: np.ndarray  # (T,) s
     settings: Mapping[str, Any]  # of simulate, those that are no axes
-    measures: Mapping[str, Any]
-    derivatives: tuple[str, ...]
-    seed: int | None  # of the design
+    measures: tuple[Measure, ...]
+    derivatives: tuple[str, ...] = ()
+    design: Design | None = None
+    token: str = field(default_factory=lambda: uuid.uuid4().hex)  # the same in every copy: what was compiled for one serves all
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -64,14 +75,67 @@ class Plan:
         return int(np.prod(self.shape))
 
     @property
-    def groups(self) -> tuple[Group, ...]:
-        """One for each combination of choices."""
-        raise NotImplementedError
+    def columns(self) -> tuple[Column, ...]:
+        """All axes, in their order."""
+        return tuple(column for dimension in self.dimensions for column in dimension.columns)
 
-    @property
+    def places(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
+        """For each axis, which of its values each member has."""
+        along = np.unravel_index(members, self.shape)
+        return {column.name: k for d, k in zip(self.dimensions, along, strict=True) for column in d.columns}
+
+    @cached_property
+    def groups(self) -> tuple[Group, ...]:
+        """One for each combination of structures that occurs among the choices."""
+        chosen = [column for column in self.columns if column.chosen]
+        places = self.places(np.arange(self.size))
+        kinds = np.stack([_kinds(column)[places[column.name]] for column in chosen] or [np.zeros(self.size, int)], axis=1)
+        _, number = np.unique(kinds, axis=0, return_inverse=True)
+        number = number.ravel()
+        found = []
+        for members in sorted((np.flatnonzero(number == k) for k in range(number.max() + 1)), key=lambda m: m[0]):
+            at = {column.name: tuple(np.unique(places[column.name][members]).tolist()) for column in chosen}
+            labels = {column.name: " | ".join(column.labels[k] for k in at[column.name]) for column in chosen}
+            found.append(Group(len(found), at, labels, members))
+        return tuple(found)
+
+    @cached_property
+    def _numbers(self) -> np.ndarray:
+        number = np.empty(self.size, np.int32)
+        for group in self.groups:
+            number[group.members] = group.index
+        return number
+
+    def group_of(self, member: int) -> int:
+        """The index of a member's group."""
+        return int(self._numbers[member])
+
+    def choice(self, group: Group, setting: str) -> Any:
+        """What a group has for a setting: the first of its choices, where these differ by numbers."""
+        for column in self.columns:
+            if column.of == (setting,) and column.chosen:
+                return column.values[group.choices[column.name][0]]
+        return self.mechanism if setting == "mechanism" else self.settings.get(setting)
+
+    @cached_property
     def variables(self) -> Mapping[str, Variable]:
-        """What is kept of each member: names, dimensions, units. `result` and `end_time` are always among them."""
-        raise NotImplementedError
+        """What is kept of each member: names, dimensions, units. `result`, `end_time` and `steps` are always among them.
+
+        Where mechanisms have other bodies, a dimension is as long as the longest.
+        """
+        from udkjax.study.sweep.chunk import described  # computing knows plans
+
+        found: dict[str, Variable] = {}
+        for group in self.groups:
+            for name, variable in described(self, group).items():
+                other = found.setdefault(name, variable)
+                if len(other.shape) != len(variable.shape):
+                    raise SweepError(
+                        [f"measure {name!r} has {other.shape} entries for some members and {variable.shape} for others"]
+                    )
+                shape = tuple(map(max, other.shape, variable.shape))
+                found[name] = Variable(other.dims, shape, other.dtype, other.units, other.long_name)
+        return found
 
     @property
     def bytes_per_member(self) -> int:
@@ -81,10 +145,65 @@ class Plan:
     def chunks(self, memory: int = 2**30) -> list[Chunk]:
         """Cut the members into chunks of at most `memory` bytes and a few seconds of work, those alike in cost together.
 
-        Deterministic on one kind of machine: where the cost is not known beforehand, a sample of the members is run.
+        The same on every machine of a kind: where the cost is not known beforehand, a sample of the members is run.
         """
-        raise NotImplementedError
+        from udkjax.study.sweep.cutting import chunks  # which runs the sample, and so knows plans
+
+        return chunks(self, memory)
 
     def fingerprint(self) -> dict[str, Any]:
         """Everything that decides the results, as JSON takes it: two plans of one fingerprint give the same dataset."""
-        raise NotImplementedError
+        from udkjax.study.sweep.fingerprint import fingerprint
+
+        return fingerprint(self)
+
+
+def planned(
+    mechanism: Mechanism,
+    axes: Mapping[str, Any],
+    ts: Any,
+    measure: Any = "final",
+    *,
+    design: Design | None = None,
+    reference: Any = None,
+    derivatives: Sequence[str] = (),
+    **settings: Any,
+) -> Plan:
+    """Make the plan of a sweep; arguments as those of `udkjax.sweep`. Raises `SweepError`, which lists every mistake."""
+    problems = [f"{name}: a sweep has no such setting" for name in settings if name in OUTSIDE]
+    if not isinstance(mechanism, Mechanism):
+        raise SweepError([f"mechanism: must be a Mechanism, is a {type(mechanism).__name__}"])
+    ts = np.asarray(ts, float)
+    if ts.ndim != 1 or len(ts) < 2 or not np.all(np.diff(ts) > 0):
+        problems.append("ts: must be at least two output times (s), increasing from the start on")
+    dimensions: tuple[Dimension, ...] = ()
+    try:
+        dimensions = laid_out(mechanism, axes, design)
+    except SweepError as error:
+        problems += error.problems
+    targets = {target for d in dimensions for c in d.columns if not callable(c.of) for target in c.of}
+    if targets & {"alpha", "beta"} and "stabilization" not in targets:
+        settings.setdefault("stabilization", Baumgarte())  # who varies gains has some
+    problems += check_settings(dimensions, settings)
+    problems += check_tangents(mechanism, dimensions, derivatives)
+    measures: tuple[Measure, ...] = ()
+    try:
+        measures = measures_of(measure, reference, ts)
+    except ValueError as error:
+        problems.append(str(error))
+    if problems:
+        raise SweepError(problems)
+    kept = ts if any(measure.along for measure in measures) else ts[[0, -1]]
+    return Plan(mechanism, dimensions, kept, settings, measures, tuple(derivatives), design)
+
+
+def _kinds(column: Column) -> np.ndarray:
+    """For each of the choices of an axis the number of its structure."""
+    structures = [structure_of(value) for value in column.values]
+    return np.array([structures.index(structure) for structure in structures])
+
+
+def stacked(choices: Sequence[Any]) -> tuple[Any, Any]:
+    """Choices of one structure: their numbers one behind the other, and everything else."""
+    parts = [eqx.partition(choice, eqx.is_array) for choice in choices]
+    return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(arrays for arrays, _ in parts)), parts[0][1]

@@ -1,0 +1,121 @@
+"""Cut a sweep into chunks: members alike in cost together, so that none waits for another.
+
+In lanes, a member that is done waits for the slowest of its lanes' chunk. So members are ordered by the steps that they will
+take: a sample is run, and a polynomial in the axes fitted to the logarithm of its steps. The longest come first: what is left for
+the end, where devices wait for the last chunk, is short.
+"""
+
+from itertools import combinations_with_replacement
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.pinv import Auto, Elimination
+from udkjax.study.sweep.chunk import program
+from udkjax.study.sweep.member import STEPS
+from udkjax.study.sweep.plan import Chunk, Group, Plan
+
+PILOT = 256  # members of a sample: 4 for each coefficient of a polynomial of second degree in nine axes
+WORTH = 8  # a sample is run of groups that are so many times as large
+SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
+SHARE = 4  # chunks in memory at a time, and copies of each: of what is kept, of its parts on the device
+# Seconds, roughly, of a step of twelve rows: by straight-line code in lanes, and by a dense method.
+QUICK, DENSE = 5e-7, 5e-4
+STEPS_GUESSED = 300.0
+WIDE = 8.0  # an axis of positive values that differ by more than this factor is taken by its logarithm
+
+
+def chunks(plan: Plan, memory: int) -> list[Chunk]:
+    """Return the chunks of a plan; see `Plan.chunks`."""
+    found: list[Chunk] = []
+    for group in plan.groups:
+        own = program(plan, group)
+        steps = expected_steps(plan, group)
+        order = np.argsort(-steps, kind="stable")
+        most = max(1, memory // (SHARE * max(1, plan.bytes_per_member)))
+        for part in _cut(steps[order] * _seconds_per_step(plan, group), own.piece, most):
+            found.append(Chunk(len(found), group.index, group.members[order[part]]))
+    return found
+
+
+def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int) -> list[slice]:
+    """Consecutive parts of at most `SECONDS` and of at most so many members, each of whole pieces."""
+    most = max(piece, most // piece * piece)
+    parts, start = [], 0
+    total = np.concatenate([[0.0], np.cumsum(seconds)])
+    while start < len(seconds):
+        enough = int(np.searchsorted(total, total[start] + SECONDS, side="right")) - 1 - start
+        size = min(most, max(piece, enough // piece * piece))
+        parts.append(slice(start, min(start + size, len(seconds))))
+        start += size
+    return parts
+
+
+def expected_steps(plan: Plan, group: Group) -> Float[np.ndarray, "n"]:
+    """Steps that the members of a group will take, roughly: up to a factor where no sample is run."""
+    features, own = _features(plan, group), program(plan, group)
+    if own.piece == 1 or len(group.members) < WORTH * PILOT or features.shape[1] == 0:
+        return _by_rule(plan, group)
+    basis = _polynomial(features)
+    sample = np.sort(np.random.default_rng(0).choice(len(group.members), PILOT, replace=False))
+    first = sample[np.argsort(-_by_rule(plan, group)[sample], kind="stable")]
+    steps = own(group.members[first])[STEPS]
+    fit = np.linalg.lstsq(basis[first], np.log(np.maximum(steps, 1)), rcond=None)[0]
+    return np.exp(basis @ fit)
+
+
+def _by_rule(plan: Plan, group: Group) -> Float[np.ndarray, "n"]:
+    """What is known beforehand: steps grow with the length of a run, and slowly with the tightness of its tolerances."""
+    places, steps = plan.places(group.members), np.full(len(group.members), STEPS_GUESSED)
+    for column in plan.columns:
+        if not column.chosen and not callable(column.of):
+            values = column.values[places[column.name]]
+            if "t1" in column.of:
+                steps = steps * values / np.max(values)
+            tolerances = len({"rtol", "atol"} & set(column.of))
+            steps = steps * np.maximum(values, 1e-300) ** (-tolerances / 16) if tolerances else steps
+    return steps
+
+
+def _features(plan: Plan, group: Group) -> Float[np.ndarray, "n d"]:
+    """The axes of a group's members, each from -1 to 1: numbers, or their logarithms, and which choices were made."""
+    places, found = plan.places(group.members), []
+    for column in plan.columns:
+        at = places[column.name]
+        if column.chosen:
+            found += [np.where(at == k, 1.0, -1.0) for k in group.choices[column.name][1:]]
+            continue
+        for x in column.values[at].reshape(len(at), -1).T:
+            low, high = x.min(), x.max()
+            if low < high:
+                x, low, high = (np.log(x), np.log(low), np.log(high)) if low > 0 and high > WIDE * low else (x, low, high)
+                found.append(2 * (x - low) / (high - low) - 1)
+    return np.stack(found, axis=1) if found else np.zeros((len(group.members), 0))
+
+
+def _polynomial(x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n terms"]:
+    """All monomials of the features up to the second degree, or the first where the sample is too small for these."""
+    n, d = x.shape
+    terms = [np.ones(n), *x.T]
+    if (d + 1) * (d + 2) // 2 <= PILOT // 4:
+        terms += [x[:, i] * x[:, j] for i, j in combinations_with_replacement(range(d), 2)]
+    return np.stack(terms, axis=1)
+
+
+def _seconds_per_step(plan: Plan, group: Group) -> float:
+    """Roughly, and the same on every machine, so that chunks are."""
+    mechanism, method = plan.choice(group, "mechanism"), plan.choice(group, "method")
+    rows = max(1, 2 * len(mechanism.constraints)) / 12
+    if isinstance(method, Auto | Elimination | None):
+        return QUICK * rows
+    return DENSE * max(rows, rows**3)
+
+
+def lane_efficiency(steps: list[np.ndarray], lanes: int) -> float:
+    """Steps taken, of all that there was room for: each lane waits for the slowest of its chunk of lanes."""
+    taken = room = 0
+    for chunk in steps:
+        for k in range(0, len(chunk), lanes):
+            part = chunk[k : k + lanes]
+            taken, room = taken + int(part.sum()), room + int(part.max()) * lanes
+    return taken / room if room else 1.0

@@ -1,0 +1,99 @@
+"""What decides the results of a sweep, as JSON takes it."""
+
+import hashlib
+import re
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from udkjax.integrate.solution import Solution, scene_text, versions
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.sweep.axes import Column
+from udkjax.study.sweep.measures import Measure
+from udkjax.study.sweep.plan import Plan
+
+SHORT = 64  # numbers that are spelled out; of more, how many, the first, the last, and a digest
+STATS = ("steps", "accepted", "rejected", "right_hand_sides", "projections")
+
+
+def fingerprint(plan: Plan) -> dict[str, Any]:
+    """Return everything that two plans of the same results have in common."""
+    return {
+        **_value(plan.mechanism),
+        "axes": {dimension.name: {c.name: _axis(plan, c) for c in dimension.columns} for dimension in plan.dimensions},
+        "design": repr(plan.design) if plan.design else None,
+        "ts": _value(plan.ts),
+        "settings": {name: _value(value) for name, value in plan.settings.items()},
+        "measures": {f"{k} {measure.name}": _measure(plan, measure) for k, measure in enumerate(plan.measures, 1)},
+        "derivatives": list(plan.derivatives),
+        "versions": {name: version for name, version in versions().items() if name != "python"},
+    }
+
+
+def _axis(plan: Plan, column: Column) -> dict[str, Any]:
+    of: Any = column.of
+    if callable(of):
+        of = _function(of, plan.mechanism, np.zeros(column.values.shape[1:]))
+    return {"of": of, "values": [_value(value) for value in column.values] if column.chosen else _value(column.values)}
+
+
+def _measure(plan: Plan, measure: Measure) -> dict[str, Any]:
+    found: dict[str, Any] = {"under": measure.renamed}
+    if measure.function is not None:
+        found["function"] = _function(measure.function, plan.mechanism, _solution(plan))
+    if callable(measure.reference):
+        found["reference"] = _function(measure.reference, plan.mechanism, plan.ts)
+    elif measure.reference is not None:
+        found["reference"] = _value(measure.reference)
+    return found
+
+
+def _solution(plan: Plan) -> Solution:
+    """A solution of the right shapes."""
+    number, states = np.zeros(()), np.zeros((len(plan.ts), len(plan.mechanism.body_names), 3))
+    count: Any = np.zeros((), int)
+    stats = dict.fromkeys(STATS, count)
+    return Solution(plan.ts, states, states, count, number, stats, number, number, plan.mechanism.body_names, ())  # pyright: ignore[reportArgumentType]
+
+
+def _function(function: Callable, *arguments: Any) -> dict[str, str]:
+    """A function by what it computes: its name, and digests of its operations and of the numbers in them."""
+    program: Any = eqx.filter_make_jaxpr(function)(*arguments)[0]
+    text = re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr))
+    constants = b"".join(np.ascontiguousarray(x).tobytes() for x in program.consts if eqx.is_array(x))
+    name = getattr(function, "__qualname__", None) or repr(function)
+    return {"name": name, "operations": _digest(text.encode()), "constants": _digest(constants)}
+
+
+def _value(value: Any) -> Any:
+    """A number, an array, a choice or a mechanism."""
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, Mechanism):
+        numbers = {name: _value(x) for name, x in value.parameters().items()}
+        return {"scene": scene_text(value), "parameters": numbers, "left_out": list(value.left_out or ())}
+    if isinstance(value, float | np.ndarray | np.number | jax.Array):
+        array = np.asarray(value)
+        if array.size <= SHORT:
+            return array.tolist()
+        first, last = float(array.flat[0]), float(array.flat[-1])
+        return {
+            "shape": list(array.shape),
+            "first": first,
+            "last": last,
+            "digest": _digest(np.ascontiguousarray(array).tobytes()),
+        }
+    leaves = jax.tree_util.tree_leaves_with_path(value)
+    static = re.sub(r"0x[0-9a-f]+", "", str(jax.tree.structure(value)))
+    return {
+        "type": type(value).__name__,
+        "digest": _digest(static.encode()),
+        **{jax.tree_util.keystr(path).lstrip("."): _value(x) if eqx.is_array(x) else repr(x) for path, x in leaves},
+    }
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]

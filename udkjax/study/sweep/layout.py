@@ -1,0 +1,208 @@
+"""From axes as a user writes them to the dimensions of a sweep; every mistake is named, all at once."""
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from udkjax.equations.assembly import State
+from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.pinv import Auto
+from udkjax.scene.checks import SceneError, quoted, shown, suggestion
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.parameters import parameters_of, split
+from udkjax.study.sweep.axes import CHOICES, Axis, Column, Dimension, Zipped, labels_of
+from udkjax.study.sweep.designs import Design, spread
+from udkjax.study.sweep.units import NUMBERS, units_of
+
+MEMBER = "member"  # the dimension of a design
+# Names of the dimensions of what is kept, which a dimension of the sweep cannot have.
+TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
+
+
+class SweepError(ValueError):
+    """A sweep cannot be what it says. `problems` lists every mistake."""
+
+    def __init__(self, problems: Sequence[str]):
+        self.problems = list(problems)
+        super().__init__(problems[0] if len(problems) == 1 else f"{len(problems)} mistakes:\n  " + "\n  ".join(problems))
+
+    def __reduce__(self):
+        return type(self), (self.problems,)
+
+
+def laid_out(mechanism: Mechanism, axes: Mapping[str, Any], design: Design | None = None) -> tuple[Dimension, ...]:
+    """Return the dimensions of a sweep over `axes`. Raises `SweepError`."""
+    problems: list[str] = []
+    ranges = [name for name, given in axes.items() if design is not None and not isinstance(given, Zipped) and _is_range(given)]
+    unit = dict(zip(ranges, design.unit(len(ranges)).T, strict=True)) if design is not None and ranges else {}
+    if design is not None and not ranges:
+        problems.append("design: no axis is a range (low, high) or a distribution for it to fill")
+    found: list[Dimension] = []
+    if unit and design is not None:
+        columns = [_column(mechanism, name, axes[name], unit[name], problems) for name in ranges]
+        found.append(Dimension(MEMBER, design.n, tuple(column for column in columns if column is not None)))
+    for name, given in axes.items():
+        if name in unit:
+            continue
+        inner = given.axes if isinstance(given, Zipped) else {name: given}
+        columns = [_column(mechanism, key, axis, None, problems) for key, axis in inner.items()]
+        columns = tuple(column for column in columns if column is not None)
+        sizes = {column.name: len(column.values) for column in columns}
+        if len(set(sizes.values())) > 1:
+            problems.append(f"{name}: axes that advance together have as many values each, but these have {sizes}")
+        if name in TAKEN or (name == MEMBER and unit):
+            problems.append(
+                f"axis {quoted(name)}: the dataset has a dimension or variable of this name; choose another, with of=..."
+            )
+        if columns:
+            found.append(Dimension(name, len(columns[0].values), columns))
+    problems += _clashes(found)
+    if not axes:
+        problems.append("axes: a sweep needs at least one")
+    if problems:
+        raise SweepError(problems)
+    return tuple(found)
+
+
+def _is_range(given: Any) -> bool:
+    """Whether a design fills this axis: all but choices."""
+    values = given.values if isinstance(given, Axis) else given
+    return hasattr(values, "ppf") or _numbers(values) is not None
+
+
+def _column(mechanism: Mechanism, name: str, given: Any, unit: np.ndarray | None, problems: list[str]) -> Column | None:
+    """One axis, or None where its mistake is among the problems."""
+    axis = given if isinstance(given, Axis) else Axis(given)
+    of = (name,) if axis.of is None else axis.of
+    before = len(problems)
+    if not callable(of):
+        problems += _unknown(mechanism, name, of)
+    values = axis.values if unit is None else spread(axis.values, unit)
+    if values is None:
+        problems.append(f"axis {quoted(name)}: with a design its values are a range (low, high), or a frozen distribution")
+    elif hasattr(values, "ppf"):
+        problems.append(f"axis {quoted(name)}: a distribution needs a design to draw from it, such as design=Sobol(1024)")
+    elif not hasattr(values, "__len__") or len(values) == 0:
+        problems.append(f"axis {quoted(name)}: needs at least one value, is {shown(values)}")
+    if len(problems) > before:
+        return None
+    if not callable(of) and any(target in CHOICES for target in of):
+        return _choices(name, of, values, problems)
+    numbers = _numbers(values)
+    if numbers is None or not np.all(np.isfinite(numbers)):
+        problems.append(f"axis {quoted(name)}: must be finite numbers, one entry a value, is {shown(values)}")
+        return None
+    if not callable(of):
+        problems += _misfits(mechanism, name, of, numbers)
+    units = axis.units if axis.units is not None else "" if callable(of) else units_of(mechanism, of[0])
+    return Column(name, numbers, of, units)
+
+
+def _choices(name: str, of: tuple[str, ...], values: Any, problems: list[str]) -> Column | None:
+    if len(of) != 1:
+        problems.append(
+            f"axis {quoted(name)}: choices cannot be tied, but it is of {', '.join(map(quoted, of))}; zip them instead"
+        )
+        return None
+    values = _states(values) if of == ("state",) and isinstance(values, State) else tuple(values)
+    if of == ("state",) and not all(isinstance(value, State) for value in values):
+        problems.append(f"axis {quoted(name)}: must be States, as `assemble` returns them")
+    if of == ("mechanism",) and not all(isinstance(value, Mechanism) for value in values):
+        problems.append(f"axis {quoted(name)}: must be Mechanisms")
+    return Column(name, values, of, "", labels_of(of[0], values))
+
+
+def _states(stacked: State) -> tuple[State, ...]:
+    return tuple(State(q, v) for q, v in zip(np.asarray(stacked.q), np.asarray(stacked.v), strict=True))
+
+
+def _numbers(values: Any) -> np.ndarray | None:
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError):
+        return None
+    return array.astype(float) if array.dtype.kind in "iuf" and array.ndim else None
+
+
+def _unknown(mechanism: Mechanism, name: str, of: Sequence[str]) -> Iterator[str]:
+    known = parameters_of(mechanism)
+    for target in of:
+        if target not in NUMBERS and target not in CHOICES and split(target, known)[0] not in known:
+            near = suggestion(target, (*known, *NUMBERS, *CHOICES)) or _ending(target, known)
+            yield f"axis {quoted(name)}: {quoted(target)} is no parameter of the mechanism, nor a setting{near}"
+
+
+def _ending(target: str, known: Mapping[str, Any]) -> str:
+    """What ends as the name does: `mass` may stand for many."""
+    last = {full.rpartition(".")[2]: full for full in known}
+    close = difflib.get_close_matches(target, last, n=1)
+    return f"; did you mean {quoted(last[close[0]])}?" if close else ""
+
+
+def _misfits(mechanism: Mechanism, name: str, of: Sequence[str], numbers: np.ndarray) -> Iterator[str]:
+    """What the mechanism says to the values: their shape, and what each must satisfy."""
+    parameters = [target for target in of if target not in NUMBERS]
+    if parameters:
+        for value in (numbers.min(axis=0), numbers.max(axis=0)):
+            try:
+                mechanism.with_parameters(dict.fromkeys(parameters, value))
+            except SceneError as error:
+                yield from (f"axis {quoted(name)}: {problem}" for problem in error.problems)
+                return
+    for target in of:
+        if target in NUMBERS and numbers.ndim != 1:
+            yield f"axis {quoted(name)}: {target} is a number, so its values are a list of numbers, not of shape {numbers.shape}"
+        elif target in NUMBERS and np.min(numbers) < 0:
+            yield f"axis {quoted(name)}: {target} must not be negative, is {np.min(numbers):g}"
+
+
+def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
+    owner: dict[str, str] = {}
+    names: dict[str, None] = {}
+    for dimension in dimensions:
+        for column in dimension.columns:
+            if column.name in names or (column.name != dimension.name and column.name in {d.name for d in dimensions}):
+                yield f"axis {quoted(column.name)} is there twice"
+            names[column.name] = None
+            for target in () if callable(column.of) else column.of:
+                if target in owner:
+                    yield f"axes {quoted(owner[target])} and {quoted(column.name)} both set {quoted(target)}"
+                owner[target] = column.name
+
+
+def check_settings(dimensions: Sequence[Dimension], settings: Mapping[str, Any]) -> list[str]:
+    """What is wrong between axes and settings: things given twice, gains and thresholds that nothing has."""
+    columns = [column for dimension in dimensions for column in dimension.columns]
+    targets = {target: column for column in columns if not callable(column.of) for target in column.of}
+    problems = [f"{name} is both a setting and an axis: leave one of them out" for name in settings if name in targets]
+
+    def all_are(setting: str, kind: Any, wanted: str, cure: str) -> Iterator[str]:
+        choices = targets[setting].values if setting in targets else (settings.get(setting),)
+        if wanted in targets and not all(isinstance(choice, kind) for choice in choices):
+            yield f"axis {quoted(targets[wanted].name)}: {wanted} is a number of {cure}, which not all members have"
+
+    for gain in ("alpha", "beta"):
+        problems += all_are("stabilization", Baumgarte, gain, "stabilization=Baumgarte()")
+    problems += all_are("method", Auto | type(None), "branch_tol", "method=Auto()")
+    return problems
+
+
+def check_tangents(mechanism: Mechanism, dimensions: Sequence[Dimension], names: Sequence[str]) -> list[str]:
+    """What is wrong with the names by which derivatives are asked for."""
+    columns = {column.name: column for dimension in dimensions for column in dimension.columns}
+    known, problems = parameters_of(mechanism), []
+    for name in names:
+        if name in columns:
+            if columns[name].chosen or columns[name].values.ndim > 1:
+                problems.append(f"derivatives: axis {quoted(name)} is not one of plain numbers")
+            continue
+        owner, index = split(name, known)
+        if owner not in known:
+            near = suggestion(name, (*known, *columns))
+            problems.append(f"derivatives: {quoted(name)} is no parameter of the mechanism, nor an axis{near}")
+        elif known[owner].value is None or np.ndim(jax.eval_shape(lambda v, i=index: v[i], known[owner].value)):
+            problems.append(f"derivatives: {quoted(name)} is not one number; name an entry, such as {quoted(name + '[0]')}")
+    return problems

@@ -1,0 +1,219 @@
+"""Measures: what is kept of each member, and nothing else is computed."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.equations.quantities import energy, violation
+from udkjax.equations.udwadia_kalaba import prepare, rank_tolerance
+from udkjax.integrate.solution import Solution
+from udkjax.pinv import SVD, Auto
+from udkjax.scene.checks import quoted, suggestion
+from udkjax.scene.mechanism import Mechanism
+
+NOT_REACHED = -1  # the rank at output times that a run has not reached
+
+
+class Run(NamedTuple):
+    """A member that has been run, as a measure sees it."""
+
+    mechanism: Mechanism
+    solution: Solution
+    method: Any
+    reference: Any  # (T, bodies, 3), or a function (mechanism, ts) of it, or None
+
+
+class Named(NamedTuple):
+    """How a dataset labels a variable."""
+
+    dims: tuple[str, ...]
+    units: str
+    long_name: str
+
+
+@dataclass(frozen=True)
+class Measure:
+    """What to keep of a run: `compute(run)` gives arrays by name."""
+
+    name: str
+    along: bool  # whether it needs all output times, not only the end
+    compute: Callable[[Run], Mapping[str, Array]]
+    labels: Mapping[str, Named]  # empty: of a user's function
+    reference: Any = None
+    renamed: str = ""  # the key that it was given under
+
+    def of(self, mechanism: Mechanism, solution: Solution, method: Any) -> dict[str, Array]:
+        """The arrays that are kept, under their names in the dataset."""
+        found = self.compute(Run(mechanism, solution, method, self.reference))
+        return {self._key(name): jnp.asarray(value) for name, value in found.items()}
+
+    @property
+    def variables(self) -> dict[str, Named]:
+        """How its variables are labelled, by their names in the dataset; those of a user's function are not known."""
+        return {self._key(name): label for name, label in self.labels.items()}
+
+    @property
+    def function(self) -> Callable[[Mechanism, Solution], Any] | None:
+        """The user's function, if it is one."""
+        return self.compute.function if isinstance(self.compute, _Own) else None
+
+    def _key(self, name: str) -> str:
+        if not self.renamed or not self.labels:
+            return name
+        return self.renamed if len(self.labels) == 1 else f"{self.renamed}_{name}"
+
+
+def guessed(name: str, shape: tuple[int, ...], outputs: int, bodies: int) -> Named:
+    """Label what a user's function returned, by its shape."""
+    dims = [f"{name}_{k}" for k in range(len(shape))]
+    if shape[-2:] == (bodies, 3):
+        dims[-2:] = "body", "coordinate"
+    if shape and shape[0] == outputs and dims[0] != "body":
+        dims[0] = "time"
+    return Named(tuple(dims), "", "")
+
+
+def measures_of(given: Any, reference: Any, ts: np.ndarray) -> tuple[Measure, ...]:
+    """Read `measure`: a name, a function of (mechanism, solution), a sequence of such, or a dict of them. Raises ValueError."""
+    if isinstance(given, Mapping):
+        items = [(str(key), value) for key, value in given.items()]
+    else:
+        items = [("", value) for value in (given if isinstance(given, list | tuple) else [given])]
+    found = tuple(_measure(key, value, reference, ts) for key, value in items)
+    if reference is not None and not any(measure.name == "error" for measure in found):
+        raise ValueError('reference: only the measure "error" looks at it, which is not among the measures')
+    return found
+
+
+def _measure(key: str, given: Any, reference: Any, ts: np.ndarray) -> Measure:
+    if isinstance(given, str):
+        if given not in BY_NAME:
+            near = suggestion(given, BY_NAME) or f"; known are {', '.join(BY_NAME)}"
+            raise ValueError(f"measure {quoted(given)}: there is none of this name{near}")
+        along, compute, labels = BY_NAME[given]
+        if given == "error":
+            reference = _reference(reference, ts)
+        return Measure(given, along, compute, labels, reference if given == "error" else None, "" if key == given else key)
+    if not callable(given):
+        raise ValueError(f"measure {quoted(key or str(given))}: must be a name or a function of (mechanism, solution)")
+    name = key or getattr(given, "__name__", "measure").strip("<>")
+    return Measure(name, True, _Own(given, name), {})
+
+
+@dataclass(frozen=True)
+class _Own:
+    """A user's function, whose single array goes by the measure's name."""
+
+    function: Callable[[Mechanism, Solution], Any]
+    name: str
+
+    def __call__(self, run: Run) -> dict[str, Array]:
+        found = self.function(run.mechanism, run.solution)
+        if isinstance(found, Mapping):
+            return {f"{self.name}_{key}": jnp.asarray(value) for key, value in found.items()}
+        return {self.name: jnp.asarray(found)}
+
+
+def _reference(given: Any, ts: np.ndarray) -> Any:
+    if given is None:
+        raise ValueError(
+            'measure "error" needs reference=: a Solution, coordinates (T, bodies, 3), or a function (mechanism, ts)'
+        )
+    if callable(given) and not hasattr(given, "shape"):
+        return given
+    q = np.asarray(getattr(given, "q", given), float)
+    if q.ndim != 3 or q.shape[0] != len(ts) or q.shape[2] != 3:
+        raise ValueError(f"reference: must be coordinates at the {len(ts)} output times, (T, bodies, 3), is of shape {q.shape}")
+    return q
+
+
+def _largest(x: Array, axis: Any = None) -> Array:
+    """The largest size that is a number: output times after the end of a run are none."""
+    return jnp.max(jnp.where(jnp.isnan(x), 0.0, jnp.abs(x)), axis=axis, initial=0.0)
+
+
+def _final(run: Run) -> dict[str, Array]:
+    return {"q_end": run.solution.q[-1], "v_end": run.solution.v[-1]}
+
+
+def _states(run: Run) -> dict[str, Array]:
+    return {"q": run.solution.q, "v": run.solution.v}
+
+
+def _violation(run: Run) -> dict[str, Array]:
+    return {"violation": _largest(violation(run.mechanism, run.solution))}
+
+
+def _energy_drift(run: Run) -> dict[str, Array]:
+    total = energy(run.mechanism, run.solution).total
+    return {"energy_drift": _largest(total - total[0])}
+
+
+def _error(run: Run) -> dict[str, Array]:
+    reference = run.reference(run.mechanism, run.solution.ts) if callable(run.reference) else run.reference
+    error = run.solution.q - jnp.asarray(getattr(reference, "q", reference))
+    return {"position_error": _largest(error[..., :2]), "angle_error": _largest(error[..., 2])}
+
+
+def _counts(run: Run) -> dict[str, Array]:
+    return {name: count for name, count in run.solution.stats.items() if name != "steps"}
+
+
+def _rank(run: Run) -> dict[str, Array]:
+    """By the method's own rule: that of `Auto` is the one of singular values that it turns to."""
+    method = Auto() if run.method is None else run.method
+    method = method.exact if isinstance(method, Auto) else method
+    if method.rank_tol is None:
+        method = type(method)(rank_tolerance(run.mechanism))
+    equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))
+    reached = jnp.all(jnp.isfinite(q), axis=1)
+    ranks = jax.vmap(lambda t, q: method.rank(equations.weighted(t, q)[0]))(ts, jnp.where(reached[:, None], q, q[0]))
+    return {"rank": jnp.where(reached, ranks, NOT_REACHED)}
+
+
+_STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
+# Whether all output times are needed, the function, and its variables.
+BY_NAME: dict[str, tuple[bool, Callable[[Run], dict[str, Array]], dict[str, Named]]] = {
+    "final": (
+        False,
+        _final,
+        {
+            "q_end": Named(_STATE, "m, m, rad", "coordinates at the end"),
+            "v_end": Named(_STATE, "m/s, m/s, rad/s", "velocities at the end"),
+        },
+    ),
+    "states": (
+        True,
+        _states,
+        {
+            "q": Named(_OVER_TIME, "m, m, rad", "coordinates: centre of mass and angle"),
+            "v": Named(_OVER_TIME, "m/s, m/s, rad/s", "velocities"),
+        },
+    ),
+    "violation": (True, _violation, {"violation": Named((), "m, rad", "largest constraint violation at an output time")}),
+    "energy_drift": (True, _energy_drift, {"energy_drift": Named((), "J", "largest change of the total energy")}),
+    "error": (
+        True,
+        _error,
+        {
+            "position_error": Named((), "m", "largest error of a coordinate of a centre of mass"),
+            "angle_error": Named((), "rad", "largest error of an angle"),
+        },
+    ),
+    "counts": (
+        False,
+        _counts,
+        {
+            "accepted": Named((), "1", "steps accepted"),
+            "rejected": Named((), "1", "steps rejected"),
+            "right_hand_sides": Named((), "1", "evaluations of the accelerations; -1: not known"),
+            "projections": Named((), "1", "returns to the constraint manifold"),
+        },
+    ),
+    "rank": (True, _rank, {"rank": Named(("time",), "1", "rank of D by the method's own rule; -1: not reached")}),
+}
