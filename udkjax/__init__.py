@@ -78,6 +78,13 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import save as save
     from udkjax.scene import with_angle as with_angle
     from udkjax.scene import with_length as with_length
+    from udkjax.study.sweep import Axis as Axis
+    from udkjax.study.sweep import LatinHypercube as LatinHypercube
+    from udkjax.study.sweep import Random as Random
+    from udkjax.study.sweep import Sobol as Sobol
+    from udkjax.study.sweep import SweepError as SweepError
+    from udkjax.study.sweep import Zipped as Zipped
+    from udkjax.study.sweep import sweep as sweep
 
 _MODULES = {"pinv": "udkjax.pinv", "equations": "udkjax.equations", "library": "udkjax.scene.library"}
 _NAMES = {
@@ -92,6 +99,7 @@ _NAMES = {
     "udkjax.equations": """
         ConstrainedSystem Baumgarte accelerations check violation energy reactions
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
+    "udkjax.study.sweep": "sweep Axis Zipped Sobol LatinHypercube Random SweepError",
     "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}

@@ -49,6 +49,11 @@ class Program:
             return min(WIDE, -(-members // ROUND) * ROUND)
         return min(LANES, -(-members // ROUND) * ROUND) if self.recipe.in_lanes else 1
 
+    @property
+    def lanes(self) -> int | None:
+        """How many members wait for each other; None: none does."""
+        return self.piece if self.piece > 1 else None
+
     def _computed(self, shared: Any, own: Any) -> tuple[Kept, Kept]:
         """What is kept, and the derivatives of it by each name, last."""
         one = self.recipe.single if self.piece == 1 else self.recipe.batch

@@ -8,7 +8,7 @@ the end, where devices wait for the last chunk, is short.
 from itertools import combinations_with_replacement
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from udkjax.pinv import Auto, Elimination
 from udkjax.study.sweep.chunk import program
@@ -33,8 +33,9 @@ def chunks(plan: Plan, memory: int) -> list[Chunk]:
         steps = expected_steps(plan, group)
         order = np.argsort(-steps, kind="stable")
         most = max(1, memory // (SHARE * max(1, plan.bytes_per_member)))
-        for part in _cut(steps[order] * _seconds_per_step(plan, group), own.piece, most):
-            found.append(Chunk(len(found), group.index, group.members[order[part]]))
+        seconds = steps[order] * _seconds_per_step(plan, group)
+        for part in _cut(seconds, own.piece, most):
+            found.append(Chunk(len(found), group.index, group.members[order[part]], float(seconds[part].sum())))
     return found
 
 
@@ -111,11 +112,7 @@ def _seconds_per_step(plan: Plan, group: Group) -> float:
     return DENSE * max(rows, rows**3)
 
 
-def lane_efficiency(steps: list[np.ndarray], lanes: int) -> float:
-    """Steps taken, of all that there was room for: each lane waits for the slowest of its chunk of lanes."""
-    taken = room = 0
-    for chunk in steps:
-        for k in range(0, len(chunk), lanes):
-            part = chunk[k : k + lanes]
-            taken, room = taken + int(part.sum()), room + int(part.max()) * lanes
-    return taken / room if room else 1.0
+def lane_steps(steps: Int[np.ndarray, "n"], lanes: int) -> tuple[int, int]:
+    """How many steps a chunk took, and how many it had room for: each lane waits for the slowest beside it."""
+    parts = [steps[k : k + lanes] for k in range(0, len(steps), lanes)]
+    return int(steps.sum()), lanes * sum(int(part.max()) for part in parts)

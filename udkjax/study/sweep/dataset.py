@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from udkjax.integrate.lanes import LANES
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.study.sweep.axes import Column, Dimension
-from udkjax.study.sweep.cutting import lane_efficiency
+from udkjax.study.sweep.chunk import program
+from udkjax.study.sweep.cutting import lane_steps
 from udkjax.study.sweep.member import RESULT, STEPS
 from udkjax.study.sweep.plan import Plan, Variable
 
@@ -22,18 +22,22 @@ COORDINATES = ("x", "y", "angle")
 def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> Any:
     """Return the xarray Dataset of a plan, from (members, what was kept of them) in any order.
 
-    What is not among them is not a number, and has the result -1. `lane_efficiency` is how much of the vector lanes was busy.
+    What is not among them is not a number, and has the result -1. `lane_efficiency` is the part of the steps that there was room
+    for in the vector lanes which members took: a lane that is done waits for the slowest.
     """
     import xarray
 
     variables = plan.variables
     places = _places(plan)
     flat = {name: np.full((plan.size, *v.shape), _nothing(name, v), v.dtype) for name, v in variables.items()}
-    steps: list[np.ndarray] = []
+    taken = room = 0
     for members, data in finished:
+        group = plan.groups[plan.group_of(int(members[0]))]
         for name, values in data.items():
-            _put(flat[name], variables[name], members, values, places.get(plan.group_of(int(members[0]))))
-        steps.append(data[STEPS])
+            _put(flat[name], variables[name], members, values, places.get(group.index))
+        if (lanes := program(plan, group).lanes) is not None:
+            some = lane_steps(data[STEPS], lanes)
+            taken, room = taken + some[0], room + some[1]
     dims = tuple(dimension.name for dimension in plan.dimensions)
     found = {
         name: ((*dims, *v.dims), flat[name].reshape(*plan.shape, *v.shape), {"units": v.units, "long_name": v.long_name})
@@ -45,7 +49,7 @@ def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[
         "flag_meanings": " ".join(["not_computed", *(result.name for result in Result)]),
         "causes": json.dumps({int(result): CAUSES[result] for result in Result}),
     }
-    data.attrs = _attributes(plan) | {"lane_efficiency": lane_efficiency(steps, LANES)}
+    data.attrs = _attributes(plan) | ({"lane_efficiency": taken / room} if room else {})
     return data
 
 
