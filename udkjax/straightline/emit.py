@@ -8,21 +8,31 @@ operations; a barrier stops the duplication and changes no value.
 """
 
 import math
-from collections.abc import Callable, Sequence
+import operator
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
 from udkjax.straightline.graph import Details, Graph, Node, Scalar
-from udkjax.straightline.trigonometry import sincos
+from udkjax.straightline.trigonometry import sincos_of_each
 
 # Operations between two optimization barriers. Without any, XLA repeats everything for each output; with too many it cannot fuse.
 CUT_EVERY = 48
 
 _PAIR = ("sin", "cos")
 _FLOATS = (*_PAIR, "tanh", "exp")  # of these names math and NumPy have functions, too
+# On floats, and traced: by what jax.lax has, since each operator on a JAX array is a function call, ten times as long to trace.
+_ARITHMETIC: dict[str, tuple[Callable, Callable]] = {
+    "add": (operator.add, jax.lax.add),
+    "sub": (operator.sub, jax.lax.sub),
+    "mul": (operator.mul, jax.lax.mul),
+    "div": (operator.truediv, jax.lax.div),
+}
 
 
 class Program:
@@ -33,6 +43,10 @@ class Program:
         self.order = _needed(graph, {s.index for s in inputs}, [s.index for s in outputs])
         self.last_use = {a.index: k for k, i in enumerate(self.order) for a in graph.nodes[i].arguments}
         self.last_use.update((s.index, len(self.order)) for s in outputs)
+        nodes = [graph.nodes[i] for i in self.order]
+        self.angles = list(
+            dict.fromkeys(n.arguments[0].index for n in nodes if n.kind == "apply" and n.detail.primitive.name in _PAIR)
+        )
         self._traced = jax.jit(self._run)  # traced once, wherever and however often it is called and differentiated
 
     def uses(self, scalar: Scalar) -> bool:
@@ -46,7 +60,9 @@ class Program:
             except (ArithmeticError, ValueError):  # 1/0, an overflow, sin(inf): in JAX no errors, but values that are not finite
                 with np.errstate(all="ignore"):
                     return self._run([np.float64(v) for v in values])
-        return self._traced([jnp.asarray(v, s.node.dtype) for v, s in zip(values, self.inputs, strict=True)])
+        dtypes = [s.node.dtype for s in self.inputs]
+        given = zip(values, dtypes, strict=True)
+        return self._traced([v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in given])
 
     def _run(self, values: Sequence[Any]) -> list[Any]:
         known: dict[int, Any] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
@@ -54,7 +70,7 @@ class Program:
         recent: list[int] = []
         for k, index in enumerate(self.order):
             node = self.graph.nodes[index]
-            known[index] = _evaluate(node, known, pairs)
+            known[index] = _evaluate(node, known, pairs, self.angles)
             if node.kind not in ("constant", "call"):
                 recent.append(index)
             if self.cut_every and len(recent) >= self.cut_every:
@@ -70,27 +86,32 @@ class Program:
     def count(self) -> dict[str, int]:
         """How many operations of each kind the program holds; the sine and cosine of one angle are one."""
         counts: dict[str, int] = {}
-        angles = set()
         for index in self.order:
             node = self.graph.nodes[index]
             name = str(node.detail) if node.kind in ("apply", "call") else node.kind
-            if name in _PAIR:
-                angles.add(node.arguments[0].index)
-            elif name not in ("constant", "pick", "input"):
+            if name not in (*_PAIR, "constant", "pick", "input"):
                 counts[name] = counts.get(name, 0) + 1
-        return counts | ({"sincos": len(angles)} if angles else {})
+        return counts | ({"sincos": len(self.angles)} if self.angles else {})
 
 
-@jax.custom_jvp
-def cut(values: list[Any]) -> list[Any]:
+def cut(values: Sequence[Any]) -> list[Any]:
     """Keep XLA from fusing across this point: the identity, with the identity's derivative."""
-    return jax.lax.optimization_barrier(values)
+    return cut_p.bind(*values)
 
 
-@cut.defjvp
-def _(primals, tangents):
+def _derivative(primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
     # One by one: a barrier of which only a part depends on what is differentiated has no transpose in jax 0.12.
-    return cut(*primals), [jax.lax.optimization_barrier(t) for t in tangents[0]]
+    return cut_p.bind(*primals), [t if isinstance(t, ad.Zero) else jax.lax.optimization_barrier(t) for t in tangents]
+
+
+# A primitive: programs hold hundreds, and a function with a derivative of its own takes ten times as long to trace.
+cut_p = Primitive("cut")
+cut_p.multiple_results = True
+cut_p.def_impl(lambda *xs: list(xs))
+cut_p.def_abstract_eval(lambda *xs: list(xs))
+batching.primitive_batchers[cut_p] = lambda xs, axes: (cut_p.bind(*xs), axes)
+ad.primitive_jvps[cut_p] = _derivative
+mlir.register_lowering(cut_p, mlir.lower_fun(lambda *xs: jax.lax.optimization_barrier(list(xs))))
 
 
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:
@@ -120,10 +141,14 @@ def _needed(graph: Graph, given: set[int], wanted: Sequence[int]) -> list[int]:
 
 def _signed(known: dict[int, Any], scalar: Scalar) -> Any:
     value = known[scalar.index]
-    return value if scalar.sign > 0 else -value
+    return value if scalar.sign > 0 else _negative(value)
 
 
-def _evaluate(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, Any]]) -> Any:
+def _negative(value: Any) -> Any:
+    return jax.lax.neg(value) if isinstance(value, jax.Array) else -value
+
+
+def _evaluate(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, Any]], angles: Collection[int]) -> Any:
     if node.kind == "constant":
         return node.detail
     if node.kind == "pick":
@@ -131,19 +156,16 @@ def _evaluate(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, Any
         array = known[node.arguments[0].index][output]
         return array.reshape(-1)[flat]
     if node.kind == "apply" and node.detail.primitive.name in _PAIR and isinstance(known[node.arguments[0].index], jax.Array):
-        return _one_of_pair(node, known, pairs)
+        return _one_of_pair(node, known, pairs, angles)
     values = [_signed(known, a) for a in node.arguments]
     match node.kind:
-        case "add":
-            return values[0] + values[1]
-        case "sub":
-            return values[0] - values[1]
-        case "mul":
-            return values[0] * values[1]
-        case "div":
-            return values[0] / values[1]
+        case "add" | "sub" | "mul" | "div":
+            on_floats, traced = _ARITHMETIC[node.kind]
+            if not any(isinstance(v, jax.Array) for v in values):
+                return on_floats(*values)
+            return traced(*(v if isinstance(v, jax.Array) else node.dtype.type(v) for v in values))
         case "sqrt":
-            return _library(values[0]).sqrt(values[0]) if isinstance(values[0], float) else jnp.sqrt(values[0])
+            return _library(values[0]).sqrt(values[0]) if isinstance(values[0], float) else jax.lax.sqrt(values[0])
         case "apply":
             return _apply(node, values)
         case "call":
@@ -151,13 +173,15 @@ def _evaluate(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, Any
     raise AssertionError(node.kind)
 
 
-def _one_of_pair(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, Any]]) -> Any:
-    """The sine or cosine of an angle, both of which are evaluated when the first of them is needed."""
+def _one_of_pair(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, Any]], angles: Collection[int]) -> Any:
+    """The sine or cosine of an angle. Both are evaluated when the first is needed, and those of other angles known by then."""
     (angle,), name = node.arguments, node.detail.primitive.name
     if angle.index not in pairs:
-        pairs[angle.index] = sincos(known[angle.index])
+        like = known[angle.index].dtype
+        ready = [i for i in angles if i in known and i not in pairs and getattr(known[i], "dtype", None) == like]
+        pairs.update(zip(ready, sincos_of_each([known[i] for i in ready]), strict=True))
     value = pairs[angle.index][_PAIR.index(name)]
-    return -value if name == "sin" and angle.sign < 0 else value
+    return _negative(value) if name == "sin" and angle.sign < 0 else value
 
 
 def _library(x: float) -> Any:

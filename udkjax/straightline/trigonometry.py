@@ -11,6 +11,7 @@ sine and cosine for angles of any size. Single precision, and devices other than
 """
 
 import math
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
@@ -42,14 +43,21 @@ _COSINE = (
 
 def sincos(x: Any) -> tuple[Any, Any]:
     """Return sin x and cos x, elementwise; x in rad. Differentiable to any order: the derivatives are the pair itself."""
-    return tuple(sincos_p.bind(jnp.asarray(x, jnp.result_type(x, float))))
+    s, c = sincos_p.bind(jnp.asarray(x, jnp.result_type(x, float)))
+    return s, c
+
+
+def sincos_of_each(xs: Sequence[Any]) -> list[tuple[Any, Any]]:
+    """As `sincos` of several angles of one shape and type: they are taken side by side, as one vector."""
+    found = sincos_p.bind(*xs) if xs else []
+    return list(zip(found[::2], found[1::2], strict=True))
 
 
 def _by_polynomials(x: Any) -> tuple[Any, Any]:
     # Without the barriers XLA would compute what both results share once for each of them, and both for each of their uses.
-    # Another between polynomials and turning saves operations and no time.
     n, r = jax.lax.optimization_barrier(_reduced(x))
-    return jax.lax.optimization_barrier(_turned(n, *_near_zero(r)))
+    s, c = jax.lax.optimization_barrier(_near_zero(r))
+    return jax.lax.optimization_barrier(_turned(n, s, c))
 
 
 def _reduced(x: Any) -> tuple[Any, Any]:
@@ -77,20 +85,31 @@ def _turned(n: Any, s: Any, c: Any) -> tuple[Any, Any]:
     return jax.lax.select(second | third, -s, s), jax.lax.select(first | second, -c, c)
 
 
-# A primitive, so that programs hold one operation for each pair, and that each platform gets its own form of it.
+# A primitive, of angles to their sines and cosines in turn, so that each platform gets its own form of it.
 sincos_p = Primitive("sincos")
 sincos_p.multiple_results = True
 sincos_p.def_impl(jax.jit(sincos_p.bind))
-sincos_p.def_abstract_eval(lambda x: (x, x))
-batching.primitive_batchers[sincos_p] = lambda xs, axes: (sincos_p.bind(*xs), [axes[0]] * 2)
+sincos_p.def_abstract_eval(lambda *xs: [x for x in xs for _ in range(2)])
 
 
-def _derivative(primals, tangents):
-    (x,), (dx,) = primals, tangents
-    s, c = sincos_p.bind(x)
-    return [s, c], [c * dx, -(s * dx)]
+def _batched(xs: Sequence[Any], axes: Sequence[int | None]) -> tuple[list[Any], list[int | None]]:
+    """Angles that differ from member to member together, and those that do not."""
+    found: list[Any] = [None] * (2 * len(xs))
+    for batched in (True, False):
+        some = [k for k, axis in enumerate(axes) if (axis is not None) == batched]
+        members = [jnp.moveaxis(xs[k], axes[k], 0) if batched else xs[k] for k in some]
+        for k, pair in zip(some, sincos_of_each(members), strict=True):
+            found[2 * k : 2 * k + 2] = pair
+    return found, [None if axis is None else 0 for axis in axes for _ in range(2)]
 
 
+def _derivative(primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    found = sincos_of_each(primals)
+    slopes = [(dx, dx) if isinstance(dx, ad.Zero) else (c * dx, -(s * dx)) for (s, c), dx in zip(found, tangents, strict=True)]
+    return [x for pair in found for x in pair], [x for pair in slopes for x in pair]
+
+
+batching.primitive_batchers[sincos_p] = _batched
 ad.primitive_jvps[sincos_p] = _derivative
 
 
@@ -105,5 +124,16 @@ def _sincos_on_cpu(x: Any) -> tuple[Any, Any]:
     return _by_polynomials(x) if x.dtype == jnp.float64 else _sincos_of_the_library(x)
 
 
-mlir.register_lowering(sincos_p, mlir.lower_fun(_sincos_of_the_library, multiple_results=True))
-mlir.register_lowering(sincos_p, mlir.lower_fun(_sincos_on_cpu, multiple_results=True), platform="cpu")
+def _one_by_one(*xs: Any) -> list[Any]:
+    return [value for x in xs for value in _sincos_of_the_library(x)]
+
+
+def _side_by_side(*xs: Any) -> list[Any]:
+    if len(xs) == 1:
+        return list(_sincos_on_cpu(xs[0]))
+    s, c = _sincos_on_cpu(jax.lax.concatenate([jax.lax.expand_dims(x, (0,)) for x in xs], 0))
+    return [jax.lax.index_in_dim(values, k, keepdims=False) for k in range(len(xs)) for values in (s, c)]
+
+
+mlir.register_lowering(sincos_p, mlir.lower_fun(_one_by_one, multiple_results=True))
+mlir.register_lowering(sincos_p, mlir.lower_fun(_side_by_side, multiple_results=True), platform="cpu")

@@ -16,7 +16,8 @@ BARRIERS_HOLD = (0, 11)
 
 def vector(values: Sequence[Any]) -> Any:
     """Return scalars (or vectors over a batch) side by side along a new first axis."""
-    values = [jnp.asarray(x, jnp.result_type(float)) for x in values]
+    dtype = jnp.result_type(float)
+    values = [x if isinstance(x, jax.Array) and x.dtype == dtype else jnp.asarray(x, dtype) for x in values]
     if not values:
         return jnp.zeros(0)
     if jax.__version_info__ < BARRIERS_HOLD and all(x.ndim == 0 for x in values):
