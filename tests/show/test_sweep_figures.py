@@ -114,6 +114,15 @@ def test_members_of_a_design_are_points():
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_yscale()) == ("mass (kg)", "rtol", "log")
 
 
+def test_members_of_a_design_with_choices_have_a_panel_for_each():
+    data = xarray.Dataset(coords={"mass": ("member", MASSES), "method": ["SVD", "Varga"]})
+    data["result"] = ("member", "method"), np.zeros((3, 2), int)
+    data["violation"] = ("member", "method"), np.arange(6.0).reshape(3, 2)
+    one, two = panels(pictures(data)["violation"])
+    assert (one.get_title(), two.get_title()) == ("SVD", "Varga")
+    np.testing.assert_array_equal(two.collections[0].get_offsets(), np.stack([MASSES, [1, 3, 5]], axis=1))
+
+
 def test_pictures_are_written(tmp_path):
     assert list(save_pictures(made("rtol", "mass"), tmp_path)) == ["result.png", "violation.png"]
     assert (tmp_path / "result.png").read_bytes().startswith(b"\x89PNG")

@@ -9,11 +9,12 @@ from udkjax.cli.check import check
 from udkjax.cli.doctor import doctor
 from udkjax.cli.report import report
 from udkjax.cli.simulate import simulate
+from udkjax.cli.sweep import sweep
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command; exit with 1 after a run that failed, with 2 after wrong input."""
-    commands = {"report": report, "simulate": simulate, "check": check, "doctor": doctor}
+    commands = {"report": report, "simulate": simulate, "sweep": sweep, "check": check, "doctor": doctor}
     tyro.extras.subcommand_cli_from_dict(
         commands, prog="udkjax", args=arguments, description="Planar mechanisms, however redundantly constrained."
     )

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from udkjax.integrate import Result
 from udkjax.show.plots import COLOURS, legend
 
-RESULT = "result"
+RESULT, MEMBER = "result", "member"  # the variable of the codes, and the dimension of a design
 OTHER = "not computed"  # what has a code of no `Result`
 SHADES = ("#d9d9d9", *COLOURS[1:6], "white")  # of the results in their order, successes in grey, and of the others
 FAILED = "0.75"  # where there is no value
@@ -47,7 +47,7 @@ def _picture(data: Any, name: str) -> Figure:
     drawn = None
     for axes, (chosen, words) in zip(grid, panels, strict=False):
         part = data.isel(chosen)
-        if "member" in across:
+        if MEMBER in across:
             drawn = _points(axes, part, name, *colours)
         elif len(across) == 1:
             _line(axes, part, name, across[0])
@@ -71,11 +71,9 @@ def _picture(data: Any, name: str) -> Figure:
 def _layout(data: Any) -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
     """The dimensions that are drawn across, and for each panel which values of the others it has, and what is said of them."""
     dims = data[RESULT].dims
-    if "member" in dims:
-        return ("member",), [({}, "")]
     longest = sorted(dims, key=lambda d: (_numeric(data, d), data.sizes[d]), reverse=True)[:2]
-    across = tuple(d for d in dims if d in longest)
-    others = [d for d in dims if d not in longest]
+    across = (MEMBER,) if MEMBER in dims else tuple(d for d in dims if d in longest)
+    others = [d for d in dims if d not in across]
     indices = islice(product(*(range(data.sizes[d]) for d in others)), PANELS)
     return across, [
         (dict(zip(others, k, strict=True)), ", ".join(_value(data, d, i) for d, i in zip(others, k))) for k in indices
@@ -127,7 +125,7 @@ def _line(axes: Axes, part: Any, name: str, dim: str) -> None:
 
 def _points(axes: Axes, part: Any, name: str, cmap: Any, norm: Any) -> Any:
     """Members of a design over its first two axes, or its only one."""
-    names = [c for c in part.coords if part[c].dims == ("member",) and part[c].dtype.kind in "iuf" and c != "member"][:2]
+    names = [c for c in part.coords if part[c].dims == (MEMBER,) and part[c].dtype.kind in "iuf" and c != MEMBER][:2]
     values = _drawable(part[name], name).values
     x = part[names[0]].values if names else np.arange(len(values))
     y = part[names[1]].values if len(names) > 1 else values
@@ -138,7 +136,7 @@ def _points(axes: Axes, part: Any, name: str, cmap: Any, norm: Any) -> Any:
     for values_, scale in ((x, axes.set_xscale), (y, axes.set_yscale)):
         if _decades(values_):
             scale("log")
-    _label(axes, _words(part, names[0]) if names else "member", _words(part, names[1] if len(names) > 1 else name))
+    _label(axes, _words(part, names[0]) if names else MEMBER, _words(part, names[1] if len(names) > 1 else name))
     return drawn
 
 

@@ -15,7 +15,7 @@ from udkjax.study.sweep.plan import Chunk
 
 distributed = pytest.importorskip("distributed", reason="dask is not installed: pip install 'udkjax[dask]'")
 
-CHUNKS = [Chunk(k, 0, np.arange(3 * k, 3 * k + 3)) for k in range(40)]
+CHUNKS = [Chunk(k, 0, np.arange(3 * k, 3 * k + 3), 1.0) for k in range(40)]
 PLAN: Any = SimpleNamespace(factor=2.0)
 
 

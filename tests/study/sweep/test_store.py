@@ -18,7 +18,7 @@ FINGERPRINT = {"settings": {"rtol": 1e-8}, "scene": "format = 1\nmass = 1.0\n", 
 
 
 def chunk(index, members):
-    return Chunk(index, 0, np.array(members))
+    return Chunk(index, 0, np.array(members), 6.0)
 
 
 CHUNKS = [chunk(0, [4, 1]), chunk(1, [0, 5]), chunk(2, [3, 2])]
@@ -57,7 +57,7 @@ def test_a_sweep_goes_on_where_it_was_cut_into_other_chunks(tmp_path):
     with Store(tmp_path, FINGERPRINT) as kept:
         left = kept.left([chunk(0, [0, 1, 2]), chunk(1, [3, 4]), chunk(2, [5])])
         assert [c.members.tolist() for c in left] == [[0, 2], [3], [5]]
-        assert [c.index for c in left] == [0, 1, 2]
+        assert [(c.index, c.work) for c in left] == [(0, 4.0), (1, 3.0), (2, 6.0)]
         for c in left:
             kept.write(c, data(c))
         assert collected(kept) == {m: data(chunk(0, [m]))["q"][0].tolist() for m in range(6)}

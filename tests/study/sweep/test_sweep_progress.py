@@ -8,7 +8,7 @@ from udkjax.study.sweep import progress
 from udkjax.study.sweep.plan import Chunk
 from udkjax.study.sweep.progress import Status, Watch, duration, teller
 
-CHUNKS = [Chunk(k, 0, np.arange(4 * k, 4 * k + 4)) for k in range(5)]
+CHUNKS = [Chunk(k, 0, np.arange(4 * k, 4 * k + 4), 2.0 if k == 3 else 1.0) for k in range(5)]
 
 
 def result(*codes):
@@ -40,12 +40,12 @@ def test_a_sweep_is_followed(clock):
     assert seen[-1] == Status(20, 8, 8.0, 0.5, None, {"drift": 1, "step_limit": 1}, (9, 9), (2, 7.5))
     clock.now += 2
     watch(CHUNKS[1], {**result(Result.drift), "steps": np.array([3, 9, 7, 1])}, 2.0)
-    assert seen[-1] == Status(20, 12, 10.0, 0.8, 4.0, {"drift": 2, "step_limit": 1}, (9, 9), (2, 7.5))
+    assert seen[-1] == Status(20, 12, 10.0, 0.8, 6.0, {"drift": 2, "step_limit": 1}, (9, 9), (2, 7.5))
     clock.now += 4
     watch(CHUNKS[4], {**result(), "steps": np.array([3, 9, 7, 10])})
-    assert seen[-1].left == 3.0 and seen[-1].slowest == (19, 10) and seen[-1].slowest_chunk == (2, 7.5)
+    assert seen[-1].left == 6.0 and seen[-1].slowest == (19, 10) and seen[-1].slowest_chunk == (2, 7.5)
     assert str(seen[-1]) == (
-        "16 of 20 members (80 %); 0.857 a second; 3 s left; failed: 2 drift, 1 step limit; slowest chunk 2: 7.5 s; "
+        "16 of 20 members (80 %); 0.857 a second; 6 s left; failed: 2 drift, 1 step limit; slowest chunk 2: 7.5 s; "
         "slowest member 19: 10 steps"
     )
     clock.now += 1

@@ -2,12 +2,14 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from udkjax.integrate.solution import versions
+from udkjax.study.machine import cores
 from udkjax.study.sweep import chunk as computing
 from udkjax.study.sweep.plan import Chunk, Plan
 
@@ -72,6 +74,25 @@ def dask(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done
             client.cancel([shared, *(future for _, future in running.values())])
 
     return engine
+
+
+@contextmanager
+def started(scheduler: str | None = None) -> Iterator[Any]:
+    """A client of the scheduler at this address; without one, of a process for each core of this machine, ended afterwards."""
+    distributed = _distributed()
+    if scheduler is not None:
+        try:
+            client = distributed.Client(scheduler)
+        except (OSError, ValueError) as error:
+            raise ClusterError(f"no scheduler of dask answers at {scheduler}: {error}") from error
+        with client:
+            yield client
+        return
+    with (
+        distributed.LocalCluster(n_workers=cores(), threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield client
 
 
 def _same(plan: Plan) -> Plan:

@@ -63,7 +63,7 @@ class _GridReader(Reader):
         if "design" in given:
             arguments["design"] = self.design(self.table("design", given["design"]))
         if "measures" in given:
-            arguments["measure"] = {name: name for name in self.names("measures", given["measures"])}
+            arguments["measure"] = self.names("measures", given["measures"])
         if "derivatives" in given:
             arguments["derivatives"] = self.names("derivatives", given["derivatives"])
         if "reference" in given:

@@ -49,6 +49,7 @@ class Chunk:
     index: int  # its place in `Plan.chunks`
     group: int  # `Group.index`
     members: Int[np.ndarray, "n"]  # places in the flattened grid, in the order in which they are computed
+    work: float  # what is expected of it, beside that of other chunks
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,7 +53,7 @@ class Watch:
 
     def __init__(self, members: int, left: Sequence[Chunk], tell: Callable[[Status], Any], codes: ArrayLike = ()):
         self.tell = tell
-        self.work, self.work_done, self.new = sum(map(_work, left)), 0.0, 0
+        self.work, self.work_done, self.new = sum(chunk.work for chunk in left), 0.0, 0
         self.begun = time.monotonic()
         self.first: tuple[float, float] | None = None  # when the first chunk came, and its work: a compilation was part of it
         self.status = Status(members, members - sum(len(chunk.members) for chunk in left), 0.0, None, None, _failed({}, codes))
@@ -63,7 +63,7 @@ class Watch:
         """Note that a chunk is done, what it gave, and how long it took (s) where that is known."""
         before, now = self.status, time.monotonic()
         self.new += len(chunk.members)
-        self.work_done += _work(chunk)
+        self.work_done += chunk.work
         self.first = self.first or (now, self.work_done)
         self.status = Status(
             before.members,
@@ -82,10 +82,6 @@ class Watch:
         assert self.first is not None
         since, work = now - self.first[0], self.work_done - self.first[1]
         return since / work * (self.work - self.work_done) if work > 0 else None
-
-
-def _work(chunk: Chunk) -> float:
-    return float(len(chunk.members))
 
 
 def _failed(before: Mapping[str, int], codes: ArrayLike) -> dict[str, int]:

@@ -57,7 +57,7 @@ class Kept(abc.ABC):
             if new.all():
                 kept.append(chunk)
             elif new.any():
-                kept.append(dataclasses.replace(chunk, members=members[new]))
+                kept.append(dataclasses.replace(chunk, members=members[new], work=chunk.work * float(new.mean())))
         return kept
 
     @abc.abstractmethod

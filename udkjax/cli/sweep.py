@@ -1,0 +1,125 @@
+"""`udkjax sweep`."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from udkjax.cli.common import BAD_RUN, Scene, load, refuse
+
+Grid = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GRID.toml")]
+
+INTERRUPTED = 130  # exit code, as of a shell
+
+
+def sweep(
+    scene: Scene,
+    grid: Grid,
+    /,
+    out: Path | None = None,
+    engine: Literal["auto", "devices", "dask"] = "auto",
+    scheduler: str | None = None,
+    memory: float = 1024.0,
+    dry_run: bool = False,
+    quiet: bool = False,
+) -> None:
+    """Simulate a scene with all combinations of some of its numbers, tolerances and methods, or with a design over their ranges.
+
+    What is finished is kept in the folder, whatever happens: the same command again goes on from there. At the end the folder
+    holds the dataset, sweep.nc, with the scene, settings and versions, and a picture of each number that was kept of a member.
+    Members that fail have a result that says how; examples/grids shows what a grid can be.
+
+    Args:
+        scene: the mechanism.
+        grid: what is varied, and what is kept of each member.
+        out: folder for the dataset, the pictures and what is finished so far.
+        engine: where members are computed: on the devices of this machine, or as tasks of dask.distributed.
+        scheduler: address of a scheduler of dask, such as tcp://host:8786; without one, workers are processes of this machine.
+        memory: what the members that are computed at a time may take (MiB).
+        dry_run: say how many members there are, and what they will take, from a sample; compute nothing else.
+        quiet: do not show how far it is.
+    """
+    if out is None and not dry_run:
+        refuse("--out FOLDER is missing (or --dry-run)")
+    if out is not None and not out.parent.is_dir():
+        refuse(f"there is no folder {out.parent} to make {out.name} in")
+    if not memory > 0:
+        refuse(f"--memory {memory:g}: must be positive")
+    if scheduler is not None and engine == "devices":
+        refuse("--scheduler is for --engine dask")
+    mech, text = load(scene)
+    arguments = _arguments(grid)
+
+    from udkjax.study.sweep.cluster import ClusterError
+    from udkjax.study.sweep.layout import SweepError
+    from udkjax.study.sweep.store import StoreError
+
+    limit = int(memory * 2**20)
+    try:
+        if dry_run:
+            _estimate(mech, arguments, limit)
+            return
+        assert out is not None
+        with _client(engine, scheduler) as client:
+            _sweep(mech, text, arguments, out, engine=engine, client=client, memory=limit, progress=False if quiet else None)
+    except SweepError as problem:
+        refuse(f"{grid}: {problem}")
+    except (StoreError, ClusterError) as problem:
+        print(f"udkjax: {problem}", file=sys.stderr)
+        sys.exit(BAD_RUN)
+    except KeyboardInterrupt:
+        print(f"\nudkjax: stopped; what is finished is in {out}, and the same command goes on from there", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+
+
+def _arguments(grid: Path) -> dict[str, Any]:
+    """Read a grid, or say everything that is wrong with it and exit."""
+    from udkjax.study.sweep.grid import load_grid
+    from udkjax.study.sweep.reading import GridError
+
+    try:
+        return load_grid(grid)
+    except OSError as problem:
+        refuse(f"cannot read {grid}: {problem}")
+    except GridError as problem:
+        refuse(str(problem))
+
+
+def _estimate(mech: Any, arguments: dict[str, Any], memory: int) -> None:
+    from udkjax.show.sweep_summary import estimate_summary
+    from udkjax.study.sweep.dry_run import estimate
+    from udkjax.study.sweep.plan import planned
+
+    plan = planned(mech, **arguments)
+    print(estimate_summary(plan, estimate(plan, memory)))
+
+
+def _sweep(mech: Any, text: str, arguments: dict[str, Any], out: Path, **choices: Any) -> None:
+    import udkjax as udk
+    from udkjax.show.sweep_figures import save_pictures
+    from udkjax.show.sweep_summary import sweep_summary
+
+    begun = time.perf_counter()
+    data = udk.sweep(mech, **arguments, out=out, **choices)
+    print(sweep_summary(data, time.perf_counter() - begun))
+    data.attrs["scene"] = text
+    unfinished = out / ".sweep.nc"
+    data.to_netcdf(unfinished, engine="h5netcdf")
+    unfinished.replace(out / "sweep.nc")
+    print(f"wrote {', '.join(['sweep.nc', *save_pictures(data, out)])} to {out}")
+
+
+@contextmanager
+def _client(engine: str, scheduler: str | None) -> Iterator[Any]:
+    """What the tasks are given to, if they are."""
+    if engine != "dask" and scheduler is None:
+        yield None
+        return
+    from udkjax.study.sweep.cluster import started
+
+    with started(scheduler) as client:
+        yield client

@@ -1,0 +1,53 @@
+"""What the command line says about a sweep, before it and after it."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from udkjax.integrate import Result
+from udkjax.show.summary import plural, table
+from udkjax.show.sweep_figures import RESULT, scalars
+from udkjax.study.sweep.dry_run import Estimate
+from udkjax.study.sweep.plan import Plan
+from udkjax.study.sweep.progress import duration
+
+
+def estimate_summary(plan: Plan, estimate: Estimate) -> str:
+    """Describe what a sweep will take."""
+    shape = " x ".join(f"{dimension.size} {dimension.name}" for dimension in plan.dimensions)
+    tried = "" if estimate.tried == estimate.groups else f", {estimate.tried} of which were tried"
+    computing, compiling = duration(estimate.computing), duration(estimate.compiling)
+    lines = {
+        "members": f"{estimate.members}: {shape}",
+        "kept of each": f"{plan.bytes_per_member} bytes: {', '.join(plan.variables)}",
+        "programs": plural(estimate.groups, "program") + tried,
+        "chunks": f"{estimate.chunks}",
+        "dataset": size(estimate.kept),
+        "memory": f"{size(estimate.memory)} at most" if estimate.memory else "not known on this system",
+        "time": f"about {computing} on the devices of this process, and {compiling} to compile",
+    }
+    return table(f"{plan.mechanism.name or 'mechanism'}: a sweep", lines)
+
+
+def sweep_summary(data: Any, seconds: float) -> str:
+    """Describe how the members of a sweep ended, and the range of each number that was kept."""
+    codes, counts = np.unique(data[RESULT].values, return_counts=True)
+    known = {int(result): result.name.replace("_", " ") for result in Result}
+    ended = ", ".join(f"{count} {known.get(int(code), 'not computed')}" for code, count in zip(codes, counts, strict=True))
+    lines = {"members": f"{data[RESULT].size}: {ended}"}
+    for name in scalars(data):
+        values = data[name].values[np.isfinite(data[name].values)]
+        units = data[name].attrs.get("units", "")
+        unit = "" if units in ("", "1") else f" {units}"
+        if values.size:
+            lines[name.replace("_", " ")] = f"{values.min():.4g} to {values.max():.4g}{unit}, median {np.median(values):.4g}"
+    lines["time"] = duration(seconds)
+    return table(f"{data.attrs.get('title') or 'mechanism'}: a sweep", lines)
+
+
+def size(count: float) -> str:
+    """Say how many bytes something has."""
+    units = ("bytes", "KiB", "MiB", "GiB", "TiB")
+    power = min(int(math.log2(max(count, 1)) / 10), len(units) - 1)
+    return f"{count / 1024**power:.3g} {units[power]}"
