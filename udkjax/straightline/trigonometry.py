@@ -95,10 +95,10 @@ sincos_p.def_abstract_eval(lambda *xs: [x for x in xs for _ in range(2)])
 def _batched(xs: Sequence[Any], axes: Sequence[int | None]) -> tuple[list[Any], list[int | None]]:
     """Angles that differ from member to member together, and those that do not."""
     found: list[Any] = [None] * (2 * len(xs))
+    xs = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(xs, axes, strict=True)]
     for batched in (True, False):
         some = [k for k, axis in enumerate(axes) if (axis is not None) == batched]
-        members = [jnp.moveaxis(xs[k], axes[k], 0) if batched else xs[k] for k in some]
-        for k, pair in zip(some, sincos_of_each(members), strict=True):
+        for k, pair in zip(some, sincos_of_each([xs[k] for k in some]), strict=True):
             found[2 * k : 2 * k + 2] = pair
     return found, [None if axis is None else 0 for axis in axes for _ in range(2)]
 
