@@ -246,9 +246,6 @@ def counted(held):
     return udk.ConstrainedSystem(lambda q: jnp.eye(2), force, (lambda t, q: q @ q - 1.0) if held else None), count
 
 
-AFTER = 1  # the end of every run looks whether what follows is finite, once: under vmap
-
-
 @pytest.mark.parametrize("held", [True, False], ids=["projected", "free"])
 @pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Heun()], ids=["Dopri8", "Tsit5", "Heun"])
 def test_right_hand_sides_are_counted(solver, held):
@@ -258,7 +255,7 @@ def test_right_hand_sides_are_counted(solver, held):
     jax.effects_barrier()
     stats = {k: int(v) for k, v in sol.stats.items()}
     assert stats["steps"] == stats["accepted"] + stats["rejected"] > 3
-    assert count.value - AFTER == stats["right_hand_sides"]
+    assert count.value == stats["right_hand_sides"]
     assert stats["projections"] == (stats["steps"] + 2 * (len(TS) - 1) if held else 0)
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from udkjax.integrate.explicit import when
 from udkjax.integrate.problem import DONE, STEP_LIMIT, Raw
 from udkjax.integrate.solution import Result
 
@@ -41,17 +42,23 @@ def _stopped(run: Run) -> Array:
     """Why the step size fell to nothing: a number that is not finite, at the end or right ahead, or something else."""
     q, v = jnp.split(run.raw.y, 2)
     times = run.raw.t + jnp.array([0.0, AHEAD]) * (run.ts[-1] - run.ts[0])
-    finite = jax.vmap(lambda t: run.equations.is_finite(t, q + (t - run.raw.t) * v, v))(times)
-    return jnp.where(jnp.all(finite), Result.step_too_small, Result.not_finite)
+
+    def finite(_: Array) -> Array:
+        return jnp.all(jax.lax.map(lambda t: run.equations.is_finite(t, q + (t - run.raw.t) * v, v), times))
+
+    return jnp.where(when(run.raw.status != DONE, finite, jnp.array(True)), Result.step_too_small, Result.not_finite)
 
 
 def _drift(run: Run, code: Array) -> tuple[Array, Array, Bool[Array, "T"]]:
     """The first output time at which a row of Psi is violated, also one that the method leaves out, ends the solution."""
     if not run.equations.constrained:
         return code, run.raw.t, run.raw.reached
-    q, v = jnp.split(run.ys, 2, axis=1)
-    psi = jax.vmap(lambda t, q, v: run.equations.violation(t, q, v)[0])(run.ts, q, v)
-    lost = run.raw.reached & ~(jnp.max(jnp.abs(psi), axis=1, initial=0.0) <= run.drift_tol)
+
+    def violation(x: tuple[Array, Array]) -> Array:
+        t, y = x
+        return jnp.max(jnp.abs(run.equations.violation(t, *jnp.split(y, 2))[0]), initial=0.0)
+
+    lost = run.raw.reached & ~(jax.lax.map(violation, (run.ts, run.ys)) <= run.drift_tol)
     drifted, first = jnp.any(lost), jnp.argmax(lost)
     reached = run.raw.reached & (~drifted | (jnp.arange(len(run.ts)) <= first))
     return jnp.where(drifted, Result.drift, code), jnp.where(drifted, run.ts[first], run.raw.t), reached
