@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from udkjax.study.sweep.chunk import program, run
-from udkjax.study.sweep.cutting import lane_efficiency
+from udkjax.study.sweep.cutting import lane_steps
+from udkjax.study.sweep.local import workers
 from udkjax.study.sweep.member import STEPS
 from udkjax.study.sweep.plan import Chunk, Group, Plan
 
@@ -39,7 +40,7 @@ def estimate(plan: Plan, memory: int = 2**30) -> Estimate:
     chosen = [plan.groups[k] for k in np.unique(np.linspace(0, count - 1, min(count, GROUPS)).astype(int))]
     tried = [_tried(plan, group) for group in chosen]
     compiling = count * float(np.mean([seconds for seconds, _ in tried]))
-    computing = plan.size * float(np.mean([seconds for _, seconds in tried]))
+    computing = plan.size * float(np.mean([seconds for _, seconds in tried])) / workers()
     kept = plan.size * plan.bytes_per_member
     used = _resident() + min(memory, kept) + kept
     return Estimate(plan.size, count, len(tried), len(plan.chunks(memory)), kept, used, compiling, computing)
@@ -55,8 +56,8 @@ def _tried(plan: Plan, group: Group) -> tuple[float, float]:
         begun = time.perf_counter()
         found = run(plan, sample)
         first, seconds = seconds, time.perf_counter() - begun
-    waited = lane_efficiency([found[STEPS]], size) if own.piece > 1 else 1.0
-    return max(first - seconds, 0.0), seconds * waited / size
+    taken, room = (1, 1) if own.lanes is None else lane_steps(found[STEPS], own.lanes)
+    return max(first - seconds, 0.0), seconds * taken / room / size
 
 
 def _resident() -> int:

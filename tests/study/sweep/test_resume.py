@@ -1,0 +1,94 @@
+"""Sweeps that are interrupted go on where they stopped, and give what an uninterrupted one gives, bit by bit."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray
+
+import udkjax as udk
+from udkjax.study.sweep.store import StoreError
+
+CHUNKS, PIECE = 10, 64
+
+
+def sweep(**choices: Any) -> Any:
+    """640 pendulums in ten chunks, as small as chunks can be."""
+    axes = {
+        "body.rod.inertia": np.linspace(0.05, 0.5, 80),
+        "tol": udk.Axis(10.0 ** np.arange(-9, -1), of=("rtol", "atol")),
+    }
+    measures = ("final", "violation")
+    return udk.sweep(udk.library.compound_pendulum(), axes, [0.0, 1.0], measures, memory=1, **{"progress": False, **choices})
+
+
+@pytest.fixture(scope="module")
+def whole() -> Any:
+    """What the sweep gives when nothing happens to it."""
+    return sweep()
+
+
+def chunks(folder: Path) -> dict[str, int]:
+    """The finished chunks, and when each was written."""
+    return {file.name: file.stat().st_mtime_ns for file in (folder / "chunks").glob("*.npz")}
+
+
+@pytest.mark.parametrize("when", [pytest.param("between two chunks", marks=pytest.mark.slow), "before a chunk has its name"])
+def test_a_killed_sweep_goes_on(tmp_path, whole, when):
+    if when == "between two chunks":
+        arrange = f"progress = lambda status: status.done < {3 * PIECE} or kill()"
+    else:
+        arrange = (
+            "os.replace, progress = lambda a, b: str(b).endswith('npz') and next(count) == 3 and kill() or replace(a, b), False"
+        )
+    code = f"""
+import importlib.util, itertools, os, signal, sys
+spec = importlib.util.spec_from_file_location("test_resume", {str(Path(__file__))!r})
+module = importlib.util.module_from_spec(spec); spec.loader.exec_module(module)
+kill, count, replace = lambda: os.kill(os.getpid(), signal.SIGKILL), itertools.count(), os.replace
+{arrange}
+module.sweep(out=sys.argv[1], progress=progress)
+"""
+    ran = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
+    assert ran.returncode == -signal.SIGKILL
+    before, seen = chunks(tmp_path), []
+    assert len(before) == 3
+    data = sweep(out=tmp_path, progress=seen.append)
+    assert seen[0].done == 3 * PIECE and len(seen) == 1 + CHUNKS - 3
+    after = chunks(tmp_path)
+    assert len(after) == CHUNKS and before.items() <= after.items()  # none was written twice
+    assert sorted(file.name for file in (tmp_path / "chunks").iterdir()) == sorted(after)  # and nothing else is there
+    xarray.testing.assert_identical(data, whole)
+
+
+def test_a_sweep_that_is_done_computes_nothing_and_another_is_refused(tmp_path, whole):
+    sweep(out=tmp_path)
+    before, seen = chunks(tmp_path), []
+    xarray.testing.assert_identical(sweep(out=tmp_path, progress=seen.append), whole)
+    assert [status.done for status in seen] == [CHUNKS * PIECE] and chunks(tmp_path) == before
+    with pytest.raises(StoreError, match=r"settings\.drift_tol: was not there, is 0\.001"):
+        sweep(out=tmp_path, drift_tol=1e-3)
+
+
+def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, monkeypatch, whole):
+    fsync, calls = os.fsync, iter(range(100))
+
+    def full(file: int) -> None:
+        if next(calls) >= 8:  # a file and its folder, four times
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(file)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(StoreError, match=r"No space left on device; 3 chunks in .* stay valid"):
+            sweep(out=tmp_path)
+    before = chunks(tmp_path)
+    assert len(before) == 3
+    xarray.testing.assert_identical(sweep(out=tmp_path), whole)
+    assert before.items() <= chunks(tmp_path).items()
