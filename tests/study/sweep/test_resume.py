@@ -18,10 +18,10 @@ from udkjax.study.sweep.store import StoreError
 CHUNKS, PIECE = 10, 64
 
 
-def sweep(**choices: Any) -> Any:
+def sweep(inertia: Any = None, **choices: Any) -> Any:
     """640 pendulums in ten chunks, as small as chunks can be."""
     axes = {
-        "body.rod.inertia": np.linspace(0.05, 0.5, 80),
+        "body.rod.inertia": udk.Axis(np.linspace(0.05, 0.5, 80), of=inertia),
         "tol": udk.Axis(10.0 ** np.arange(-9, -1), of=("rtol", "atol")),
     }
     measures = ("final", "violation")
@@ -92,3 +92,32 @@ def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, monkeypatch, whole
     assert len(before) == 3
     xarray.testing.assert_identical(sweep(out=tmp_path), whole)
     assert before.items() <= chunks(tmp_path).items()
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_costs_nothing_but_time(tmp_path, whole):
+    """Worker processes and a scheduler as on a cluster; one is killed in the middle of a chunk, another between two."""
+    distributed = pytest.importorskip("distributed", reason="dask is not installed: pip install 'udkjax[dask]'")
+    flag = str(tmp_path / "killed")
+
+    def inertia(mechanism, value):
+        if "distributed.worker" in sys.modules and distributed.worker.Worker._instances and not os.path.exists(flag):
+            open(flag, "w").close()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return mechanism.with_parameters({"body.rod.inertia": value})
+
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        alive = client.run(os.getpid)
+        assert len(alive) == 2 and os.getpid() not in alive.values()
+
+        def kill(status):
+            if status.done == 2 * PIECE:
+                os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+
+        data = sweep(inertia=inertia, out=tmp_path / "sweep", client=client, progress=kill)
+        assert os.path.exists(flag) and not set(alive.values()) <= set(client.run(os.getpid).values())
+        assert len(chunks(tmp_path / "sweep")) == CHUNKS
+        xarray.testing.assert_equal(data, whole)
