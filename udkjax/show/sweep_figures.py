@@ -23,12 +23,13 @@ PANELS = 12  # of one picture; of the dimensions that these cannot show, the fir
 
 
 def pictures(data: Any) -> dict[str, Figure]:
-    """Draw the dataset of a sweep: `result`, and every variable with one number a member, each as a figure of its own.
+    """Draw the dataset of a sweep: `result`, and every variable with one number a member, not the same for all of them.
 
     Two dimensions are the axes of a map, those with most values; each combination of the others has a panel. One dimension is a
     line. Members of a design, which has no grid, are points over its first two axes.
     """
-    return {name: _picture(data, name) for name in (RESULT, *scalars(data))}
+    differing = [name for name in scalars(data) if len(np.unique(data[name])) > 1]
+    return {name: _picture(data, name) for name in (RESULT, *differing)}
 
 
 def scalars(data: Any) -> list[str]:

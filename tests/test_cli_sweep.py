@@ -1,0 +1,102 @@
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+
+from udkjax.cli import main
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PENDULUM, EXAMPLE = EXAMPLES / "compound_pendulum.toml", EXAMPLES / "grids" / "parallelogram.toml"
+GRID = """
+t1 = 0.5
+measures = ["final", "violation"]
+[axes]
+"body.rod.inertia" = [0.1, 0.2, 0.4]
+tol = { from = 1e-8, to = 1e-4, num = 3, scale = "log", of = ["rtol", "atol"] }
+[settings]
+max_steps = 5
+"""
+
+
+def udkjax(*arguments) -> int:
+    """Run the command line here, and return its exit code."""
+    try:
+        main([str(argument) for argument in arguments])
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 0 if end.code is None else 1
+    return 0
+
+
+@pytest.fixture
+def grid(tmp_path):
+    file = tmp_path / "grid.toml"
+    file.write_text(GRID)
+    return file
+
+
+def test_a_sweep_is_run_and_refused_where_it_is_another(tmp_path, grid, capsys):
+    out = tmp_path / "sweep"
+    assert udkjax("sweep", PENDULUM, grid, "--out", out, "--quiet") == 0
+    first = capsys.readouterr()
+    assert first.err == ""
+    with xarray.open_dataset(out / "sweep.nc", engine="h5netcdf") as data:
+        assert dict(data.sizes) == {"body.rod.inertia": 3, "tol": 3, "body": 1, "coordinate": 3}
+        np.testing.assert_allclose(data["tol"], [1e-8, 1e-6, 1e-4])
+        failed = int((data.result == 1).sum())
+        assert 0 < failed < 9 and np.isnan(data.q_end.values[data.result.values == 1]).all()
+        assert data.attrs["scene"] == PENDULUM.read_text() and data.attrs["setting_max_steps"] == 5
+    assert f"{9 - failed} successful, {failed} step limit" in first.out and "wrote sweep.nc" in first.out
+    pictures = {file.name for file in out.glob("*.png")}
+    assert {"result.png", "end_time.png"} <= pictures and "q_end.png" not in pictures
+    assert json.loads((out / "sweep.json").read_text())["settings"] == {"max_steps": 5}
+
+    grid.write_text(GRID.replace("max_steps = 5", "max_steps = 6"))
+    assert udkjax("sweep", PENDULUM, grid, "--out", out) == 1
+    assert "settings.max_steps: was 5, is 6" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "problem"),
+    [
+        ("", [], "--out FOLDER is missing"),
+        ("", ["--out", "nowhere/sweep"], "there is no folder nowhere"),
+        ("", ["--out", "sweep", "--memory", "0"], "--memory 0: must be positive"),
+        ("", ["--out", "sweep", "--engine", "devices", "--scheduler", "tcp://x:1"], "--scheduler is for --engine dask"),
+        (
+            "rod.inertia",
+            ["--out", "sweep"],
+            '"body.rod.inertai" is no parameter of the mechanism, nor a setting; did you mean "body.rod.inertia"?',
+        ),
+        ("max_steps", ["--out", "sweep"], 'settings.max_stpes: unknown key; did you mean "max_steps"?'),
+        ("violation", ["--out", "sweep"], '"voilation": there is none of this name; did you mean "violation"?'),
+    ],
+)
+def test_wrong_input_is_refused_before_anything_is_run(tmp_path, monkeypatch, capsys, grid, change, arguments, problem):
+    monkeypatch.chdir(tmp_path)
+    wrong = {"rod.inertia": "rod.inertai", "max_steps": "max_stpes", "violation": "voilation"}
+    grid.write_text(GRID.replace(change, wrong[change]) if change else GRID)
+    assert udkjax("sweep", PENDULUM, grid, *arguments) == 2
+    shown = capsys.readouterr().err
+    assert problem in shown and "Traceback" not in shown
+    assert os.listdir() == [grid.name]
+    assert udkjax("sweep", PENDULUM, "nowhere.toml", "--dry-run") == 2
+    assert "cannot read nowhere.toml" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_example_on_workers_of_dask(tmp_path, capsys):
+    pytest.importorskip("distributed", reason="dask is not installed: pip install 'udkjax[dask]'")
+    arguments = ("sweep", EXAMPLES / "parallelogram.toml", EXAMPLE)
+    assert udkjax(*arguments, "--dry-run") == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for part in ("members 288: 9 body.coupler.mass x 8 tolerance x 2 start x 2 stabilization", "2 programs", "chunks 4", "q_end"):
+        assert part in shown
+    assert list(tmp_path.iterdir()) == []
+    assert udkjax(*arguments, "--out", tmp_path / "sweep", "--engine", "dask") == 0
+    assert "288 successful" in capsys.readouterr().out
+    with xarray.open_dataset(tmp_path / "sweep" / "sweep.nc", engine="h5netcdf") as data:
+        assert float(data.violation.sel(stabilization="Projection").max()) < 1e-12
+        assert float(data.violation.max()) < 1e-3
