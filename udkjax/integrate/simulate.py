@@ -1,5 +1,8 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -84,7 +87,8 @@ def simulate(
     choices = (solver, adjoint, max_steps, _meter(progress))
 
     def run(mechanism: Any, careful: bool) -> tuple[Solution, Any, Any]:
-        return _simulate(mechanism, ts, state, closure, *settings, *choices, careful)
+        with _uncollected():
+            return _simulate(mechanism, ts, state, closure, *settings, *choices, careful)
 
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
@@ -186,6 +190,22 @@ def _step(dt0: ArrayLike | None) -> Array | None:
     if not isinstance(dt0, Tracer) and not 0 < float(dt0) < jnp.inf:
         raise ValueError(f"the first step dt0 must be positive, not {float(dt0)} s")
     return dt0
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Keep Python from looking for garbage meanwhile.
+
+    What is traced and compiled makes a hundred thousand objects that stay: each collection would look at them, and at all of JAX,
+    again, which takes a tenth of the time of a first run.
+    """
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
 
 
 # diffrax is imported where it is asked for: it takes as long as all of JAX.
