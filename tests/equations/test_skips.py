@@ -29,8 +29,10 @@ ARITHMETIC = (
 )
 TRIGONOMETRY = ("sincos", "sine", "cosine", "tan", "tanh", "atan2", "exponential", "log")
 PAIR = 51  # floating-point operations in `sincos`
-CHOICES = ("compare", "select", "clamp", "and", "or", "not")
-MOVES = "constant reshape slice concatenate broadcast_in_dim convert optimization_barrier transpose".split()
+CHOICES = ("compare", "select", "clamp", "and", "or", "not", "reduce")
+MOVES = (
+    "while constant reshape slice concatenate broadcast_in_dim convert optimization_barrier transpose".split()
+)  # the body of a loop stands in the text once
 NAME = r'@"?([^"(\s]+)"?'  # of a function
 ELIMINATION = udk.Elimination()
 

@@ -21,10 +21,12 @@ from jaxtyping import Array, Bool
 from udkjax.equations.code import scalars, stacked
 from udkjax.equations.motion import Vector
 from udkjax.equations.plain import plain_accelerations, plain_correction, plain_project, plain_tangential
-from udkjax.straightline import Program
+from udkjax.straightline import Program, when
 
 if TYPE_CHECKING:
     from udkjax.equations.udwadia_kalaba import Equations
+
+FAR = 1e-8  # m, rad: Newton's method converges quadratically, and leaves rounding errors of a residual that moves less
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -53,7 +55,7 @@ def _projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Ve
         return x - stacked(step([*equations.constants, *factors, *residual]))
 
     q1 = without(q, "psi_kept", q)
-    q2 = without(q1, "psi_kept", q1)
+    q2 = when(jnp.max(jnp.abs(q1 - q)) > FAR, lambda q1: without(q1, "psi_kept", q1), q1)
     found = q2, without(v, "psi_dot_kept", q2)
     if equations.branches:
         return *_branched(equations, safe, found, plain_project, t, q, v), jnp.array(True)

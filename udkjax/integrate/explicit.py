@@ -27,6 +27,7 @@ from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TO
 from udkjax.integrate.record import Record, blank, noted
 from udkjax.integrate.tableau import Method
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.straightline import when
 from udkjax.straightline.emit import cut
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0  # of the step's size: diffrax's own, so that both take the same steps
@@ -92,11 +93,6 @@ def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial
     a = jnp.zeros((last + 1, *here.a.shape), here.a.dtype).at[0].set(here.a)
     a, q1, v1 = jax.lax.fori_loop(jnp.where(jnp.all(begin), last, 1), last + 1, stage, (a, here.q, here.v))
     return judged(task, here, Point(t1, q1, v1, a[last]), h, a[:last], jnp.where(begin, 1, last))
-
-
-def when(condition: Array, function: Callable, x: Any) -> Any:
-    """`function(x)` or x: a branch that does not keep XLA from compiling the loop that it is in into one function."""
-    return jax.lax.while_loop(lambda c: c[0], lambda c: (jnp.zeros_like(condition), function(c[1])), (condition, x))[1]
 
 
 def stage_state(method: Method, here: Point, h: Array, a: Array, i: Any) -> tuple[Array, Array, Array]:

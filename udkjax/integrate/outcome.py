@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from udkjax.integrate.explicit import when
 from udkjax.integrate.problem import DONE, STEP_LIMIT, Raw
 from udkjax.integrate.solution import Result
+from udkjax.straightline import when
 
 AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one looks for what is not finite
 
