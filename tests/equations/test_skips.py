@@ -30,9 +30,7 @@ ARITHMETIC = (
 TRIGONOMETRY = ("sincos", "sine", "cosine", "tan", "tanh", "atan2", "exponential", "log")
 PAIR = 51  # floating-point operations in `sincos`
 CHOICES = ("compare", "select", "clamp", "and", "or", "not", "reduce")
-MOVES = (
-    "while constant reshape slice concatenate broadcast_in_dim convert optimization_barrier transpose".split()
-)  # the body of a loop stands in the text once
+MOVES = "constant reshape slice concatenate broadcast_in_dim convert optimization_barrier transpose branch".split()
 NAME = r'@"?([^"(\s]+)"?'  # of a function
 ELIMINATION = udk.Elimination()
 
@@ -65,11 +63,13 @@ def operations(text: str) -> Counter:
     @cache
     def inside(name: str) -> Counter:
         found = Counter()
-        for line in lines[name][1:]:
+        for line, after in zip(lines[name][1:], [*lines[name][3:], "", ""], strict=True):
             if match := re.match(rf"\s*(?:%\S+ = )?(?:func\.)?call {NAME}\(", line):
                 found.update({"sincos": results(line)} if match[1].startswith("_sincos") else inside(match[1]))
             elif match := re.match(r'\s*%\S+ = "?(\w+)\.(\w+)', line):
-                found[match[2]] += results(line)
+                # Of a loop for as long as the value it begins with is true, a branch, the text holds the body once.
+                once = match[2] == "while" and re.match(r"\s*stablehlo\.return %iterArg\w* : tensor<i1>$", after)
+                found["branch" if once else match[2]] += results(line)
         return found
 
     found = Counter(inside("main"))
