@@ -24,6 +24,9 @@ from udkjax.study.sweep.plan import Chunk, Group, Plan, Variable
 from udkjax.study.sweep.units import units_of
 
 WIDE = 4096  # members of a piece where a device takes them all at once
+# Chunks of lanes in a piece, at most: to call a program takes what ten of its members take. And pieces that a group has at least,
+# before its pieces get larger: for as many devices there is something to do.
+TOGETHER, MANY = 8, 16
 PROGRAMS = 64  # that are kept: a program holds its plan
 LABELS = {
     RESULT: Named((), "1", "how the run ended"),
@@ -45,14 +48,17 @@ class Program:
         self._compiled: Any = None
 
     def _piece(self, members: int) -> int:
+        full = -(-members // ROUND) * ROUND
         if self.devices[0].platform not in CHUNKED:
-            return min(WIDE, -(-members // ROUND) * ROUND)
-        return min(LANES, -(-members // ROUND) * ROUND) if self.recipe.in_lanes else 1
+            return min(WIDE, full)
+        if not self.recipe.in_lanes:
+            return 1
+        return min(LANES * max(1, min(TOGETHER, members // (LANES * MANY))), full)
 
     @property
     def lanes(self) -> int | None:
         """How many members wait for each other; None: none does."""
-        return self.piece if self.piece > 1 else None
+        return None if self.piece == 1 else min(self.piece, LANES) if self.devices[0].platform in CHUNKED else self.piece
 
     def _computed(self, shared: Any, own: Any) -> tuple[Kept, Kept]:
         """What is kept, and the derivatives of it by each name, last."""
@@ -89,11 +95,12 @@ class Program:
         return {k: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for k, x in _named(self.recipe.names, kept, slopes).items()}
 
     @property
-    def compiled(self) -> Any:
-        """The executable."""
+    def compiled(self) -> tuple[Any, Any]:
+        """The executable, and the numbers that all members share, on the devices."""
         with self._lock:
             if self._compiled is None:
-                self._compiled = self._lower().compile()
+                executable = self._lower().compile()
+                self._compiled = executable, jax.device_put(self.recipe.shared, executable.input_shardings[0][0])
         return self._compiled
 
     def __call__(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
@@ -101,10 +108,8 @@ class Program:
         size, n = self.piece * len(self.devices), len(members)
         full = members[np.minimum(np.arange(-(-n // size) * size), n - 1)]
         own = self.recipe.own(full)
-        started = [
-            self.compiled(self.recipe.shared, jax.tree.map(lambda x, k=k: x[k : k + size], own))
-            for k in range(0, len(full), size)
-        ]
+        compiled, shared = self.compiled
+        started = [compiled(shared, jax.tree.map(lambda x, k=k: x[k : k + size], own)) for k in range(0, len(full), size)]
         parts = [jax.tree.map(np.asarray, part) for part in started]
         joined = jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
         return _named(self.recipe.names, *joined)
