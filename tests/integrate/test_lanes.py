@@ -44,8 +44,13 @@ def members(size):
 
 
 @pytest.fixture(scope="module")
-def batch(pendulum):
-    return jax.jit(jax.vmap(last(pendulum)))(*members(MEMBERS))
+def in_lanes(pendulum):
+    return jax.jit(jax.vmap(last(pendulum)))
+
+
+@pytest.fixture(scope="module")
+def batch(in_lanes):
+    return in_lanes(*members(MEMBERS))
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +66,13 @@ def test_members_are_what_they_are_alone(batch, alone):
         assert {name: int(x[k]) for name, x in batch.stats.items()} == {name: int(x) for name, x in one.stats.items()}
     assert np.all(np.asarray(batch.result) == udk.Result.successful)
     assert len(np.unique(np.asarray(batch.stats["steps"]))) > 5  # each takes steps of its own
+
+
+def test_no_member_depends_on_those_beside_it(batch, in_lanes):
+    """To the last bit: in another order each has another chunk and another lane."""
+    order = np.random.default_rng(0).permutation(MEMBERS)
+    found = in_lanes(*(x[order] for x in members(MEMBERS)))
+    assert np.array_equal(found.q, batch.q[order]) and np.array_equal(found.v, batch.v[order])
 
 
 @pytest.mark.slow

@@ -209,10 +209,11 @@ def _projected(lanes: Lanes, ts: Array, ys: Array) -> Array:
         t, y = x
 
         def again(carry: Any) -> Any:
-            k, y, _ = carry
+            k, y, far = carry
             nearer = over(t, y)
-            return k + 1, nearer, jnp.any(jnp.abs(nearer - y) > FAR)
+            return k + 1, jnp.where(far, nearer, y), far & jnp.any(jnp.abs(nearer - y) > FAR, axis=0)
 
-        return jax.lax.while_loop(lambda c: c[2] & (c[0] < PASSES), again, (0, y, jnp.array(True)))[1]
+        start = 0, y, jnp.ones(lanes.shape, bool)  # no lane's result depends on those beside it
+        return jax.lax.while_loop(lambda c: jnp.any(c[2]) & (c[0] < PASSES), again, start)[1]
 
     return jax.lax.map(one, (ts, ys))  # one time after another is faster, and compiles faster, than all at once
