@@ -24,8 +24,8 @@ def sweep(inertia: Any = None, **choices: Any) -> Any:
         "body.rod.inertia": udk.Axis(np.linspace(0.05, 0.5, 80), of=inertia),
         "tol": udk.Axis(10.0 ** np.arange(-9, -1), of=("rtol", "atol")),
     }
-    measures = ("final", "violation")
-    return udk.sweep(udk.library.compound_pendulum(), axes, [0.0, 1.0], measures, memory=1, **{"progress": False, **choices})
+    settings = {"method": udk.Elimination(), "progress": False, **choices}
+    return udk.sweep(udk.library.compound_pendulum(), axes, [0.0, 1.0], ("final", "violation"), memory=1, **settings)
 
 
 @pytest.fixture(scope="module")
