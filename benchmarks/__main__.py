@@ -5,7 +5,7 @@ import json
 from importlib import import_module
 from pathlib import Path
 
-NAMES = ("right_hand_side", "integrators", "trajectory", "batch", "gradients", "startup", "scaling", "peers")
+NAMES = ("right_hand_side", "integrators", "trajectory", "batch", "gradients", "startup", "scaling", "sweep", "peers")
 
 
 def main(words: list[str] | None = None) -> None:

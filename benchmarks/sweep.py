@@ -20,7 +20,7 @@ from udkjax.study.machine import cores
 
 LINKS = ("link1", "link2", "link3")
 END = 10.0  # s
-MEMORY = 2**24  # bytes: chunks small enough for a kill to hit one of many
+MEMORY = 40  # bytes for each member of the sweep: so little that there are many chunks, one of which is hit by a kill
 KILLED = 0.5  # of the members
 
 
@@ -145,7 +145,8 @@ def _sweep(size: Size, end: float, folder: str, killed: bool) -> dict[str, float
         if killed and status.done >= KILLED * status.members:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    data = udk.sweep(udk.library.parallelogram(), **arguments(size, end), out=folder, memory=MEMORY, progress=progress)
+    memory = MEMORY * int(np.prod(size))
+    data = udk.sweep(udk.library.parallelogram(), **arguments(size, end), out=folder, memory=memory, progress=progress)
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(data[name].values).tobytes() for name in sorted(data.data_vars)))
     Path(f"{folder}.digest").write_text(digest.hexdigest())
     assert int((data.result != 0).sum()) == 0, "members failed"

@@ -76,6 +76,9 @@ def _claims() -> Iterable[Claim]:
             yield Claim(f"20 s, {motion}, error {target:.0e}: a script's time, in times ours", "trajectory", 20.0, against, True)
     rate = value("per_second", name="udkjax", start=-45.0, target=1e-6, outputs="end only")
     yield Claim("batch, 10 s, hanging, error 1e-06: trajectories a second and core", "batch", 18_000.0, rate, True)
+    share = value("throughput", name="sweep")
+    yield Claim("sweep of 100,000: throughput of a core, beside the batch's", "sweep", 0.8, share, True)
+    yield Claim("sweep of 100,000: memory, GiB", "sweep", 2.0, value("gib", name="sweep"))
     for key, what in (("us", "time"), ("temporary_bytes", "memory")):
         grows = value(key, name="exponents, N-four-bar")
         yield Claim(f"N-four-bar, N = 1 to 200: power of N of a right-hand side's {what}", "scaling", 1.1, grows)

@@ -9,7 +9,7 @@ import pytest
 
 benchmarks = pytest.importorskip("benchmarks", reason="not in a source tree")
 
-from benchmarks import batch, gradients, integrators, right_hand_side, trajectory  # noqa: E402
+from benchmarks import batch, gradients, integrators, right_hand_side, sweep, trajectory  # noqa: E402
 from benchmarks.__main__ import main  # noqa: E402
 from benchmarks.common import Compiled, Work, alternate, at_equal_error, frontier, ratio  # noqa: E402
 from benchmarks.scripts import by_cholesky, by_pinv  # noqa: E402
@@ -38,6 +38,14 @@ def test_batch():
     figures = batch.main(smoke=True)
     assert all(row["error"] < 1e-3 and row["per_second"] > 0 for row in figures if "tol" in row)
     assert figures[-1]["name"] == "two cores" and figures[-1]["speedup"] > 0
+
+
+@pytest.mark.slow
+def test_sweep():
+    """Killed and resumed: which is held against the whole one inside."""
+    (row,) = sweep.main(smoke=True)
+    assert row["kept_when_killed"] == 1 and row["resumed_members"] == 64 and row["members"] == 128
+    assert 0.5 < row["lane_efficiency"] <= 1 and row["gib"] < 4
 
 
 @pytest.mark.slow
