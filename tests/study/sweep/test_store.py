@@ -28,6 +28,10 @@ def data(chunk):
     return {"result": np.zeros(len(chunk.members), int), "q": np.sqrt(chunk.members[:, None] + np.arange(3.0))}
 
 
+def not_done(kept, chunks=CHUNKS):
+    return store.left(chunks, kept.done("result")[0])
+
+
 def collected(kept):
     """Everything that is finished, by member."""
     return {int(m): d["q"][k].tolist() for members, d in kept.finished() for k, m in enumerate(members)}
@@ -41,9 +45,12 @@ def files(folder):
 def test_what_is_finished_is_left_out_and_given_back(tmp_path, place):
     out = place and tmp_path / place
     with opened(out, FINGERPRINT) as kept:
-        assert kept.left(CHUNKS) == CHUNKS
+        assert not_done(kept) == CHUNKS
         kept.write(CHUNKS[1], data(CHUNKS[1]))
-        assert kept.left(CHUNKS) == [CHUNKS[0], CHUNKS[2]]
+        assert not_done(kept) == [CHUNKS[0], CHUNKS[2]]
+        done, codes = kept.done("result")
+        np.testing.assert_array_equal(done, [0, 5])
+        np.testing.assert_array_equal(codes, [0, 0])
         ((members, found),) = kept.finished()
         np.testing.assert_array_equal(members, [0, 5])
         assert {name: values.dtype.kind for name, values in found.items()} == {"result": "i", "q": "f"}
@@ -55,13 +62,13 @@ def test_a_sweep_goes_on_where_it_was_cut_into_other_chunks(tmp_path):
     with Store(tmp_path, FINGERPRINT) as kept:
         kept.write(CHUNKS[0], data(CHUNKS[0]))
     with Store(tmp_path, FINGERPRINT) as kept:
-        left = kept.left([chunk(0, [0, 1, 2]), chunk(1, [3, 4]), chunk(2, [5])])
+        left = not_done(kept, [chunk(0, [0, 1, 2]), chunk(1, [3, 4]), chunk(2, [5])])
         assert [c.members.tolist() for c in left] == [[0, 2], [3], [5]]
         assert [(c.index, c.work) for c in left] == [(0, 4.0), (1, 3.0), (2, 6.0)]
         for c in left:
             kept.write(c, data(c))
         assert collected(kept) == {m: data(chunk(0, [m]))["q"][0].tolist() for m in range(6)}
-        assert kept.left(CHUNKS) == []
+        assert not_done(kept) == []
 
 
 def test_an_archive_with_any_bit_changed_or_cut_off_is_none(tmp_path):
@@ -88,7 +95,7 @@ def test_a_damaged_chunk_is_computed_again_and_no_other(tmp_path, damage):
         broken.write_bytes(damage(broken.read_bytes()))
     with Store(tmp_path, FINGERPRINT) as kept:
         with pytest.warns(UserWarning, match=f"{broken.name} is damaged"):
-            left = kept.left(CHUNKS)
+            left = not_done(kept)
         assert left == [CHUNKS[1]]
         kept.write(left[0], data(left[0]))
         assert collected(kept) == whole
@@ -149,7 +156,7 @@ def test_what_was_being_written_when_the_process_died_is_removed(tmp_path):
     torn.write_bytes(b"half")
     with Store(tmp_path, FINGERPRINT) as kept:
         assert not torn.exists()
-        assert kept.left(CHUNKS) == CHUNKS[1:]
+        assert not_done(kept) == CHUNKS[1:]
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
@@ -166,7 +173,7 @@ def test_a_full_disk_is_named_and_what_is_finished_stays_valid(tmp_path, monkeyp
                 kept.write(CHUNKS[1], data(CHUNKS[1]))
         assert len(files(tmp_path)) == 1
     with Store(tmp_path, FINGERPRINT) as kept:
-        assert kept.left(CHUNKS) == CHUNKS[1:]
+        assert not_done(kept) == CHUNKS[1:]
 
 
 def test_a_file_that_cannot_be_written_to_its_end_is_not_there(tmp_path):

@@ -44,21 +44,11 @@ class Kept(abc.ABC):
     def __exit__(self, *_: Any) -> None:
         return None
 
-    def left(self, chunks: Sequence[Chunk]) -> list[Chunk]:
-        """Return the chunks that are not finished, or the part of them that is not.
-
-        By member, since the chunks are not the same with another memory or another number of devices.
-        """
-        done = np.concatenate([np.empty(0, int), *[members for members, _ in self.finished()]])
-        kept = []
-        for chunk in chunks:
-            members = np.asarray(chunk.members)
-            new = ~np.isin(members, done)
-            if new.all():
-                kept.append(chunk)
-            elif new.any():
-                kept.append(dataclasses.replace(chunk, members=members[new], work=chunk.work * float(new.mean())))
-        return kept
+    def done(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the members that are finished, and what is kept of them under a name."""
+        parts = [(members, data[name]) for members, data in self.finished()] or [(np.empty(0, int), np.empty(0, int))]
+        members, values = zip(*parts, strict=True)
+        return np.concatenate(members), np.concatenate(values)
 
     @abc.abstractmethod
     def write(self, chunk: Chunk, data: Data) -> None:
@@ -152,6 +142,22 @@ class Store(Kept):
             kept = f"{len(self._files())} chunks in {self.folder} are finished and stay valid"
             advice = "once it can be written to, run the same sweep again: it goes on from there"
             raise StoreError(f"cannot write {name}: {error.strerror or error}; {kept}; {advice}") from error
+
+
+def left(chunks: Sequence[Chunk], done: np.ndarray) -> list[Chunk]:
+    """Leave out the members that are done, and the chunks of which none is left.
+
+    By member, since the chunks are not the same with another memory or another number of devices.
+    """
+    found = []
+    for chunk in chunks:
+        members = np.asarray(chunk.members)
+        new = ~np.isin(members, done)
+        if new.all():
+            found.append(chunk)
+        elif new.any():
+            found.append(dataclasses.replace(chunk, members=members[new], work=chunk.work * float(new.mean())))
+    return found
 
 
 def opened(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Any]) -> Kept:

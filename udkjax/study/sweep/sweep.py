@@ -12,7 +12,7 @@ from udkjax.study.sweep.layout import SweepError
 from udkjax.study.sweep.member import RESULT
 from udkjax.study.sweep.plan import Chunk, Plan, planned
 from udkjax.study.sweep.progress import Watch, teller
-from udkjax.study.sweep.store import opened
+from udkjax.study.sweep.store import left, opened
 
 ENGINES = ("auto", "devices", "dask")
 MEMORY = 2**30  # bytes
@@ -63,12 +63,11 @@ def sweep(
         raise SweepError([f"engine: there is no {engine!r}; known are {', '.join(ENGINES)}"])
     plan = planned(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
     compute = _engine(engine, client)
-    chunks = plan.chunks(memory)
     with opened(out, plan.fingerprint() if out is not None else {}) as kept:
-        left = kept.left(chunks)
-        codes = [data[RESULT] for _, data in kept.finished()]
-        watch = Watch(plan.size, left, teller(progress), [code for part in codes for code in part])
-        for chunk, data, seconds in compute(plan, left):
+        done, codes = kept.done(RESULT)
+        chunks = left(plan.chunks(memory), done) if len(done) < plan.size else []
+        watch = Watch(plan.size, chunks, teller(progress), codes)
+        for chunk, data, seconds in compute(plan, chunks):
             kept.write(chunk, data)
             watch(chunk, data, seconds)
         return assemble(plan, kept.finished())
