@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 from scipy import stats
 
 import udkjax as udk
@@ -114,6 +115,7 @@ def test_output_times():
         ("t1 = 1.0\naxes.a = [0, 1]\ndesign = {type = 'sobol'}", "design.members: missing"),
         ("t1 = 1.0\naxes.a = {distribution = 'nrom'}\ndesign = {type = 'sobol', members = 4}", 'did you mean "norm"?'),
         ("t1 = 1.0\naxes.a = {distribution = 'norm', mu = 1}\ndesign = {type = 'sobol', members = 4}", "axes.a: "),
+        ("t1 = 1.0\naxes.a = [1]\nreference = 3", "reference: must be the name of a file that udkjax simulate wrote, is 3"),
         ("t1 = ", "not valid TOML"),
     ],
 )
@@ -121,6 +123,17 @@ def test_a_mistake_is_named_by_its_place(text, problem):
     with pytest.raises(GridError) as caught:
         loads_grid(text, "grid.toml")
     assert len(caught.value.problems) == 1 and problem in str(caught.value) and str(caught.value).startswith("grid.toml: ")
+
+
+def test_a_reference_is_the_file_of_a_simulation(tmp_path):
+    q = np.arange(12.0).reshape(2, 2, 3)
+    xarray.Dataset({"q": (("time", "body", "coordinate"), q)}).to_netcdf(tmp_path / "run.nc", engine="h5netcdf")
+    grid = tmp_path / "grid.toml"
+    grid.write_text("t1 = 1.0\naxes.rtol = [1e-8]\nmeasures = 'error'\nreference = 'run.nc'")
+    np.testing.assert_array_equal(load_grid(grid)["reference"], q)
+    grid.write_text("t1 = 1.0\naxes.rtol = [1e-8]\nmeasures = 'error'\nreference = 'runs.nc'")
+    with pytest.raises(GridError, match=r"reference: .*runs\.nc has no coordinates q"):
+        load_grid(grid)
 
 
 def test_all_mistakes_are_named_at_once(tmp_path):

@@ -36,7 +36,7 @@ def loads_grid(text: str, source: str = "") -> dict[str, Any]:
         given = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise GridError([f"not valid TOML: {error}"], source) from None
-    reader = _GridReader("design" in given)
+    reader = _GridReader("design" in given, Path(source).parent)
     arguments = reader.sweep(given)
     if reader.problems:
         raise GridError(reader.problems, source)
@@ -44,11 +44,14 @@ def loads_grid(text: str, source: str = "") -> dict[str, Any]:
 
 
 class _GridReader(Reader):
-    """Reads the file of a sweep; `drawn`: by a design, from ranges and distributions, instead of from lists of values."""
+    """Reads the file of a sweep; `drawn`: by a design, from ranges and distributions, instead of from lists of values.
 
-    def __init__(self, drawn: bool):
+    Other files are looked for beside it, in `folder`.
+    """
+
+    def __init__(self, drawn: bool, folder: Path):
         super().__init__()
-        self.drawn = drawn
+        self.drawn, self.folder = drawn, folder
 
     def sweep(self, given: Mapping[str, Any]) -> dict[str, Any]:
         self.known("", given, TOP)
@@ -67,8 +70,20 @@ class _GridReader(Reader):
         if "derivatives" in given:
             arguments["derivatives"] = self.names("derivatives", given["derivatives"])
         if "reference" in given:
-            arguments["reference"] = given["reference"]
+            arguments["reference"] = self.reference(given["reference"])
         return arguments
+
+    def reference(self, given: Any) -> np.ndarray | None:
+        """Coordinates (T, bodies, 3) from the file of a simulation, such as `udkjax simulate` writes."""
+        import xarray
+
+        if not isinstance(given, str):
+            return self.wrong("reference", f"must be the name of a file that udkjax simulate wrote, is {shown(given)}")
+        try:
+            with xarray.open_dataset(self.folder / given, engine="h5netcdf") as data:
+                return data["q"].transpose("time", "body", "coordinate").values
+        except (OSError, KeyError, ValueError) as error:
+            return self.wrong("reference", f"{self.folder / given} has no coordinates q of a simulation ({error})")
 
     def times(self, given: Mapping[str, Any]) -> np.ndarray | None:
         """Output times: `ts`, or from `t0` (0) to `t1` in steps of `dt`, or the start and the end alone."""
