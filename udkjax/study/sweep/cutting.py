@@ -20,7 +20,7 @@ WORTH = 8  # a sample is run of groups that are so many times as large
 SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
 SHARE = 4  # chunks in memory at a time, and copies of each: of what is kept, of its parts on the device
 # Seconds, roughly, of a step of twelve rows: by straight-line code in lanes, and by a dense method.
-QUICK, DENSE = 5e-7, 5e-4
+QUICK, DENSE = 1e-6, 5e-4
 STEPS_GUESSED = 300.0
 WIDE = 8.0  # an axis of positive values that differ by more than this factor is taken by its logarithm
 

@@ -1,0 +1,143 @@
+"""Axes become dimensions; every mistake is named, with its cure."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import scipy.stats
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.study.sweep.designs import spread
+from udkjax.study.sweep.layout import laid_out
+from udkjax.study.sweep.plan import planned
+
+TS = [0.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    return udk.library.parallelogram()
+
+
+def problems(mechanism, axes, measure="final", **arguments):
+    with pytest.raises(udk.SweepError) as raised:
+        planned(mechanism, axes, TS, measure, **arguments)
+    return raised.value.problems
+
+
+def test_a_grid_has_its_axes_as_dimensions_and_zipped_ones_share_one(linkage):
+    axes = {
+        "body.link1.mass": [1.0, 2.0, 3.0],
+        "both": udk.Zipped({"rtol": [1e-4, 1e-8], "method": [udk.SVD(), udk.Varga()]}),
+        "tol": udk.Axis([1e-9], of=["atol", "rank_tol"]),
+    }
+    dimensions = laid_out(linkage, axes)
+    assert [(d.name, d.size, [c.name for c in d.columns]) for d in dimensions] == [
+        ("body.link1.mass", 3, ["body.link1.mass"]),
+        ("both", 2, ["rtol", "method"]),
+        ("tol", 1, ["tol"]),
+    ]
+    assert dimensions[0].columns[0].units == "kg"
+    plan = planned(linkage, axes, TS)
+    assert plan.size == 6 and plan.shape == (3, 2, 1)
+    assert plan.places(np.array([0, 3, 5]))["method"].tolist() == [0, 1, 1]
+    assert [group.members.tolist() for group in plan.groups] == [[0, 2, 4], [1, 3, 5]]
+    assert [group.labels for group in plan.groups] == [{"method": "SVD"}, {"method": "Varga"}]
+
+
+def test_choices_that_differ_by_numbers_share_a_program(linkage):
+    axes = {
+        "stabilization": [udk.Baumgarte(0.0, 0.0), udk.Baumgarte(1000.0, 100.0), None],
+        "mechanism": [udk.library.parallelogram(angle) for angle in (-0.7, -0.5)],
+    }
+    plan = planned(linkage, axes, TS)
+    assert [len(group.members) for group in plan.groups] == [4, 2]
+    (column, mechanisms) = plan.columns
+    assert column.labels == ("Baumgarte(alpha=0, beta=0)", "Baumgarte(alpha=1000, beta=100)", "none")
+    assert mechanisms.labels == ("five-bar parallelogram", "five-bar parallelogram #2")
+
+
+@pytest.mark.parametrize("design", [udk.Sobol(16, seed=3), udk.LatinHypercube(16, seed=3), udk.Random(16, seed=3)])
+def test_a_design_fills_ranges_and_distributions_and_repeats_itself(linkage, design):
+    axes = {"body.link1.mass": (1.0, 3.0), "rtol": scipy.stats.loguniform(1e-8, 1e-4), "method": [udk.SVD(), udk.Varga()]}
+    member, method = laid_out(linkage, axes, design)
+    assert (member.name, member.size, method.size) == ("member", 16, 2)
+    mass, rtol = (column.values for column in member.columns)
+    assert np.all((mass > 1) & (mass < 3) & (rtol > 1e-8) & (rtol < 1e-4)) and len(set(mass)) == 16
+    again = laid_out(linkage, axes, design)[0].columns[0].values
+    assert_allclose(again, mass, rtol=0)
+    assert not np.allclose(laid_out(linkage, axes, type(design)(16, seed=4))[0].columns[0].values, mass)
+
+
+def test_a_latin_hypercube_has_one_member_in_each_part():
+    unit = udk.LatinHypercube(50).unit(3)
+    assert np.all(np.sort(np.floor(50 * unit), axis=0) == np.arange(50)[:, None])
+    assert spread((2.0, 1.0), unit[:, 0]) is None
+
+
+@pytest.mark.parametrize(
+    ("axes", "arguments", "message"),
+    [
+        ({"body.lnik1.mass": [1.0]}, {}, 'is no parameter of the mechanism, nor a setting; did you mean "body.link1.mass"'),
+        ({"rtool": [1.0]}, {}, 'did you mean "rtol"'),
+        ({"body.link1.mass": [1.0, -1.0]}, {}, "mass: must be > 0, is -1.0"),
+        ({"gravity": [1.0, 2.0]}, {}, "gravity: must have the shape (2,), has ()"),
+        ({"rtol": [1e-4, np.nan]}, {}, "must be finite numbers"),
+        ({"rtol": []}, {}, "needs at least one value"),
+        ({"alpha": [1.0]}, {"stabilization": None}, "alpha is a number of stabilization=Baumgarte()"),
+        ({"rtol": [1e-4]}, {"rtol": 1e-3}, "rtol is both a setting and an axis"),
+        ({"rtol": [1e-4], "tol": udk.Axis([1e-3], of="rtol")}, {}, 'axes "rtol" and "tol" both set "rtol"'),
+        ({"z": udk.Zipped({"rtol": [1e-4], "atol": [1e-4, 1e-3]})}, {}, "advance together"),
+        ({"rtol": scipy.stats.loguniform(1e-8, 1e-4)}, {}, "a distribution needs a design"),
+        ({"rtol": [1e-8, 1e-6, 1e-4]}, {"design": udk.Sobol(4)}, "its values are a range (low, high)"),
+        ({"method": [udk.SVD()]}, {"design": udk.Sobol(4)}, "no axis is a range"),
+        ({"time": udk.Axis([1e-8], of="rtol")}, {}, "choose another"),
+        ({}, {}, "a sweep needs at least one"),
+        ({"rtol": [1e-4]}, {"derivatives": ["body.link1.mas"]}, 'did you mean "body.link1.mass"'),
+        ({"rtol": [1e-4]}, {"derivatives": ["gravity"]}, 'is not one number; name an entry, such as "gravity[0]"'),
+        ({"rtol": [1e-4]}, {"throw": True}, "a sweep has no such setting"),
+        ({"rtol": [1e-4]}, {"measure": "finl"}, 'did you mean "final"'),
+        ({"rtol": [1e-4]}, {"measure": "error"}, 'measure "error" needs reference='),
+        ({"rtol": [1e-4]}, {"measure": "error", "reference": np.zeros((3, 4, 3))}, "coordinates at the 2 output times"),
+        ({"rtol": [1e-4]}, {"reference": np.zeros((2, 4, 3))}, 'only the measure "error" looks at it'),
+    ],
+)
+def test_mistakes_are_named(linkage, axes, arguments, message):
+    (problem,) = problems(linkage, axes, **arguments)
+    assert message in problem
+
+
+def test_all_mistakes_are_named_at_once(linkage):
+    assert len(problems(linkage, {"a": [1.0], "b": [2.0]}, "c", derivatives=["d"], progress=True)) == 5
+    with pytest.raises(udk.SweepError, match="engine: there is no 'gpu'; known are auto, devices, dask"):
+        udk.sweep(linkage, {"rtol": [1e-4]}, TS, engine="gpu")
+
+
+def test_gains_are_varied_of_a_stabilization_that_has_some(linkage):
+    assert isinstance(planned(linkage, {"alpha": [1.0, 2.0]}, TS).settings["stabilization"], udk.Baumgarte)
+
+
+def test_the_fingerprint_tells_what_decides_the_results(linkage):
+    def fingerprint(values=(1e-4, 1e-6), measure="final", mechanism=linkage, factor=2.0, **settings):
+        length = udk.Axis([1.0], of=lambda m, x: m.with_parameters({"body.coupler.mass": factor * x}))
+        return planned(mechanism, {"rtol": values, "x": length}, TS, measure, **settings).fingerprint()
+
+    def last(power):
+        return {"angle": lambda m, s: s.q[-1, 0, 2] ** power}
+
+    base = fingerprint()
+    assert fingerprint() == base
+    assert fingerprint(measure=last(2)) == fingerprint(measure=last(2)) != fingerprint(measure=last(3))
+    others = [
+        fingerprint((1e-4, 1e-7)),
+        fingerprint(measure="counts"),
+        fingerprint(mechanism=udk.library.parallelogram(mass=1.5)),
+        fingerprint(factor=3.0),
+        fingerprint(atol=1e-9),
+        fingerprint(method=udk.SVD()),
+        fingerprint(method=udk.SVD(1e-8)),
+        fingerprint(stabilization=udk.Baumgarte(2.0)),
+        fingerprint(derivatives=["body.link1.mass"]),
+    ]
+    assert all(base != other for other in others) and all(a != b for a, b in pairwise(others))
