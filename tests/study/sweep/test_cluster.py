@@ -1,5 +1,7 @@
 """Sweeps on the workers of a cluster, some of which are lost."""
 
+import os
+import signal
 import sys
 import threading
 import time
@@ -13,6 +15,7 @@ from udkjax.study.sweep import cluster
 from udkjax.study.sweep.cluster import ClusterError, dask
 from udkjax.study.sweep.plan import Chunk
 
+dask_config = pytest.importorskip("dask.config", reason="dask is not installed: pip install 'udkjax[dask]'")
 distributed = pytest.importorskip("distributed", reason="dask is not installed: pip install 'udkjax[dask]'")
 
 CHUNKS = [Chunk(k, 0, np.arange(3 * k, 3 * k + 3), 1.0) for k in range(40)]
@@ -23,7 +26,7 @@ PLAN: Any = SimpleNamespace(factor=2.0)
 def client():
     """Workers that are threads of this process."""
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         yield client
@@ -105,6 +108,25 @@ def test_workers_with_other_versions_are_refused(client, monkeypatch):
     monkeypatch.setattr(cluster, "_deciding", lambda: mine if threading.current_thread() is main else other)
     with pytest.raises(ClusterError, match=rf"jax 0\.1 instead of {mine['jax']}$"):
         list(engine(PLAN, CHUNKS))
+
+
+@pytest.mark.slow
+def test_a_chunk_that_kills_its_workers_is_named():
+    """In processes of their own, whose deaths the scheduler forgives less often here."""
+
+    class Deadly:
+        @property
+        def groups(self):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    deadly: Any = Deadly()
+    with (
+        dask_config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as local,
+        distributed.Client(local) as client,
+        pytest.raises(ClusterError, match=r"chunk 0 \(3 members\) was being computed by several workers that died"),
+    ):
+        list(dask(client)(deadly, CHUNKS[:1]))
 
 
 def test_without_dask_or_a_client_the_cure_is_told(monkeypatch):

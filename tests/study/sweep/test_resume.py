@@ -107,7 +107,7 @@ def test_a_worker_that_is_killed_costs_nothing_but_time(tmp_path, whole):
         return mechanism.with_parameters({"body.rod.inertia": value})
 
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         alive = client.run(os.getpid)

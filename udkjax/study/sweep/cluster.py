@@ -89,7 +89,7 @@ def started(scheduler: str | None = None) -> Iterator[Any]:
             yield client
         return
     with (
-        distributed.LocalCluster(n_workers=cores(), threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=cores(), threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         yield client
