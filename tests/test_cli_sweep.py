@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray
 
+import udkjax as udk
 from udkjax.cli import main
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -85,6 +86,17 @@ def test_wrong_input_is_refused_before_anything_is_run(tmp_path, monkeypatch, ca
     assert os.listdir() == [grid.name]
     assert udkjax("sweep", PENDULUM, "nowhere.toml", "--dry-run") == 2
     assert "cannot read nowhere.toml" in capsys.readouterr().err
+
+
+def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys, grid):
+    def interrupted(*_, **choices):
+        assert choices["engine"] == "devices" and choices["memory"] == 2**20 and choices["progress"] is None
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(udk, "sweep", interrupted)
+    arguments = ("--out", tmp_path / "sweep", "--engine", "devices", "--memory", 1)
+    assert udkjax("sweep", PENDULUM, grid, *arguments) == 130
+    assert "the same command goes on from there" in capsys.readouterr().err
 
 
 @pytest.mark.slow
