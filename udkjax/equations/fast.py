@@ -106,19 +106,36 @@ def _(program, primals, tangents):
 
 @partial(_projected.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
-    """Where the residuals vanish the tangents of one Newton step are those of the projection."""
     equations, t, q, v = primals
     q, v, safe = _projected(equations, t, q, v)
+    dq, dv = _correction(equations, t, q, v, tangents)
+    return (q, v, safe), (dq, dv, np.zeros(jnp.shape(safe), jax.dtypes.float0))
+
+
+@jax.custom_jvp
+def as_projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    """A state on the manifold, with the derivatives of a projection that returns it."""
+    del equations, t
+    return q, v
+
+
+@partial(as_projected.defjvp, symbolic_zeros=True)
+def _(primals, tangents):
+    equations, t, q, v = primals
+    dq, dv = _correction(equations, t, q, v, tangents)
+    return (q, v), (dq, dv)
+
+
+def _correction(equations: "Equations", t: Any, q: Vector, v: Vector, tangents: Any) -> Sequence[Array]:
+    """Where the residuals vanish the tangents of one Newton step are those of the projection."""
     primals, moving = (equations, t, q, v), _moving(tangents)
     if not any(moving):
-        dq, dv = jnp.zeros_like(q), jnp.zeros_like(v)
-    elif equations.branches or not equations.code.elimination:
-        dq, dv = _by_plain_form("projection", primals, tangents)
-    else:
-        program = equations.code.derivative("projection", moving).evaluation("projection")
-        kept = _run(program, *jax.lax.stop_gradient(primals))
-        dq, dv = _apply(Linear.at("projection", primals, moving, kept), _those(tangents, moving))
-    return (q, v, safe), (dq, dv, np.zeros(jnp.shape(safe), jax.dtypes.float0))
+        return jnp.zeros_like(q), jnp.zeros_like(v)
+    if equations.branches or not equations.code.elimination:
+        return _by_plain_form("projection", primals, tangents)
+    program = equations.code.derivative("projection", moving).evaluation("projection")
+    kept = _run(program, *jax.lax.stop_gradient(primals))
+    return _apply(Linear.at("projection", primals, moving, kept), _those(tangents, moving))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -179,7 +196,9 @@ def _linear(linear: Linear, vector: Array) -> Array:
 
 @eqxi.filter_primitive_def
 def _shape(linear, vector):
-    found = jax.eval_shape(_linear, *jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), (linear, vector)))
+    found = jax.eval_shape(
+        _linear, *jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), (linear, vector))
+    )
     return jax.core.ShapedArray(found.shape, found.dtype)
 
 

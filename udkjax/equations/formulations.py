@@ -178,6 +178,9 @@ class Formulated(Rewritten):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.project(t, q, v)
 
+    def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        return self.equations.as_projected(t, q, v)
+
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
         return self.equations.tangential(t, q, v, dq, dv)
 

@@ -53,6 +53,10 @@ class Motion(eqx.Module):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """q and v returned to the constraint manifold."""
 
+    def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """A state on the manifold, with the derivatives of a projection that returns it. By default it is projected again."""
+        return self.project(t, q, v)
+
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
         """What projection at q leaves of small changes of positions and velocities. By default: all of them."""
         return dq, dv

@@ -87,6 +87,10 @@ class Equations(MechanismMotion):
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
         return fast.project(self, t, q, v)
 
+    def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """A state on the manifold, with the derivatives that `project` has where it returns it."""
+        return fast.as_projected(self, t, q, v)
+
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
         return fast.tangential(self, t, q, v, dq, dv)
