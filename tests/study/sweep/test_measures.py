@@ -1,0 +1,83 @@
+"""What is kept of a member, and its derivatives."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.study.exact import exact_coordinates
+from udkjax.study.sweep.measures import NOT_REACHED, guessed, measures_of
+
+TS = np.linspace(0.0, 1.0, 6)
+
+
+def test_a_measure_goes_by_the_name_that_it_is_given():
+    def names(measure):
+        return [name for one in measures_of(measure, None, TS) for name in one.variables]
+
+    assert names("final") == ["q_end", "v_end"] and names({"final": "final"}) == ["q_end", "v_end"]
+    assert names({"last": "final", "open": "violation"}) == ["last_q_end", "last_v_end", "open"]
+
+
+def test_only_what_needs_all_output_times_gets_them():
+    assert [m.along for m in measures_of(["final", "counts", "violation", len], None, TS)] == [False, False, True, True]
+
+
+def test_a_users_arrays_are_labelled_by_their_shapes():
+    assert guessed("x", (6, 4, 3), 6, 4).dims == ("time", "body", "coordinate")
+    assert guessed("x", (6, 2), 6, 4).dims == ("time", "x_1")
+    assert guessed("x", (4, 3), 6, 4).dims == ("body", "coordinate")
+    assert guessed("x", (), 6, 4).dims == ()
+
+
+@pytest.mark.slow
+def test_measures_by_name_are_what_one_would_compute():
+    linkage = udk.library.parallelogram()
+    exact = exact_coordinates(linkage, TS, linkage.q0, linkage.v0)
+    axes = {"stabilization": [None, udk.Projection()], "rank_tol": [1e-4, 10.0], "method": [udk.SVD()]}
+    data = udk.sweep(
+        linkage,
+        axes,
+        TS,
+        ["states", "violation", "energy_drift", "error", "rank"],
+        reference=exact,
+        rtol=1e-5,
+        atol=1e-5,
+        progress=False,
+    ).isel(method=0)
+    for k, stabilization in enumerate(axes["stabilization"]):
+        solution = udk.simulate(linkage, TS, rtol=1e-5, atol=1e-5, method=udk.SVD(1e-4), stabilization=stabilization)
+        member, total = data.isel(stabilization=k, rank_tol=0), udk.energy(linkage, solution).total
+        assert_allclose(member.q, solution.q, rtol=0, atol=1e-12)
+        assert_allclose(member.violation, np.abs(udk.violation(linkage, solution)).max(), rtol=0, atol=1e-14)
+        assert_allclose(member.energy_drift, np.abs(total - total[0]).max(), rtol=0, atol=1e-12)
+        assert_allclose(member.position_error, np.abs(solution.q - exact)[..., :2].max(), rtol=0, atol=1e-12)
+        assert np.all(member["rank"] == 11)
+    lost = data.isel(stabilization=0, rank_tol=1)  # no row counts: the bodies fall apart, and that is seen at the first output
+    assert int(lost.result) == udk.Result.drift and lost["rank"].values.tolist()[2:] == [NOT_REACHED] * 4
+    assert np.all(lost["rank"].values[:2] == 0)
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_each_member_by_itself():
+    pendulum, names = udk.library.compound_pendulum(0.8), ["gravity[1]", "mass", "t1", "body.rod.inertia"]
+    axes = {"mass": udk.Axis([1.0, 2.5], of="body.rod.mass"), "t1": [1.0, 0.5], "rtol": [1e-9]}
+
+    def end(gravity, mass, t1, inertia):
+        values = {"body.rod.mass": mass, "gravity[1]": gravity, "body.rod.inertia": inertia}
+        adjoint = diffrax.ForwardMode()
+        return udk.simulate(pendulum.with_parameters(values), TS[[0, -1]] * t1, rtol=1e-9, adjoint=adjoint, throw=False).q[-1]
+
+    data = udk.sweep(pendulum, axes, TS, "final", derivatives=names, progress=False)
+    assert data["d_q_end_d_mass"].dims == data.q_end.dims
+    inertia = float(pendulum.bodies["rod"].inertia)
+    slopes = jax.jit(jax.jacfwd(lambda x: end(*x)))
+    for i, k in ((0, 0), (1, 1)):
+        expected = slopes(jnp.array([-9.81, axes["mass"].values[i], axes["t1"][k], inertia]))
+        member = data.isel(mass=i, t1=k, rtol=0)
+        for column, name in enumerate(names):
+            assert_allclose(member[f"d_q_end_d_{name}"], expected[..., column], rtol=0, atol=1e-10)
+        assert_allclose(member["d_q_end_d_t1"], member.v_end, rtol=0, atol=1e-6)

@@ -1,0 +1,131 @@
+"""Sweeps: each member as a run by itself, failures as data, nothing kept that was not asked for."""
+
+import itertools
+import json
+import pickle
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.study.sweep.chunk import program, run
+from udkjax.study.sweep.cutting import SECONDS, _cut, lane_steps
+from udkjax.study.sweep.dataset import NOT_COMPUTED, assemble
+from udkjax.study.sweep.plan import planned
+
+LINKS = ("link1", "link2", "link3")
+TS = np.linspace(0.0, 1.0, 6)
+MASSES, TOLERANCES = [1.0, 2.5, 4.0], [1e-3, 1e-7, 1e-11]
+STEPS = 15  # too few for the tightest of the tolerances, to the later of the ends
+
+
+def swing(mechanism, solution):
+    return {"highest": jnp.max(solution.q[:, 0, 1]), "path": solution.q[:, 0, :2]}
+
+
+AXES = {"mass": udk.Axis(MASSES, of="body.rod.mass"), "tol": udk.Axis(TOLERANCES, of=["rtol", "atol"]), "t1": [1.0, 0.5]}
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return udk.library.compound_pendulum(0.8)
+
+
+@pytest.fixture(scope="module")
+def reference(pendulum):
+    return np.asarray(udk.simulate(pendulum, TS, rtol=1e-10, atol=1e-10).q)
+
+
+@pytest.fixture(scope="module")
+def plan(pendulum, reference):
+    return planned(pendulum, AXES, TS, ["final", "error", "counts", swing], reference=reference, max_steps=STEPS)
+
+
+@pytest.fixture(scope="module")
+def finished(plan):
+    return [(chunk.members, run(plan, chunk)) for chunk in plan.chunks()]
+
+
+@pytest.fixture(scope="module")
+def data(plan, finished):
+    return assemble(plan, finished)
+
+
+def test_each_member_is_as_by_itself(data, pendulum, reference):
+    for i, j, k in ((0, 0, 0), (2, 1, 0), (1, 1, 1)):
+        mechanism = pendulum.with_parameters({"body.rod.mass": MASSES[i]})
+        solution = udk.simulate(mechanism, TS * AXES["t1"][k], rtol=TOLERANCES[j], atol=TOLERANCES[j])
+        member = data.isel(mass=i, tol=j, t1=k)
+        assert int(member.result) == 0 and int(member.end_time == AXES["t1"][k])
+        assert int(member.steps) == int(solution.stats["steps"]) and int(member.accepted) == int(solution.stats["accepted"])
+        assert_allclose(member.q_end, solution.q[-1], rtol=0, atol=1e-13)
+        assert_allclose(member.v_end, solution.v[-1], rtol=0, atol=1e-13)
+        assert_allclose(member.swing_path, solution.q[:, 0, :2], rtol=0, atol=1e-13)
+        error = np.abs(solution.q - reference)
+        assert_allclose(member.position_error, error[..., :2].max(), rtol=0, atol=1e-13)
+        assert_allclose(member.angle_error, error[..., 2].max(), rtol=0, atol=1e-13)
+
+
+def test_what_fails_is_data(data):
+    tight = data.sel(tol=1e-11, t1=1.0)
+    assert np.all(tight.result == udk.Result.step_limit)
+    assert np.all(np.isnan(tight.q_end)) and np.all(tight.steps == STEPS) and np.all(tight.end_time < 1.0)
+    assert np.all(np.isfinite(tight.swing_path[:, 0])) and np.all(np.isnan(tight.swing_path[:, -1]))
+    assert np.all(data.sel(tol=1e-3).result == 0) and np.all(np.isfinite(data.sel(tol=1e-3).q_end))
+    meanings = dict(zip(data.result.attrs["flag_values"], data.result.attrs["flag_meanings"].split(), strict=True))
+    assert meanings[1] == "step_limit" and meanings[NOT_COMPUTED] == "not_computed"
+    assert "max_steps" in json.loads(data.result.attrs["causes"])["1"]
+
+
+def test_the_dataset_says_what_it_is(data, pendulum):
+    assert data.q_end.dims == ("mass", "tol", "t1", "body", "coordinate")
+    assert data.swing_path.dims[:4] == ("mass", "tol", "t1", "time") and data.swing_highest.dims == ("mass", "tol", "t1")
+    assert (data.mass.attrs["units"], data.t1.attrs["units"], data.mass.attrs["of"]) == ("kg", "s", "body.rod.mass")
+    assert data.time.attrs["units"] == "1"  # runs of other lengths have their own times
+    assert data.attrs["setting_max_steps"] == STEPS and udk.loads(data.attrs["scene"]).name == pendulum.name
+    assert "position_error" in data and "rank" not in data and "q" not in data
+    assert data.attrs["lane_efficiency"] == data.steps.values.sum() / (24 * data.steps.values.max())  # 18 members in 24 lanes
+
+
+def test_what_is_not_finished_is_marked(plan, finished):
+    members, values = finished[0]
+    part = assemble(plan, [(members[:4], {name: array[:4] for name, array in values.items()})])
+    assert np.sum(part.result.values == NOT_COMPUTED) == plan.size - 4
+    assert np.isnan(part.q_end.values[part.result.values == NOT_COMPUTED]).all()
+
+
+def test_copies_of_a_plan_share_its_program(plan, finished, compilations):
+    copy = pickle.loads(pickle.dumps(plan))
+    chunk = plan.chunks()[0]
+    again = {}
+    assert compilations(lambda: again.update(run(copy, chunk))) == []
+    for name, values in finished[0][1].items():
+        assert np.array_equal(again[name], values, equal_nan=True)
+
+
+def test_a_member_does_not_depend_on_its_neighbours(plan, finished):
+    members, values = finished[0]
+    order = np.random.default_rng(0).permutation(len(members))
+    other = program(plan, plan.groups[0])(members[order])
+    assert_allclose(other["q_end"], values["q_end"][order], rtol=0, atol=1e-14)
+    assert np.array_equal(other["steps"], values["steps"][order])
+
+
+def test_chunks_are_cut_by_work_and_by_memory():
+    parts = _cut(np.full(1000, SECONDS / 100), 8, 10_000)
+    assert {part.stop - part.start for part in parts[:-1]} == {96} and parts[-1].stop == 1000
+    assert [part.stop - part.start for part in _cut(np.full(100, SECONDS), 8, 16)] == [8] * 12 + [4]
+    assert {part.stop - part.start for part in _cut(np.zeros(64), 8, 17)} == {16}
+
+
+def test_all_members_are_in_one_chunk_each(plan):
+    chunks = plan.chunks(memory=1)
+    assert sorted(itertools.chain(*(chunk.members.tolist() for chunk in chunks))) == list(range(plan.size))
+    assert [chunk.index for chunk in chunks] == list(range(len(chunks)))
+
+
+def test_lanes_wait_for_the_slowest():
+    assert lane_steps(np.array([4, 2, 2, 1]), 2) == (9, 12)
+    assert lane_steps(np.array([4, 4, 3]), 2) == (11, 14)

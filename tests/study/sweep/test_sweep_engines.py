@@ -1,0 +1,180 @@
+"""Sweeps on several devices, in lanes, through other redundant rows, and the paper's table as one sweep."""
+
+import os
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+import scipy.stats
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations.assembly import close
+from udkjax.study.exact import exact_coordinates
+from udkjax.study.sweep.chunk import program, run
+from udkjax.study.sweep.plan import planned
+
+LINKS = ("link1", "link2", "link3")
+DEVICES = 8
+SCRIPT = """
+import re, sys
+import jax, numpy as np, udkjax as udk
+from udkjax.study.sweep.chunk import program, run
+from udkjax.study.sweep.plan import planned
+
+axes = {"mass": udk.Axis(np.linspace(1.0, 3.0, 20), of="body.rod.mass"), "tol": udk.Axis(np.geomspace(1e-10, 1e-4, 30), of="rtol")}
+plan = planned(udk.library.compound_pendulum(), axes, [0.0, 3.0])
+(chunk,) = plan.chunks()
+found = run(plan, chunk)
+np.savez(sys.argv[1], members=chunk.members, **found)
+own = program(plan, plan.groups[0])
+text = own.compiled[0].as_text()
+print(len(own.devices), len(jax.devices()), f"num_partitions={len(jax.devices())}" in text or len(jax.devices()) == 1)
+print(re.findall("all-reduce|all-gather|all-to-all|collective|reduce-scatter|send|recv", text))
+"""
+
+
+def on(devices: int, file) -> tuple[str, dict]:
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    words = [sys.executable, "-c", SCRIPT, str(file)]
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    said = subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout
+    with np.load(file) as found:
+        return said, dict(found)
+
+
+@pytest.mark.slow
+def test_eight_devices_give_what_one_gives_bit_by_bit_and_do_not_talk(tmp_path):
+    alone, one = on(1, tmp_path / "one.npz")
+    said, many = on(DEVICES, tmp_path / "many.npz")
+    assert said.splitlines() == [f"{DEVICES} {DEVICES} True", "[]"] and alone.splitlines() == ["1 1 True", "[]"]
+    assert one.keys() == many.keys() and len(one["members"]) == 600
+    for name in one:
+        assert np.array_equal(one[name], many[name], equal_nan=True), name
+
+
+@pytest.fixture(scope="module")
+def cart():
+    """A cart in three guides, of which two are enough as long as they are parallel, and a bob on it."""
+    return udk.Mechanism(
+        {"cart": udk.Body(1.0, 0.5), "bob": udk.Body(1.0, 0.1, (0.3, -1.0))},
+        {
+            "a": udk.Slot((udk.GROUND, "cart"), [(0, 0), (0.5, 0)], axis=0.0),
+            "b": udk.Slot((udk.GROUND, "cart"), [(0, 0), (-0.5, 0)], axis=0.0),
+            "c": udk.Slot((udk.GROUND, "cart"), [(0, 0), (0, 0)], axis=0.0),
+            "pin": udk.Revolute(("cart", "bob"), [(0, 0), (-0.3, 1.0)]),
+        },
+    )
+
+
+@pytest.mark.slow
+def test_rows_that_become_independent_count_again(cart):
+    assert cart.left_out == (2,)
+    ts = [0.0, 0.5, 1.0]
+    data = udk.sweep(cart, {"axis": udk.Axis([0.0, 0.3], of="joint.c.axis")}, ts, "states", progress=False)
+    for k, axis in enumerate((0.0, 0.3)):
+        alone = udk.simulate(cart.with_parameters({"joint.c.axis": axis}), ts)
+        assert_allclose(data.q[k], alone.q, rtol=0, atol=1e-12)
+    assert np.all(data.result == 0)
+    assert abs(data.q.values[0, -1, 0, 0]) > 0.1 and abs(data.q.values[1, -1, 0, 0]) < 1e-12  # the cart moves, and is held
+
+
+@pytest.mark.slow
+def test_guesses_that_open_are_closed_and_what_cannot_be_is_data():
+    linkage = udk.library.parallelogram()
+    axes = {"angle": udk.Axis([-0.785, -0.6], of="body.link1.angle"), "reach": udk.Axis([0.5, 0.3], of="joint.B3.points[1][0]")}
+    data = udk.sweep(linkage, axes, [0.0, 1.0], progress=False)
+    assert data.result.values.tolist() == [[0, udk.Result.could_not_assemble]] * 2
+    for k, angle in enumerate((-0.785, -0.6)):
+        alone = udk.simulate(linkage.with_parameters({"body.link1.angle": angle}), [0.0, 1.0])
+        assert_allclose(data.q_end[k, 0], alone.q[-1], rtol=0, atol=1e-10)
+    assert np.all(np.isnan(data.q_end[:, 1]))
+
+
+@pytest.fixture(scope="module")
+def spread():
+    """Ten seconds of the paper's linkage over mass, length, initial angle and tolerance."""
+    axes = {
+        "mass": udk.Axis((0.5, 3.0), of="body.coupler.mass"),
+        "length": udk.Axis((0.7, 1.3), of=lambda m, x: udk.with_length(m, LINKS, x)),
+        "angle": udk.Axis((-0.9, -0.6), of=lambda m, x: udk.with_angle(m, LINKS, x)),
+        "tol": udk.Axis(scipy.stats.loguniform(1e-10, 1e-3), of=["rtol", "atol"]),
+    }
+    return planned(udk.library.parallelogram(), axes, [0.0, 10.0], design=udk.Sobol(4096))
+
+
+@pytest.mark.slow
+def test_lanes_are_busy_and_a_sweep_takes_what_a_plain_batch_takes(spread):
+    """Tolerances from 1e-3 to 1e-10: in the order of the design, less than half of the lanes are busy."""
+    own, chunks = program(spread, spread.groups[0]), spread.chunks()
+    members = np.concatenate([chunk.members for chunk in chunks])
+    steps = np.concatenate([run(spread, chunk)["steps"] for chunk in chunks]).reshape(-1, 64)
+    unordered = np.empty(spread.size)
+    unordered[members] = steps.ravel()
+    unordered = unordered.reshape(-1, 64)
+    assert steps.sum() / (64 * steps.max(axis=1).sum()) > 0.85
+    assert unordered.sum() / (64 * unordered.max(axis=1).sum()) < 0.6
+
+    recipe, numbers = own.recipe, own.recipe.own(members)
+    mechanisms = jax.jit(jax.vmap(lambda own: recipe.mechanism(recipe.shared, own, {})))(numbers)
+    states = jax.vmap(lambda m: udk.State(m.q0, m.v0))(mechanisms)
+
+    @jax.jit
+    @jax.vmap
+    def plain(mechanism, state, tol):
+        return udk.simulate(mechanism, [0.0, 10.0], state, tol, tol, throw=False).q[-1]
+
+    def cpu(function) -> float:
+        start = time.process_time()
+        jax.block_until_ready(function())
+        return time.process_time() - start
+
+    candidates = (lambda: [run(spread, chunk) for chunk in chunks]), (lambda: plain(mechanisms, states, numbers[1]["tol"]))
+    for candidate in candidates:
+        candidate()
+    ratios = [cpu(candidates[0]) / cpu(candidates[1]) for _ in range(5)]
+    assert np.median(ratios) < 1.2
+
+
+@pytest.mark.slow
+def test_members_of_a_random_design_are_as_by_themselves(spread):
+    (chunk, *_) = spread.chunks(memory=1)
+    found = run(spread, chunk)
+    mass, length, angle, tol = (column.values for column in spread.columns)
+    for k, member in enumerate(chunk.members[:3].tolist()):
+        mechanism = spread.mechanism.with_parameters({"body.coupler.mass": mass[member]})
+        mechanism = udk.with_angle(udk.with_length(mechanism, LINKS, length[member]), LINKS, angle[member])
+        assert np.abs(close(mechanism).state.q - mechanism.q0).max() < 1e-12
+        alone = udk.simulate(mechanism, [0.0, 10.0], rtol=tol[member], atol=tol[member])
+        assert_allclose(found["q_end"][k], alone.q[-1], rtol=0, atol=1e-8)
+        assert abs(int(found["steps"][k]) - int(alone.stats["steps"])) <= 2
+
+
+@pytest.mark.slow
+def test_the_papers_table_is_one_sweep():
+    """Five methods with its rule for the rank, three tolerances, with its gains and without, by its kind of integrator."""
+    linkage, ts = udk.library.parallelogram(), np.linspace(0.0, 0.2, 5)
+    methods = [method.absolute(0.0) for method in (udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt)]
+    axes = {
+        "method": methods,
+        "tol": udk.Axis([1e-10, 1e-8, 1e-6], of=["rtol", "atol", "rank_tol"]),
+        "stabilization": [udk.Baumgarte(0.0, 0.0), udk.Baumgarte(1000.0, 100.0)],
+    }
+    settings = {"solver": udk.Adams(), "dt0": 0.66e-2, "drift_tol": np.inf, "max_steps": 200_000}
+    exact = exact_coordinates(linkage, ts, linkage.q0, linkage.v0)
+    plan = planned(linkage, axes, ts, ["error", "counts", "rank"], reference=exact, **settings)
+    assert len(plan.groups) == 5  # gains are numbers
+    data = udk.sweep(linkage, axes, ts, ["error", "counts", "rank"], reference=exact, progress=False, **settings)
+    assert data.angle_error.shape == (5, 3, 2) and np.all(data.result == 0)
+    assert np.all(data.angle_error <= 100 * data.tol)
+    assert np.all(data.steps[..., 1] > 2 * data.steps[..., 0])  # stiff
+    gains, method = data.stabilization.values.tolist(), udk.Varga.absolute(1e-8)
+    assert gains == ["Baumgarte(alpha=0, beta=0)", "Baumgarte(alpha=1000, beta=100)"]
+    assert data.method.values.tolist() == ["SVD", "Varga", "Greville", "Householder", "GramSchmidt"]
+    alone = udk.simulate(linkage, ts, None, 1e-8, 1e-8, method, udk.Baumgarte(0.0, 0.0), **settings)
+    member = data.sel(method="Varga", tol=1e-8, stabilization=gains[0])
+    assert int(member.steps) == int(alone.stats["steps"])
+    assert_allclose(member.angle_error, np.abs(alone.q - exact)[..., 2].max(), rtol=1e-6)
