@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.alike import Fields
 from udkjax.equations.code import CONSISTENT, TINY, structure
+from udkjax.equations.large_plain import branch, by_method, plain_accelerations, plain_correction, plain_project, plain_tangential
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
 from udkjax.equations.motion import MechanismMotion, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
@@ -63,10 +63,10 @@ class LargeEquations(MechanismMotion):
             return jnp.zeros(0)
 
         def solve(plus: Plus, rows: Selection) -> Vector:
-            b = self._arrays(rows, ["b"], t, q, v, self._free(t, q, v))[0]
+            b = self.arrays(rows, ["b"], t, q, v, self.free(t, q, v))[0]
             return rows.listed(by_block(-(plus.T @ (plus @ flat(b))), rows.height))
 
-        return _by_method(self.exact() if self.by_levels and self.left_out else self, solve, t, q, v)
+        return by_method(self.exact() if self.by_levels and self.left_out else self, solve, t, q, v)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
@@ -74,7 +74,7 @@ class LargeEquations(MechanismMotion):
 
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
-        return _compiled(_tangential, self, t, q, v, dq, dv)
+        return _compiled(plain_tangential, self, t, q, v, dq, dv)
 
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""
@@ -82,14 +82,14 @@ class LargeEquations(MechanismMotion):
 
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
         """Whether everything that the equation is made of is a number."""
-        free = self._free(t, q, v)
-        made_of = [*self._arrays(self.layout.all, ["D", "b"], t, q, v, free), free]
+        free = self.free(t, q, v)
+        made_of = [*self.arrays(self.layout.all, ["D", "b"], t, q, v, free), free]
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in made_of]))
 
     def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
         """M, F, Psi_q and gamma - 2 alpha Psi_dot - beta^2 Psi, of all rows, dense."""
-        free = self._free(t, q, v)
-        D, b = self._arrays(self.layout.all, ["D", "b"], t, q, v, free)
+        free = self.free(t, q, v)
+        D, b = self.arrays(self.layout.all, ["D", "b"], t, q, v, free)
         root, free = flat(self.numbers["root"]), flat(free)
         M, A = 1 / root**2, self.layout.all.dense(D) / root
         return jnp.diag(M), M * free, A, self.layout.all.listed(b) + A @ free
@@ -101,7 +101,7 @@ class LargeEquations(MechanismMotion):
 
     def weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """D, Psi and M^(-1/2) of all rows, dense."""
-        D, psi = self._arrays(self.layout.all, ["D", "psi"], t, q, q)
+        D, psi = self.arrays(self.layout.all, ["D", "psi"], t, q, q)
         return self.layout.all.dense(D), self.layout.all.listed(psi), flat(self.numbers["root"])
 
     def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
@@ -121,11 +121,11 @@ class LargeEquations(MechanismMotion):
     def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Plus, Array, Vector]:
         """D^+ by the method, dense and of all rows or by blocks of those kept; the residual `name` of these; and M^(-1/2)."""
         root, name = flat(self.numbers["root"]), _RESIDUALS[name]
-        free = self._free(t, q, v) if name == "b" else None
+        free = self.free(t, q, v) if name == "b" else None
         rows = self.layout.kept if self.by_levels else self.layout.all
-        D, residual = self._arrays(rows, ["D", name], t, q, v, free)
+        D, residual = self.arrays(rows, ["D", name], t, q, v, free)
         if self.by_levels:
-            return self._elimination.plus(D), flat(residual), root
+            return self.elimination.plus(D), flat(residual), root
         if isinstance(self.method, BlockElimination):
             plus = self.method.plus(D)
             return eqx.tree_at(lambda p: p.factors.rank, plus, self._rank(D, t, q)), flat(residual), root
@@ -178,7 +178,8 @@ class LargeEquations(MechanismMotion):
         return self.method.branch_tol if isinstance(self.method, Auto) else jnp.asarray(self.method.rank_tol) ** 2
 
     @property
-    def _elimination(self) -> BlockElimination:
+    def elimination(self) -> BlockElimination:
+        """D^+ of the rows kept, by levels."""
         return BlockElimination(self.layout.kept.pattern, jnp.sqrt(jnp.asarray(self.drop)))
 
     def _rank(self, D: Float[Array, "r 3 s"], t: Any, q: Vector) -> Array:
@@ -186,7 +187,7 @@ class LargeEquations(MechanismMotion):
         every, kept = self.layout.all, self.layout.kept
         if not self.left_out:
             return jnp.asarray(self.layout.count)
-        plus = self._elimination.plus(self._arrays(kept, ["D"], t, q, q)[0])
+        plus = self.elimination.plus(self.arrays(kept, ["D"], t, q, q)[0])
         motion = jnp.asarray(np.random.default_rng(0).standard_normal(3 * self.layout.bodies))
         motion = motion - plus @ plus.method.matvec(plus.matrix, motion)
         missed = every.listed(every.pattern.matvec(D, by_block(motion, 3)))
@@ -199,10 +200,11 @@ class LargeEquations(MechanismMotion):
         fields = fields_of(q, v)
         return fields if free is None else fields | dict(zip(("fx", "fy", "fangle"), free, strict=True))
 
-    def _arrays(self, rows: Selection, names: Sequence[str], t: Any, q: Vector, v: Vector, free: Any = None) -> list[Array]:
+    def arrays(self, rows: Selection, names: Sequence[str], t: Any, q: Vector, v: Vector, free: Any = None) -> list[Array]:
+        """`names`, of D, b, psi and psi_dot, of some rows in blocks; b takes a_F."""
         return rows.evaluate(names, self.numbers["constraints"], t, self._fields(q, v, free))
 
-    def _free(self, t: Any, q: Vector, v: Vector) -> Float[Array, "3 bodies"]:
+    def free(self, t: Any, q: Vector, v: Vector) -> Float[Array, "3 bodies"]:
         """a_F = M^-1 F."""
         fall = jnp.broadcast_to(self.numbers["gravity"][:, None], (3, self.layout.bodies))
         if self.layout.loaded is None:
@@ -230,7 +232,7 @@ def prepare_closing(mechanism: Mechanism) -> LargeEquations:
 
 def _violation(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
     rows = equations.layout.all
-    psi, rate = equations._arrays(rows, ["psi", "psi_dot"], t, q, v)
+    psi, rate = equations.arrays(rows, ["psi", "psi_dot"], t, q, v)
     return rows.listed(psi), rows.listed(rate)
 
 
@@ -244,79 +246,6 @@ def _called(function: Any, *arguments: Any) -> Any:
     return function(*arguments)
 
 
-# --- plain
-
-
-def plain_accelerations(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> Vector:
-    """a = a_F + M^(-1/2) D^+ b."""
-    free, root = equations._free(t, q, v), flat(equations.numbers["root"])
-
-    def solve(plus: Any, rows: Selection) -> Vector:
-        b = equations._arrays(rows, ["b"], t, q, v, free)[0]
-        return flat(free) + root * (plus @ flat(b))
-
-    return _by_method(equations, solve, t, q, v)
-
-
-def plain_project(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """Two Newton steps in position and one in velocity."""
-    root = flat(equations.numbers["root"])
-
-    def step(name: str, q: Vector) -> Vector:
-        def solve(plus: Any, rows: Selection) -> Vector:
-            return -root * (plus @ flat(equations._arrays(rows, [name], t, q, v)[0]))
-
-        return _by_method(equations, solve, t, q, v)
-
-    q = q + step("psi", q)
-    q = q + step("psi", q)
-    return q, v + step("psi_dot", q)
-
-
-def _plain_correction(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """One Newton step in position and one in velocity, with one D^+: of a projected state it changes the tangents alone."""
-    root = flat(equations.numbers["root"])
-
-    def step(plus: Any, rows: Selection) -> tuple[Vector, Vector]:
-        psi = equations._arrays(rows, ["psi"], t, q, v)[0]
-        closed = q - root * (plus @ flat(psi))
-        rate = equations._arrays(rows, ["psi_dot"], t, closed, v)[0]
-        return closed, v - root * (plus @ flat(rate))
-
-    return _by_method(equations, step, t, q, v)
-
-
-def _tangential(equations: LargeEquations, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
-    root = flat(equations.numbers["root"])
-
-    def left(plus: Any, rows: Selection) -> tuple[Vector, Vector]:
-        first, second = (x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv))
-        return first, second
-
-    return _by_method(equations, left, t, q, v) if len(equations.layout.kept.rows) else (dq, dv)
-
-
-def _by_method(equations: LargeEquations, use: Any, t: Any, q: Vector, v: Vector) -> Any:
-    """Call `use` with D^+ by the equations' method, and the rows that it is of."""
-    layout = equations.layout
-    if not len(layout.kept.rows):
-        return use(_Unconstrained(), layout.kept)
-    if not equations.by_levels:
-        D = equations._arrays(layout.all, ["D"], t, q, v)[0]
-        return use(DenseParts(layout.all.pattern, equations.method).plus(D), layout.all)
-    plus = equations._elimination.plus(equations._arrays(layout.kept, ["D"], t, q, v)[0])
-    if not equations.branches:
-        return use(plus, layout.kept)
-    return _branch(plus.rank > 0, lambda: use(plus, layout.kept), lambda: _by_method(equations.exact(), use, t, q, v))
-
-
-class _Unconstrained:
-    """D^+ of no rows at all."""
-
-    def __matmul__(self, b: Any) -> float:
-        return 0.0
-
-
 def _plainly(equations: LargeEquations, t: Any, q: Vector, v: Vector, _: bool) -> Vector:
     return plain_accelerations(equations, t, q, v)
 
@@ -327,10 +256,10 @@ def _plainly(equations: LargeEquations, t: Any, q: Vector, v: Vector, _: bool) -
 @partial(jax.custom_jvp, nondiff_argnums=(4,))
 def _accelerations(equations: LargeEquations, t: Any, q: Vector, v: Vector, watch: bool) -> Vector:
     layout, root = equations.layout, equations.numbers["root"]
-    free = equations._free(t, q, v)
+    free = equations.free(t, q, v)
     if not len(layout.kept.rows):
         return flat(free)
-    D, b = equations._arrays(layout.kept, ["D", "b"], t, q, v, free)
+    D, b = equations.arrays(layout.kept, ["D", "b"], t, q, v, free)
     pattern = layout.kept.pattern
     factors, safe = factorized(pattern, D, equations.drop)
     x = pattern.rmatvec(D, pattern.levels.solve(factors, b.T).T)
@@ -343,7 +272,7 @@ def _accelerations(equations: LargeEquations, t: Any, q: Vector, v: Vector, watc
 def _satisfied(equations: LargeEquations, t: Any, q: Vector, v: Vector, free: Array, x: Array) -> Bool[Array, ""]:
     """Whether the accelerations satisfy the rows left out, too: D x = b, relative to the size of its terms."""
     rows = equations.layout.all
-    D, b = equations._arrays(rows, ["D", "b"], t, q, v, free)
+    D, b = equations.arrays(rows, ["D", "b"], t, q, v, free)
     sum_of = rows.pattern.matvec
     return jnp.all(jnp.abs(sum_of(D, x) - b) <= CONSISTENT * (sum_of(jnp.abs(D), jnp.abs(x)) + jnp.abs(b)) + TINY)
 
@@ -358,7 +287,7 @@ def _(primals, tangents):
     """Where the residuals vanish the tangents of one Newton step are those of the projection."""
     equations, t, q, v = primals
     q, v = _project(equations, t, q, v)
-    return (q, v), jax.jvp(_plain_correction, (equations, t, q, v), tangents)[1]
+    return (q, v), jax.jvp(plain_correction, (equations, t, q, v), tangents)[1]
 
 
 def _fast_project(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
@@ -366,15 +295,15 @@ def _fast_project(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tu
     rows, root = equations.layout.kept, equations.numbers["root"]
     if not len(rows.rows):
         return q, v
-    D, psi = equations._arrays(rows, ["D", "psi"], t, q, v)
+    D, psi = equations.arrays(rows, ["D", "psi"], t, q, v)
     factors, safe = factorized(rows.pattern, D, equations.drop)
 
     def without(x: Vector, residual: Array) -> Vector:
         return x - flat(root * rows.pattern.rmatvec(D, rows.pattern.levels.solve(factors, residual.T).T))
 
     q1 = without(q, psi)
-    q2 = without(q1, equations._arrays(rows, ["psi"], t, q1, v)[0])
-    result = q2, without(v, equations._arrays(rows, ["psi_dot"], t, q2, v)[0])
+    q2 = without(q1, equations.arrays(rows, ["psi"], t, q1, v)[0])
+    result = q2, without(v, equations.arrays(rows, ["psi_dot"], t, q2, v)[0])
     return _checked(equations, safe, result, plain_project, t, q, v)
 
 
@@ -387,10 +316,4 @@ def _checked(equations: LargeEquations, safe: Bool[Array, ""], fast: Any, plain:
         return fast
     if not equations.branches:
         return jax.tree.map(lambda x: jnp.where(safe, x, jnp.nan), fast)
-    return _branch(safe, lambda: fast, lambda: plain(equations.exact(), *state))
-
-
-def _branch(safe: Bool[Array, ""], fast: Any, careful: Any) -> Any:
-    """One of two results; under vmap, `careful` is taken for all as soon as one is in need of it."""
-    where = lambda a, b: jnp.where(safe, a, b)  # noqa: E731
-    return jax.lax.cond(eqxi.unvmap_all(safe), fast, lambda: jax.tree.map(where, fast(), careful()))
+    return branch(safe, lambda: fast, lambda: plain(equations.exact(), *state))
