@@ -24,7 +24,7 @@ def sweep(inertia: Any = None, **choices: Any) -> Any:
         "body.rod.inertia": udk.Axis(np.linspace(0.05, 0.5, 80), of=inertia),
         "tol": udk.Axis(10.0 ** np.arange(-9, -1), of=("rtol", "atol")),
     }
-    settings = {"method": udk.Elimination(), "progress": False, **choices}
+    settings = {"method": udk.Elimination(), "stabilization": None, "progress": False, **choices}
     return udk.sweep(udk.library.compound_pendulum(), axes, [0.0, 1.0], ("final", "violation"), memory=1, **settings)
 
 
