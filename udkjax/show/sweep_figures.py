@@ -205,7 +205,7 @@ def _words(data: Any, name: str) -> str:
 
 def _value(data: Any, dim: str, index: int) -> str:
     value = data[dim].values[index]
-    return f"{dim} {value:g}" if data[dim].dtype.kind in "iuf" else str(value)
+    return f"{dim} {value:.4g}" if data[dim].dtype.kind in "iuf" else str(value)
 
 
 def _label(axes: Axes, right: str, up: str) -> None:
