@@ -58,6 +58,15 @@ def test_what_is_finished_is_left_out_and_given_back(tmp_path, place):
     assert isinstance(kept, Memory if place is None else Store)
 
 
+def test_what_is_kept_may_have_any_name(tmp_path):
+    given = {name: np.array([k, 2 * k]) for k, name in enumerate(("file", "members", "allow_pickle", "kept/x", "a b"))}
+    with Store(tmp_path, FINGERPRINT) as kept:
+        kept.write(CHUNKS[0], given)
+        ((members, found),) = kept.finished()
+    np.testing.assert_array_equal(members, CHUNKS[0].members)
+    assert {name: values.tolist() for name, values in found.items()} == {name: v.tolist() for name, v in given.items()}
+
+
 def test_a_sweep_goes_on_where_it_was_cut_into_other_chunks(tmp_path):
     with Store(tmp_path, FINGERPRINT) as kept:
         kept.write(CHUNKS[0], data(CHUNKS[0]))

@@ -23,7 +23,7 @@ from udkjax.study.sweep.plan import Chunk
 
 FORMAT = 1
 MANIFEST, CHUNKS, LOCK = "sweep.json", "chunks", "lock"
-MEMBERS = "members"  # the name under which a file keeps whom its numbers belong to
+MEMBERS, KEPT = "members", "kept/"  # in a file: whom its numbers belong to, and what goes before the names of these
 
 Data = Mapping[str, np.ndarray]
 
@@ -98,7 +98,10 @@ class Store(Kept):
     def write(self, chunk: Chunk, data: Data) -> None:
         """Write what a chunk gave, whole or not at all."""
         members = np.asarray(chunk.members)
-        self._write(f"{CHUNKS}/{_name(chunk.index, members)}", packed({MEMBERS: members, **data}))
+        self._write(
+            f"{CHUNKS}/{_name(chunk.index, members)}",
+            packed({MEMBERS: members, **{KEPT + name: values for name, values in data.items()}}),
+        )
 
     def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
         """Iterate over what is finished, one file at a time: members, and their data. Damaged files are removed."""
@@ -108,7 +111,8 @@ class Store(Kept):
                 warnings.warn(f"{file} is damaged: what it held is computed again", stacklevel=2)
                 file.unlink()
             else:
-                yield data.pop(MEMBERS), data
+                members = data.pop(MEMBERS)
+                yield members, {name.removeprefix(KEPT): values for name, values in data.items()}
 
     def _begin(self, sweep: dict[str, Any]) -> None:
         """Say what the sweep is; where something is there already, compare."""
