@@ -23,7 +23,13 @@ BELOW = {
     "study": {"integrate", "equations", "scene", "pinv", "straightline"},
     "show": {"environment", "study", "integrate", "equations", "scene", "pinv", "straightline"},
 }
-ONLY_IN = {"diffrax": {"integrate", "cli"}, "matplotlib": {"show"}, "tyro": {"cli"}, "msgspec": {"scene"}, "distributed": {"study"}}
+ONLY_IN = {
+    "diffrax": {"integrate", "cli"},
+    "matplotlib": {"show"},
+    "tyro": {"cli"},
+    "msgspec": {"scene"},
+    "distributed": {"study"},
+}
 
 
 def imports(file: Path, package: str) -> Iterator[str]:
