@@ -118,6 +118,7 @@ def test_chunks_are_cut_by_work_and_by_memory():
     assert {part.stop - part.start for part in parts[:-1]} == {96} and parts[-1].stop == 1000
     assert [part.stop - part.start for part in _cut(np.full(100, SECONDS), 8, 16)] == [8] * 12 + [4]
     assert {part.stop - part.start for part in _cut(np.zeros(64), 8, 17)} == {16}
+    assert _cut(np.zeros(23), 8, 100) == [slice(0, 23)]
 
 
 def test_all_members_are_in_one_chunk_each(plan):

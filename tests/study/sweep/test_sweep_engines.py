@@ -25,7 +25,7 @@ import jax, numpy as np, udkjax as udk
 from udkjax.study.sweep.chunk import program, run
 from udkjax.study.sweep.plan import planned
 
-axes = {"mass": udk.Axis(np.linspace(1.0, 3.0, 20), of="body.rod.mass"), "tol": udk.Axis(np.geomspace(1e-10, 1e-4, 30), of="rtol")}
+axes = {"mass": udk.Axis(np.linspace(1.0, 3.0, 20), of="body.rod.mass"), "rtol": np.geomspace(1e-10, 1e-4, 30)}
 plan = planned(udk.library.compound_pendulum(), axes, [0.0, 3.0])
 (chunk,) = plan.chunks()
 found = run(plan, chunk)

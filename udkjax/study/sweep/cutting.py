@@ -46,8 +46,9 @@ def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int) -> list[slice]:
     total = np.concatenate([[0.0], np.cumsum(seconds)])
     while start < len(seconds):
         enough = int(np.searchsorted(total, total[start] + SECONDS, side="right")) - 1 - start
-        size = min(most, max(piece, enough // piece * piece))
-        parts.append(slice(start, min(start + size, len(seconds))))
+        rest = len(seconds) - start
+        size = rest if rest <= min(most, enough) else min(most, max(piece, enough // piece * piece), rest)
+        parts.append(slice(start, start + size))
         start += size
     return parts
 
