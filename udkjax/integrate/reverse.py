@@ -32,13 +32,15 @@ def reversible(problem: Problem, integrate: Callable[[Problem], Raw]) -> Raw:
 
     def forward(inputs: Any) -> Any:
         values = jax.tree.map(lambda x: x.value, inputs)
-        moving = eqx.filter(values, jax.tree.map(lambda x: x.perturbed, inputs))
+        # In shapes, not in the tree: JAX may take the residual of one call apart by the tree of another.
+        moves = jax.tree.map(lambda x: jnp.zeros(int(x.perturbed)), inputs)
         problem = eqx.combine(values, static)
         raw, record = _recorded(problem) if replayed else (integrate(problem), None)
-        return raw, (values, moving, raw, record)
+        return raw, (values, moves, raw, record)
 
     def backward(residual: Any, cotangents: Raw) -> Any:
-        values, moving, raw, record = residual
+        values, moves, raw, record = residual
+        moving = eqx.filter(values, jax.tree.map(lambda x: x.size > 0, moves))
         problem = eqx.combine(values, static)
         ys, y = (_instantiated(x) for x in (cotangents.ys, cotangents.y))
         if replayed:
