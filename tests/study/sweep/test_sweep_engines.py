@@ -175,6 +175,6 @@ def test_the_papers_table_is_one_sweep():
     assert gains == ["Baumgarte(alpha=0, beta=0)", "Baumgarte(alpha=1000, beta=100)"]
     assert data.method.values.tolist() == ["SVD", "Varga", "Greville", "Householder", "GramSchmidt"]
     alone = udk.simulate(linkage, ts, None, 1e-8, 1e-8, method, udk.Baumgarte(0.0, 0.0), **settings)
-    member = data.sel(method="Varga", tol=1e-8, stabilization=gains[0])
+    member = data.sel({"method": "Varga", "tol": 1e-8, "stabilization": gains[0]})  # sel has a method of its own
     assert int(member.steps) == int(alone.stats["steps"])
     assert_allclose(member.angle_error, np.abs(alone.q - exact)[..., 2].max(), rtol=1e-6)
