@@ -68,13 +68,21 @@ class Twin:
         return cls.loads(mechanism, t, q, v) - jax.grad(cls.potential, 2)(mechanism, t, q, v)
 
     @classmethod
+    def terms(cls, mechanism, t, q, v):
+        """Psi_q, gamma, M and F."""
+        A, gamma = cls.psi_q(mechanism, t, q), cls.gamma(mechanism, t, q, v)
+        return A, gamma, jnp.diag(cls.mass(mechanism)), cls.force(mechanism, t, q, v)
+
+    @classmethod
     def kkt(cls, mechanism, t, q, v):
         """Accelerations and multipliers from M a + Psi_q^T lambda = F, Psi_q a = gamma, in the sense of least squares."""
-        A, gamma = (np.asarray(f(mechanism, t, q, *r)) for f, r in ((cls.psi_q, ()), (cls.gamma, (v,))))
-        M, F = np.diag(cls.mass(mechanism)), np.asarray(cls.force(mechanism, t, q, v))
+        A, gamma, M, F = (np.asarray(x) for x in TERMS(mechanism, jnp.asarray(t), jnp.asarray(q), jnp.asarray(v)))
         matrix = np.block([[M, A.T], [A, np.zeros((len(A), len(A)))]])
         solution = np.linalg.lstsq(matrix, np.concatenate([F, gamma]), rcond=1e-9)[0]
         return solution[: len(q)], solution[len(q) :]
+
+
+TERMS = jax.jit(Twin.terms)  # operation by operation they are hundreds of programs
 
 
 @pytest.fixture(scope="session")
@@ -89,6 +97,7 @@ def closed():
     def state(mechanism, seed=0):
         q, t = mechanism.q0.ravel(), jnp.array(0.0)
         v = jnp.asarray(np.random.default_rng(seed).standard_normal(q.shape))
-        return q, v - jnp.linalg.pinv(Twin.psi_q(mechanism, t, q), rtol=1e-9) @ Twin.psi_dot(mechanism, t, q, v)
+        A, rate = jax.jit(lambda m, t, q, v: (Twin.psi_q(m, t, q), Twin.psi_dot(m, t, q, v)))(mechanism, t, q, v)
+        return q, v - jnp.linalg.pinv(A, rtol=1e-9) @ rate
 
     return state

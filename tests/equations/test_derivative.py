@@ -37,7 +37,7 @@ def inner(a, b):
 @pytest.mark.parametrize(
     ("scene", "method", "baumgarte"),
     [
-        ("driven", ELIMINATION, BAUMGARTE),
+        pytest.param("driven", ELIMINATION, BAUMGARTE, marks=pytest.mark.barriers),
         pytest.param("parallelogram", udk.Auto(), None, marks=pytest.mark.slow),
         *(pytest.param(scene, udk.Auto(), BAUMGARTE, marks=pytest.mark.slow) for scene in SCENES),
     ],

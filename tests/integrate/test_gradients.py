@@ -192,6 +192,7 @@ def test_gradient_of_a_trajectory_forward(method):
     check(*forward(method=method))
 
 
+@pytest.mark.barriers
 @pytest.mark.parametrize("method", fast("Elimination"))
 def test_gradient_of_a_trajectory_reverse(method):
     check(*reverse(method=method))
