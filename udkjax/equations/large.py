@@ -72,6 +72,10 @@ class LargeEquations(MechanismMotion):
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
         return _compiled(_project, self, t, q, v)
 
+    def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """A state on the manifold, with the derivatives that `project` has where it returns it."""
+        return _compiled(_as_projected, self, t, q, v)
+
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
         return _compiled(plain_tangential, self, t, q, v, dq, dv)
@@ -284,10 +288,21 @@ def _project(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[V
 
 @_project.defjvp
 def _(primals, tangents):
-    """Where the residuals vanish the tangents of one Newton step are those of the projection."""
     equations, t, q, v = primals
-    q, v = _project(equations, t, q, v)
-    return (q, v), jax.jvp(plain_correction, (equations, t, q, v), tangents)[1]
+    return jax.jvp(_as_projected, (equations, t, *_project(equations, t, q, v)), tangents)
+
+
+@jax.custom_jvp
+def _as_projected(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    del equations, t
+    return q, v
+
+
+@_as_projected.defjvp
+def _(primals, tangents):
+    """Where the residuals vanish the tangents of one Newton step are those of the projection."""
+    _, _, q, v = primals
+    return (q, v), jax.jvp(plain_correction, primals, tangents)[1]
 
 
 def _fast_project(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
