@@ -159,3 +159,24 @@ def test_other_methods(solver):
     choices = {"solver": solver_named(solver), "rtol": 1e-6, "atol": 1e-6}
     forward = jax.jit(jax.jacfwd(lambda x: total(x, adjoint=ForwardMode(), **choices)))(X)
     assert_same(jax.jit(jax.grad(lambda x: total(x, **choices)))(X), forward, 1e-12)
+
+
+@pytest.mark.slow
+def test_steps_taken_with_care():
+    """Released from rest where all links of the linkage are in line: the first steps take singular values."""
+    from diffrax import ForwardMode
+
+    linkage = udk.library.parallelogram(0.0)
+
+    def end(x, **choices):
+        angle, gravity = x
+        along = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        links = [jnp.append(jnp.array([x0, 0.0]) + along / 2, angle) for x0 in (0.0, 1.0, 2.0)]
+        q = jnp.stack([*links, jnp.append(jnp.array([1.0, 0.0]) + along, 0.0)])
+        m = linkage.with_parameters({"gravity": jnp.stack([0.0 * gravity, -gravity])})
+        solution = udk.simulate(m, [0.0, 0.5, 1.0], udk.State(q, jnp.zeros((4, 3))), dt0=0.03, throw=False, **choices)
+        return jnp.stack([solution.q[1:, 0, 2], solution.v[1:, 0, 2]])
+
+    x = (jnp.array(0.0), jnp.array(9.81))
+    forward = jax.jit(jax.jacfwd(lambda x: end(x, adjoint=ForwardMode())))(x)
+    assert_same(jax.jit(jax.jacrev(end))(x), forward, 1e-8)
