@@ -3,6 +3,7 @@
 import itertools
 import json
 import pickle
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -60,12 +61,14 @@ def test_each_member_is_as_by_itself(data, pendulum, reference):
         member = data.isel(mass=i, tol=j, t1=k)
         assert int(member.result) == 0 and int(member.end_time == AXES["t1"][k])
         assert int(member.steps) == int(solution.stats["steps"]) and int(member.accepted) == int(solution.stats["accepted"])
-        assert_allclose(member.q_end, solution.q[-1], rtol=0, atol=1e-13)
-        assert_allclose(member.v_end, solution.v[-1], rtol=0, atol=1e-13)
-        assert_allclose(member.swing_path, solution.q[:, 0, :2], rtol=0, atol=1e-13)
+        # Rounding changes the sizes of steps a little, and with them a small part of the error that the tolerance allows.
+        near = partial(assert_allclose, rtol=0, atol=1e-13 + 1e-6 * TOLERANCES[j])
+        near(member.q_end, solution.q[-1])
+        near(member.v_end, solution.v[-1])
+        near(member.swing_path, solution.q[:, 0, :2])
         error = np.abs(solution.q - reference)
-        assert_allclose(member.position_error, error[..., :2].max(), rtol=0, atol=1e-13)
-        assert_allclose(member.angle_error, error[..., 2].max(), rtol=0, atol=1e-13)
+        near(member.position_error, error[..., :2].max())
+        near(member.angle_error, error[..., 2].max())
 
 
 def test_what_fails_is_data(data):

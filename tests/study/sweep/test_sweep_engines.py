@@ -178,3 +178,23 @@ def test_the_papers_table_is_one_sweep():
     member = data.sel({"method": "Varga", "tol": 1e-8, "stabilization": gains[0]})  # sel has a method of its own
     assert int(member.steps) == int(alone.stats["steps"])
     assert_allclose(member.angle_error, np.abs(alone.q - exact)[..., 2].max(), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_mechanisms_with_other_bodies_states_and_formulations_beside_each_other():
+    one, two = udk.library.compound_pendulum(), udk.library.double_pendulum()
+    mechanisms = [one, two, udk.library.compound_pendulum(0.3)]
+    data = udk.sweep(one, {"mechanism": mechanisms, "max_steps": [5, 1000]}, [0.0, 1.0], progress=False)
+    assert data.body.values.tolist() == ["rod", "upper", "lower"]
+    assert data.result.values.tolist() == [[udk.Result.step_limit, 0]] * 3
+    for k, bodies in enumerate((["rod"], ["upper", "lower"], ["rod"])):
+        member = data.q_end.isel(mechanism=k).sel(max_steps=1000)
+        assert_allclose(member.sel(body=bodies), udk.simulate(mechanisms[k], [0.0, 1.0]).q[-1], rtol=0, atol=1e-12)
+        assert np.isfinite(member).sum() == 3 * len(bodies)
+
+    states = [udk.assemble(mechanism) for mechanism in (one, udk.library.compound_pendulum(0.5))]
+    axes = {"state": states, "formulation": [None, udk.Augmented()]}
+    data = udk.sweep(one, axes, [0.0, 1.0], progress=False)
+    for k, state in enumerate(states):
+        for found in data.q_end[k]:
+            assert_allclose(found, udk.simulate(one, [0.0, 1.0], state).q[-1], rtol=0, atol=1e-10)

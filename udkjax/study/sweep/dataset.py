@@ -69,14 +69,9 @@ def _put(into: np.ndarray, variable: Variable, members: np.ndarray, values: np.n
         into[(members, *(slice(n) for n in values.shape[1:]))] = values
 
 
-def _bodies(plan: Plan) -> list[str]:
-    """The bodies of all mechanisms, in their order."""
-    return list(dict.fromkeys(name for group in plan.groups for name in plan.choice(group, "mechanism").body_names))
-
-
 def _places(plan: Plan) -> dict[int, list[int]]:
     """For each group, the places of its bodies among all bodies, where it has not all of them."""
-    everyone = _bodies(plan)
+    everyone = list(plan.bodies)
     own = {group.index: list(plan.choice(group, "mechanism").body_names) for group in plan.groups}
     return {index: [everyone.index(name) for name in names] for index, names in own.items() if names != everyone}
 
@@ -94,7 +89,7 @@ def _coordinates(plan: Plan) -> dict[str, Any]:
         part = "time", fractions, {"units": "1", "long_name": "part of the span from the start to t1"}
         found["time"] = part if scaled else ("time", plan.ts, {"units": "s"})
     if "body" in along:
-        found["body"] = _bodies(plan)
+        found["body"] = list(plan.bodies)
     if "coordinate" in along:
         found["coordinate"] = list(COORDINATES)
     return found

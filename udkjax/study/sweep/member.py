@@ -74,14 +74,14 @@ class Recipe:
             and fixed.get("formulation") is None
         )
 
-    def own(self, members: Int[np.ndarray, "n"]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The numbers of members: those of their choices, and those of their axes; (n, ...) each."""
+    def own(self, members: Int[np.ndarray, "n"]) -> tuple[dict[str, Any], dict[str, Any], np.ndarray]:
+        """The numbers of members: those of their choices, those of their axes, and who they are; (n, ...) each."""
         places = self.plan.places(members)
         choices = {}
         for setting, (name, arrays, _, occurring) in self._own.items():
             rows = np.searchsorted(occurring, places[name])
             choices[setting] = jax.tree.map(lambda x, rows=rows: x[rows], arrays)
-        return choices, {column.name: column.values[places[column.name]] for column in self.numbers}
+        return choices, {column.name: column.values[places[column.name]] for column in self.numbers}, members
 
     def mechanism(self, shared: Any, own: Any, shift: Mapping[str, Array]) -> Mechanism:
         """The mechanism of one member. `shift` is added to what derivatives are taken by."""

@@ -119,10 +119,15 @@ class Plan:
         return self.mechanism if setting == "mechanism" else self.settings.get(setting)
 
     @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        """The bodies of all mechanisms, in their order."""
+        return tuple(dict.fromkeys(name for group in self.groups for name in self.choice(group, "mechanism").body_names))
+
+    @cached_property
     def variables(self) -> Mapping[str, Variable]:
         """What is kept of each member: names, dimensions, units. `result`, `end_time` and `steps` are always among them.
 
-        Where mechanisms have other bodies, a dimension is as long as the longest.
+        Where mechanisms have other bodies, the dimension "body" has all of them, and any other is as long as the longest.
         """
         from udkjax.study.sweep.chunk import described  # computing knows plans
 
@@ -134,7 +139,8 @@ class Plan:
                     raise SweepError(
                         [f"measure {name!r} has {other.shape} entries for some members and {variable.shape} for others"]
                     )
-                shape = tuple(map(max, other.shape, variable.shape))
+                longest = map(max, other.shape, variable.shape)
+                shape = tuple(len(self.bodies) if d == "body" else size for d, size in zip(variable.dims, longest, strict=True))
                 found[name] = Variable(other.dims, shape, other.dtype, other.units, other.long_name)
         return found
 
