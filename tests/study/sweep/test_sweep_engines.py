@@ -27,9 +27,9 @@ from udkjax.study.sweep.plan import planned
 
 axes = {"mass": udk.Axis(np.linspace(1.0, 3.0, 20), of="body.rod.mass"), "rtol": np.geomspace(1e-10, 1e-4, 30)}
 plan = planned(udk.library.compound_pendulum(), axes, [0.0, 3.0])
-(chunk,) = plan.chunks()
-found = run(plan, chunk)
-np.savez(sys.argv[1], members=chunk.members, **found)
+parts = [{"members": chunk.members, **run(plan, chunk)} for chunk in plan.chunks()]
+found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+np.savez(sys.argv[1], **{name: values[np.argsort(found["members"])] for name, values in found.items()})
 own = program(plan, plan.groups[0])
 text = own.compiled[0].as_text()
 print(len(own.devices), len(jax.devices()), f"num_partitions={len(jax.devices())}" in text or len(jax.devices()) == 1)

@@ -12,12 +12,14 @@ from jaxtyping import Float, Int
 
 from udkjax.pinv import Auto, Elimination
 from udkjax.study.sweep.chunk import program
+from udkjax.study.sweep.local import workers
 from udkjax.study.sweep.member import STEPS
 from udkjax.study.sweep.plan import Chunk, Group, Plan
 
 PILOT = 256  # members of a sample: 4 for each coefficient of a polynomial of second degree in nine axes
 WORTH = 8  # a sample is run of groups that are so many times as large
 SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
+TURNS, LEAST = 4, 0.05  # chunks for each that computes at a time, so that all have something to do; but none shorter (s)
 SHARE = 4  # chunks in memory at a time, and copies of each: of what is kept, of its parts on the device
 # Seconds, roughly, of a step of twelve rows: by straight-line code in lanes, and by a dense method.
 QUICK, DENSE = 1e-6, 5e-4
@@ -34,18 +36,19 @@ def chunks(plan: Plan, memory: int) -> list[Chunk]:
         order = np.argsort(-steps, kind="stable")
         most = max(1, memory // (SHARE * max(1, plan.bytes_per_member)))
         seconds = steps[order] * _seconds_per_step(plan, group)
-        for part in _cut(seconds, own.piece, most):
+        enough = max(LEAST, float(seconds.sum()) / (TURNS * workers()))
+        for part in _cut(seconds, own.piece * len(own.devices), most, min(SECONDS, enough)):
             found.append(Chunk(len(found), group.index, group.members[order[part]], float(seconds[part].sum())))
     return found
 
 
-def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int) -> list[slice]:
-    """Consecutive parts of at most `SECONDS` and of at most so many members, each of whole pieces."""
+def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = SECONDS) -> list[slice]:
+    """Consecutive parts of at most `limit` seconds and of at most so many members, each of whole pieces."""
     most = max(piece, most // piece * piece)
     parts, start = [], 0
     total = np.concatenate([[0.0], np.cumsum(seconds)])
     while start < len(seconds):
-        enough = int(np.searchsorted(total, total[start] + SECONDS, side="right")) - 1 - start
+        enough = int(np.searchsorted(total, total[start] + limit, side="right")) - 1 - start
         rest = len(seconds) - start
         size = rest if rest <= min(most, enough) else min(most, max(piece, enough // piece * piece), rest)
         parts.append(slice(start, start + size))
