@@ -65,6 +65,14 @@ def test_singular_configurations_cost_few_steps(angle):
     assert sol.stats["right_hand_sides"] < 13.5 * sol.stats["steps"]  # hardly one was taken again with care
 
 
+def test_outputs_beside_singular_configurations():
+    """Steps that end beside one have accelerations of few digits, which interpolation would spread over the next step."""
+    mech = udk.library.parallelogram(np.deg2rad(60))
+    for tol in np.geomspace(3e-9, 3e-10, 12):
+        energy = udk.energy(mech, udk.simulate(mech, TS, rtol=tol, atol=tol)).total
+        assert np.abs(energy - energy[0]).max() < 1e3 * tol
+
+
 def test_many_starts_cross_singular_configurations(linkage, placed):
     """One start flatters: 64 spread by 5 degrees about each of three, every one of which crosses."""
 

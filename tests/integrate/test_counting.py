@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from udkjax.equations.motion import Tangential
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, count_evaluations, evaluations
 from udkjax.integrate.multistep import Multistep, from_controller
@@ -124,8 +125,15 @@ class Branching(eqx.Module):
         jax.debug.callback(self.calls.add)
         return jnp.where((t > 0.3) & (t < 0.6) & (not self.branches), jnp.nan, jnp.stack([y[1], -4 * y[0]]))
 
+    @property
+    def forgiving(self):
+        return self.quick
+
     def project(self, t, q, v):
         return q, v
+
+    def tangential(self, t, q, v, dq, dv):
+        return Tangential(dq, dv)
 
     def held(self, t, q, v):
         return self

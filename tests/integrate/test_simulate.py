@@ -135,7 +135,7 @@ def test_what_cannot_be_assembled(hung):
     assert sol.result == RESULTS.could_not_assemble
     assert sol.time == 0.0
     assert np.isfinite(sol.q[0]).all() and np.isnan(sol.q[1:]).all()
-    assert sol.stats["steps"] < 30
+    assert sol.stats["steps"] < 100
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,9 @@ from udkjax.straightline import Program, Scalar, frontier, vector
 # What a row left out may disagree by, relative to its terms, and still count as satisfied: far above rounding, and above what
 # states carry that are closed to the tolerances of an integration.
 CONSISTENT = 1e-6
+# A pivot, relative to its row's diagonal entry, that counts as near to a singular configuration: a thirtieth of a radian or so.
+# Rounding errors of accelerations grow with the third power of the distance's reciprocal: here they are some 1e-11.
+NEAR = 1e-3
 TINY = 1e-12  # m/s^2: rows at rest have terms of no size at all
 
 
@@ -30,7 +33,7 @@ class Code:
 
     and for elimination: `accelerations` (a, whether all pivots are safe), `factor` (the factors at (t, q), whether safe), `step`
     (the change of q or v that removes a residual, given the factors), `psi` and `psi_dot` (of the rows kept), `tangential` (of
-    changes of q and v, given after q in place of v, what projection leaves; whether safe).
+    changes of q and v, given after q in place of v, what projection leaves; whether all pivots are far from none).
     """
 
     def __init__(self, equations: Expressions, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None):
@@ -80,7 +83,8 @@ class Code:
         self.residual = [graph.input(f"r{k}", "residual") for k in range(len(self.kept))]
         self.outputs["step"] = self.spread(self.solved(self.residual))
         self.changes = [graph.input(f"d{k}", "change") for k in range(2 * self.n)]
-        self.outputs["tangential"] = [*self._tangential(self.changes[: self.n]), *self._tangential(self.changes[self.n :]), safe]
+        far = all_of([greater(pivot, diagonal * NEAR) for pivot, diagonal in self._gram.pivots], graph)
+        self.outputs["tangential"] = [*self._tangential(self.changes[: self.n]), *self._tangential(self.changes[self.n :]), far]
         early = frontier(graph, self.outputs["step"], lambda node: "residual" not in node.depends)
         self.factors = [s for s in early if not s.node.depends <= {"parameter"}]
         self.outputs["factor"] = [*self.factors, safe]

@@ -19,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool
 
 from udkjax.equations.code import scalars, stacked
-from udkjax.equations.motion import Vector
+from udkjax.equations.motion import Tangential, Vector
 from udkjax.equations.plain import plain_accelerations, plain_correction, plain_project, plain_tangential
 from udkjax.straightline import Program, when
 
@@ -62,16 +62,13 @@ def _projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Ve
     return *found, safe if _checks(equations) else jnp.array(True)
 
 
-def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
-    """What projection at q leaves of small changes: for estimates of errors, which nobody differentiates."""
+def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+    """What projection at q leaves of small changes: for estimates of errors, which nobody differentiates, nor do they branch."""
     if not equations.code.elimination:
         return plain_tangential(equations, t, q, v, dq, dv)
     program = equations.code.program("tangential")
-    *changes, safe = program([*equations.constants, t, *scalars([q, dq, dv])])
-    left = stacked(changes[: len(q)]), stacked(changes[len(q) :])
-    if equations.branches:
-        return _branched(equations, safe, left, plain_tangential, t, q, v, dq, dv)
-    return left
+    *changes, far = program([*equations.constants, t, *scalars([q, dq, dv])])
+    return Tangential(stacked(changes[: len(q)]), stacked(changes[len(q) :]), far)
 
 
 def _checked(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:

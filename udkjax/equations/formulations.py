@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.motion import Motion, Vector
+from udkjax.equations.motion import Motion, Tangential, Vector
 from udkjax.equations.udwadia_kalaba import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
@@ -181,7 +181,7 @@ class Formulated(Rewritten):
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.as_projected(t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         return self.equations.tangential(t, q, v, dq, dv)
 
     @property

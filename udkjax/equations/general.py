@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.equations.motion import Motion, Vector
+from udkjax.equations.motion import Motion, Tangential, Vector
 from udkjax.equations.udwadia_kalaba import RANK_TOL, Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
 from udkjax.scene.fields import number
@@ -70,7 +70,7 @@ class GeneralEquations(Motion):
             v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
         return q, v
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq."""
         if self.system.constraint is not None:
             slopes = jax.jacfwd(self._psi, 1)(t, q)
@@ -80,7 +80,7 @@ class GeneralEquations(Motion):
             slopes = self._slopes(t, q, v)
             plus, weight = self._plus(q, slopes)
             dv = dv - weight(plus @ (slopes @ dv))
-        return dq, dv
+        return Tangential(dq, dv)
 
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Any:
         return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))

@@ -21,7 +21,7 @@ from udkjax.equations.alike import Fields
 from udkjax.equations.code import CONSISTENT, TINY, structure
 from udkjax.equations.large_plain import branch, by_method, plain_accelerations, plain_correction, plain_project, plain_tangential
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
-from udkjax.equations.motion import MechanismMotion, Vector
+from udkjax.equations.motion import MechanismMotion, Tangential, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.block_methods import BlockElimination, DenseParts, factorized
 from udkjax.pinv.blocks import by_block, flat
@@ -76,7 +76,7 @@ class LargeEquations(MechanismMotion):
         """A state on the manifold, with the derivatives that `project` has where it returns it."""
         return _compiled(_as_projected, self, t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
         return _compiled(plain_tangential, self, t, q, v, dq, dv)
 

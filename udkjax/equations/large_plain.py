@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from udkjax.equations.code import NEAR
 from udkjax.equations.layout import Selection
-from udkjax.equations.motion import Vector
-from udkjax.pinv.block_methods import DenseParts
+from udkjax.equations.motion import Tangential, Vector
+from udkjax.pinv.block_methods import DenseParts, factorized
 from udkjax.pinv.blocks import flat
 
 if TYPE_CHECKING:
@@ -55,15 +56,17 @@ def plain_correction(equations: "LargeEquations", t: Any, q: Vector, v: Vector) 
     return by_method(equations, step, t, q, v)
 
 
-def plain_tangential(equations: "LargeEquations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+def plain_tangential(equations: "LargeEquations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
     """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors."""
+    if not len(equations.layout.kept.rows):
+        return Tangential(dq, dv)
     root = flat(equations.numbers["root"])
 
-    def left(plus: Any, rows: Selection) -> tuple[Vector, Vector]:
-        first, second = (x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv))
-        return first, second
+    def left(plus: Any, rows: Selection) -> Tangential:
+        far = factorized(rows.pattern, plus.matrix, NEAR)[1] if equations.by_levels else True
+        return Tangential(*(x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv)), far)
 
-    return by_method(equations, left, t, q, v) if len(equations.layout.kept.rows) else (dq, dv)
+    return by_method(equations, left, t, q, v)
 
 
 def by_method(equations: "LargeEquations", use: Any, t: Any, q: Vector, v: Vector) -> Any:

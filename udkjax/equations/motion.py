@@ -1,12 +1,20 @@
 """What an integrator asks of equations of motion, whoever writes them."""
 
 from abc import abstractmethod
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
 Vector = Float[Array, "n"]
+
+
+class Tangential(NamedTuple):
+    """The parts of small changes of q and v within the constraint manifold."""
+
+    dq: Vector
+    dv: Vector
+    far: Any = True  # from singular configurations, as far as the method knows
 
 
 class Motion(eqx.Module):
@@ -57,9 +65,9 @@ class Motion(eqx.Module):
         """A state on the manifold, with the derivatives of a projection that returns it. By default it is projected again."""
         return self.project(t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """What projection at q leaves of small changes of positions and velocities. By default: all of them."""
-        return dq, dv
+        return Tangential(dq, dv)
 
     @abstractmethod
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 
 from udkjax.equations.code import stacked
-from udkjax.equations.motion import Vector
+from udkjax.equations.motion import Tangential, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse, SparseElimination
 
 if TYPE_CHECKING:
@@ -46,15 +46,14 @@ def plain_correction(equations: "Equations", t: Any, q: Vector, v: Vector) -> tu
     return _by_method(equations, step, "closure", t, q, v)
 
 
-def plain_tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+def plain_tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
     """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors."""
     if not equations.code.kept:
-        return dq, dv
+        return Tangential(dq, dv)
 
-    def left(plus: Plus, name: str) -> tuple[Vector, Vector]:
+    def left(plus: Plus, name: str) -> Tangential:
         root = equations.arrays(name, t, q, v)[-1]
-        first, second = (x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv))
-        return first, second
+        return Tangential(*(x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv)))
 
     return _by_method(equations, left, "closure", t, q, v)
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations import fast
 from udkjax.equations.code import Code, code, scalars, stacked
-from udkjax.equations.motion import MechanismMotion, Vector
+from udkjax.equations.motion import MechanismMotion, Tangential, Vector
 from udkjax.equations.plain import plain_accelerations
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse
 from udkjax.scene.fields import number
@@ -91,7 +91,7 @@ class Equations(MechanismMotion):
         """A state on the manifold, with the derivatives that `project` has where it returns it."""
         return fast.as_projected(self, t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector]:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
         return fast.tangential(self, t, q, v, dq, dv)
 

@@ -54,7 +54,7 @@ class Constrained(Wrapper):
         if self.projected:
             y1 = project(equations, t1, y1)
             if error is not None and not isinstance(self.solver, Multistep):
-                error = jnp.concatenate(lasting(equations, t1, *jnp.split(y1, 2), *jnp.split(error, 2)))
+                error = jnp.concatenate(lasting(equations, t1, *jnp.split(y1, 2), *jnp.split(error, 2))[:2])
         if judged is not None:
             error = jnp.where(judged, jnp.asarray(error), jnp.where(jnp.isfinite(y1), 0.0, jnp.nan))
         return y1, tally(self.solver, error, solver_state, state, made_jump), dense, state, result

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from udkjax.equations.motion import Tangential
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
 from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
@@ -31,9 +32,9 @@ from udkjax.straightline import when
 from udkjax.straightline.emit import cut
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0  # of the step's size: diffrax's own, so that both take the same steps
-# A stage that lands on a singular configuration by chance misses it in a step that is a tenth shorter: cheaper than care, and the
-# state at the end of a step then has accelerations that interpolation can use. Where that does not help, one is on it.
-DODGES = 3
+# A stage on a singular configuration, or an end beside it, whose accelerations are not good enough to interpolate with, is there
+# by chance: a step that is a little shorter misses it, and costs less than care. Where a few do not help, one is on it.
+DODGE, DODGES = 0.8, 3
 BLOCK = 4  # output times that are interpolated together
 
 
@@ -42,6 +43,7 @@ class March(NamedTuple):
 
     here: Point
     back: tuple[Point, ...]  # the accepted states before, the latest last
+    far: Array  # whether here is far from singular configurations
     h: Array
     code: Array  # RUNNING, DONE, ...
     doubt: Array  # whether the step has to be taken again with care
@@ -59,6 +61,7 @@ class Trial(NamedTuple):
 
     to: Point
     error: Array  # the largest error of any coordinate or velocity, relative to its tolerance
+    far: Array  # whether its end is far from singular configurations
     evaluations: Array
     stages: Array | None = None  # accelerations (stages, n) of its stages, for the record
 
@@ -68,7 +71,7 @@ class Task(NamedTuple):
 
     accelerations: Callable[..., Array]  # of lanes: (t, q, v) -> a
     project: Callable[..., tuple[Array, Array]]
-    lasting: Callable[..., tuple[Array, Array]]  # (t, q, v, error of q, error of v) -> the errors as they count
+    lasting: Callable[..., Tangential]  # (t, q, v, error of q, error of v) -> the errors as they count
     careful: Callable[..., Trial] | None  # takes a step again, by equations that may branch; None: the lane ends as `DOUBTED`
     doubts: bool  # whether accelerations that are not a number mean that a step wants care
     ts: Array  # (T, *lanes)
@@ -108,11 +111,11 @@ def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: 
     a = a.at[-1].set(to.a) if method.ends else a
     error_v = h * _combine(jnp.asarray(method.error_v), a)
     error_q = h * (h * _combine(jnp.asarray(method.error_q), a))
-    error_q, error_v = task.lasting(to.t, to.q, to.v, error_q, error_v)
+    error_q, error_v, far = task.lasting(to.t, to.q, to.v, error_q, error_v)
     size = jnp.maximum(_relative(task, error_q, here.q, to.q), _relative(task, error_v, here.v, to.v))
     size = jnp.where(jnp.all(jnp.isfinite(to.a), axis=0), size, jnp.nan)
     evaluations = jnp.broadcast_to(jnp.asarray(evaluations), size.shape)
-    return Trial(to, undifferentiated(size), evaluations, a if task.recorded else None)
+    return Trial(to, undifferentiated(size), far, evaluations, a if task.recorded else None)
 
 
 def _combine(weights: Array, a: Array) -> Array:
@@ -134,7 +137,7 @@ def march(task: Task, q: Array, v: Array) -> March:
     # The first round is no step: it finds the accelerations, and with them the first step, where the others have their code.
     back, no = (start,) * (POINTS - 2), jnp.zeros(lanes, bool)
     record = blank(start, task.method.stages, task.max_steps) if task.recorded else None
-    first = March(start, back, jnp.zeros(lanes), none, no, none, none - 1, none - 1, none, none, outputs, record)
+    first = March(start, back, no, jnp.zeros(lanes), none, no, none, none - 1, none - 1, none, none, outputs, record)
 
     def running(m: March) -> Array:
         return jnp.any(m.code == RUNNING)
@@ -143,8 +146,10 @@ def march(task: Task, q: Array, v: Array) -> March:
         t1, last = _end(task, m)
         trial = attempt(task, m.here, jnp.where(m.code == RUNNING, t1 - m.here.t, 0.0), t1, m.tried < 0)
         doubt = (m.code == RUNNING) & ~jnp.isfinite(trial.error) & task.doubts
-        dodge = doubt & (m.dodged < DODGES) & (m.tried >= 0)
-        trial, doubt = trial._replace(error=jnp.where(dodge, 1.0, trial.error)), doubt & ~dodge
+        beside = (m.code == RUNNING) & (trial.error < 1.0) & m.far & ~trial.far & ~last
+        dodge = (doubt | beside) & (m.dodged < DODGES) & (m.tried >= 0)
+        error = jnp.where(dodge, (SAFETY / DODGE) ** task.method.order, trial.error)  # too large by as much
+        trial, doubt = trial._replace(error=error), doubt & ~dodge
         m = m._replace(dodged=jnp.where(dodge, m.dodged + 1, 0))
         m = _decide(task, m, trial, last, (m.code == RUNNING) & ~doubt, careful=False)
         return m._replace(doubt=doubt) if task.careful else m._replace(code=jnp.where(doubt, DOUBTED, m.code))
@@ -188,7 +193,8 @@ def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array, care
     if m.record is not None and trial.stages is not None:
         m = m._replace(record=noted(m.record, m.accepted + 2, (*old, trial.to), trial.stages, careful))
     *back, here = jax.tree.map(lambda x, y: jnp.where(accept, x, y), (*old[1:], trial.to), old)
-    m = m._replace(h=h, code=code, tried=tried, accepted=m.accepted + accept)
+    far = jnp.where(accept, trial.far, m.far)
+    m = m._replace(far=far, h=h, code=code, tried=tried, accepted=m.accepted + accept)
     m = m._replace(evaluations=m.evaluations + jnp.where(judged, trial.evaluations, 0))
     if len(task.ts) > 2:
         until = jnp.where(accept & (m.accepted > 0), undifferentiated(trial.to.t), -jnp.inf)

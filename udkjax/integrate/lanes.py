@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
-from udkjax.equations.motion import Motion
+from udkjax.equations.motion import Motion, Tangential
 from udkjax.integrate.explicit import March, Task, Trial, judged, march, stage_state
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
@@ -148,7 +148,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     task = Task(
         partial(lanes.over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
         partial(lanes.over, lambda e, t, q, v: e.quick.project(t, q, v)) if problem.projected else lambda t, q, v: (q, v),
-        partial(lanes.over, lasting) if problem.projected else lambda t, q, v, dq, dv: (dq, dv),
+        partial(lanes.over, lasting) if problem.projected else _all_of_it,
         None,
         problem.equations.branches,
         *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
@@ -157,6 +157,11 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     if problem.equations.branches and problem.careful:
         task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
     return task
+
+
+def _all_of_it(t: Array, q: Array, v: Array, dq: Array, dv: Array) -> Tangential:
+    """Errors where nothing takes any of them back."""
+    return Tangential(dq, dv, jnp.ones(t.shape, bool))
 
 
 def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
@@ -195,7 +200,7 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
 
     tolerances = (jnp.broadcast_to(x, h.shape) for x in (task.rtol, task.atol))
     unknown = jnp.zeros((stages, *here.a.shape)) if task.recorded else None
-    nothing = Trial(here, jnp.full(h.shape, jnp.inf), jnp.zeros(h.shape, int), unknown)
+    nothing = Trial(here, jnp.full(h.shape, jnp.inf), doubt, jnp.zeros(h.shape, int), unknown)
     return lanes.each(doubt, one, nothing, here, h, t1, begin, *tolerances)
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.equations.motion import Motion
+from udkjax.equations.motion import Motion, Tangential
 from udkjax.integrate.undifferentiated import undifferentiated
 
 # How much of an error counts that projection takes back. What lasts of it is what it does to the rest while the step is taken.
@@ -28,14 +28,14 @@ def project(equations: Motion, t: Any, y: Float[Array, "2n"]) -> Float[Array, "2
     return jnp.concatenate(equations.project(t, q, v))
 
 
-def lasting(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array) -> tuple[Array, Array]:
+def lasting(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array) -> Tangential:
     """The errors dq and dv of a step that ends in q and v, with what projection takes back of them counted by `TAKEN_BACK`.
 
     Close to dependent rows it need not be exact, and does not branch.
     """
     q, v, dq, dv = undifferentiated((q, v, dq, dv))
-    left_q, left_v = undifferentiated(equations.forgiving).tangential(t, q, v, dq, dv)
-    return left_q + TAKEN_BACK * (dq - left_q), left_v + TAKEN_BACK * (dv - left_v)
+    left_q, left_v, far = undifferentiated(equations.forgiving).tangential(t, q, v, dq, dv)
+    return Tangential(left_q + TAKEN_BACK * (dq - left_q), left_v + TAKEN_BACK * (dv - left_v), jnp.asarray(far))
 
 
 def project_all(equations: Any, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:

@@ -105,6 +105,7 @@ class Factors(NamedTuple):
     lower: list[dict[int, Scalar]]  # by columns, without the unit diagonal
     inverse_pivots: list[Scalar]
     kept: list[Scalar]  # booleans, in the order of elimination
+    pivots: list[tuple[Scalar, Scalar]]  # each with its row's diagonal entry
 
 
 def factorize(rows: Sequence[Row], drop: Scalar) -> Factors:
@@ -128,12 +129,13 @@ def factorize(rows: Sequence[Row], drop: Scalar) -> Factors:
                     target = column[place[j]]
                     target[place[i]] = target.get(place[i], zero) + rows[i][k] * rows[j][k]
     diagonal = [column[j].get(j, zero) for j in range(len(rows))]
-    inverse, kept = [], []
+    inverse, kept, pivots = [], [], []
     for j in range(len(rows)):
         d = column[j].get(j, zero)
         keep = greater(d, drop * diagonal[j])
         inverse.append(where(keep, one / d, zero))
         kept.append(keep)
+        pivots.append((d, diagonal[j]))
         below = sorted(i for i in column[j] if i > j)
         lower = {i: column[j][i] * inverse[j] for i in below}
         for i in below:
@@ -141,7 +143,7 @@ def factorize(rows: Sequence[Row], drop: Scalar) -> Factors:
                 if k <= i:
                     column[k][i] = column[k].get(i, zero) - lower[i] * column[j][k]
         column[j] = lower
-    return Factors(order, column, inverse, kept)
+    return Factors(order, column, inverse, kept, pivots)
 
 
 def multipliers(factors: Factors, b: Sequence[Scalar]) -> list[Scalar]:
