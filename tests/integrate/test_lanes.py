@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax.integrate import lanes
 from udkjax.integrate.tableau import method_of
+from udkjax.straightline.vector import BARRIERS_HOLD
 from udkjax.study.exact import exact_coordinates
 
 TS = np.linspace(0.0, 2.0, 21)
@@ -69,10 +70,14 @@ def test_members_are_what_they_are_alone(batch, alone):
 
 
 def test_no_member_depends_on_those_beside_it(batch, in_lanes):
-    """To the last bit: in another order each has another chunk and another lane."""
-    order = np.random.default_rng(0).permutation(MEMBERS)
+    """To the last bit: in another order each has another chunk and another lane.
+
+    Before jax 0.11 XLA rounds in the lanes that do not fill its unrolled loops otherwise than in those that do.
+    """
+    order, bits = np.random.default_rng(0).permutation(MEMBERS), 0.0 if jax.__version_info__ >= BARRIERS_HOLD else 1e-12
     found = in_lanes(*(x[order] for x in members(MEMBERS)))
-    assert np.array_equal(found.q, batch.q[order]) and np.array_equal(found.v, batch.v[order])
+    assert_allclose(found.q, batch.q[order], rtol=0, atol=bits)
+    assert_allclose(found.v, batch.v[order], rtol=0, atol=bits)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 from udkjax.equations.code import NEAR
 from udkjax.equations.layout import Selection
 from udkjax.equations.motion import Tangential, Vector
-from udkjax.pinv.block_methods import DenseParts, factorized
+from udkjax.pinv.block_methods import BlockElimination, DenseParts, factorized
 from udkjax.pinv.blocks import flat
 
 if TYPE_CHECKING:
@@ -63,8 +63,9 @@ def plain_tangential(equations: "LargeEquations", t: Any, q: Vector, v: Vector, 
     root = flat(equations.numbers["root"])
 
     def left(plus: Any, rows: Selection) -> Tangential:
-        far = factorized(rows.pattern, plus.matrix, NEAR)[1] if equations.by_levels else True
-        return Tangential(*(x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv)), far)
+        known = isinstance(plus.method, BlockElimination)
+        first, second = (x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv))
+        return Tangential(first, second, factorized(rows.pattern, plus.matrix, NEAR)[1] if known else jnp.array(True))
 
     return by_method(equations, left, t, q, v)
 

@@ -1,7 +1,7 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -43,7 +43,7 @@ SMALLEST_STEP = 100.0  # ulps of the end time: below it time does not advance
 
 def simulate(
     mechanism: Mechanism | ConstrainedSystem,
-    ts: ArrayLike,
+    ts: ArrayLike | Sequence[float],
     state: State | Closure | None = None,
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike = 1e-8,
@@ -172,7 +172,7 @@ def _start(equations: Any, state: State | None, closure: Closure | None) -> tupl
     return closure.state, closed, closed & (closure.rank > kept)
 
 
-def _times(ts: ArrayLike) -> Float[Array, "T"]:
+def _times(ts: ArrayLike | Sequence[float]) -> Float[Array, "T"]:
     ts = number(ts)
     if ts.ndim != 1 or len(ts) < 2:
         raise ValueError(f"ts must be a vector of at least two output times, from the start on; its shape is {ts.shape}")

@@ -119,7 +119,7 @@ def test_gains_are_varied_of_a_stabilization_that_has_some(linkage):
 
 
 def test_the_fingerprint_tells_what_decides_the_results(linkage):
-    def fingerprint(values=(1e-4, 1e-6), measure="final", mechanism=linkage, factor=2.0, **settings):
+    def fingerprint(values=(1e-4, 1e-6), measure: object = "final", mechanism=linkage, factor=2.0, **settings):
         length = udk.Axis([1.0], of=lambda m, x: m.with_parameters({"body.coupler.mass": factor * x}))
         return planned(mechanism, {"rtol": values, "x": length}, TS, measure, **settings).fingerprint()
 

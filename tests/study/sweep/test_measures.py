@@ -37,6 +37,7 @@ def test_a_users_arrays_are_labelled_by_their_shapes():
 def test_measures_by_name_are_what_one_would_compute():
     linkage = udk.library.parallelogram()
     exact = exact_coordinates(linkage, TS, linkage.q0, linkage.v0)
+    assert exact is not None
     axes = {"stabilization": [None, udk.Projection()], "rank_tol": [1e-4, 10.0], "method": [udk.SVD()]}
     data = udk.sweep(
         linkage,

@@ -165,6 +165,7 @@ def test_the_papers_table_is_one_sweep():
     }
     settings = {"solver": udk.Adams(), "dt0": 0.66e-2, "drift_tol": np.inf, "max_steps": 200_000}
     exact = exact_coordinates(linkage, ts, linkage.q0, linkage.v0)
+    assert exact is not None
     plan = planned(linkage, axes, ts, ["error", "counts", "rank"], reference=exact, **settings)
     assert len(plan.groups) == 5  # gains are numbers
     data = udk.sweep(linkage, axes, ts, ["error", "counts", "rank"], reference=exact, progress=False, **settings)
