@@ -127,7 +127,7 @@ def study(smoke: bool) -> xarray.Dataset:
     for (i, orbit), (j, solver) in tracked(
         [(s, m) for s in enumerate(systems.values()) for m in enumerate(solvers)], "long_runs"
     ):
-        end = 300.0 if smoke else orbit.end
+        end = 1000.0 if smoke else orbit.end
         run = by_tolerance(orbit.mechanism, SOLVERS[solver](), end, 4 if smoke else EVERY, MAX_STEPS // (64 if smoke else 1))
         for k, tol in enumerate(tolerances):
             ts, ys, cost[i, j, k], good, _ = run(tol)
