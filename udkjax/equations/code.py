@@ -19,7 +19,7 @@ from udkjax.straightline import Program, Scalar, frontier, vector
 # states carry that are closed to the tolerances of an integration.
 CONSISTENT = 1e-6
 # A pivot, relative to its row's diagonal entry, that counts as near to a singular configuration: a thirtieth of a radian or so.
-# Rounding errors of accelerations grow with the third power of the distance's reciprocal: here they are some 1e-11.
+# Rounding errors of accelerations grow with the third power of the distance's reciprocal: here they are some 1e-10.
 NEAR = 1e-3
 TINY = 1e-12  # m/s^2: rows at rest have terms of no size at all
 
