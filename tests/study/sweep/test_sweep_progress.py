@@ -53,24 +53,10 @@ def test_a_sweep_is_followed(clock):
     assert str(seen[-1]).startswith("20 of 20 members (100 %); 1.07 a second; 15 s; failed")
 
 
-class Stream(list):
-    def __init__(self, terminal):
-        self.terminal = terminal
-
-    def isatty(self):
-        return self.terminal
-
-    def write(self, text):
-        self.append(text)
-
-    def flush(self):
-        pass
-
-
 @pytest.mark.parametrize(("terminal", "lines", "shown"), [(True, 1, 5), (False, 3, 3)])
-def test_it_is_shown_on_one_line_of_a_terminal_and_on_a_few_of_a_log(clock, terminal, lines, shown):
-    stream = Stream(terminal)
-    watch = Watch(20, CHUNKS, teller(None, stream))  # pyright: ignore[reportArgumentType]
+def test_it_is_shown_on_one_line_of_a_terminal_and_on_a_few_of_a_log(clock, streams, terminal, lines, shown):
+    stream = streams(terminal)
+    watch = Watch(20, CHUNKS, teller(None, stream))
     for chunk in CHUNKS:
         clock.now += 10
         watch(chunk, result())
