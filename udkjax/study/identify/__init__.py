@@ -1,0 +1,1 @@
+"""Identification: parameters of mechanisms, found from measured motion."""
