@@ -26,6 +26,7 @@ MECHANISMS = {
     "scissor_lift": (16, 14, {"angular_velocity": 1.3}),
     "peaucellier": (20, 20, {"angular_velocity": 1.3}),
     "planetary_gear": (16, 14, {}),
+    "excavator": (12, 12, {}),
 }
 
 
@@ -67,6 +68,47 @@ def test_slider_crank_starts_as_in_the_reference():
     assert_allclose(mech.q0.ravel(), data["q"], atol=1e-15)
     assert_allclose(mech.v0.ravel(), data["v"], atol=1e-15)
     assert not library.slider_crank(driven=False).drivers
+
+
+def test_a_spring_holds_the_slider_of_a_slider_crank(at):
+    """Stretched by 0.5 m from 1.5 m, the slider moving away at v: V = 1/2 k 0.25, and the damper brakes it."""
+    mech = library.slider_crank(angle=0.0, spring=(40.0, 1.5, 3.0))
+    frames = at(mech, mech.q0, mech.v0 + jnp.array([[0.0] * 3, [0.0] * 3, [0.2, 0.0, 0.0]]))
+    spring = mech.forces["spring"]
+    ground, slider = (frames[name] for name in spring.bodies)
+    assert_allclose(spring.potential(0.0, ground, slider), 5.0, rtol=1e-14)
+    assert_allclose(spring.loads(0.0, ground, slider)[1], (-0.6, 0.0, 0.0), atol=1e-15)
+
+
+def test_the_excavator_is_in_equilibrium_on_its_cylinders(at):
+    """With its cylinders as they are, turning the boom, the stick or the bucket changes its potential energy by nothing."""
+    start = library.excavator()
+    lengths = {f"force.{name}.length": spring.length for name, spring in start.forces.items()}
+
+    def energy(angles, gravity):
+        mech = library.excavator(angles).with_parameters(lengths | {"gravity": jnp.stack([0.0, -gravity])})
+        frames = at(mech, mech.q0, mech.v0)
+        springs = sum(force.potential(0.0, *(frames[n] for n in force.bodies)) for force in mech.forces.values())
+        return springs - sum(body.mass * (mech.gravity @ body.position) for body in mech.bodies.values())
+
+    torques = jax.jit(jax.jacfwd(energy))
+    angles = start.q0[jnp.array([0, 1, 4]), 2]
+    assert_allclose(torques(angles, 9.81), 0.0, atol=1e-9 * 1.5e5)
+    assert (jnp.abs(torques(angles, 0.0)) > 500.0).all()  # N m, without the weight
+
+
+@pytest.mark.parametrize("driven", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_excavator_moves_for_20_s_without_a_singular_configuration(driven, psi):
+    import udkjax
+
+    mech = library.excavator(driven=driven)
+    motion = udkjax.simulate(mech, np.linspace(0.0, 20.0, 401))
+    jacobians = jax.jit(jax.vmap(lambda q, t: jax.jacfwd(lambda q: psi(mech, q, t))(q)))(motion.q, motion.ts)
+    least = np.linalg.svd(np.reshape(jacobians, (401, -1, 15)), compute_uv=False)[:, -1]
+    assert least.min() > 0.6 * least[0]
+    turned = np.ptp(motion.q[..., 2], axis=0)
+    assert (turned > (0.3 if driven else 0.02)).all(), turned
+    assert_allclose(motion.q[0], mech.q0, atol=1e-9)
 
 
 def test_n_four_bar_is_the_benchmark_s():

@@ -9,6 +9,7 @@ from jaxtyping import ArrayLike
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drivers import Driver, Polynomial
 from udkjax.scene.fields import number
+from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Prismatic, Revolute, Slot
 from udkjax.scene.library.poses import ORIGINS, apex, bar, down, moving, uniform_rod
 from udkjax.scene.mechanism import Mechanism
@@ -112,11 +113,13 @@ def slider_crank(
     masses: Sequence[ArrayLike] = (1.0, 1.5, 2.0),
     slider_inertia: ArrayLike = 0.1,
     gravity: ArrayLike = 9.81,
+    spring: Sequence[ArrayLike] | None = None,
 ) -> Mechanism:
     """Return a slider-crank on the x axis: crank of length `crank` on the origin, connecting rod, slider in a guide.
 
     `driven`: a motor turns the crank at constant `angular_velocity` from `angle`; otherwise these are its initial state.
-    `masses` are those of crank, rod (both uniform) and slider.
+    `masses` are those of crank, rod (both uniform) and slider. `spring`: stiffness (N/m), length (m) and damping (N s/m) of one
+    that holds the slider to the origin, from which it is rod - crank to rod + crank away.
     """
 
     def pose(s):
@@ -136,6 +139,7 @@ def slider_crank(
             "guide": Prismatic((GROUND, "slider"), ORIGINS, axis=0.0, angle=0.0),
         },
         {"motor": motor} if driven else {},
+        {} if spring is None else {"spring": Spring((GROUND, "slider"), ORIGINS, *spring)},
         gravity=down(gravity),
         name="slider-crank",
     )

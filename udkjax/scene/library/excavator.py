@@ -1,0 +1,124 @@
+"""The arm of an excavator: an open chain of three bodies, the last of which is moved through a four-bar. SI units, radians."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from udkjax.scene.bodies import GROUND, Frame, between
+from udkjax.scene.drivers import Driver, Sine
+from udkjax.scene.fields import Numbers, number
+from udkjax.scene.forces import Spring
+from udkjax.scene.joints import Revolute
+from udkjax.scene.library.poses import apex, bar, down, moving, uniform_rod
+from udkjax.scene.mechanism import Mechanism
+
+# Points of a body in units of its length, from its first pin on, the x axis towards its last one.
+BOOM = {"centre": (0.44, 0.09), "foot": (0.0, 0.0), "tip": (1.0, 0.0), "cylinder": (0.44, 0.12), "stick cylinder": (0.52, 0.20)}
+STICK = {"centre": (0.35, 0.05), "tip": (0.0, 0.0), "rocker": (0.855, 0.02), "bucket": (1.0, 0.0)}
+STICK |= {"cylinder": (-0.22, 0.10), "bucket cylinder": (0.05, 0.20)}
+BUCKET = {"centre": (0.45, 0.20), "bucket": (0.0, 0.0), "link": (-0.13, 0.28)}
+BASE = (0.13, -0.09)  # of the boom's cylinder on the ground, from the boom's foot, in units of the boom's length
+
+
+def excavator(
+    angles: Sequence[ArrayLike] = (0.6, -1.1, -2.2),
+    angular_velocities: Sequence[ArrayLike] = (-0.2, 0.3, 0.6),
+    driven: bool = False,
+    lengths: Sequence[ArrayLike] = (5.7, 2.9, 0.62, 0.6, 1.45),
+    masses: Sequence[ArrayLike] = (1500.0, 750.0, 80.0, 60.0, 900.0),
+    stiffness: Sequence[ArrayLike] = (1.5e7, 1.2e7, 8e6),
+    damping: Sequence[ArrayLike] = (6e4, 4e4, 1e4),
+    strokes: Sequence[ArrayLike] = (0.3, -0.4, -0.3),
+    frequencies: Sequence[ArrayLike] = (0.6, 0.8, 1.1),
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return the arm of an excavator of 20 t: boom, stick, rocker, link and bucket, 12 rows, three degrees of freedom.
+
+    `angles` are those of boom, stick and bucket to the horizontal; rocker and link, which close a four-bar with these two,
+    follow. `lengths` (m) and `masses` (kg) come in the order of the bodies: a bucket's is from its pin to its teeth, and where
+    cylinders are attached goes with the lengths. Inertias are those of rods.
+
+    By default valves have shut while the arm moves at `angular_velocities`: the oil in the cylinders of boom, stick and bucket
+    makes each a spring of `stiffness` (N/m) and `damping` (N s/m), so long that the arm is in equilibrium at `angles`. `driven`:
+    the cylinders, from rest, get longer by `strokes` / 2 (1 - cos(`frequencies` t)) (m, rad/s), and their forces are reactions.
+    Neither motion meets a singular configuration within 20 s, with the default numbers.
+    """
+    boom, stick, rocker, link, bucket = map(number, lengths)
+    on_boom, on_stick, on_bucket = _points(BOOM, boom), _points(STICK, stick), _points(BUCKET, bucket)
+    on_rocker, on_link = ((number([-0.5 * k, 0.0]), number([0.5 * k, 0.0])) for k in (rocker, link))
+    names = ("boom", "stick", "rocker", "link", "bucket")
+    cylinders = {
+        "boom cylinder": ((GROUND, "boom"), (boom * number(BASE), on_boom["cylinder"])),
+        "stick cylinder": (("boom", "stick"), (on_boom["stick cylinder"], on_stick["cylinder"])),
+        "bucket cylinder": (("stick", "rocker"), (on_stick["bucket cylinder"], on_rocker[1])),
+    }
+
+    def pose(s):
+        arm = _held(on_boom["foot"], number([0.0, 0.0]), s[0])
+        fore = _held(on_stick["tip"], _spot(arm, on_boom["tip"]), s[1])
+        shovel = _held(on_bucket["bucket"], _spot(fore, on_stick["bucket"]), s[2])
+        start, end = _spot(fore, on_stick["rocker"]), _spot(shovel, on_bucket["link"])
+        knee = apex(start, end, rocker, link)
+        return [arm, fore, bar(start, knee), bar(knee, end), shovel]
+
+    def extents(s):
+        frames = {GROUND: _frame(number([0.0, 0.0]), 0.0)} | {n: _frame(*p) for n, p in zip(names, pose(s), strict=True)}
+        return jnp.stack([between(points, *(frames[n] for n in pair)).norm() for pair, points in cylinders.values()])
+
+    def weight(s):
+        return gravity * sum(mass * position[1] for mass, (position, _) in zip(masses, pose(s), strict=True))
+
+    def oil(s):
+        """How long the cylinders are, and by how much they are longer unloaded: principle of virtual work over the angles."""
+        shorter = jnp.linalg.solve(jax.jacfwd(extents)(s).T, jax.grad(weight)(s)) / number(stiffness)
+        return extents(s), shorter
+
+    start = number(angles)
+    length, shorter = jax.jit(oil)(start)
+    half = 0.5 * number(strokes)
+    drivers = {
+        name: Driver(pair, "distance", Sine(half[k], frequencies[k], -np.pi / 2, length[k] + half[k]), points)
+        for k, (name, (pair, points)) in enumerate(cylinders.items())
+    }
+    springs = {
+        name: Spring(pair, points, stiffness[k], length[k] + shorter[k], damping[k])
+        for k, (name, (pair, points)) in enumerate(cylinders.items())
+    }
+    physics = [uniform_rod(mass, k) for mass, k in zip(masses, (boom, stick, rocker, link, bucket), strict=True)]
+    return Mechanism(
+        moving(names, physics, pose, start, 0.0 * start if driven else angular_velocities),
+        {
+            "foot": Revolute((GROUND, "boom"), [(0.0, 0.0), on_boom["foot"]]),
+            "tip": Revolute(("boom", "stick"), [on_boom["tip"], on_stick["tip"]]),
+            "rocker pin": Revolute(("stick", "rocker"), [on_stick["rocker"], on_rocker[0]]),
+            "knee": Revolute(("rocker", "link"), [on_rocker[1], on_link[0]]),
+            "link pin": Revolute(("link", "bucket"), [on_link[1], on_bucket["link"]]),
+            "bucket pin": Revolute(("stick", "bucket"), [on_stick["bucket"], on_bucket["bucket"]]),
+        },
+        drivers if driven else {},
+        {} if driven else springs,
+        gravity=down(gravity),
+        name="excavator",
+    )
+
+
+def _points(places, length) -> dict[str, Numbers]:
+    """Return points of a body of a length in its own frame, from its centre of mass."""
+    return {name: length * (number(place) - number(places["centre"])) for name, place in places.items()}
+
+
+def _frame(position, angle) -> Frame:
+    return Frame(position[0], position[1], angle, jnp.cos(angle), jnp.sin(angle))
+
+
+def _spot(placed, local):
+    """Return where a point of a body is."""
+    return jnp.stack(_frame(*placed).point(local))
+
+
+def _held(local, spot, angle):
+    """Return position and angle of a body that is held at a point."""
+    return spot - jnp.stack(_frame(number([0.0, 0.0]), angle).vector(local)), angle
