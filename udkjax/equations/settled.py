@@ -21,20 +21,23 @@ from udkjax.scene.mechanism import Mechanism
 ROUNDING = 32.0  # eps of the size of the coordinates: what is left of Psi in a guess that was computed to be closed
 
 
-def close_all(mechanisms: Mechanism, t: ArrayLike = 0.0) -> Closure:
-    """Close a batch of mechanisms of one structure at time t (s): leaves have the members first, and so has the closure.
+def close_all(mechanisms: Mechanism, t: ArrayLike = 0.0, states: State | None = None) -> Closure:
+    """Close a batch of mechanisms of one structure at time t (s), each at its own where there are several.
 
-    Each as `close` does, up to rounding; only the rank of a member that was closed before is not looked at further than whether
-    it exceeds that of the rows not left out. Differentiable forward.
+    Leaves have the members first, and so has the closure. From `states`, or from the guesses of their bodies. Each as `close`
+    does, up to rounding; only the rank of a member that was closed before is not looked at further than whether it exceeds that
+    of the rows not left out. Differentiable forward.
     """
-    first = jax.tree.leaves(mechanisms)[0]
+    size = len(jax.tree.leaves(mechanisms)[0])
+    ts = jnp.broadcast_to(number(t), size)
 
     def one(k: Any) -> Closure:
-        return close(jax.tree.map(lambda leaf: leaf[k], mechanisms), t)
+        mechanism, t, state = jax.tree.map(lambda leaf: leaf[k], (mechanisms, ts, states))
+        return close(mechanism, t, state)
 
     if mechanisms.left_out is None or is_large(mechanisms) or not mechanisms.constraints:
-        return jax.lax.map(one, jnp.arange(len(first)))
-    found, settled = jax.vmap(lambda mechanism: _as_it_is(mechanism, number(t)))(mechanisms)
+        return jax.lax.map(one, jnp.arange(size))
+    found, settled = jax.vmap(_as_it_is)(mechanisms, ts, states)
 
     def next_one(carry: tuple[Array, Closure]) -> tuple[Array, Closure]:
         left, found = carry
@@ -44,10 +47,10 @@ def close_all(mechanisms: Mechanism, t: ArrayLike = 0.0) -> Closure:
     return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), next_one, (~settled, found))[1]
 
 
-def _as_it_is(mechanism: Mechanism, t: Float[Array, ""]) -> tuple[Closure, Bool[Array, ""]]:
+def _as_it_is(mechanism: Mechanism, t: Float[Array, ""], state: State | None) -> tuple[Closure, Bool[Array, ""]]:
     """The guess, moved by rounding errors at most, and whether that is its closure."""
     equations = prepare(mechanism, Auto()).quick
-    q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
+    q, v = (mechanism.q0.ravel(), mechanism.v0.ravel()) if state is None else (state.q.ravel(), state.v.ravel())
     D, psi, _ = equations.weighted(t, q)
     psi_dot = equations.violation(t, q, v)[1]
     eps = ROUNDING * float(jnp.finfo(psi.dtype).eps)

@@ -32,15 +32,23 @@ def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: Array
     values: dict[str, Any] = {}
     for body in names:
         points = dict(_attachments(mechanism, body))
-        here = _extent(list(points.values()))
-        if here is None:
-            raise SceneError([f"body {quoted(body)} has no length: it is attached at fewer than two points"], mechanism.name)
-        scale = number(length) / here
+        scale = number(length) / length_of(mechanism, body)
         values |= {name: scale * point for name, point in points.items()}
         if as_rod:
             element = mechanism.bodies[body]
             values |= {f"body.{body}.mass": scale * element.mass, f"body.{body}.inertia": scale**3 * element.inertia}
     return _followed(mechanism, mechanism.with_parameters(values))
+
+
+def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
+    """Return the largest distance (m) between two points where a body is attached. Raises `SceneError`."""
+    _known(mechanism, body)
+    points = [point for _, point in _attachments(mechanism, body)]
+    if len(points) < 2:
+        raise SceneError([f"body {quoted(body)} has no length: it is attached at fewer than two points"], mechanism.name)
+    stacked = jnp.stack(points)
+    square = jnp.sum((stacked[:, None] - stacked[None]) ** 2, axis=-1)
+    return jnp.sqrt(jnp.max(square))
 
 
 def with_angle(
@@ -77,14 +85,6 @@ def _attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[A
                 yield from ((f"{section}.{name}.points[{k}]", points[k]) for k, b in enumerate(element.bodies) if b == body)
             if getattr(element, "body", None) == body and hasattr(element, "point"):
                 yield f"{section}.{name}.point", element.point
-
-
-def _extent(points: Sequence[Array]) -> Array | None:
-    if len(points) < 2:
-        return None
-    stacked = jnp.stack(points)
-    square = jnp.sum((stacked[:, None] - stacked[None]) ** 2, axis=-1)
-    return jnp.sqrt(jnp.max(square))
 
 
 def _followed(before: Mechanism, after: Mechanism) -> Mechanism:

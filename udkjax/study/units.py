@@ -1,4 +1,4 @@
-"""Units of what a sweep varies."""
+"""Units of parameters and of the settings of a run."""
 
 from typing import Any
 

@@ -21,7 +21,7 @@ from udkjax.integrate.solution import Result
 from udkjax.study.sweep.measures import Named, guessed
 from udkjax.study.sweep.member import END, RESULT, STEPS, Kept, Recipe
 from udkjax.study.sweep.plan import Chunk, Group, Plan, Variable
-from udkjax.study.sweep.units import units_of
+from udkjax.study.units import units_of
 
 WIDE = 4096  # members of a piece where a device takes them all at once
 # Chunks of lanes in a piece, at most: to call a program takes what ten of its members take. And pieces that a group has at least,

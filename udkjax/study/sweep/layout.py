@@ -15,7 +15,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.parameters import parameters_of, split
 from udkjax.study.sweep.axes import CHOICES, Axis, Column, Dimension, Zipped, labels_of
 from udkjax.study.sweep.designs import Design, spread
-from udkjax.study.sweep.units import NUMBERS, units_of
+from udkjax.study.units import NUMBERS, units_of
 
 MEMBER = "member"  # the dimension of a design
 # Names of the dimensions of what is kept, which a dimension of the sweep cannot have.

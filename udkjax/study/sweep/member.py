@@ -23,7 +23,7 @@ from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.parameters import parameters_of, split
 from udkjax.study.sweep.plan import Group, Plan, stacked
-from udkjax.study.sweep.units import NUMBERS
+from udkjax.study.units import NUMBERS
 
 Kept = dict[str, Array]
 RESULT, END, STEPS = "result", "end_time", "steps"  # kept of every member

@@ -1,0 +1,325 @@
+"""The least-squares problem: residuals of all records, weighted by their noise, and of priors; and their Jacobian.
+
+With y what is measured, yhat(z) what the mechanism with the unknowns z would show, and sigma the standard deviation of the noise,
+
+    r = (yhat(z) - y) / sigma,        J = dr/dz,
+
+followed by (x - mean) / sigma of each prior. Every number y that is there is one residual; the order is record, time, channel.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.equations.assembly import assemble
+from udkjax.equations.redundancy import rows_of
+from udkjax.integrate.solution import Result
+from udkjax.scene.checks import SceneError, quoted
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.parameters import parameters_of, split
+from udkjax.study.identify.channels import Channel, Quantity, channel_of
+from udkjax.study.identify.errors import IdentificationError
+from udkjax.study.identify.parameters import Unknowns, applied
+from udkjax.study.identify.program import Members, Program
+from udkjax.study.identify.records import Record, Start
+
+AFTER = 1e-9  # of the length of a record: the distance of times that stand in for those that are not looked at
+COORDINATES, RATES = ("x", "y", "angle"), ("vx", "vy", "omega")
+READABLE = 1e-3  # coordinates are taken as unknowns of a start where they tell its neighbours apart at least as well as this
+SPREAD = 1e-12  # of the largest number in a channel: below it the channel does not move
+
+
+class StartUnknowns(NamedTuple):
+    """The unknowns of one start, or of several that are tied: how each changes q and v of its guess, and what it is called."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    basis: Float[np.ndarray, "2 n S"]
+
+
+class Evaluated(NamedTuple):
+    """Residuals (B, R), Jacobians (B, R, K), and how the runs ended: the worst code of all records (B,)."""
+
+    r: np.ndarray
+    J: np.ndarray
+    code: np.ndarray
+
+    @property
+    def ok(self) -> np.ndarray:
+        """Whether all of it is numbers."""
+        return (self.code == Result.successful) & np.isfinite(self.r).all(1) & np.isfinite(self.J).all((1, 2))
+
+
+class Problem:
+    """What is to be minimized, as a function of the unknowns z (K,): those of the parameters, then those of the starts.
+
+    `sigma` (R,) are the standard deviations that residuals are divided by; `known` says which of them were given.
+    """
+
+    def __init__(
+        self, mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any] | None = None
+    ):
+        self.mechanism, self.unknowns, self.records = mechanism, unknowns, tuple(records)
+        self.channels = _channels(mechanism, self.records)
+        self.names = tuple(str(channel.name) for channel in self.channels)
+        self.starts, self._columns = _starts(mechanism, unknowns, self.records)
+        self.K = len(unknowns.names) + sum(len(start.names) for start in self.starts)
+        self._numbers()
+        self.program = Program(mechanism, unknowns.targets, self.channels, settings or {})
+
+    @property
+    def all_names(self) -> tuple[str, ...]:
+        """The names of all unknowns."""
+        return (*self.unknowns.names, *(name for start in self.starts for name in start.names))
+
+    @property
+    def all_units(self) -> tuple[str, ...]:
+        """The units of all unknowns."""
+        return (*self.unknowns.units, *(unit for start in self.starts for unit in start.units))
+
+    def _numbers(self) -> None:
+        """Tables of all records, of one length: where one is shorter, times follow at which nothing was measured."""
+        tables = [_with_start(record) for record in self.records]
+        length = max(2, *(len(ts) for ts, _ in tables))
+        self.ts = np.stack([_lengthened(ts, length) for ts, _ in tables])
+        shape = len(self.records), length, len(self.channels)
+        self.y, sigma = np.full(shape, np.nan), np.full(shape, np.nan)
+        for r, (record, (ts, first)) in enumerate(zip(self.records, tables, strict=True)):
+            for text, values in record.values.items():
+                c = self.names.index(str(channel_of(self.mechanism, text).name))
+                self.y[r, first : len(ts), c] = values
+                noise = record.noise[text]
+                sigma[r, first : len(ts), c] = np.nan if noise is None else noise
+        self.there = np.isfinite(self.y)
+        self.known = np.isfinite(sigma)[self.there]
+        spread = np.array([_spread(self.y[:, :, c]) for c in range(shape[2])])
+        self.sigma = np.where(np.isfinite(sigma), sigma, spread)[self.there]
+        self.where = np.argwhere(self.there)  # (R, 3): record, time, channel of each residual
+
+    @property
+    def priors(self) -> np.ndarray:
+        """Which parameters have a prior."""
+        return np.flatnonzero(np.isfinite(self.unknowns.sigma))
+
+    def members(self, z: Float[np.ndarray, "B K"], horizon: float | None = None) -> Members:
+        """The members of B sets of unknowns: all records of the first, then of the next."""
+        sets, P, records = len(z), len(self.unknowns.names), len(self.records)
+        x = np.repeat(self.unknowns.values(z[:, :P]), records, axis=0)
+        S = max((len(start.names) for start in self.starts), default=0)
+        n = 3 * len(self.mechanism.body_names)
+        shift, bases = np.zeros((sets, records, S)), np.zeros((records, 2, n, S))
+        for r, columns in enumerate(self._columns):
+            if columns is not None:
+                at, start = columns
+                shift[:, r, : len(start.names)] = z[:, at : at + len(start.names)]
+                bases[r, :, :, : len(start.names)] = start.basis
+        ts = self.ts if horizon is None else np.stack([_until(ts, horizon) for ts in self.ts])
+        states = [record.start.state for record in self.records]
+        q = v = None
+        if any(state is not None for state in states):
+            mech = self.mechanism
+            q = np.stack([np.asarray(mech.q0 if state is None else state.q) for state in states])
+            v = np.stack([np.asarray(mech.v0 if state is None else state.v) for state in states])
+        one = ts, q, v, bases, _conditions(self.mechanism, self.records)
+        ts, q, v, bases, conditions = _tiled(one, sets)
+        return Members(x, shift.reshape(sets * records, S), ts, q, v, bases, conditions)
+
+    def evaluate(self, z: Float[np.ndarray, "B K"], tol: tuple[float, float], horizon: float | None = None) -> Evaluated:
+        """Residuals and Jacobian of sets of unknowns. Beyond the `horizon`, a part of each record, residuals are zero."""
+        sets, P, records = len(z), len(self.unknowns.names), len(self.records)
+        found = self.program(self.members(z, horizon), tol)
+        y = found.y.reshape(sets, records, *found.y.shape[1:])
+        slope = found.slope.reshape(sets, records, *found.slope.shape[1:])
+        r = (y[:, self.there] - self.y[self.there]) / self.sigma
+        J = np.zeros((sets, *r.shape[1:], self.K))
+        by = slope[:, self.there] / self.sigma[:, None]
+        J[:, :, :P] = by[:, :, :P] * self.unknowns.slopes(z[:, :P])[:, None, :]
+        record = self.where[:, 0]
+        for k, columns in enumerate(self._columns):
+            if columns is not None:
+                at, start = columns
+                J[:, record == k, at : at + len(start.names)] = by[:, record == k, P : P + len(start.names)]
+        if horizon is not None:
+            beyond = self.ts[tuple(self.where[:, :2].T)] > _end(self.ts[record], horizon)
+            r[:, beyond], J[:, beyond] = 0.0, 0.0
+        code = found.code.reshape(sets, records).max(1)
+        return Evaluated(*self._with_priors(z, r, J), code)
+
+    def _with_priors(self, z: np.ndarray, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        which, P, u = self.priors, len(self.unknowns.names), self.unknowns
+        if not len(which):
+            return r, J
+        x, slope = u.values(z[:, :P])[:, which], u.slopes(z[:, :P])[:, which]
+        more = np.zeros((len(z), len(which), self.K))
+        more[:, np.arange(len(which)), which] = slope / u.sigma[which]
+        return np.concatenate([r, (x - u.mean[which]) / u.sigma[which]], 1), np.concatenate([J, more], 1)
+
+
+def _tiled(tree: Any, times: int) -> Any:
+    import jax
+
+    return jax.tree.map(lambda leaf: np.tile(leaf, (times, *[1] * (np.ndim(leaf) - 1))), tree)
+
+
+def _spread(values: np.ndarray) -> float:
+    """The size of what a channel shows: the deviation from its mean; of one that stands still, its size; of zeros, 1."""
+    found = values[np.isfinite(values)]
+    size = np.abs(found).max(initial=0.0)
+    deviation = found.std() if found.size else 0.0
+    return float(deviation if deviation > SPREAD * size else size or 1.0)
+
+
+def _with_start(record: Record) -> tuple[np.ndarray, int]:
+    """Output times from the start on, and which of them is the first that was measured."""
+    return (record.times, 0) if record.t0 == record.times[0] else (np.concatenate([[record.t0], record.times]), 1)
+
+
+def _lengthened(ts: np.ndarray, length: int) -> np.ndarray:
+    span = max(ts[-1] - ts[0], AFTER)
+    return np.concatenate([ts, ts[-1] + AFTER * span * np.arange(1, length - len(ts) + 1)])
+
+
+def _end(ts: np.ndarray, horizon: float) -> np.ndarray:
+    return ts[..., 0] + horizon * (ts[..., -1] - ts[..., 0])
+
+
+def _until(ts: np.ndarray, horizon: float) -> np.ndarray:
+    """Times up to a part of a record; those after it follow so closely that they cost nothing."""
+    last = max(1, int(np.searchsorted(ts, _end(ts, horizon), side="right")) - 1)
+    return _lengthened(ts[: last + 1], len(ts))
+
+
+def _channels(mechanism: Mechanism, records: Sequence[Record]) -> tuple[Channel | Quantity, ...]:
+    found: dict[str, Any] = {}
+    problems = []
+    for record in records:
+        mine: dict[str, str] = {}
+        for text in record.values:
+            try:
+                channel = channel_of(mechanism, text)
+            except ValueError as problem:
+                problems.append(f"{_of(record)}{problem}")
+                continue
+            name = str(channel.name)
+            if name in mine:
+                problems.append(f"{_of(record)}{quoted(text)} and {quoted(mine[name])} are the same channel")
+            mine[name] = text
+            found.setdefault(name, channel)
+    if problems:
+        raise IdentificationError(problems)
+    return tuple(found.values())
+
+
+def _of(record: Record) -> str:
+    return f"record {quoted(record.name)}: " if record.name else ""
+
+
+def _conditions(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np.ndarray]:
+    """Values of all records for everything that differs between them."""
+    known, problems = parameters_of(mechanism), []
+    found: dict[str, np.ndarray] = {}
+    for name in dict.fromkeys(name for record in records for name in record.conditions):
+        owner, index = split(name, known)
+        if owner not in known or known[owner].value is None:
+            problems.append(f"conditions: no parameter {quoted(name)}")
+            continue
+        usual = np.asarray(known[owner].value)[index]
+        try:
+            found[name] = np.stack(
+                [np.broadcast_to(np.asarray(r.conditions.get(name, usual), float), usual.shape) for r in records]
+            )
+        except ValueError:
+            problems.append(f"conditions: {quoted(name)} must be of shape {usual.shape} in each record")
+    if problems:
+        raise IdentificationError(problems)
+    return found
+
+
+# --- starts
+
+
+def _starts(
+    mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record]
+) -> tuple[tuple[StartUnknowns, ...], list[tuple[int, StartUnknowns] | None]]:
+    """The unknowns of all starts, and for each record which of them are its own: from where in z on."""
+    found: list[StartUnknowns] = []
+    columns: list[tuple[int, StartUnknowns] | None] = []
+    tied: dict[str, tuple[Start, tuple[int, StartUnknowns]]] = {}
+    at, problems = len(unknowns.names), []
+    for k, record in enumerate(records):
+        start = record.start
+        if start.estimate == "nothing":
+            columns.append(None)
+            continue
+        if start.name and start.name in tied:
+            first, mine = tied[start.name]
+            if first.estimate != start.estimate or (first.state is not start.state and not _same(first.state, start.state)):
+                problems.append(
+                    f"{_of(record)}start {quoted(start.name)} is another one in an earlier record: give one Start to both"
+                )
+            columns.append(mine)
+            continue
+        label = start.name or record.name or (f"record {k + 1}" if len(records) > 1 else "start")
+        mine = at, _unknowns_of(mechanism, unknowns, record, label)
+        found.append(mine[1])
+        columns.append(mine)
+        at += len(mine[1].names)
+        if start.name:
+            tied[start.name] = start, mine
+    if problems:
+        raise IdentificationError(problems)
+    return tuple(found), columns
+
+
+def _same(one: Any, two: Any) -> bool:
+    return one is not None and two is not None and np.array_equal(one.q, two.q) and np.array_equal(one.v, two.v)
+
+
+def _unknowns_of(mechanism: Mechanism, unknowns: Unknowns, record: Record, label: str) -> StartUnknowns:
+    """Coordinates that tell the closed states beside the guess apart: angles where they do."""
+    mech = mechanism.with_parameters(record.conditions) if record.conditions else mechanism
+    try:
+        mech = applied(mech, unknowns.targets, unknowns.start)  # pyright: ignore[reportArgumentType]
+        state = assemble(mech, record.t0, record.start.state)
+    except (SceneError, ValueError) as problem:
+        raise IdentificationError([f"{_of(record)}its start cannot be closed: {problem}"]) from None
+    rows: Any = rows_of(mech)
+    q = np.asarray(state.q, float).ravel()
+    free = np.eye(len(q))
+    if rows.count:
+        position = rows.close(record.t0, q)
+        free = rows.root[:, None] * position.vt[position.rank :].T
+    chosen = _telling(free)
+    basis = free @ np.linalg.inv(free[chosen])
+    names: list[str] = []
+    units: list[str] = []
+    parts = []
+    nothing = np.zeros_like(basis)
+    for estimated, fields, unit, part in (
+        (record.start.position, COORDINATES, ("m", "m", "rad"), np.stack([basis, nothing])),
+        (record.start.velocity, RATES, ("m/s", "m/s", "rad/s"), np.stack([nothing, basis])),
+    ):
+        if estimated:
+            names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3]}" for k in chosen]
+            units += [unit[k % 3] for k in chosen]
+            parts.append(part)
+    return StartUnknowns(tuple(names), tuple(units), np.concatenate(parts, axis=2))
+
+
+def _telling(free: np.ndarray) -> list[int]:
+    """As many rows as there are columns, far from dependent on each other; of angles where they are no worse than that."""
+    for rows in (np.arange(2, len(free), 3), np.arange(len(free))):
+        left, chosen = free / np.linalg.norm(free, 2), []
+        for _ in range(free.shape[1]):
+            sizes = np.linalg.norm(left[rows], axis=1)
+            k = int(rows[np.argmax(sizes)])
+            if sizes.max() < READABLE:
+                break
+            chosen.append(k)
+            away = left[k] / np.linalg.norm(left[k])
+            left = left - np.outer(left @ away, away)
+        else:
+            return sorted(chosen)
+    return sorted(chosen)
