@@ -75,18 +75,29 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     leaves = jax.tree.leaves(mechanism)
     if any(isinstance(leaf, Tracer) for leaf in leaves):
         return None
-    rows: Any = rows_of(mechanism)
+    rows = rows_of(mechanism)
     if not rows.count:
         return ()
-    first = rows.close(0.0, np.asarray(mechanism.q0, float).ravel())
+    positions = positions_of(rows, np.asarray(mechanism.q0, float).ravel())
+    return chosen_rows(rows, positions) if positions else None
+
+
+@np.errstate(all="ignore")
+def positions_of(rows: Any, q: np.ndarray) -> list[Any]:
+    """Closed positions of the highest rank along a random motion from a guess q: one is enough where no row is redundant.
+
+    None at all where the guess cannot be closed or moved.
+    """
+    first = rows.close(0.0, q)
     if first is None:
-        return None
+        return []
     found = [first]
     random = np.random.default_rng(0)
     heading = random.standard_normal(rows.size)
     for k in range(rows.samples):
-        if any(p.clear and p.rank == rows.count for p in found):
-            return ()
+        full = [p for p in found if p.clear and p.rank == rows.count]
+        if full:
+            return full[:1]
         last = found[-1]
         heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(rows.size) / np.sqrt(rows.size)
         heading = last.along(heading)  # onward, so that the motion gets around
@@ -97,12 +108,18 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
             position = rows.close(TICK * (k + 1), first.q + TURN * random.uniform(-1.0, 1.0, rows.size))
         found.extend([] if position is None else [position])
     found = [p for p in found if p.clear]
-    if not found or (found == [first] and first.rank < rows.size):
-        return None
+    if not found or (len(found) == 1 and found[0] is first and first.rank < rows.size):
+        return []
     rank = max(p.rank for p in found)
-    generic = [p for p in found if p.rank == rank]
+    return [p for p in found if p.rank == rank]
+
+
+def chosen_rows(rows: Any, positions: list[Any]) -> tuple[int, ...]:
+    """The rows to leave out, of positions of ordinary rank: those whose absence never makes the others dependent."""
+    if positions[0].rank == rows.count:
+        return ()
     chosen = []
-    for members, found in rows.parts_of(generic):
+    for members, found in rows.parts_of(positions):
         ordinary = [part for part in found if part.smallest > ORDINARY] or found
         chosen += members[list(dispensable([part.null_space for part in ordinary]))].tolist()
     return tuple(sorted(chosen))
@@ -164,12 +181,12 @@ class Rows:
         return np.split(np.array(outputs, float), self._split)
 
     def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Psi, and Psi and D scaled to rows of D of length one (which changes no solution of a consistent system)."""
+        """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
         values, psi, _ = self._evaluate(t, q)
         D = self._code.pattern.dense(values, np)
         length = np.linalg.norm(D, axis=1)
         length[length == 0.0] = 1.0
-        return psi, psi / length, D / length[:, None]
+        return psi, length, D / length[:, None]
 
     def parts_of(self, positions: list[Position]) -> list[tuple[np.ndarray, list[Position]]]:
         """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""
@@ -181,7 +198,7 @@ class Rows:
         Damped: a random motion out of a singular configuration ends far from closure in badly determined directions.
         """
         damping = DAMPING
-        psi, scaled, D = self.at(t, q)
+        psi, length, D = self.at(t, q)
         for _ in range(ITERATIONS):
             if not (np.all(np.isfinite(psi)) and np.all(np.isfinite(D))):
                 return None
@@ -189,11 +206,11 @@ class Rows:
             if np.abs(psi).max() <= CLOSED * (1.0 + np.abs(q).max()):
                 return Position(t, q, u, sigma, vt)
             gain = sigma / (sigma**2 + damping)
-            step = -self.root * (vt[: len(sigma)].T @ (gain * (u[:, : len(sigma)].T @ scaled)))
+            step = -self.root * (vt[: len(sigma)].T @ (gain * (u[:, : len(sigma)].T @ (psi / length))))
             ahead = q + step * min(1.0, TURN / max(np.abs(step).max(), 1e-300))
             trial = self.at(t, ahead)
             if np.linalg.norm(trial[0]) < np.linalg.norm(psi):
-                q, (psi, scaled, D), damping = ahead, trial, 0.1 * damping
+                q, (psi, length, D), damping = ahead, trial, 0.1 * damping
             elif damping > 1e6:
                 return None
             else:

@@ -122,10 +122,10 @@ class SparseRows:
         return minimum_degree(rows)
 
     def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
-        """Psi, and Psi and D scaled to rows of D of length one (which changes no solution of a consistent system)."""
+        """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
         psi, _, values = (np.asarray(x) for x in self._evaluate(t, q, q))
         D, length = self._scaled(values)
-        return psi, psi / length, D
+        return psi, length, D
 
     def _scaled(self, values: np.ndarray) -> tuple[Any, np.ndarray]:
         row, column, place = self._places
@@ -142,15 +142,15 @@ class SparseRows:
     def _settled(self, t: float, q: np.ndarray, enough: float) -> tuple[np.ndarray, np.ndarray, Any]:
         """Levenberg-Marquardt in the mass metric, with steps of limited length, until Psi is small enough or grows no smaller."""
         damping, least = DAMPING
-        psi, scaled, D = self.at(t, q)
+        psi, length, D = self.at(t, q)
         for _ in range(ITERATIONS):
             size = np.abs(psi).max()
             if not (np.isfinite(size) and np.all(np.isfinite(D.data))) or size <= enough * (1.0 + np.abs(q).max()):
                 break
-            ahead = q + _limited(self._correction(D, scaled, damping))
+            ahead = q + _limited(self._correction(D, psi / length, damping))
             trial = self.at(t, ahead)
             if np.linalg.norm(trial[0]) < np.linalg.norm(psi):
-                q, (psi, scaled, D), damping = ahead, trial, max(0.1 * damping, least)
+                q, (psi, length, D), damping = ahead, trial, max(0.1 * damping, least)
             elif damping > 1e6 or size <= CLOSED * (1.0 + np.abs(q).max()):
                 break
             else:
