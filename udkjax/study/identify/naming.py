@@ -55,7 +55,7 @@ def _body(mechanism: Mechanism, text: str) -> Channel:
     spot, rest = _spot(rest, _CENTRE)
     shown = _shown(name, spot) if spot is not _CENTRE else name
     known = _OF_POINTS if spot is not _CENTRE else {**_OF_POINTS, **_OF_ANGLES}
-    quantity = _quantity(f"body {shown}", rest, known)
+    quantity = _quantity(f"body {quoted(shown)}", rest, known)
     needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
     return Channel(f"body.{shown}.{quantity}", _UNITS[quantity], needs, "body", "", (name,), (spot,), quantity)
 
@@ -65,11 +65,11 @@ def _joint(mechanism: Mechanism, text: str) -> Channel:
     bodies = mechanism.frames_of(mechanism.joints[name])
     for body in sorted(bodies, key=len, reverse=True):
         if rest.startswith(f".{body}."):
-            quantity = _quantity(f"joint {name} on body {body}", rest.removeprefix(f".{body}"), LOADS)
+            quantity = _quantity(f"joint {quoted(name)} on body {quoted(body)}", rest.removeprefix(f".{body}"), LOADS)
             return Channel(f"joint.{name}.{body}.{quantity}", _UNITS[quantity], "reactions", "joint", name, (body,), (), quantity)
     two = bodies[:2]
     known = {**(_OF_ANGLES if len(two) == 2 else {}), **LOADS}
-    quantity = _quantity(f"joint {name}", rest, known, [f"{b}.{q}" for b in bodies for q in LOADS])
+    quantity = _quantity(f"joint {quoted(name)}", rest, known, [f"{b}.{q}" for b in bodies for q in LOADS])
     units, label = _UNITS[quantity], f"joint.{name}.{quantity}"
     if quantity in LOADS:
         return Channel(label, units, "reactions", "joint", name, two[-1:], (), quantity)
@@ -79,7 +79,7 @@ def _joint(mechanism: Mechanism, text: str) -> Channel:
 
 def _driver(mechanism: Mechanism, text: str) -> Channel:
     name, rest = _owner("driver", mechanism.driver_names, text)
-    quantity = _quantity(f"driver {name}", rest, {"load": ""})
+    quantity = _quantity(f"driver {quoted(name)}", rest, {"load": ""})
     driver = mechanism.drivers[name]
     units = "N m" if driver.coordinate == "angle" else "N"
     return Channel(f"driver.{name}.{quantity}", units, "reactions", "driver", name, driver.bodies[1:], (), quantity)
@@ -108,13 +108,14 @@ _READERS: dict[str, Callable[[Mechanism, str], Channel]] = {
 
 def _owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
     """Split a text into one of these names, the longest that fits, and what follows it."""
-    for name in sorted(names, key=len, reverse=True):
-        if text.startswith(name) and text[len(name) : len(name) + 1] in ("", ".", "("):
-            return name, text[len(name) :]
+    fitting = [name for name in names if text.startswith(name) and text[len(name) :].startswith((".", "("))]
+    if fitting or text in names:
+        name = max(fitting, key=len, default=text)
+        return name, text[len(name) :]
     given = re.split(r"\(|\.[^.]*$", text)[0]
     if given == GROUND:
         raise ValueError(f'"{GROUND}" does not move; name a body')
-    known = f"; there are {', '.join(map(quoted, names))}" if names else f"; there is no {kind}"
+    known = f"; there are {', '.join(map(quoted, names))}" if names else "; the mechanism has none"
     raise ValueError(f"no {kind} named {quoted(given)}{suggestion(given, names) or known}")
 
 
@@ -139,7 +140,7 @@ def _quantity(owner: str, text: str, known: Iterable[str], more: Iterable[str] =
     if text.startswith(".") and name in known:
         return name
     near = suggestion(name, [*known, *more]) or f"; it has {', '.join([*known, *more])}"
-    raise ValueError(f"{owner} has no {quoted(name)}{near}")
+    raise ValueError(f"{owner} has no {quoted(name)}{near}" if name else f"{owner}: name one of {', '.join([*known, *more])}")
 
 
 def _shown(name: str, spot: Spot) -> str:
