@@ -1,0 +1,186 @@
+"""Which parameters of overconstrained mechanisms may move."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax.equations.redundancy import rows_of
+from udkjax.scene.joints import Gear, Revolute
+from udkjax.study.identify.legality import illegal, tie
+
+
+def lengths(*groups):
+    """Each value the common length of a group of bodies."""
+
+    def apply(mechanism, x):
+        for k, bodies in enumerate(groups):
+            mechanism = udk.with_length(mechanism, bodies, x[k])
+        return mechanism
+
+    return apply
+
+
+def numbers(*names):
+    return lambda mechanism, x: mechanism.with_parameters({name: x[k] for k, name in enumerate(names)})
+
+
+def asked(mechanism, *names):
+    """What is wrong with moving some numbers of a scene."""
+    return illegal(mechanism, numbers(*names), [entry(mechanism.parameters(), name) for name in names], names)
+
+
+def entry(values, name):
+    owner, _, index = name.partition("[")
+    return float(np.asarray(values[owner])[tuple(int(i) for i in index[:-1].split("]["))])
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    return udk.library.parallelogram()
+
+
+ALL = 'joints "A1", "A2", "A3", "B1", "B2" and "B3" close a loop'
+
+
+def test_three_cranks_must_stay_equal(linkage):
+    (problem,) = illegal(linkage, lengths("link1", "link2", "link3"), [1.0, 1.0, 1.0], ["a", "b", "c"])
+    assert problem == f"a, b and c cannot move each by itself: {ALL} that only holds for a = b = c; tie them, or leave them fixed"
+
+
+@pytest.mark.parametrize("groups", [(("link1", "link2"), "link3"), (("link1", "link3"), "link2")])
+def test_two_tied_and_one_free_are_refused(linkage, groups):
+    (problem,) = illegal(linkage, lengths(*groups), [1.0, 1.0], ["two", "one"])
+    assert "two and one cannot move each by itself" in problem and "only holds for two = one; tie them" in problem
+
+
+def test_all_three_tied_are_legal_and_so_are_masses(linkage):
+    def apply(mechanism, x):
+        mechanism = udk.with_length(mechanism, ("link1", "link2", "link3"), x[0])
+        return mechanism.with_parameters({"body.link1.mass": x[1], "body.coupler.inertia": x[2], "gravity": x[3:]})
+
+    assert illegal(linkage, apply, [1.0, 3.0, 0.3, 0.0, -9.81], ["l", "m", "I", "gx", "gy"]) == []
+
+
+def test_one_crank_alone_is_refused(linkage):
+    (problem,) = illegal(linkage, lengths("link2"), [1.0], ["length(link2)"])
+    assert problem.startswith("length(link2) cannot move by itself: joints")
+    assert problem.endswith("leave it fixed, or tie it to what has to move with it")
+
+
+def test_first_guesses_that_open_a_loop_are_refused(linkage):
+    (problem,) = illegal(linkage, lengths("link1", "link2", "link3"), [1.0, 1.2, 1.0], ["a", "b", "c"])
+    assert problem.startswith("the first guesses of a, b and c open a loop")
+
+
+def test_legal_to_first_order_is_not_enough(linkage):
+    """Cranks of l + d, l and l - d: Psi along the left null space changes by d^2, at every position."""
+
+    def apply(mechanism, x):
+        return lengths("link1", "link3")(mechanism, [1.0 + x[0], 1.0 - x[0]])
+
+    for name in ("link1", "link3"):
+        assert illegal(linkage, lengths(name), [1.0], ["one of them"])
+    (problem,) = illegal(linkage, apply, [0.0], ["d"])
+    assert problem.startswith("d cannot move by itself")
+    # A pin beside its crank's line: longer by the square of the distance.
+    (problem,) = asked(linkage, "joint.A1.points[1][1]")
+    assert "cannot move by itself" in problem
+
+
+def triangle():
+    """Three equal cranks on the corners of a triangle carry one that is as large: closed along all of the motion."""
+    corners, angle = [(0.0, 0.0), (1.0, 0.8), (2.0, 0.0)], 0.9
+    e = jnp.array([np.cos(angle), np.sin(angle)])
+    bodies = {f"link{i}": udk.Body(1.0, 0.1, jnp.array(c) + 0.5 * e, angle) for i, c in enumerate(corners)}
+    bodies["plate"] = udk.Body(2.0, 0.2, jnp.array([1.0, 0.3]) + e, 0.0)
+    joints = {f"A{i}": Revolute(("ground", f"link{i}"), [c, (-0.5, 0.0)]) for i, c in enumerate(corners)}
+    joints |= {f"B{i}": Revolute(("plate", f"link{i}"), [(x - 1.0, y - 0.3), (0.5, 0.0)]) for i, (x, y) in enumerate(corners)}
+    return udk.Mechanism(bodies, joints), np.array(corners) - [1.0, 0.3], angle
+
+
+def test_a_tie_that_is_legal_at_one_position_only_is_refused():
+    """Cranks longer by what a small turn of the plate takes along them: at the angle at which that was computed."""
+    mechanism, arms, angle = triangle()
+    assert len(mechanism.left_out) == 1
+    weights = arms @ [np.sin(-angle), np.cos(angle)]
+
+    def apply(mechanism, x):
+        return lengths("link0", "link1", "link2")(mechanism, 1.0 + weights * x[0])
+
+    rows, d = rows_of(mechanism), 1e-6
+    here: Any = rows.close(0.0, np.asarray(mechanism.q0).ravel())
+    change = [(rows_of(apply(mechanism, [s])).at(0.0, here.q)[0]) for s in (d, -d)]
+    along = here.null_space.T @ ((change[0] - change[1]) / (2 * d) / rows.at(0.0, here.q)[1])
+    assert np.abs(along).max() < 1e-8  # legal here
+    (problem,) = illegal(mechanism, apply, [0.0], ["turned"])
+    assert "turned cannot move by itself" in problem
+    (problem,) = illegal(mechanism, lengths("link0", "link1", "link2"), [1.0] * 3, ["a", "b", "c"])
+    assert "only holds for a = b = c" in problem
+
+
+def test_pivots_move_with_the_coupler(linkage):
+    a, b = "joint.A3.points[0][0]", "joint.B3.points[0][0]"
+    (problem,) = asked(linkage, a, b)
+    assert f"only holds for {a} and {b} changing by the same amount; tie them" in problem
+    (problem,) = asked(linkage, "joint.B1.points[0][0]", b)
+    assert "cannot move, each by itself or together" in problem and problem.endswith("leave them fixed")
+    # A third one that has no partner stays fixed.
+    (problem,) = asked(linkage, a, b, "joint.B1.points[0][0]")
+    assert problem.endswith("tie them, and leave joint.B1.points[0][0] fixed")
+
+
+def test_gears_on_two_axles_keep_their_ratio():
+    bodies = {"one": udk.Body(1.0, 0.1, (0.0, 0.0)), "two": udk.Body(1.0, 0.1, (0.6, 0.0))}
+    axles = {name: Revolute(("ground", name), [body.position, (0.0, 0.0)]) for name, body in bodies.items()}
+    wheels = {"pair": Gear(("one", "two"), (0.2, 0.4)), "second pair": Gear(("one", "two"), (0.1, 0.2))}
+    mechanism = udk.Mechanism(bodies, axles | wheels)
+    names = ["joint.pair.radii[0]", "joint.second pair.radii[0]"]
+    (problem,) = asked(mechanism, *names)
+    assert 'joints "pair" and "second pair" close a loop' in problem
+    assert f"only holds for {names[0]} and {names[1]} in proportion 1 : 0.5; tie them" in problem
+    assert asked(mechanism, "joint.one.points[0][0]", "joint.two.points[1][0]") == []  # wheels mesh wherever their axles are
+
+
+def test_bars_of_a_scissor_lift_stay_equal_in_pairs():
+    lift = udk.library.scissor_lift(1)
+    names = ("rising0", "falling0")
+    (problem,) = illegal(lift, lengths(*names), [1.0, 1.0], names)
+    assert "only holds for rising0 = falling0" in problem and '"guide"' in problem
+    assert illegal(lift, lengths(names), [1.0], ["both"]) == []
+
+
+def test_loops_of_which_none_is_overconstrained_move_freely(compilations):
+    """Four-bars in a row have rows that depend on each other in singular configurations alone: nothing is looked at."""
+    bars = udk.library.n_four_bar(3)
+    assert bars.left_out == ()
+    apply = lengths("link0", "link1", "coupler2")
+    assert compilations(lambda: illegal(bars, apply, [1.0, 1.0, 1.0], ["a", "b", "c"])) == []
+    assert illegal(bars, apply, [1.0, 1.0, 1.0], ["a", "b", "c"]) == []
+
+
+def test_loops_side_by_side_are_told_apart(linkage):
+    """Of two linkages in one scene, each has its own tie, and names its own joints."""
+    bodies, joints = {}, {}
+    for k in (0, 1):
+        bodies |= {f"{name}/{k}": body for name, body in linkage.bodies.items()}
+        for name, joint in linkage.joints.items():
+            ends = tuple(b if b == "ground" else f"{b}/{k}" for b in joint.bodies)
+            joints[f"{name}/{k}"] = Revolute(ends, joint.points)
+    both = udk.Mechanism(bodies, joints)
+    names = [f"link{i}/{k}" for i in (1, 2, 3) for k in (0, 1)]
+    problems = illegal(both, lengths(*names), [1.0] * 6, names)
+    assert len(problems) == 2
+    for k, problem in enumerate(problems):
+        assert f"only holds for link1/{k} = link2/{k} = link3/{k};" in problem
+        assert f'"A1/{k}"' in problem and f'"A1/{1 - k}"' not in problem
+
+
+def test_texts_of_ties():
+    names = ["a", "b", "c"]
+    assert tie(names, np.array([2.0, 2.0, 1.0]), np.array([1.0, 1.0, 0.0])) == "a = b"
+    assert tie(names, np.array([1.0, 2.0, 0.5]), np.array([2.0, 4.0, 1.0])) == "a, b and c in proportion 1 : 2 : 0.5"
+    assert tie(names, np.array([0.0, 2.0, 0.5]), np.array([3.0, 3.0, 3.0])) == "a, b and c changing by the same amount"
+    assert tie(names, np.array([0.0, 2.0, 0.5]), np.array([2.0, -1.0, 0.0])) == "a and b changing in proportion 1 : -0.5"

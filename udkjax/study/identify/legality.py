@@ -1,0 +1,200 @@
+"""Which parameters may move: those that leave the loops of an overconstrained mechanism closed.
+
+Rows of Psi that depend on each other hold on a part of all parameters only: three cranks carry one coupler as long as they are
+equal. With N the left null space of Psi_q at a closed position, a change dp of parameters is legal to first order if and only if
+
+    N^T (dPsi/dp) dp = 0        with dPsi/dp at fixed q
+
+at that position; it has to be so at all of them. To first order is not enough: cranks of l + d, l and l - d satisfy it, and miss
+each other by distances of second order. So what is legal to first order is moved by a finite step and closed again: the rank must
+still be what it was. All of it is NumPy on the graph's programs; without redundant rows there is nothing to do.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import ArrayLike
+
+from udkjax.equations.redundancy import ORDINARY, chosen_rows, positions_of, rows_of
+from udkjax.scene.checks import quoted
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.directions import COEFFICIENT, connected, listed, null_space, ratio, reduced, row_space
+
+# Of what a parameter does to Psi at all, the part along N that counts as none. Central differences leave 1e-10, positions closed
+# to 1e-11 with singular values above ORDINARY 1e-9, a direction that opens a loop leaves a tenth or more.
+ALONG = 1e-6
+DIFFERENCE = 1e-5  # of a parameter's size: the step of the central differences
+# Of a parameter's size: the step after which a mechanism must close again. What opens to second order does so by 1e-4 of the
+# size, ten million times what closing attains (redundancy.CLOSED).
+STEP = 1e-2
+SMALL = 1e-3  # of the mechanism's size: a coordinate as small as this counts as zero, and has no size of its own
+FEW = 4  # positions that are closed again
+
+
+def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], x: ArrayLike, names: Sequence[str]) -> list[str]:
+    """Return what is wrong with moving these parameters each by itself, around the values x; nothing if all of it is legal.
+
+    `apply(mechanism, x)` puts the values x (P,) in; it is pure, and x may be traced. A message names the constraints that close
+    the loop, the parameters that would open it, and the ties that keep it closed.
+    """
+    if mechanism.left_out == () or not names:
+        return []
+    loops = Loops(mechanism, apply, np.asarray(x, float))
+    if mechanism.left_out and loops.redundant < len(mechanism.left_out):
+        return [
+            f"the first guesses of {listed(names)} open a loop that closes with the scene's own values: it has more "
+            "constraints than it needs, and only certain values satisfy all of them; start from such values"
+        ]
+    return loops.problems(names) if loops.redundant else []
+
+
+class Loops:
+    """The positions of a mechanism with redundant rows, and what parameters do to these rows there."""
+
+    def __init__(self, mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], x: np.ndarray):
+        # Traced, so that no step of differences is refused for a sign; and as it was when its redundant rows were looked for, so
+        # that the graph is there already.
+        placed = jax.jit(lambda x: apply(mechanism, x).with_left_out(None))
+        self._rows = lambda x: rows_of(placed(x))
+        self.x, rows = x, self._rows(x)
+        guess = np.asarray(placed(x).q0, float)
+        with np.errstate(all="ignore"):
+            found = positions_of(rows, guess.ravel())
+        self.redundant = rows.count - found[0].rank if found else 0
+        if not self.redundant:
+            return
+        self._drivers = mechanism.driver_names
+        self._positions = [p for p in found if p.smallest > ORDINARY] or found
+        self._names = [name for name, _ in rows.names]
+        self._left_out = list(chosen_rows(rows, found))
+        spread = float(np.ptp(guess[:, :2], axis=0).max())
+        size = min(spread, 1.0) or 1.0
+        self._size = np.where(np.abs(x) > SMALL * size, np.abs(x), 0.1 * size)
+        self._measure(rows)
+
+    def _measure(self, rows: Any):
+        """What each parameter, changed by its own size, does to Psi, and how much of it no motion makes up for."""
+        lengths = [rows.at(p.t, p.q)[1] for p in self._positions]
+        columns = []
+        for unit in np.eye(len(self.x)):
+            step = DIFFERENCE * self._size * unit
+            ahead, behind = self._rows(self.x + step), self._rows(self.x - step)
+            moved = [ahead.at(p.t, p.q)[0] - behind.at(p.t, p.q)[0] for p in self._positions]
+            columns.append([m / (2 * DIFFERENCE * length) for m, length in zip(moved, lengths, strict=True)])
+        effect = np.moveaxis(np.array(columns), 0, -1)  # (positions, rows, P)
+        total = np.sqrt((effect**2).sum((0, 1)) / len(effect))
+        # In units in which each parameter has an effect of one.
+        self._unit = self._size / np.where(total > 0, total, 1.0)
+        self._effect = effect / np.where(total > 0, total, 1.0)
+        null_spaces = [np.asarray(getattr(N, "toarray", lambda N=N: N)()) for N in (p.null_space for p in self._positions)]
+        self._along = np.concatenate([N.T @ e for N, e in zip(null_spaces, self._effect, strict=True)])
+        # One combination of rows for each row left out: that row as the others make it up.
+        self._circuits = np.array([N @ np.linalg.inv(N[self._left_out]) for N in null_spaces])
+
+    def problems(self, names: Sequence[str]) -> list[str]:
+        """One message for each set of parameters that depend on each other."""
+        found = []
+        relations = row_space(self._along, ALONG)
+        sets = connected(relations)
+        free = sorted(set(range(len(self.x))) - {i for members in sets for i in members})
+        if free and not self._closes(np.eye(len(self.x))[free]):
+            ties = self._ties(free, np.eye(len(free)))
+            for part in connected(row_space(null_space(ties, COEFFICIENT), COEFFICIENT)):
+                members = [free[i] for i in part]
+                inside = [i for i in range(len(ties)) if np.any(ties[i, part])]
+                found.append(self._problem(names, members, ties[np.ix_(inside, part)]))
+        for members in sets:
+            ties = self._ties(members, null_space(self._along[:, members], ALONG))
+            found.append(self._problem(names, members, ties))
+        return found
+
+    def _closes(self, directions: np.ndarray) -> bool:
+        """Whether the mechanism closes, as redundant as it was, after a step along all of some directions at once."""
+        if not len(directions):
+            return True
+        step = np.random.default_rng(1).uniform(0.5, 1.0, len(directions)) @ directions
+        step = step * STEP / np.max(np.abs(step * self._unit) / self._size) * self._unit
+        rows = self._rows(self.x + step)
+        every = max(1, len(self._positions) // FEW)
+        for p in self._positions[::every]:
+            with np.errstate(all="ignore"):
+                closed = rows.close(p.t, p.q)
+            if closed is None or closed.rank != p.rank:
+                return False
+        return True
+
+    def _ties(self, members: Sequence[int], legal: np.ndarray) -> np.ndarray:
+        """Directions (ties, members) in which these parameters may move, the simplest first, of what is legal to first order."""
+        chosen = np.zeros((0, len(members)))
+        for candidate in self._candidates(members, legal):
+            size = np.linalg.norm(candidate)
+            outside = candidate - legal.T @ (legal @ candidate)
+            if np.linalg.norm(outside) > COEFFICIENT * size:
+                continue
+            trial = np.vstack([chosen, candidate / size])
+            if np.linalg.svd(trial)[1][-1] < COEFFICIENT:
+                continue
+            every = np.zeros((len(trial), len(self.x)))
+            every[:, members] = trial
+            if self._closes(every):
+                chosen = trial
+            if len(chosen) == len(legal):
+                break
+        return chosen
+
+    def _candidates(self, members: Sequence[int], legal: np.ndarray) -> Iterator[np.ndarray]:
+        """Each by itself, two by the same amount or factor, all by the same amount or factor, whatever else is legal."""
+        x, unit, n = self.x[members], self._unit[members], len(members)
+        each = np.eye(n)
+        yield from each
+        for together in (np.ones(n), x):
+            for i in range(n):
+                yield from ((each[i] + each[j]) * together / unit for j in range(i) if together[i] and together[j])
+        yield from (together / unit for together in (x, np.ones(n)) if np.any(together))
+        yield from reduced(legal)
+
+    def _problem(self, names: Sequence[str], members: Sequence[int], ties: np.ndarray) -> str:
+        ties = np.where(np.abs(ties) > COEFFICIENT, ties, 0.0)
+        ties = ties[np.count_nonzero(ties, axis=1) > 1] * self._unit[members]
+        own, x = [names[i] for i in members], self.x[members]
+        who = listed(own)
+        stuck = [name for name, tied in zip(own, np.any(ties, axis=0), strict=True) if not tied]
+        if len(own) == 1:
+            return (
+                f"{who} cannot move by itself: {self._loop(members)} that only holds for the value that it has; "
+                "leave it fixed, or tie it to what has to move with it"
+            )
+        if not len(ties):
+            return (
+                f"{who} cannot move, each by itself or together: {self._loop(members)} that only holds for the values that they "
+                "have; leave them fixed"
+            )
+        condition = ", ".join(tie(own, x, u) for u in ties)
+        leave = f"tie them, and leave {listed(stuck)} fixed" if stuck else "tie them, or leave them fixed"
+        return f"{who} cannot move each by itself: {self._loop(members)} that only holds for {condition}; {leave}"
+
+    def _loop(self, members: Sequence[int]) -> str:
+        """The constraints that close what these parameters would open."""
+        opened = np.einsum("srk,srm->skm", self._circuits, self._effect[:, :, members])
+        part_of = np.abs(opened).max((0, 2)) > ALONG
+        circuits = self._circuits[:, :, part_of if part_of.any() else slice(None)]
+        involved = np.abs(circuits).max((0, 2)) > COEFFICIENT
+        constraints = list(dict.fromkeys(name for name, there in zip(self._names, involved, strict=True) if there))
+        what = "constraints" if set(constraints) & set(self._drivers) else "joints"
+        return f"{what} {listed([quoted(name) for name in constraints])} close a loop"
+
+
+def tie(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:
+    """Say how parameters with the values x have to move together, where u are their changes."""
+    there = np.flatnonzero(u).tolist()
+    names, x, u = [names[i] for i in there], x[there], u[there]
+    same = np.allclose(u, u[0], rtol=1e-3)
+    if same and np.allclose(x, x[0], rtol=1e-9):
+        return " = ".join(names)
+    if np.all(x != 0) and np.allclose(u / x, u[0] / x[0], rtol=1e-3):
+        return f"{listed(names)} in proportion {ratio(x)}"
+    if same:
+        return f"{listed(names)} changing by the same amount"
+    return f"{listed(names)} changing in proportion {ratio(u)}"
