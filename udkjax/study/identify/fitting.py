@@ -22,7 +22,9 @@ SETTLED = 1e-10  # of an unknown, dimensionless: a Gauss-Newton step below it ch
 NOTHING = 1e-9  # cosine of the angle between residuals and what the unknowns can change of them
 FLAT = 1e-9  # of the largest singular value: directions that a step is not expected to be known in
 FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
-FIRST = 10.0  # the method's first damping is 1 / FIRST^2 of the largest singular value squared
+# What residuals are multiplied by, over the largest singular value: the method's first damping is 1 / FIRST^2 of its square.
+# Where a minimum is near there is none to speak of.
+FIRST, NEAR = 10.0, 1e8
 STUCK = 8  # steps refused one after another
 
 
@@ -43,11 +45,15 @@ def descend(
     horizon: float | None = None,
     steps: int = STEPS,
     settled: float = SETTLED,
+    near: bool = False,
     method: Any = None,
     loss: Callable[[Evaluated], Evaluated] | None = None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Fit:
-    """Minimize r.r / 2 from several first guesses; each until its Gauss-Newton step is below `settled`."""
+    """Minimize r.r / 2 from several first guesses; each until its Gauss-Newton step is below `settled`.
+
+    `near`: the guesses are at a minimum, up to the tolerance of the integration; steps are not damped.
+    """
     sets, K = z.shape
     start, step = _machine(method, K, sets)
     state, y, at, trial = start, jnp.asarray(z), z.copy(), z.copy()
@@ -58,8 +64,7 @@ def descend(
     history: list[tuple[float, ...]] = []
     for count in range(steps):
         active = np.flatnonzero(going)
-        near = np.abs(trial[active]).max(1, initial=0.0) < FAR
-        asked = active[near]
+        asked = active[np.abs(trial[active]).max(1, initial=0.0) < FAR]
         costs, triangles = np.full(sets, np.inf), np.zeros((sets, K + 1, K + 1))
         if len(asked):
             found = problem.evaluate(trial[asked], tol, horizon)
@@ -70,7 +75,7 @@ def descend(
         better = costs < best
         if count == 0:
             going &= np.isfinite(costs)
-            unit = np.array([FIRST / max(np.linalg.norm(t[:-1, :-1], 2), 1e-300) for t in triangles])
+            unit = np.array([(NEAR if near else FIRST) / max(np.linalg.norm(t[:-1, :-1], 2), 1e-300) for t in triangles])
         refused = np.where(better, 0, refused + 1)
         at, best = np.where(better[:, None], trial, at), np.where(better, costs, best)
         reduced = np.where(better[:, None, None], triangles, reduced)

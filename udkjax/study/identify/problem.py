@@ -63,7 +63,7 @@ class Problem:
     ):
         self.mechanism, self.unknowns, self.records = mechanism, unknowns, tuple(records)
         self.channels = _channels(mechanism, self.records)
-        self.names = tuple(str(channel.name) for channel in self.channels)
+        self.names = tuple(channel.name for channel in self.channels)
         self.starts, self._columns = _starts(mechanism, unknowns, self.records)
         self.K = len(unknowns.names) + sum(len(start.names) for start in self.starts)
         self._numbers()
@@ -88,15 +88,21 @@ class Problem:
         self.y, sigma = np.full(shape, np.nan), np.full(shape, np.nan)
         for r, (record, (ts, first)) in enumerate(zip(self.records, tables, strict=True)):
             for text, values in record.values.items():
-                c = self.names.index(str(channel_of(self.mechanism, text).name))
+                c = self.names.index(_channel(self.mechanism, text).name)
                 self.y[r, first : len(ts), c] = values
                 noise = record.noise[text]
                 sigma[r, first : len(ts), c] = np.nan if noise is None else noise
         self.there = np.isfinite(self.y)
         self.known = np.isfinite(sigma)[self.there]
-        spread = np.array([_spread(self.y[:, :, c]) for c in range(shape[2])])
-        self.sigma = np.where(np.isfinite(sigma), sigma, spread)[self.there]
+        self.spread = np.array([_spread(self.y[:, :, c]) for c in range(shape[2])])
+        self.sigma = np.where(np.isfinite(sigma), sigma, self.spread)[self.there]
         self.where = np.argwhere(self.there)  # (R, 3): record, time, channel of each residual
+
+    def series(self) -> list[np.ndarray]:
+        """Which residuals belong to one channel of one record, in the order of time: for each that has some."""
+        record, _, channel = self.where.T
+        pairs = ((k, c) for k in range(len(self.records)) for c in range(len(self.channels)))
+        return [places for k, c in pairs if len(places := np.flatnonzero((record == k) & (channel == c)))]
 
     @property
     def priors(self) -> np.ndarray:
@@ -195,21 +201,25 @@ def _channels(mechanism: Mechanism, records: Sequence[Record]) -> tuple[Channel 
     found: dict[str, Any] = {}
     problems = []
     for record in records:
-        mine: dict[str, str] = {}
+        mine: dict[str, Any] = {}
         for text in record.values:
             try:
-                channel = channel_of(mechanism, text)
+                channel = _channel(mechanism, text)
             except ValueError as problem:
                 problems.append(f"{_of(record)}{problem}")
                 continue
-            name = str(channel.name)
+            name = channel.name
             if name in mine:
-                problems.append(f"{_of(record)}{quoted(text)} and {quoted(mine[name])} are the same channel")
+                problems.append(f"{_of(record)}{quoted(str(text))} and {quoted(str(mine[name]))} are the same channel")
             mine[name] = text
             found.setdefault(name, channel)
     if problems:
         raise IdentificationError(problems)
     return tuple(found.values())
+
+
+def _channel(mechanism: Mechanism, given: Any) -> Channel | Quantity:
+    return given if isinstance(given, Quantity) else channel_of(mechanism, given)
 
 
 def _of(record: Record) -> str:

@@ -85,6 +85,11 @@ class Program:
             parts = [self._piece(pieces[0], tol)]
         return Predicted(*jax.tree.map(lambda *x: np.concatenate(x)[:size], *parts))
 
+    def guess(self, members: Members, which: int) -> tuple[Any, Any]:
+        """The state that the start of a member is closed from."""
+        _, state = _member(self.mechanism, jax.tree.map(lambda leaf: leaf[which], members), self.targets)
+        return state.q, state.v
+
     def _piece(self, members: Members, tol: tuple[float, float]) -> tuple:
         tols = tuple(np.asarray(x, float) for x in tol)
         found = _computed(self.mechanism, members, tols, self.settings, self.targets, self.channels, self.ends)

@@ -9,6 +9,7 @@ from jaxtyping import ArrayLike, Float
 
 from udkjax.equations.assembly import State
 from udkjax.scene.checks import quoted
+from udkjax.study.identify.channels import Quantity
 from udkjax.study.identify.errors import IdentificationError
 
 Estimated = Literal["nothing", "position", "velocity", "both"]
@@ -45,10 +46,10 @@ class Start:
 class Record:
     """What was measured at some times (T,), s: `values` maps channels to arrays (T,), not a number where nothing was measured.
 
-    Channels are named as in `udkjax.study.identify.channels` ("body.crank.angle"). `noise` is the standard deviation of all
-    channels, or maps channels to their own, a number or (T,); where it is not given, it is estimated from what the fit leaves.
-    The motion begins at `t0` (s; by default at the first time) with `start`. `conditions` maps names of parameters to values that
-    they are known to have had in this record: a payload, the amplitude of a driver.
+    Channels are named as in `udkjax.study.identify.channels` ("body.crank.angle"), or `Quantity`s of the user's own. `noise` is
+    the standard deviation of all channels, or maps channels to their own, a number or (T,); where it is not given, it is
+    estimated from what the fit leaves. The motion begins at `t0` (s; by default at the first time) with `start`. `conditions`
+    maps names of parameters to values that they are known to have had in this record: a payload, the amplitude of a driver.
 
     Raises `IdentificationError`, which lists every mistake.
     """
@@ -56,8 +57,8 @@ class Record:
     def __init__(
         self,
         times: ArrayLike | Sequence[float],
-        values: Mapping[str, Any],
-        noise: Mapping[str, Any] | float | None = None,
+        values: Mapping[Any, Any],
+        noise: Mapping[Any, Any] | float | None = None,
         start: Start | State | None = None,
         t0: float | None = None,
         conditions: Mapping[str, Any] | None = None,
@@ -67,7 +68,7 @@ class Record:
         self.name = name
         self.times: Float[np.ndarray, "T"] = _numbers("time", times, None, problems)
         self._check_times(t0, problems)
-        self.values = {str(c): _numbers(str(c), v, self.times.shape, problems) for c, v in values.items()}
+        self.values = {_key(c): _numbers(str(c), v, self.times.shape, problems) for c, v in values.items()}
         self.t0 = float(self.times[0]) if t0 is None and self.times.size else float(t0 or 0.0)
         self.noise = self._noise(noise, problems)
         self.start = start if isinstance(start, Start) else Start(start)
@@ -76,15 +77,17 @@ class Record:
             problems.append("nothing was measured: there is no channel")
         for channel, value in self.values.items():
             if not np.isfinite(value).any() and value.size:
-                problems.append(f"{quoted(channel)}: holds no number; leave the channel out")
+                problems.append(f"{quoted(str(channel))}: holds no number; leave the channel out")
             elif np.isinf(value).any():
-                problems.append(f"{quoted(channel)}: entry {int(np.flatnonzero(np.isinf(value))[0])} is infinite; a gap is nan")
+                problems.append(
+                    f"{quoted(str(channel))}: entry {int(np.flatnonzero(np.isinf(value))[0])} is infinite; a gap is nan"
+                )
         if problems:
             where = f"record {quoted(name)}: " if name else ""
             raise IdentificationError([where + problem for problem in problems])
 
     def __repr__(self) -> str:
-        return f"Record({len(self.times)} times, {', '.join(self.values)})"
+        return f"Record({len(self.times)} times, {', '.join(map(str, self.values))})"
 
     def _check_times(self, t0: float | None, problems: list[str]) -> None:
         if self.times.ndim != 1 or not self.times.size:
@@ -97,8 +100,8 @@ class Record:
         elif t0 is not None and not t0 <= self.times[0]:
             problems.append(f"t0: the motion begins at {t0} s, after the first time measured, {self.times[0]} s")
 
-    def _noise(self, given: Any, problems: list[str]) -> dict[str, Float[np.ndarray, "T"] | None]:
-        mapped = given if isinstance(given, Mapping) else dict.fromkeys(self.values, given)
+    def _noise(self, given: Any, problems: list[str]) -> dict[Any, Float[np.ndarray, "T"] | None]:
+        mapped = {_key(c): s for c, s in given.items()} if isinstance(given, Mapping) else dict.fromkeys(self.values, given)
         found: dict[str, Any] = dict.fromkeys(self.values)
         for channel, sigma in mapped.items():
             if channel not in self.values:
@@ -109,11 +112,16 @@ class Record:
                 shapes = self.times.shape, sigma.shape
                 of = sigma[np.isfinite(self.values[channel])] if sigma.shape == self.times.shape else sigma
                 if sigma.shape != self.times.shape:
-                    problems.append(f"noise of {quoted(channel)}: must be a number or of shape {shapes[0]}, is {shapes[1]}")
+                    problems.append(f"noise of {quoted(str(channel))}: must be a number or of shape {shapes[0]}, is {shapes[1]}")
                 elif not (np.isfinite(of).all() and (of > 0).all()):
-                    problems.append(f"noise of {quoted(channel)}: a standard deviation must be a finite number > 0")
+                    problems.append(f"noise of {quoted(str(channel))}: a standard deviation must be a finite number > 0")
                 found[channel] = sigma
         return found
+
+
+def _key(channel: Any) -> Any:
+    """Channels that are named go by their names, a user's own by itself."""
+    return channel if isinstance(channel, Quantity) else str(channel)
 
 
 def _numbers(name: str, given: Any, shape: tuple[int, ...] | None, problems: list[str]) -> np.ndarray:

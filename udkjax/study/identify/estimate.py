@@ -1,0 +1,225 @@
+"""What an identification returns: the values, how well they are known, what the records cannot tell, and how it was found."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.equations.assembly import State, assemble
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.fitting import Fit
+from udkjax.study.identify.knowledge import Knowledge, Values, Whiteness, knowledge, whiteness
+from udkjax.study.identify.losses import Loss
+from udkjax.study.identify.parameters import applied
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.search import Found
+
+DOUBT = 1e-3  # probability that noise looks like this: below it residuals are not taken for noise
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Values of parameters that were identified, and what there is to know of them.
+
+    `success` says that the fit has settled and that the records tell every parameter; `message` says what there is to say.
+    """
+
+    mechanism: Mechanism  # with the values in
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Float[np.ndarray, "P"]
+    knowledge: Knowledge
+    at_bounds: tuple[str, ...]
+    starts: tuple[State, ...]  # of each record, closed
+    start_values: Mapping[str, tuple[float, float]]  # of what was estimated of them: the change, and its standard error
+    predicted: tuple[Mapping[str, np.ndarray], ...]  # of each record, by channel, at its times
+    residuals: tuple[Mapping[str, np.ndarray], ...]  # measured - predicted, in the channel's units
+    noise: tuple[Mapping[str, np.ndarray], ...]  # standard deviation, given or estimated
+    whiteness: Mapping[tuple[int, str], Whiteness]  # of each record's channels
+    converged: bool
+    agreeing: int  # first guesses that led here, out of
+    guesses: int
+    ways: tuple[str, ...]
+    history: tuple[tuple[float, float], ...]  # cost and Gauss-Newton step, evaluation by evaluation of the best fit
+    evaluations: int  # of a record, each with its derivatives
+    seconds: float
+    tol: tuple[float, float]
+    z: Float[np.ndarray, "K"]
+    problem: Problem
+    loss: Loss
+
+    @classmethod
+    def of(
+        cls, problem: Problem, fit: Fit, found: Found, history: list, tol: tuple[float, float], loss: Loss, seconds: float
+    ) -> "Estimate":
+        """What a fit has found."""
+        unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z[0]
+        x = unknowns.values(z[:P])
+        plain = problem.evaluate(fit.z, tol)
+        counted = plain if loss is None else loss(plain)
+        groups = _groups(problem)
+        values = Values(
+            problem.all_names,
+            problem.all_units,
+            np.concatenate([x, z[P:]]),
+            np.concatenate([unknowns.slopes(z[:P]), np.ones(problem.K - P)]),
+            (*unknowns.kinds, *["free"] * (problem.K - P)),
+        )
+        known = knowledge(counted.J[0], counted.r[0], values, groups, P)
+        every = knowledge(counted.J[0], counted.r[0], values, groups).standard_errors if problem.K > P else known.standard_errors
+        scale = np.append(known.noise, 1.0)[groups]
+        rows = len(problem.where)
+        sigma = problem.sigma * scale[:rows]
+        left = -plain.r[0, :rows] * problem.sigma
+        tables = [_by_record(problem, part) for part in (problem.y[problem.there] - left, left, sigma)]
+        placed = applied(problem.mechanism, unknowns.targets, jnp.asarray(x))
+        white = {}
+        for places in problem.series():
+            record, _, channel = problem.where[places[0]]
+            ts = problem.ts[record, problem.where[places, 1]]
+            white[int(record), problem.names[channel]] = whiteness(
+                (counted.r[0, :rows] / scale[:rows])[places], ts, known.projection[places]
+            )
+        return cls(
+            mechanism=placed,
+            names=unknowns.names,
+            units=unknowns.units,
+            values=x,
+            knowledge=known,
+            at_bounds=unknowns.at_bounds(x),
+            starts=_starts(problem, placed, z),
+            start_values={name: (float(z[P + k]), float(every[P + k])) for k, name in enumerate(problem.all_names[P:])},
+            predicted=tables[0],
+            residuals=tables[1],
+            noise=tables[2],
+            whiteness=white,
+            converged=bool(fit.settled[0]),
+            agreeing=found.agreeing,
+            guesses=found.guesses,
+            ways=found.ways,
+            history=tuple(history),
+            evaluations=problem.program.calls,
+            seconds=seconds,
+            tol=tol,
+            z=z,
+            problem=problem,
+            loss=loss,
+        )
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The values by name."""
+        return dict(zip(self.names, self.values.tolist(), strict=True))
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """One standard error of each value, by name; inf where the records do not tell it."""
+        return dict(zip(self.names, self.knowledge.standard_errors.tolist(), strict=True))
+
+    @property
+    def success(self) -> bool:
+        """Whether the fit has settled, and the records tell every parameter."""
+        return self.converged and not self.knowledge.dead and not self.knowledge.flat
+
+    @property
+    def unexplained(self) -> tuple[tuple[int, str], ...]:
+        """Channels of records whose residuals are not noise: the mechanism does not move as they say."""
+        return tuple(key for key, found in self.whiteness.items() if found.p < DOUBT)
+
+    @property
+    def message(self) -> str:
+        """What there is to say of the estimate, one sentence a line."""
+        lines = [] if self.converged else ["the fit has not settled: these are the best values that were found"]
+        lines += self.knowledge.texts
+        lines += [f"{name} is at one of its bounds" for name in self.at_bounds]
+        lines += [f"{self._where(*key)}: what is left is not noise; the mechanism misses something" for key in self.unexplained]
+        if self.guesses > 1 and self.agreeing == 1:
+            lines.append(f"only one of {self.guesses} first guesses led here: there may be a better minimum")
+        return "\n".join(lines) or "every parameter is known from the records"
+
+    def _where(self, record: int, channel: str) -> str:
+        records = self.problem.records
+        return channel if len(records) == 1 else f"{records[record].name or f'record {record + 1}'}, {channel}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures as plain numbers and texts, as a JSON file has them."""
+        import udkjax
+
+        known = self.knowledge
+        return {
+            "success": self.success,
+            "converged": self.converged,
+            "message": self.message,
+            "parameters": {
+                name: {"value": value, "standard_error": _plain(error), "units": units}
+                for name, value, error, units in zip(
+                    self.names, self.values.tolist(), known.standard_errors, self.units, strict=True
+                )
+            },
+            "correlation": [[_plain(x) for x in row] for row in known.correlation],
+            "unknown": {"dead": list(known.dead), "flat": [direction.text for direction in known.flat]},
+            "at_bounds": list(self.at_bounds),
+            "starts": {
+                name: {"change": _plain(x), "standard_error": _plain(error)} for name, (x, error) in self.start_values.items()
+            },
+            "chi2": known.chi2,
+            "degrees_of_freedom": known.degrees_of_freedom,
+            "noise": [
+                {channel: _plain(np.median(sigma[np.isfinite(sigma)])) for channel, sigma in table.items()}
+                for table in self.noise
+            ],
+            "whiteness": [
+                {"record": record, "channel": channel, "p": found.p} for (record, channel), found in self.whiteness.items()
+            ],
+            "guesses": self.guesses,
+            "agreeing": self.agreeing,
+            "ways": list(self.ways),
+            "evaluations": self.evaluations,
+            "seconds": self.seconds,
+            "tolerance": self.tol[0],
+            "udkjax": udkjax.__version__,
+        }
+
+    def to_json(self) -> str:
+        """The same as text."""
+        return json.dumps(self.to_dict(), indent=1)
+
+
+def _plain(x: Any) -> float | None:
+    """A number as JSON knows it: what is not finite is null."""
+    return float(x) if np.isfinite(x) else None
+
+
+def _groups(problem: Problem) -> np.ndarray:
+    """Of each residual, which noise it shares that is to be estimated: that of its channel; -1 where it is known."""
+    unknown = np.where(problem.known, -1, problem.where[:, 2])
+    _, group = np.unique(unknown, return_inverse=True)
+    group = group - 1 if problem.known.any() else group
+    return np.concatenate([group, np.full(len(problem.priors), -1)])
+
+
+def _by_record(problem: Problem, rows: np.ndarray) -> tuple[dict[str, np.ndarray], ...]:
+    """Numbers of all residuals as tables: of each record, its channels at its times."""
+    full = np.full(problem.y.shape, np.nan)
+    full[problem.there] = rows
+    found = []
+    for k, record in enumerate(problem.records):
+        first = 0 if record.t0 == record.times[0] else 1
+        part = full[k, first : first + len(record.times)]
+        found.append({name: part[:, c] for c, name in enumerate(problem.names) if np.isfinite(part[:, c]).any()})
+    return tuple(found)
+
+
+def _starts(problem: Problem, mechanism: Mechanism, z: np.ndarray) -> tuple[State, ...]:
+    """The states that the records began with, closed."""
+    members = problem.members(z[None])
+    found = []
+    for k, record in enumerate(problem.records):
+        q, v = problem.program.guess(members, k)
+        mine = mechanism.with_parameters(record.conditions) if record.conditions else mechanism
+        found.append(assemble(mine, record.t0, State(q, v), throw=False))
+    return tuple(found)

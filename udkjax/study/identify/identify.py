@@ -1,0 +1,195 @@
+"""Identify: from a mechanism, records and the names of parameters to an estimate."""
+
+import dataclasses
+import inspect
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from udkjax.equations.assembly import close, is_closed, require_closed
+from udkjax.equations.redundancy import redundant_rows
+from udkjax.integrate.simulate import simulate
+from udkjax.integrate.solution import CAUSES, Result
+from udkjax.scene.checks import SceneError, suggestion
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.errors import IdentificationError
+from udkjax.study.identify.estimate import Estimate
+from udkjax.study.identify.fitting import Fit, descend
+from udkjax.study.identify.legality import illegal
+from udkjax.study.identify.losses import Loss, loss_of
+from udkjax.study.identify.parameters import Unknowns, applied, unknowns_of
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.reading import records_of
+from udkjax.study.identify.search import GUESSES, Found, beside, search
+from udkjax.study.progress import Line
+
+TOL = 1e-11  # relative and absolute, of the integration: what parameters are known to where there is no noise
+WEIGHED = 2  # fits, each with noise as the one before left it
+EVEN = 1e-6  # of what a channel shows: residuals below it count alike, since they are not of measurements
+POLISHED = 15  # steps at the end
+NEARBY = 64  # guesses that are tried where the first cannot be closed
+DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress")  # not settings that one may give
+
+
+def identify(
+    mechanism: Mechanism,
+    data: Any,
+    parameters: Sequence[Any] | str,
+    *,
+    noise: Any = None,
+    starts: int | Any = GUESSES,
+    loss: str = "least_squares",
+    optimizer: Any = None,
+    tol: float = TOL,
+    seed: int = 0,
+    progress: Any = None,
+    **settings: Any,
+) -> Estimate:
+    """Find the values of parameters with which a mechanism moves as was measured.
+
+    `data` is a `Record`, a mapping of times ("time") and channels, a table of pandas or a dataset of xarray, the path of a CSV or
+    NetCDF file, or a sequence of these: records, each with a start of its own. `parameters` are names of numbers of the scene,
+    `length`s, ties in text (`body.a.mass = body.b.mass`), or `Parameter`s with bounds and priors. `noise` is the standard
+    deviation of all channels, or maps channels to theirs; where none is given it is estimated from what the fit leaves.
+
+    With y what was measured and yhat(z) what the mechanism shows, sum ((yhat(z) - y) / sigma)^2 is minimized, by
+    Levenberg-Marquardt with exact forward derivatives, through the closure of all loops; `loss="huber"` lets single wrong
+    numbers count less, `optimizer` is another least-squares solver of optimistix. Where the first guess does not lead to a fit
+    that explains the records, it is looked for along growing parts of them, and from other guesses: `starts` is how many more
+    there may be (0: none), or an array of guesses (B, P) to try besides the first.
+
+    `tol` is the tolerance of the integration at the end; `settings` are others of `simulate`. `progress`: None shows a line,
+    False nothing.
+
+    Raises `IdentificationError`, which lists every mistake; also where a parameter would open a loop that has more constraints
+    than it needs. What the records cannot tell is no error: `Estimate.success` is false, and `Estimate.message` says what.
+    """
+    begun = time.perf_counter()
+    _check(settings)
+    unknowns = unknowns_of(mechanism, parameters)
+    records = records_of(mechanism, data, noise)
+    mechanism, unknowns = _closable(mechanism, unknowns, seed)
+    wrong = illegal(mechanism, partial(_placed, unknowns), unknowns.start, unknowns.names)
+    if wrong:
+        raise IdentificationError(wrong)
+    problem = Problem(mechanism, unknowns, records, settings)
+    lost = loss_of(loss, len(problem.where))
+    tell = _teller(progress)
+    guesses, more = _guesses(problem, starts)
+    choices = {"loss": lost, "method": optimizer}
+    found = search(problem, guesses, (tol, tol), more, seed, tell, **choices)
+    _require_some(problem, found)
+    fit, history = _settled(problem, found, tol, tell, choices)
+    tell("")
+    return Estimate.of(problem, fit, found, history, (tol, tol), lost, time.perf_counter() - begun)
+
+
+def _placed(unknowns: Unknowns, mechanism: Mechanism, x: Any) -> Mechanism:
+    return applied(mechanism, unknowns.targets, x)
+
+
+def _settled(problem: Problem, found: Found, tol: float, tell: Callable, choices: Mapping[str, Any]) -> tuple[Fit, list]:
+    """The fit to the end, each channel weighted by the noise that it has turned out to have."""
+    fit, history = found.fit, list(found.history)
+    end = partial(descend, problem, tol=(tol, tol), steps=POLISHED, near=True, tell=tell, **choices)
+    fit = end(fit.z)
+    history += fit.history
+    unknown = {problem.names[c] for c in np.unique(problem.where[~problem.known, 2])}
+    for _ in range(WEIGHED if len(unknown) + problem.known.any() > 1 else 0):
+        weigh(problem, fit.z, tol, choices["loss"], EVEN)
+        fit = end(fit.z)
+        history += fit.history
+    return fit, history
+
+
+def weigh(problem: Problem, z: np.ndarray, tol: float, loss: Loss, least: float = 0.0) -> None:
+    """Take as the noise of each channel whose noise is not known what a fit leaves of it, and `least` of what it shows."""
+    found = problem.evaluate(z, (tol, tol))
+    found = found if loss is None else loss(found)
+    rows = len(problem.where)
+    left = found.r[0, :rows] * problem.sigma
+    for c in range(len(problem.channels)):
+        mine = (problem.where[:, 2] == c) & ~problem.known
+        if mine.any():
+            free = mine.sum() - problem.K * mine.sum() / rows  # unknowns take their part of each channel's freedom
+            size = np.sqrt(left[mine] @ left[mine] / max(free, 1.0))
+            problem.sigma[mine] = max(size, least * problem.spread[c], np.finfo(float).tiny ** 0.25 * problem.spread[c])
+
+
+def _check(settings: Mapping[str, Any]) -> None:
+    known = [name for name in inspect.signature(simulate).parameters if name not in DECIDED]
+    problems = [
+        f"{name}: no setting of simulate that can be given here{suggestion(name, known)}"
+        for name in settings
+        if name not in known
+    ]
+    if problems:
+        raise IdentificationError(problems)
+
+
+def _guesses(problem: Problem, starts: Any) -> tuple[np.ndarray, int]:
+    """First guesses (B, K), and how many more may be made."""
+    first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
+    if isinstance(starts, int | np.integer):
+        if starts < 0:
+            raise IdentificationError([f"starts: must be a number of guesses from 0 on, is {starts}"])
+        return first, int(starts)
+    given = np.asarray(starts, float)
+    if given.ndim != 2 or given.shape[1] != P or not np.isfinite(given).all():
+        raise IdentificationError(
+            [f"starts: must be a number, or guesses (B, {P}), one value a parameter; is of shape {given.shape}"]
+        )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = problem.unknowns.unknowns(given)
+    if not np.isfinite(z).all():
+        wrong = problem.unknowns.names[int(np.argmax(~np.isfinite(z).all(0)))]
+        raise IdentificationError([f"starts: a guess of {wrong} is not between its bounds, or not positive"])
+    return np.concatenate([first, np.concatenate([z, np.zeros((len(z), problem.K - P))], 1)]), 0
+
+
+def _closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tuple[Mechanism, Unknowns]:
+    """The mechanism with the redundant rows of its first guess, or, where that cannot be closed, of the nearest that can."""
+    tried = [unknowns.start, *_nearby(unknowns, seed)]
+    for x in tried:
+        try:
+            placed = applied(mechanism, unknowns.targets, x)
+        except SceneError:
+            continue
+        if is_closed(close(placed)):
+            rows = redundant_rows(placed) if mechanism.left_out != () else ()
+            return mechanism.with_left_out(rows), dataclasses.replace(unknowns, start=np.asarray(x, float))
+    placed = applied(mechanism, unknowns.targets, unknowns.start)
+    require_closed(placed, close(placed))
+    raise AssertionError
+
+
+def _nearby(unknowns: Unknowns, seed: int) -> list[np.ndarray]:
+    """Values beside the first guesses, the nearest first."""
+    z = beside(unknowns, np.zeros(len(unknowns.names)), NEARBY, seed)
+    return list(unknowns.values(z[np.argsort(np.linalg.norm(z, axis=1))]))
+
+
+def _require_some(problem: Problem, found: Found) -> None:
+    if np.isfinite(found.fit.cost).any():
+        return
+    code = problem.evaluate(found.fit.z, (1e-6, 1e-6)).code[0]
+    raise IdentificationError([f"no first guess could be simulated along the records: {CAUSES[Result(int(code))]}"])
+
+
+def _teller(progress: Any) -> Callable[[str], None]:
+    if progress is False:
+        return lambda text: None
+    if callable(progress):
+        return progress
+    line = Line()
+
+    def tell(text: str) -> None:
+        if not text and line.over:
+            line.say("identified", last=True)
+        elif text and line.due():
+            line.say(text)
+
+    return tell
