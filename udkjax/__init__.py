@@ -78,6 +78,14 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import save as save
     from udkjax.scene import with_angle as with_angle
     from udkjax.scene import with_length as with_length
+    from udkjax.study.identify import Estimate as Estimate
+    from udkjax.study.identify import IdentificationError as IdentificationError
+    from udkjax.study.identify import Parameter as Parameter
+    from udkjax.study.identify import Quantity as Quantity
+    from udkjax.study.identify import Record as Record
+    from udkjax.study.identify import Start as Start
+    from udkjax.study.identify import identify as identify
+    from udkjax.study.identify import length as length
     from udkjax.study.sweep import Axis as Axis
     from udkjax.study.sweep import LatinHypercube as LatinHypercube
     from udkjax.study.sweep import Random as Random
@@ -99,6 +107,7 @@ _NAMES = {
     "udkjax.equations": """
         ConstrainedSystem Baumgarte accelerations check violation energy reactions
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
+    "udkjax.study.identify": "identify Record Start Parameter length Quantity Estimate IdentificationError",
     "udkjax.study.sweep": "sweep Axis Zipped Sobol LatinHypercube Random SweepError",
     "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }
