@@ -22,14 +22,14 @@ def row_space(matrix: np.ndarray, tol: float) -> np.ndarray:
     return reduced(vt[: int(np.sum(sigma > tol))])
 
 
-def reduced(rows: np.ndarray) -> np.ndarray:
-    """Independent rows in reduced echelon form; what is below `COEFFICIENT` is made zero."""
+def reduced(rows: np.ndarray, tol: float = COEFFICIENT) -> np.ndarray:
+    """Independent rows in reduced echelon form; what is below `tol`, relative to a row's largest entry, is made zero."""
     rows, done = np.array(rows, float), 0
     for column in range(rows.shape[1]):
         if done == len(rows):
             break
         pivot = done + int(np.argmax(np.abs(rows[done:, column])))
-        if abs(rows[pivot, column]) <= COEFFICIENT:
+        if abs(rows[pivot, column]) <= tol:
             continue
         rows[[done, pivot]] = rows[[pivot, done]]
         rows[done] /= rows[done, column]
@@ -37,7 +37,7 @@ def reduced(rows: np.ndarray) -> np.ndarray:
         rows[others] -= np.outer(rows[others, column], rows[done])
         done += 1
     rows = rows[:done]
-    return np.where(np.abs(rows) > COEFFICIENT * np.abs(rows).max(axis=1, keepdims=True, initial=0.0), rows, 0.0)
+    return np.where(np.abs(rows) > tol * np.abs(rows).max(axis=1, keepdims=True, initial=0.0), rows, 0.0)
 
 
 def connected(relations: np.ndarray) -> list[list[int]]:
