@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,13 +13,14 @@ from jaxtyping import Float
 from udkjax.equations.assembly import State, assemble
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.fitting import Fit
-from udkjax.study.identify.knowledge import Knowledge, Values, Whiteness, knowledge, whiteness
+from udkjax.study.identify.knowledge import Knowledge, Values, knowledge
 from udkjax.study.identify.losses import Loss
 from udkjax.study.identify.parameters import applied
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.search import Found
+from udkjax.study.identify.whiteness import Whiteness, whiteness
 
-DOUBT = 1e-3  # probability that noise looks like this: below it residuals are not taken for noise
+ROUNDING = 1e-8  # of what a channel shows: residuals below it are errors of the integration, which are not noise and need not be
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +36,11 @@ class Estimate:
     values: Float[np.ndarray, "P"]
     knowledge: Knowledge
     at_bounds: tuple[str, ...]
-    starts: tuple[State, ...]  # of each record, closed
     start_values: Mapping[str, tuple[float, float]]  # of what was estimated of them: the change, and its standard error
     predicted: tuple[Mapping[str, np.ndarray], ...]  # of each record, by channel, at its times
     residuals: tuple[Mapping[str, np.ndarray], ...]  # measured - predicted, in the channel's units
     noise: tuple[Mapping[str, np.ndarray], ...]  # standard deviation, given or estimated
-    whiteness: Mapping[tuple[int, str], Whiteness]  # of each record's channels
+    whiteness: Mapping[tuple[int, str], Whiteness]  # of each record's channels, where anything is left but rounding
     converged: bool
     agreeing: int  # first guesses that led here, out of
     guesses: int
@@ -81,9 +82,9 @@ class Estimate:
         for places in problem.series():
             record, _, channel = problem.where[places[0]]
             ts = problem.ts[record, problem.where[places, 1]]
-            white[int(record), problem.names[channel]] = whiteness(
-                (counted.r[0, :rows] / scale[:rows])[places], ts, known.projection[places]
-            )
+            if np.abs(left[places]).max() > ROUNDING * problem.spread[channel]:
+                seen = (counted.r[0, :rows] / scale[:rows])[places]
+                white[int(record), problem.names[channel]] = whiteness(ts, seen, known.projection[places])
         return cls(
             mechanism=placed,
             names=unknowns.names,
@@ -91,7 +92,6 @@ class Estimate:
             values=x,
             knowledge=known,
             at_bounds=unknowns.at_bounds(x),
-            starts=_starts(problem, placed, z),
             start_values={name: (float(z[P + k]), float(every[P + k])) for k, name in enumerate(problem.all_names[P:])},
             predicted=tables[0],
             residuals=tables[1],
@@ -120,15 +120,21 @@ class Estimate:
         """One standard error of each value, by name; inf where the records do not tell it."""
         return dict(zip(self.names, self.knowledge.standard_errors.tolist(), strict=True))
 
+    @cached_property
+    def starts(self) -> tuple[State, ...]:
+        """The states that the records began with, closed."""
+        problem, found = self.problem, []
+        members = problem.members(self.z[None])
+        for k, record in enumerate(problem.records):
+            q, v = problem.program.guess(members, k)
+            mine = self.mechanism.with_parameters(record.conditions) if record.conditions else self.mechanism
+            found.append(assemble(mine, record.t0, State(q, v), throw=False))
+        return tuple(found)
+
     @property
     def success(self) -> bool:
         """Whether the fit has settled, and the records tell every parameter."""
         return self.converged and not self.knowledge.dead and not self.knowledge.flat
-
-    @property
-    def unexplained(self) -> tuple[tuple[int, str], ...]:
-        """Channels of records whose residuals are not noise: the mechanism does not move as they say."""
-        return tuple(key for key, found in self.whiteness.items() if found.p < DOUBT)
 
     @property
     def message(self) -> str:
@@ -136,7 +142,7 @@ class Estimate:
         lines = [] if self.converged else ["the fit has not settled: these are the best values that were found"]
         lines += self.knowledge.texts
         lines += [f"{name} is at one of its bounds" for name in self.at_bounds]
-        lines += [f"{self._where(*key)}: what is left is not noise; the mechanism misses something" for key in self.unexplained]
+        lines += [found.text(self._where(*key)) for key, found in self.whiteness.items() if not found.white]
         if self.guesses > 1 and self.agreeing == 1:
             lines.append(f"only one of {self.guesses} first guesses led here: there may be a better minimum")
         return "\n".join(lines) or "every parameter is known from the records"
@@ -173,7 +179,8 @@ class Estimate:
                 for table in self.noise
             ],
             "whiteness": [
-                {"record": record, "channel": channel, "p": found.p} for (record, channel), found in self.whiteness.items()
+                {"record": record, "channel": channel, "p": _plain(found.p)}
+                for (record, channel), found in self.whiteness.items()
             ],
             "guesses": self.guesses,
             "agreeing": self.agreeing,
@@ -211,15 +218,4 @@ def _by_record(problem: Problem, rows: np.ndarray) -> tuple[dict[str, np.ndarray
         first = 0 if record.t0 == record.times[0] else 1
         part = full[k, first : first + len(record.times)]
         found.append({name: part[:, c] for c, name in enumerate(problem.names) if np.isfinite(part[:, c]).any()})
-    return tuple(found)
-
-
-def _starts(problem: Problem, mechanism: Mechanism, z: np.ndarray) -> tuple[State, ...]:
-    """The states that the records began with, closed."""
-    members = problem.members(z[None])
-    found = []
-    for k, record in enumerate(problem.records):
-        q, v = problem.program.guess(members, k)
-        mine = mechanism.with_parameters(record.conditions) if record.conditions else mechanism
-        found.append(assemble(mine, record.t0, State(q, v), throw=False))
     return tuple(found)

@@ -19,7 +19,9 @@ from udkjax.study.identify.problem import Evaluated, Problem
 
 STEPS = 60
 SETTLED = 1e-10  # of an unknown, dimensionless: a Gauss-Newton step below it changes nothing that can be told
-NOTHING = 1e-9  # cosine of the angle between residuals and what the unknowns can change of them
+# Cosine of the angle between residuals and what the unknowns can change of them: times the root of their number it is a
+# Gauss-Newton step in standard errors, of which a hundred-thousandth changes nothing either.
+NOTHING = 1e-6
 FLAT = 1e-9  # of the largest singular value: directions that a step is not expected to be known in
 FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
 # What residuals are multiplied by, over the largest singular value: the method's first damping is 1 / FIRST^2 of its square.

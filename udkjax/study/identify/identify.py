@@ -31,6 +31,7 @@ WEIGHED = 2  # fits, each with noise as the one before left it
 EVEN = 1e-6  # of what a channel shows: residuals below it count alike, since they are not of measurements
 POLISHED = 15  # steps at the end
 NEARBY = 64  # guesses that are tried where the first cannot be closed
+PATIENCE = 2.0  # s: what is done before then needs no line to say so
 DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress")  # not settings that one may give
 
 
@@ -184,12 +185,14 @@ def _teller(progress: Any) -> Callable[[str], None]:
         return lambda text: None
     if callable(progress):
         return progress
-    line = Line()
+    line, begun = Line(), time.monotonic()
 
     def tell(text: str) -> None:
-        if not text and line.over:
-            line.say("identified", last=True)
-        elif text and line.due():
+        if time.monotonic() - begun < PATIENCE:
+            return
+        if text and line.due():
             line.say(text)
+        elif not text and line.over:
+            line.say("identified", last=True)
 
     return tell
