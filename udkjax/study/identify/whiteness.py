@@ -43,8 +43,8 @@ class Whiteness(NamedTuple):
             return ""
         return (
             f"residuals of {channel} are not noise: neighbours have the correlation {self.lag1:.2f} (probability {self.p:.1g} "
-            f"for {self.samples} samples of white noise): the model leaves something out, or the noise is coloured; standard errors "
-            "are too small"
+            f"for {self.samples} samples of white noise): the model leaves something out, or the noise is "
+            "coloured; standard errors are too small"
         )
 
 
