@@ -42,7 +42,7 @@ def problems(mech, data, **settings) -> list[str]:
     return error.value.problems
 
 
-def sigma(record: Record, channel: str) -> np.ndarray:
+def sigma(record: Record, channel: str | Quantity) -> np.ndarray:
     """The standard deviation of a channel, which is known."""
     found = record.noise[channel]
     assert found is not None
@@ -169,22 +169,25 @@ def test_files_that_cannot_be_read_are_told(mech, file, tmp_path):
 
 
 @pytest.mark.parametrize("kind", [dict, pandas.DataFrame, lambda table: pandas.DataFrame(table).set_index("time [ms]")])
-def test_mappings_and_frames_read_as_files_do(mech, kind):
+@pytest.mark.parametrize("by_name", [True, False])
+def test_mappings_and_frames_read_as_files_do(mech, kind, by_name):
+    spin = Quantity("spin", lambda mech, solution: solution.v[:, 0, 2], "N m s")
     table = {
         "time [ms]": [0, 10],
         "body.crank.angle [deg]": np.array([90.0, 180.0]),
         "body.crank.angle.noise": [0.9, 0.9],
         "body.rod.x [mm]": [None, 1.0],
-        "spin": [1, 2],
+        "spin" if by_name else spin: [1, 2],
     }
-    spin = Quantity("spin", lambda mech, solution: solution.v[:, 0, 2], "N m s")
-    (record,) = records_of(mech, kind(table), noise=0.1, quantities=[spin])
+    noise = {"spin" if by_name else spin: 0.1}
+    (record,) = records_of(mech, kind(table), noise, quantities=[spin] if by_name else ())
     assert_allclose(record.times, [0.0, 0.01])
     assert_allclose(record.values["body.crank.angle"], [math.pi / 2, math.pi])
     assert_allclose(record.values["body.rod.x"], [np.nan, 1e-3])
-    assert_allclose(record.values["spin"], [1.0, 2.0])
+    assert_allclose(record.values[spin], [1.0, 2.0])
     assert_allclose(sigma(record, "body.crank.angle"), 0.9 * DEG)
-    assert_allclose(sigma(record, "spin"), 0.1)
+    assert_allclose(sigma(record, spin), 0.1)
+    assert record.noise["body.rod.x"] is None and records_of(mech, record) == (record,)
 
 
 def test_one_standard_deviation_serves_a_whole_column(mech):

@@ -45,8 +45,8 @@ class Columns:
         times = self.numbers(time, self.columns[time], "s")
         numbers = len(self.problems) == before
         found = self.measured([name for name in self.columns if name not in (time, RECORD)])
-        values = {m.channel.name: self.numbers(m.heading, m.values, m.channel.units) for m in found}
-        noise = {m.channel.name: self.numbers(m.heading + NOISE, m.noise, m.channel.units) for m in found if m.noise}
+        values = {key_of(m.channel): self.numbers(m.heading, m.values, m.channel.units) for m in found}
+        noise = {key_of(m.channel): self.numbers(m.heading + NOISE, m.noise, m.channel.units) for m in found if m.noise}
         for label, places in self.labelled():
             if numbers:
                 self.check_times(time, times, places)
@@ -132,6 +132,11 @@ class Columns:
             self.problems.append(f"{self.table.source}, {self.table.rows[k]}, column {quoted(heading)}: {problem(k)}")
         if len(rows) > SHOWN:
             self.wrong(heading, f"and so in {len(rows) - SHOWN} more rows")
+
+
+def key_of(channel: Channel | Quantity) -> Any:
+    """What a channel goes by in a record: its name, or itself if it is the user's own."""
+    return channel if isinstance(channel, Quantity) else channel.name
 
 
 def _number(cell: Any) -> float:

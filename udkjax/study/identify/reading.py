@@ -2,14 +2,14 @@
 
 import csv
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from udkjax.scene.checks import quoted
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.channels import Channel, Quantity, channel_of
-from udkjax.study.identify.columns import Columns
+from udkjax.study.identify.columns import Columns, key_of
 from udkjax.study.identify.datasets import of_dataset
 from udkjax.study.identify.errors import IdentificationError
 from udkjax.study.identify.records import Record
@@ -19,7 +19,7 @@ from udkjax.study.identify.tables import Table, of_columns, of_csv, of_frame
 def records_of(
     mechanism: Mechanism,
     data: Any,
-    noise: Mapping[str, Any] | float | None = None,
+    noise: Mapping[Any, Any] | float | None = None,
     ignore: Sequence[str] = (),
     quantities: Sequence[Quantity] = (),
 ) -> tuple[Record, ...]:
@@ -35,18 +35,21 @@ def records_of(
     * `record` says which record a row belongs to (in xarray: a dimension).
 
     `noise` is the standard deviation, in SI units, of what has none in the data: of all channels, or by channel. Columns in
-    `ignore` are left out; any other that is no channel is a mistake. `quantities` are the user's own that columns may name.
+    `ignore` are left out; any other that is no channel is a mistake. `quantities` are the user's own that headings may name;
+    in Python they may themselves stand in place of names.
 
     Raises `IdentificationError`, which lists every mistake.
     """
-    reader = _Reader(mechanism, tuple(ignore), {quantity.name: quantity for quantity in quantities})
+    reader = _Reader(mechanism, tuple(ignore), _quantities(quantities))
     found = [reader.named(record) for record in reader.read(data, "data")]
     if not found and not reader.problems:
         reader.problems.append("data: there are no records")
     given = reader.by_channel(noise, "noise") if isinstance(noise, Mapping) else noise
     if isinstance(given, Mapping):
         measured = {channel for record in found for channel in record.values}
-        reader.problems += [f"noise: {quoted(channel)} is measured in no record" for channel in given if channel not in measured]
+        reader.problems += [
+            f"noise: {quoted(str(channel))} is measured in no record" for channel in given if channel not in measured
+        ]
     records = [reader.with_noise(record, given) for record in found]
     if reader.problems:
         raise IdentificationError(reader.problems)
@@ -56,7 +59,7 @@ def records_of(
 class _Reader:
     """Reads data for a mechanism. What is not as it should be becomes one of `problems`."""
 
-    def __init__(self, mechanism: Mechanism, ignore: tuple[str, ...], quantities: Mapping[str, Quantity]):
+    def __init__(self, mechanism: Mechanism, ignore: tuple[str, ...], quantities: dict[str, Quantity]):
         self.mechanism, self.ignore, self.quantities = mechanism, ignore, quantities
         self.problems: list[str] = []
 
@@ -79,8 +82,10 @@ class _Reader:
         elif hasattr(data, "data_vars"):
             yield from of_dataset(data, bodies, source, self.problems)
         elif hasattr(data, "columns") and hasattr(data, "index"):
+            self.quantities |= _quantities(data.columns)
             yield of_frame(data, source, self.problems)
         elif isinstance(data, Mapping):
+            self.quantities |= _quantities(data)
             yield of_columns(source, [(str(key), value) for key, value in data.items()], self.problems)
         else:
             what = "a Record, a mapping, a pandas DataFrame, an xarray Dataset, the path of a .csv or .nc file, or a list of such"
@@ -101,22 +106,23 @@ class _Reader:
         except (OSError, ValueError, csv.Error) as error:
             self.problems.append(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})")
 
-    def channel(self, text: str) -> Channel | Quantity:
-        """The channel of a name. Raises ValueError."""
-        return self.quantities[text] if text in self.quantities else channel_of(self.mechanism, text)
+    def channel(self, given: Any) -> Channel | Quantity:
+        """The channel of a name, or the user's own. Raises ValueError."""
+        own = given if isinstance(given, Quantity) else self.quantities.get(str(given))
+        return channel_of(self.mechanism, str(given)) if own is None else own
 
-    def by_channel(self, given: Mapping[str, Any], place: str) -> dict[str, Any]:
-        """The same under the usual names of the channels."""
-        found: dict[str, Any] = {}
+    def by_channel(self, given: Mapping[Any, Any], place: str) -> dict[Any, Any]:
+        """The same under the usual names of the channels; those of the user go by themselves."""
+        found: dict[Any, Any] = {}
         for text, value in given.items():
             try:
-                name = self.channel(str(text)).name
+                key = key_of(self.channel(text))
             except ValueError as error:
                 self.problems.append(f"{place}, {quoted(str(text))}: {error}")
                 continue
-            if name in found:
-                self.problems.append(f"{place}, {quoted(str(text))}: {quoted(name)} is there twice")
-            found[name] = value
+            if key in found:
+                self.problems.append(f"{place}, {quoted(str(text))}: {quoted(str(key))} is there twice")
+            found[key] = value
         return found
 
     def named(self, record: Record) -> Record:
@@ -128,7 +134,7 @@ class _Reader:
         noise = dict(zip(values, record.noise.values(), strict=True))
         return Record(record.times, values, noise, record.start, record.t0, record.conditions, record.name)
 
-    def with_noise(self, record: Record, given: Mapping[str, Any] | float | None) -> Record:
+    def with_noise(self, record: Record, given: Mapping[Any, Any] | float | None) -> Record:
         """A record with a standard deviation, where one is given, of those channels whose own is not known."""
         of = given if isinstance(given, Mapping) else dict.fromkeys(record.values, given)
         if all(own is not None or of.get(channel) is None for channel, own in record.noise.items()):
@@ -139,3 +145,7 @@ class _Reader:
         except IdentificationError as error:
             self.problems += error.problems
             return record
+
+
+def _quantities(given: Iterable[Any]) -> dict[str, Quantity]:
+    return {quantity.name: quantity for quantity in given if isinstance(quantity, Quantity)}
