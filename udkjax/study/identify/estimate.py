@@ -11,23 +11,26 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.equations.assembly import State, assemble
+from udkjax.integrate.solution import versions
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.fitting import Fit
 from udkjax.study.identify.knowledge import Knowledge, Values, knowledge
 from udkjax.study.identify.losses import Loss
 from udkjax.study.identify.parameters import applied
 from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.results import dataset, labels, text
 from udkjax.study.identify.search import Found
 from udkjax.study.identify.whiteness import Whiteness, whiteness
 
 ROUNDING = 1e-8  # of what a channel shows: residuals below it are errors of the integration, which are not noise and need not be
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Estimate:
     """Values of parameters that were identified, and what there is to know of them.
 
     `success` says that the fit has settled and that the records tell every parameter; `message` says what there is to say.
+    `print` shows a table.
     """
 
     mechanism: Mechanism  # with the values in
@@ -149,12 +152,20 @@ class Estimate:
 
     def _where(self, record: int, channel: str) -> str:
         records = self.problem.records
-        return channel if len(records) == 1 else f"{records[record].name or f'record {record + 1}'}, {channel}"
+        return channel if len(records) == 1 else f"{labels(records)[record]}, {channel}"
+
+    def __str__(self) -> str:
+        return text(self)
+
+    def __repr__(self) -> str:
+        return f"Estimate({', '.join(f'{name}: {value:.6g}' for name, value in self.parameters.items())})"
+
+    def to_xarray(self) -> Any:
+        """Return an xarray Dataset: what was measured, what the mechanism shows, and what is known of the parameters."""
+        return dataset(self)
 
     def to_dict(self) -> dict[str, Any]:
         """The figures as plain numbers and texts, as a JSON file has them."""
-        import udkjax
-
         known = self.knowledge
         return {
             "success": self.success,
@@ -188,7 +199,7 @@ class Estimate:
             "evaluations": self.evaluations,
             "seconds": self.seconds,
             "tolerance": self.tol[0],
-            "udkjax": udkjax.__version__,
+            "versions": versions(),
         }
 
     def to_json(self) -> str:
