@@ -46,6 +46,12 @@ def test_noise_that_is_not_known_is_estimated():
     assert_allclose(known.chi2, known.degrees_of_freedom)
 
 
+def test_exact_data_have_no_noise():
+    J, _ = problem()
+    known = knowledge(J, np.zeros(60), positive("a", "b", "c"), known_noise=False)
+    assert np.all(known.standard_errors < 1e-14) and known.texts == ()
+
+
 def test_each_group_has_its_own_noise_and_priors_have_theirs():
     """Two channels, one five times as noisy, and a prior: estimates agree with the noise there is, on average without bias."""
     random, found = RNG(1), []

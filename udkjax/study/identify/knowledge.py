@@ -27,6 +27,7 @@ ALIKE = 1e-2  # by how much the factors of a common one may differ
 POOR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
 CORRELATED = 0.98  # of two parameters: their difference is known ten times worse than their sum
 DOUBTFUL = 1e-3  # probability that chance alone makes chi^2 this large, or this small: below it the noise is not as given
+LEAST = 1e-15  # of what residuals were divided by: noise below it is rounding
 ROUNDS = 50  # of the noise, and of what is determined with such noise, in turn
 SETTLED = 1e-10
 
@@ -175,7 +176,7 @@ def _noise(J: np.ndarray, r: np.ndarray, group: np.ndarray, flat: float) -> np.n
         before, s2 = s2, np.where(left > SETTLED * counts, sums / np.where(left > 0, left, 1.0), np.nan)
         if np.isnan(s2).any() or np.all(np.abs(s2 - before) <= SETTLED * s2):
             break
-    return np.sqrt(s2)
+    return np.maximum(np.sqrt(s2), LEAST)
 
 
 # --- words
