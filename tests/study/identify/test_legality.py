@@ -9,6 +9,7 @@ import pytest
 import udkjax as udk
 from udkjax.equations.redundancy import rows_of
 from udkjax.scene.joints import Gear, Revolute
+from udkjax.study.identify import legality
 from udkjax.study.identify.legality import illegal, tie
 
 
@@ -33,8 +34,8 @@ def asked(mechanism, *names):
 
 
 def entry(values, name):
-    owner, _, index = name.partition("[")
-    return float(np.asarray(values[owner])[tuple(int(i) for i in index[:-1].split("]["))])
+    owner, *index = name.removesuffix("]").replace("][", "[").split("[")
+    return float(np.asarray(values[owner])[tuple(map(int, index))])
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +63,11 @@ def test_all_three_tied_are_legal_and_so_are_masses(linkage):
         return mechanism.with_parameters({"body.link1.mass": x[1], "body.coupler.inertia": x[2], "gravity": x[3:]})
 
     assert illegal(linkage, apply, [1.0, 3.0, 0.3, 0.0, -9.81], ["l", "m", "I", "gx", "gy"]) == []
+
+
+def test_of_masses_nothing_is_looked_at(linkage, monkeypatch):
+    monkeypatch.setattr(legality, "positions_of", None)
+    assert asked(linkage, "body.link1.mass", "gravity[1]") == []
 
 
 def test_one_crank_alone_is_refused(linkage):
@@ -104,7 +110,7 @@ def triangle():
 def test_a_tie_that_is_legal_at_one_position_only_is_refused():
     """Cranks longer by what a small turn of the plate takes along them: at the angle at which that was computed."""
     mechanism, arms, angle = triangle()
-    assert len(mechanism.left_out) == 1
+    assert mechanism.left_out is not None and len(mechanism.left_out) == 1
     weights = arms @ [np.sin(-angle), np.cos(angle)]
 
     def apply(mechanism, x):

@@ -15,10 +15,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike
 
 from udkjax.equations.redundancy import ORDINARY, chosen_rows, positions_of, rows_of
 from udkjax.scene.checks import quoted
+from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.directions import COEFFICIENT, connected, listed, null_space, ratio, reduced, row_space
 
@@ -33,7 +33,7 @@ SMALL = 1e-3  # of the mechanism's size: a coordinate as small as this counts as
 FEW = 4  # positions that are closed again
 
 
-def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], x: ArrayLike, names: Sequence[str]) -> list[str]:
+def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], x: Numbers, names: Sequence[str]) -> list[str]:
     """Return what is wrong with moving these parameters each by itself, around the values x; nothing if all of it is legal.
 
     `apply(mechanism, x)` puts the values x (P,) in; it is pure, and x may be traced. A message names the constraints that close
@@ -41,7 +41,20 @@ def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], 
     """
     if mechanism.left_out == () or not names:
         return []
-    loops = Loops(mechanism, apply, np.asarray(x, float))
+    # Traced, so that no step of differences is refused for its sign; and as it was when its redundant rows were looked for, so
+    # that the graph is there already.
+    placed = jax.jit(lambda x: apply(mechanism, x).with_left_out(None))
+    x = np.asarray(x, float)
+    guess = np.asarray(placed(x).q0, float)
+    size = min(float(np.ptp(guess[:, :2], axis=0).max()), 1.0) or 1.0
+    sizes = np.where(np.abs(x) > SMALL * size, np.abs(x), 0.1 * size)
+    steps = DIFFERENCE * np.diag(sizes)
+    moving = [i for i, step in enumerate(steps) if _constraints(placed(x + step)) != _constraints(placed(x - step))]
+    if not moving:  # masses, forces
+        return []
+    names = [names[i] for i in moving]
+    at = np.eye(len(x))[moving]
+    loops = Loops(mechanism, lambda change: placed(x + change @ at), x[moving], sizes[moving])
     if mechanism.left_out and loops.redundant < len(mechanism.left_out):
         return [
             f"the first guesses of {listed(names)} open a loop that closes with the scene's own values: it has more "
@@ -50,18 +63,23 @@ def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], 
     return loops.problems(names) if loops.redundant else []
 
 
-class Loops:
-    """The positions of a mechanism with redundant rows, and what parameters do to these rows there."""
+def _constraints(mechanism: Mechanism) -> list[bytes]:
+    """All numbers of its joints and drivers."""
+    return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(list(mechanism.constraints.values()))]
 
-    def __init__(self, mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], x: np.ndarray):
-        # Traced, so that no step of differences is refused for a sign; and as it was when its redundant rows were looked for, so
-        # that the graph is there already.
-        placed = jax.jit(lambda x: apply(mechanism, x).with_left_out(None))
-        self._rows = lambda x: rows_of(placed(x))
-        self.x, rows = x, self._rows(x)
-        guess = np.asarray(placed(x).q0, float)
+
+class Loops:
+    """The positions of a mechanism with redundant rows, and what parameters do to these rows there.
+
+    `changed` maps changes (P,) of the parameters, whose values are x and whose typical `sizes` are given, to mechanisms.
+    """
+
+    def __init__(self, mechanism: Mechanism, changed: Callable[[np.ndarray], Mechanism], x: np.ndarray, sizes: np.ndarray):
+        self._rows = lambda change: rows_of(changed(change))
+        here = changed(np.zeros(len(x)))
+        self.x, self._size, rows = x, sizes, rows_of(here)
         with np.errstate(all="ignore"):
-            found = positions_of(rows, guess.ravel())
+            found = positions_of(rows, np.asarray(here.q0, float).ravel())
         self.redundant = rows.count - found[0].rank if found else 0
         if not self.redundant:
             return
@@ -69,9 +87,6 @@ class Loops:
         self._positions = [p for p in found if p.smallest > ORDINARY] or found
         self._names = [name for name, _ in rows.names]
         self._left_out = list(chosen_rows(rows, found))
-        spread = float(np.ptp(guess[:, :2], axis=0).max())
-        size = min(spread, 1.0) or 1.0
-        self._size = np.where(np.abs(x) > SMALL * size, np.abs(x), 0.1 * size)
         self._measure(rows)
 
     def _measure(self, rows: Any):
@@ -80,7 +95,7 @@ class Loops:
         columns = []
         for unit in np.eye(len(self.x)):
             step = DIFFERENCE * self._size * unit
-            ahead, behind = self._rows(self.x + step), self._rows(self.x - step)
+            ahead, behind = self._rows(step), self._rows(-step)
             moved = [ahead.at(p.t, p.q)[0] - behind.at(p.t, p.q)[0] for p in self._positions]
             columns.append([m / (2 * DIFFERENCE * length) for m, length in zip(moved, lengths, strict=True)])
         effect = np.moveaxis(np.array(columns), 0, -1)  # (positions, rows, P)
@@ -116,7 +131,7 @@ class Loops:
             return True
         step = np.random.default_rng(1).uniform(0.5, 1.0, len(directions)) @ directions
         step = step * STEP / np.max(np.abs(step * self._unit) / self._size) * self._unit
-        rows = self._rows(self.x + step)
+        rows = self._rows(step)
         every = max(1, len(self._positions) // FEW)
         for p in self._positions[::every]:
             with np.errstate(all="ignore"):
