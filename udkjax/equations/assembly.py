@@ -75,13 +75,14 @@ def assemble(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = Non
     return closure.state
 
 
-def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None) -> Closure:
+def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None, forward: bool = False) -> Closure:
     """As `assemble`, with the residuals instead of an error.
 
-    Where all numbers are known the closure is, too, also while something else is traced.
+    Where all numbers are known the closure is, too, also while something else is traced. With `forward` it has derivatives by
+    forward mode only, which take no more steps than closing does.
     """
     if not _known((mechanism, t, state)):
-        return _close(mechanism, t, state)
+        return _close(mechanism, t, state, forward)
     of, when, found = _latest.get(id(mechanism), (None, 0.0, None))
     if found is not None and state is None and of is not None and of() is mechanism and when == np.asarray(t).item():
         return found
@@ -101,10 +102,11 @@ _latest: dict[int, tuple[Any, float, Closure | None]] = {}
 
 
 @eqx.filter_jit
-def _close(mechanism: Mechanism, t: ArrayLike, state: State | None) -> Closure:
+def _close(mechanism: Mechanism, t: ArrayLike, state: State | None, forward: bool) -> Closure:
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
-    q, v, psi, psi_dot, rank = assembled(prepare_to_close(mechanism), _closed, number(t), q, v)
+    closed = _closed_forward if forward else _closed
+    q, v, psi, psi_dot, rank = assembled(prepare_to_close(mechanism), closed, number(t), q, v)
     return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank))
 
 
@@ -202,8 +204,9 @@ def _step(equations: MechanismMotion, t: Any, q: Any) -> tuple[Any, Any]:
     return jnp.where(better, q + scale * step, q), better
 
 
-@jax.custom_jvp
-def _closed(equations: MechanismMotion, t: Any, q: Any) -> Any:
+def _steps(equations: MechanismMotion, t: Any, q: Any) -> Any:
+    """Steps until none makes the residual smaller."""
+
     def unfinished(carry):
         _, better, k = carry
         return better & (k < ITERATIONS)
@@ -213,6 +216,15 @@ def _closed(equations: MechanismMotion, t: Any, q: Any) -> Any:
         return *_step(equations, t, q), k + 1
 
     return jax.lax.while_loop(unfinished, body, (q, jnp.array(True), 0))[0]
+
+
+_closed = jax.custom_jvp(_steps)
+
+
+def _closed_forward(equations: MechanismMotion, t: Any, q: Any) -> Any:
+    """The same; forward mode follows the steps as they are, and one more, which projects the tangent: see `_closed_plain`."""
+    q = _steps(equations, t, q)
+    return q + direction(equations, t, q)
 
 
 def _closed_plain(equations: MechanismMotion, t: Any, q: Any) -> Any:

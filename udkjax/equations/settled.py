@@ -33,7 +33,7 @@ def close_all(mechanisms: Mechanism, t: ArrayLike = 0.0, states: State | None = 
 
     def one(k: Any) -> Closure:
         mechanism, t, state = jax.tree.map(lambda leaf: leaf[k], (mechanisms, ts, states))
-        return close(mechanism, t, state)
+        return close(mechanism, t, state, forward=True)
 
     if mechanisms.left_out is None or is_large(mechanisms) or not mechanisms.constraints:
         return jax.lax.map(one, jnp.arange(size))

@@ -57,6 +57,7 @@ def simulate(
     formulation: Formulation | None = None,
     throw: bool = True,
     progress: Any = None,
+    careful: bool = True,
 ) -> Solution:
     """Integrate the motion of a mechanism; return its states at the times `ts` (T,), in s. The motion starts at ts[0].
 
@@ -67,7 +68,9 @@ def simulate(
     tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity. `dt0` is the first
     step that is tried, in s; by default it is chosen. `formulation` finds the accelerations in
     another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`, `NullSpaceSVD` or `CoordinatePartitioning`;
-    `method` then serves projection and derivatives. `progress=True` prints how far the run is.
+    `method` then serves projection and derivatives. `progress=True` prints how far the run is. `careful=False` leaves out what
+    steps beside singular configurations take, which is more than half of what there is to compile: a run that comes to one ends
+    there (`Result.needs_care`).
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. For forward mode give `adjoint=diffrax.ForwardMode()`; reverse mode works as it is. Explicit Runge-Kutta methods
@@ -93,16 +96,16 @@ def simulate(
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
     if state is None and closure is None and isinstance(mechanism, Mechanism):
-        closure = close(mechanism, start)
+        closure = close(mechanism, start, forward=adjoint is not None and _by_jax(adjoint))
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, ts, state, closure, settings)))
-    solution, missed, doubted = run(mechanism, careful=traced)
+    solution, missed, doubted = run(mechanism, careful=traced and careful)
     if isinstance(solution.code, Tracer):
-        return solution if traced else run(mechanism, careful=True)[0]
-    if doubted:  # few runs meet what it takes singular values for: only these compile them
+        return solution if traced or not careful else run(mechanism, careful=True)[0]
+    if doubted and careful:  # few runs meet what it takes singular values for: only these compile them
         solution, missed, _ = run(mechanism, careful=True)
     if isinstance(mechanism, Mechanism) and missed:  # the numbers made rows independent that were left out: choose again
         mechanism = mechanism.with_left_out(redundant_rows(mechanism))
-        solution, *_ = run(mechanism, careful=True)
+        solution, *_ = run(mechanism, careful=careful)
     if throw and isinstance(mechanism, Mechanism) and closure is not None:
         require_closed(mechanism, closure)
     if throw and solution.result != Result.successful:

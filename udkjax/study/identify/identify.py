@@ -32,7 +32,17 @@ EVEN = 1e-6  # of what a channel shows: residuals below it count alike, since th
 POLISHED = 15  # steps at the end
 NEARBY = 64  # guesses that are tried where the first cannot be closed
 PATIENCE = 2.0  # s: what is done before then needs no line to say so
-DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress")  # not settings that one may give
+DECIDED = (
+    "ts",
+    "mechanism",
+    "state",
+    "rtol",
+    "atol",
+    "adjoint",
+    "throw",
+    "progress",
+    "careful",
+)  # not settings that one may give
 
 
 def identify(

@@ -64,7 +64,7 @@ class Problem:
         self.mechanism, self.unknowns, self.records = mechanism, unknowns, tuple(records)
         self.channels = _channels(mechanism, self.records)
         self.names = tuple(channel.name for channel in self.channels)
-        self.starts, self._columns = _starts(mechanism, unknowns, self.records)
+        self.starts, self.columns = _starts(mechanism, unknowns, self.records)
         self.K = len(unknowns.names) + sum(len(start.names) for start in self.starts)
         self._numbers()
         self.program = Program(mechanism, unknowns.targets, self.channels, settings or {})
@@ -116,7 +116,7 @@ class Problem:
         S = max((len(start.names) for start in self.starts), default=0)
         n = 3 * len(self.mechanism.body_names)
         shift, bases = np.zeros((sets, records, S)), np.zeros((records, 2, n, S))
-        for r, columns in enumerate(self._columns):
+        for r, columns in enumerate(self.columns):
             if columns is not None:
                 at, start = columns
                 shift[:, r, : len(start.names)] = z[:, at : at + len(start.names)]
@@ -143,7 +143,7 @@ class Problem:
         by = slope[:, self.there] / self.sigma[:, None]
         J[:, :, :P] = by[:, :, :P] * self.unknowns.slopes(z[:, :P])[:, None, :]
         record = self.where[:, 0]
-        for k, columns in enumerate(self._columns):
+        for k, columns in enumerate(self.columns):
             if columns is not None:
                 at, start = columns
                 J[:, record == k, at : at + len(start.names)] = by[:, record == k, P : P + len(start.names)]
@@ -151,14 +151,15 @@ class Problem:
             beyond = self.ts[tuple(self.where[:, :2].T)] > _end(self.ts[record], horizon)
             r[:, beyond], J[:, beyond] = 0.0, 0.0
         code = found.code.reshape(sets, records).max(1)
-        return Evaluated(*self._with_priors(z, r, J), code)
+        return Evaluated(*self.with_priors(z, r, J), code)
 
-    def _with_priors(self, z: np.ndarray, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def with_priors(self, z: np.ndarray, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals and Jacobian, followed by those of the priors. Columns may be more than K: of unknowns that have none."""
         which, P, u = self.priors, len(self.unknowns.names), self.unknowns
         if not len(which):
             return r, J
         x, slope = u.values(z[:, :P])[:, which], u.slopes(z[:, :P])[:, which]
-        more = np.zeros((len(z), len(which), self.K))
+        more = np.zeros((len(z), len(which), J.shape[2]))
         more[:, np.arange(len(which)), which] = slope / u.sigma[which]
         return np.concatenate([r, (x - u.mean[which]) / u.sigma[which]], 1), np.concatenate([J, more], 1)
 
@@ -272,7 +273,7 @@ def _starts(
             columns.append(mine)
             continue
         label = start.name or record.name or (f"record {k + 1}" if len(records) > 1 else "start")
-        mine = at, _unknowns_of(mechanism, unknowns, record, label)
+        mine = at, start_unknowns(mechanism, unknowns, record, label)
         found.append(mine[1])
         columns.append(mine)
         at += len(mine[1].names)
@@ -287,7 +288,7 @@ def _same(one: Any, two: Any) -> bool:
     return one is not None and two is not None and np.array_equal(one.q, two.q) and np.array_equal(one.v, two.v)
 
 
-def _unknowns_of(mechanism: Mechanism, unknowns: Unknowns, record: Record, label: str) -> StartUnknowns:
+def start_unknowns(mechanism: Mechanism, unknowns: Unknowns, record: Record, label: str) -> StartUnknowns:
     """Coordinates that tell the closed states beside the guess apart: angles where they do."""
     mech = mechanism.with_parameters(record.conditions) if record.conditions else mechanism
     try:

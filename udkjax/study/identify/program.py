@@ -19,7 +19,7 @@ from udkjax.equations.assembly import State, close
 from udkjax.equations.settled import close_all
 from udkjax.integrate.lanes import CHUNKED, LANES
 from udkjax.integrate.simulate import simulate
-from udkjax.integrate.solution import Solution
+from udkjax.integrate.solution import Result, Solution
 from udkjax.integrate.solvers import forward_mode
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.channels import Channel, Quantity, measured
@@ -45,7 +45,7 @@ class Members(NamedTuple):
 class Predicted(NamedTuple):
     """What members would have measured (M, T, C), its derivatives by x and shift (M, T, C, P + S), and how the runs ended (M,).
 
-    With the states at the last time, (M, 2, 3 bodies), and their derivatives, where these are asked for.
+    With the states at the first and at the last time, (M, 2, 2, 3 bodies), and their derivatives, where these are asked for.
     """
 
     y: np.ndarray
@@ -92,8 +92,14 @@ class Program:
 
     def _piece(self, members: Members, tol: tuple[float, float]) -> tuple:
         tols = tuple(np.asarray(x, float) for x in tol)
-        found = _computed(self.mechanism, members, tols, self.settings, self.targets, self.channels, self.ends)
-        return jax.tree.map(np.asarray, found)
+        rest = self.settings, self.targets, self.channels, self.ends
+        found = jax.tree.map(np.asarray, _computed(self.mechanism, members, tols, *rest, False))
+        again = found[2] == Result.needs_care
+        if not again.any():
+            return found
+        # Few runs meet a singular configuration: only these compile what it takes there, which is most of a program.
+        better = jax.tree.map(np.asarray, _computed(self.mechanism, members, tols, *rest, True))
+        return jax.tree.map(lambda x, y: np.where(again.reshape(-1, *[1] * (x.ndim - 1)), y, x), found, better)
 
 
 def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
@@ -102,7 +108,7 @@ def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _computed(mechanism, members, tol, settings, targets, channels, ends):
+def _computed(mechanism, members, tol, settings, targets, channels, ends, careful):
     several = len(members.x) > 1
 
     def along(e):
@@ -118,13 +124,13 @@ def _computed(mechanism, members, tol, settings, targets, channels, ends):
     def one(members, x, shift):
         member = jax.tree.map(lambda leaf: leaf[0], members._replace(x=x, shift=shift))
         mech, state = _member(mechanism, member, targets)
-        closure = close(mech, member.ts[0], state)
-        return jax.tree.map(lambda leaf: leaf[None], _run(mech, member.ts, closure, tol, settings, channels, ends))
+        closure = close(mech, member.ts[0], state, forward=True)
+        return jax.tree.map(lambda leaf: leaf[None], _run(mech, member.ts, closure, tol, settings, channels, ends, careful))
 
     def every(members):
         mechs, states = jax.vmap(lambda member: _member(mechanism, member, targets))(members)
         closures = close_all(mechs, members.ts[:, 0], states)
-        return jax.vmap(lambda m, ts, c: _run(m, ts, c, tol, settings, channels, ends))(mechs, members.ts, closures)
+        return jax.vmap(lambda m, ts, c: _run(m, ts, c, tol, settings, channels, ends, careful))(mechs, members.ts, closures)
 
     size = members.x.shape[1] + members.shift.shape[1]
     outputs, slopes, code = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(size))
@@ -149,9 +155,10 @@ def _guessing(mechanism: Mechanism, q: Any, v: Any) -> Mechanism:
     return mechanism.with_parameters(values)
 
 
-def _run(mechanism, ts, closure, tol, settings, channels, ends):
-    solution: Solution = simulate(mechanism, ts, closure, *tol, adjoint=forward_mode(), throw=False, **settings)
+def _run(mechanism, ts, closure, tol, settings, channels, ends, careful):
+    solution: Solution = simulate(mechanism, ts, closure, *tol, adjoint=forward_mode(), throw=False, careful=careful, **settings)
     y = measured(mechanism, solution, channels)
     if not ends:
         return (y,), solution.code
-    return (y, jnp.stack([solution.q[-1].ravel(), solution.v[-1].ravel()])), solution.code
+    ends = jnp.stack([solution.q[jnp.array([0, -1])], solution.v[jnp.array([0, -1])]], axis=1)
+    return (y, ends.reshape(2, 2, -1)), solution.code

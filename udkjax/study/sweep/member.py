@@ -145,7 +145,7 @@ class Recipe:
     def _closure(self, shared: Any, mechanism: Mechanism) -> Closure | None:
         if shared[1] is not None or not self.assembled:
             return shared[1]
-        return close(mechanism, self.plan.ts[0])
+        return close(mechanism, self.plan.ts[0], forward=True)
 
     def _run(self, shared: Any, shift: Any, own: Any, mechanism: Mechanism, closure: Closure | None) -> Kept:
         settings = self.settings(shared, own, shift)
