@@ -1,4 +1,4 @@
-"""The command line: `udkjax report | simulate | sweep | check | doctor`.
+"""The command line: `udkjax report | simulate | sweep | identify | check | doctor`.
 
 Only the standard library and tyro are imported before a command is known, so that help comes at once.
 """
@@ -7,6 +7,7 @@ import tyro
 
 from udkjax.cli.check import check
 from udkjax.cli.doctor import doctor
+from udkjax.cli.identify import identify
 from udkjax.cli.report import report
 from udkjax.cli.simulate import simulate
 from udkjax.cli.sweep import sweep
@@ -14,7 +15,14 @@ from udkjax.cli.sweep import sweep
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command; exit with 1 after a run that failed, with 2 after wrong input."""
-    commands = {"report": report, "simulate": simulate, "sweep": sweep, "check": check, "doctor": doctor}
+    commands = {
+        "report": report,
+        "simulate": simulate,
+        "sweep": sweep,
+        "identify": identify,
+        "check": check,
+        "doctor": doctor,
+    }
     tyro.extras.subcommand_cli_from_dict(
         commands, prog="udkjax", args=arguments, description="Planar mechanisms, however redundantly constrained."
     )

@@ -9,7 +9,7 @@ import tyro
 if TYPE_CHECKING:
     from udkjax import Mechanism
 
-BAD_RUN, BAD_INPUT = 1, 2  # exit codes
+BAD_RUN, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes; the last as of a shell
 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml")]
 

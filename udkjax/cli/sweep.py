@@ -9,11 +9,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from udkjax.cli.common import BAD_RUN, Scene, load, refuse
+from udkjax.cli.common import BAD_RUN, INTERRUPTED, Scene, load, refuse
 
 Grid = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GRID.toml")]
-
-INTERRUPTED = 130  # exit code, as of a shell
 
 
 def sweep(

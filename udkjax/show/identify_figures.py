@@ -123,7 +123,7 @@ def residuals(data: Any) -> Figure:
     if 1 < len(records) <= NAMED:
         _key(figure, grid[0, 0])
     few = f"the {ROWS} of {len(channels)} channels that look least like noise" if len(channels) > ROWS else ""
-    _title(figure, data, "measured minus predicted, on two standard deviations of the noise", few)
+    _title(figure, data, "measured minus predicted; grey: two standard deviations of the noise", few)
     return figure
 
 
@@ -223,20 +223,30 @@ def _errors(axes: Axes, data: Any) -> None:
 
 
 def convergence(data: Any) -> Figure:
-    """Draw the cost of each trial, and by how much the next step would change an unknown."""
+    """Draw the cost of each trial, and by how much the next step would change an unknown.
+
+    Within a fit the cost never rises. Where it does, another one begins: of a longer part of the records, from another guess, or
+    with other weights.
+    """
     figure = Figure(figsize=(7, 5.4), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     trials = np.arange(1, data.sizes["trial"] + 1)
+    fits = np.split(trials, np.flatnonzero(np.diff(data["cost"].values) > 0) + 1)
     words = {"cost": "cost (half of the sum of squares)", "change": "largest change of an unknown"}
     for axes, name in zip(panels, words, strict=True):
         values = data[name].values
-        there = np.isfinite(values)
-        axes.semilogy(trials[there], np.maximum(values[there], ROUNDING), "o-", ms=3, lw=1, color=COLOURS[0])
+        for one in fits:
+            axes.semilogy(one, np.maximum(values[one - 1], ROUNDING), "o-", ms=3, lw=1, color=COLOURS[0])
         axes.set_ylabel(words[name])
         _plain(axes)
     panels[-1].set_xlabel("trial")
     panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    _title(figure, data, "how the fit settled")
+    _title(
+        figure,
+        data,
+        "how the fit settled",
+        "a gap: another guess, part of the records, or weight of channels" if fits[1:] else "",
+    )
     return figure
 
 

@@ -1,0 +1,37 @@
+"""Makes four_bar.csv: what encoders at the two pins of examples/four_bar.toml would show, of a linkage that is not quite as drawn.
+
+The coupler is heavier and longer than the scene says, the rocker is lighter, and the crank is released from another angle.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+import udkjax as udk
+
+HERE = Path(__file__).parent
+TRUTH = {"body.coupler.mass": 3.1, "body.rocker.mass": 1.6}
+LENGTH = 2.53  # of the coupler, m
+ANGLE = np.radians(58.0)  # of the crank at its release
+NOISE = 0.2  # standard deviation, degrees
+SEED = 1
+
+
+def main() -> None:
+    """Simulate three seconds, sampled fifty times a second, and add noise."""
+    mech = udk.load(HERE.parent / "four_bar.toml").with_parameters(TRUTH)
+    mech = udk.with_angle(udk.with_length(mech, "coupler", LENGTH), "crank", ANGLE)
+    ts = np.linspace(0.0, 3.0, 151)
+    sol = udk.simulate(mech, ts, rtol=1e-10, atol=1e-10)
+    angles = np.degrees(np.asarray(sol.q)[:, [mech.body_names.index(body) for body in ("crank", "rocker")], 2])
+    angles += NOISE * np.random.default_rng(SEED).normal(size=angles.shape)
+    lines = [
+        "# encoders of a four-bar, made by four_bar.py",
+        "time [ms],joint.A.angle [deg],joint.D.angle [deg]",
+        *(f"{1e3 * t:.0f},{a:.2f},{d:.2f}" for t, (a, d) in zip(ts, angles, strict=True)),
+    ]
+    (HERE / "four_bar.csv").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""What is asked of `udkjax identify`, from texts: everything that is wrong with them is told at once."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from udkjax.scene import Mechanism
+from udkjax.scene.checks import quoted, suggestion
+from udkjax.study.identify import IdentificationError, Parameter, Record, Start
+from udkjax.study.identify.parameters import unknowns_of
+from udkjax.study.identify.reading import records_of
+
+Groups = Iterable[Iterable[str]]
+Found = TypeVar("Found")
+
+
+class Texts:
+    """Parameters as texts, and what is said of them in `options`, by the names that `Parameter` has for it.
+
+    What is wrong becomes one of `problems`.
+    """
+
+    def __init__(self, mechanism: Mechanism, parameters: Groups, options: Mapping[str, Groups]):
+        self.mechanism, self.problems = mechanism, []
+        names = [name for group in parameters for name in group]
+        said: dict[str, dict[str, Any]] = {name: {} for name in names}
+        for option, groups in options.items():
+            for text in (text for group in groups for text in group):
+                self._add(said, option, text)
+        self.parameters = [Parameter(name, **said[name]) for name in names]
+        if not names:
+            self.problems.append("--parameters: name at least one, such as body.link1.mass")
+
+    def check(self, settings: Mapping[str, Any]) -> None:
+        """Look whether there are such parameters, and whether settings make sense."""
+        if self.parameters:
+            self._tried(lambda: unknowns_of(self.mechanism, self.parameters), None)
+        if settings["starts"] < 0:
+            self.problems.append(f"--starts {settings['starts']}: must not be negative")
+        if not 0 < settings["tol"] < 1:
+            self.problems.append(f"--tol {settings['tol']:g}: must be between 0 and 1")
+        if settings["seed"] < 0:
+            self.problems.append(f"--seed {settings['seed']}: must not be negative")
+
+    def records(self, data: Sequence[Path], noise: Groups, ignore: Groups, start: Any) -> list[Record]:
+        """Read the data."""
+        if not data:
+            self.problems.append("name a file of measurements, .csv or .nc, after the scene")
+            return []
+        everywhere, by_channel = self._noise(noise)
+        left_out = [name for group in ignore for name in group]
+        found = self._tried(lambda: records_of(self.mechanism, list(data), by_channel, left_out), ())
+        found = self._tried(lambda: records_of(self.mechanism, found, everywhere), ()) if found else ()
+        return [Record(r.times, r.values, r.noise, Start(estimate=start), r.t0, r.conditions, r.name) for r in found]
+
+    def _noise(self, groups: Groups) -> tuple[float | None, dict[str, float]]:
+        """The standard deviation of all channels, and of those that have one of their own."""
+        everywhere, by_channel = None, {}
+        for text in (text for group in groups for text in group):
+            channel, _, number = text.rpartition("=")
+            sigma = _numbers(number, 1)
+            if sigma is None or not sigma[0] > 0:
+                self.problems.append(f"--noise {quoted(text)}: must be NUMBER or CHANNEL=NUMBER, in SI units, and positive")
+            elif channel.strip() in by_channel or (not channel and everywhere is not None):
+                self.problems.append(f"--noise {quoted(text)}: is there twice")
+            elif channel:
+                by_channel[channel.strip()] = sigma[0]
+            else:
+                everywhere = sigma[0]
+        return everywhere, by_channel
+
+    def _add(self, said: dict[str, dict[str, Any]], option: str, text: str) -> None:
+        """Note what is said of a parameter, which may be called by any of the names that are tied in it."""
+        place = f"--{'guess' if option == 'start' else option} {quoted(text)}"
+        name, _, numbers = text.rpartition("=")
+        of = {_plain(part): whole for whole in said for part in (whole, *whole.split("="))}.get(_plain(name))
+        values = _numbers(numbers, 1 if option == "start" else 2)
+        if not name or values is None:
+            form = {"start": "NAME=VALUE", "bounds": "NAME=LOW,HIGH", "prior": "NAME=MEAN,DEVIATION"}[option]
+            self.problems.append(f"{place}: must be {form}, in SI units")
+        elif of is None:
+            near = suggestion(name.strip(), [part.strip() for whole in said for part in (whole, *whole.split("="))])
+            self.problems.append(f"{place}: {quoted(name.strip())} is not among --parameters{near}")
+        elif option in said[of]:
+            self.problems.append(f"{place}: is there twice for {quoted(of)}")
+        elif option == "bounds" and not values[0] < values[1]:
+            self.problems.append(f"{place}: the lower bound must be below the upper one")
+        else:
+            said[of][option] = values[0] if option == "start" else tuple(values)
+
+    def _tried(self, read: Callable[[], Found], otherwise: Found) -> Found:
+        try:
+            return read()
+        except IdentificationError as error:
+            self.problems += error.problems
+            return otherwise
+
+
+def _numbers(text: str, count: int) -> list[float] | None:
+    """So many finite numbers, separated by commas; None: it is something else."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        return None
+    return found if len(found) == count and all(map(math.isfinite, found)) else None
+
+
+def _plain(text: str) -> str:
+    return "".join(text.split())
