@@ -56,6 +56,7 @@ def identify(
     optimizer: Any = None,
     tol: float = TOL,
     seed: int = 0,
+    ignore: Sequence[str] = (),
     progress: Any = None,
     **settings: Any,
 ) -> Estimate:
@@ -64,7 +65,8 @@ def identify(
     `data` is a `Record`, a mapping of times ("time") and channels, a table of pandas or a dataset of xarray, the path of a CSV or
     NetCDF file, or a sequence of these: records, each with a start of its own. `parameters` are names of numbers of the scene,
     `length`s, ties in text (`body.a.mass = body.b.mass`), or `Parameter`s with bounds and priors. `noise` is the standard
-    deviation of all channels, or maps channels to theirs; where none is given it is estimated from what the fit leaves.
+    deviation of all channels, or maps channels to theirs; where none is given it is estimated from what the fit leaves. `ignore`
+    names columns of tables that are not looked at.
 
     With y what was measured and yhat(z) what the mechanism shows, sum ((yhat(z) - y) / sigma)^2 is minimized, by
     Levenberg-Marquardt with exact forward derivatives, through the closure of all loops; `loss="huber"` lets single wrong
@@ -79,9 +81,11 @@ def identify(
     than it needs. What the records cannot tell is no error: `Estimate.success` is false, and `Estimate.message` says what.
     """
     begun = time.perf_counter()
-    _check(settings)
-    unknowns = unknowns_of(mechanism, parameters)
-    records = records_of(mechanism, data, noise)
+    unknowns, records = _gathered(
+        lambda: _check(settings),
+        lambda: unknowns_of(mechanism, parameters),
+        lambda: records_of(mechanism, data, noise, ignore),
+    )[1:]
     mechanism, unknowns = _closable(mechanism, unknowns, seed)
     wrong = illegal(mechanism, partial(_placed, unknowns), unknowns.start, unknowns.names)
     if wrong:
@@ -96,6 +100,19 @@ def identify(
     fit, history = _settled(problem, found, tol, tell, choices)
     tell("")
     return Estimate.of(problem, fit, found, history, (tol, tol), lost, time.perf_counter() - begun)
+
+
+def _gathered(*steps: Callable[[], Any]) -> list[Any]:
+    """What some steps give; if any of them finds mistakes, those of all."""
+    found, problems = [], []
+    for step in steps:
+        try:
+            found.append(step())
+        except IdentificationError as error:
+            problems += error.problems
+    if problems:
+        raise IdentificationError(problems)
+    return found
 
 
 def _placed(unknowns: Unknowns, mechanism: Mechanism, x: Any) -> Mechanism:
@@ -190,10 +207,10 @@ def _require_some(problem: Problem, found: Found) -> None:
     raise IdentificationError([f"no first guess could be simulated along the records: {CAUSES[Result(int(code))]}"])
 
 
-def _teller(progress: Any) -> Callable[[str], None]:
+def _teller(progress: Callable[[str], Any] | bool | None) -> Callable[[str], Any]:
     if progress is False:
         return lambda text: None
-    if callable(progress):
+    if progress is not None and progress is not True:
         return progress
     line, begun = Line(), time.monotonic()
 

@@ -292,7 +292,7 @@ def start_unknowns(mechanism: Mechanism, unknowns: Unknowns, record: Record, lab
     """Coordinates that tell the closed states beside the guess apart: angles where they do."""
     mech = mechanism.with_parameters(record.conditions) if record.conditions else mechanism
     try:
-        mech = applied(mech, unknowns.targets, unknowns.start)  # pyright: ignore[reportArgumentType]
+        mech = applied(mech, unknowns.targets, unknowns.start)
         state = assemble(mech, record.t0, record.start.state)
     except (SceneError, ValueError) as problem:
         raise IdentificationError([f"{_of(record)}its start cannot be closed: {problem}"]) from None

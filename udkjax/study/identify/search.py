@@ -65,7 +65,7 @@ def search(
         other = growing(problem, guesses, loose, tell, **choices)
         history += other.history
         z = np.concatenate([z, guesses])
-        fit = Fit(*(np.concatenate(pair) for pair in zip(fit[:3], other[:3], strict=True)), other.evaluations, fit.history)
+        fit = _together(fit, other)
     best = int(np.argmin(fit.cost))
     there = np.abs(fit.z - fit.z[best]).max(1) <= SAME * (1.0 + np.abs(fit.z[best]).max())
     agreeing = int((there & np.isfinite(fit.cost)).sum())
@@ -147,6 +147,12 @@ def _better(one: Fit, two: Fit) -> Fit:
     which = two.cost < one.cost
     z = np.where(which[:, None], two.z, one.z)
     cost, settled = np.where(which, two.cost, one.cost), np.where(which, two.settled, one.settled)
+    return Fit(z, cost, settled, two.evaluations, one.history)
+
+
+def _together(one: Fit, two: Fit) -> Fit:
+    """Fits from some guesses, then those from others."""
+    z, cost, settled = (np.concatenate(pair) for pair in zip(one[:3], two[:3], strict=True))
     return Fit(z, cost, settled, two.evaluations, one.history)
 
 
