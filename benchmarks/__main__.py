@@ -5,7 +5,18 @@ import json
 from importlib import import_module
 from pathlib import Path
 
-NAMES = ("right_hand_side", "integrators", "trajectory", "batch", "gradients", "startup", "scaling", "sweep", "peers")
+NAMES = (
+    "right_hand_side",
+    "integrators",
+    "trajectory",
+    "batch",
+    "gradients",
+    "startup",
+    "scaling",
+    "sweep",
+    "identification",
+    "peers",
+)
 
 
 def main(words: list[str] | None = None) -> None:

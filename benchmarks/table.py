@@ -93,10 +93,23 @@ def _claims() -> Iterable[Claim]:
         yield Claim(f"gradient, {count} parameters, forward, in times the run", "gradients", 1 + 0.5 * count, forward)
     reverse = value("times_run", name="udkjax", mode="reverse", parameters=8)
     yield Claim("gradient, 8 parameters, reverse, in times the run", "gradients", 5.0, reverse)
+    for case in IDENTIFIED:
+        reached = value("reached", name=case, protocol="without noise")
+        yield Claim(f"identified from within 50 %, {case}: share right to 1e-8", "identification", 0.95, reached, True)
+        covered = value("covered", name=case, protocol="1 % noise")
+        yield Claim(f"identified with 1 % noise, {case}: share within two errors", "identification", 0.93, covered, True)
     for name, target in STARTS.items():
         yield Claim(f"start: {name}, s", "startup", target, value("seconds", name=name))
 
 
+IDENTIFIED = (
+    "linkage",
+    "four-bar",
+    "slider-crank",
+    "excavator, valves shut",
+    "excavator, driven",
+    "linkage, crossing",
+)
 STARTS = {
     "import udkjax and simulate": 1.5,
     "udkjax --help": 0.4,

@@ -9,7 +9,7 @@ import pytest
 
 benchmarks = pytest.importorskip("benchmarks", reason="not in a source tree")
 
-from benchmarks import batch, gradients, integrators, right_hand_side, sweep, trajectory  # noqa: E402
+from benchmarks import batch, gradients, identification, integrators, measurements, right_hand_side, sweep, table, trajectory  # noqa: E402
 from benchmarks.__main__ import main  # noqa: E402
 from benchmarks.common import Compiled, Work, alternate, at_equal_error, frontier, ratio  # noqa: E402
 from benchmarks.scripts import by_cholesky, by_pinv  # noqa: E402
@@ -53,6 +53,42 @@ def test_gradients():
     """Which are held against the C++ program's inside."""
     figures = gradients.main(smoke=True)
     assert {"udkjax"} <= {row["name"] for row in figures if row["mode"] == "forward"}
+
+
+@pytest.mark.slow
+def test_identification():
+    """The true values are reached, also by differences, and every claim finds its row."""
+    figures = identification.main(smoke=True)
+    first, noisy, *timed = figures
+    assert first["name"] == "linkage" and first["reached"] == 1.0 and first["error"] < 1e-8
+    assert noisy["protocol"] == "1 % noise" and 1e-5 < noisy["error"] < 0.1 and 0 <= noisy["covered"] <= 1
+    compared = {row["name"]: row for row in timed if row["protocol"] == "four-bar, warm"}
+    assert set(compared) == set(identification.WAYS)
+    assert compared["udkjax"]["error"] < 1e-8 and compared["least_squares"]["error"] < 1e-3
+    assert [row["parameters"] for row in timed if row["protocol"] == "sprung chain, warm"] == [3]
+    judged = {row["claim"]: row["figure"] for row in table.judge({"identification": figures})}
+    assert judged["identified from within 50 %, linkage: share right to 1e-8"] == 1.0
+
+
+@pytest.mark.slow
+def test_measurements_tell_what_is_to_be_found():
+    """No parameter of the smallest case could be another one: central differences of what is measured."""
+    m = measurements.linkage(end=2.0)
+    predicted, truth = m.predictor(), m.unknowns.start
+    values = np.asarray(predicted(truth, 1e-10)[0])
+    steps = 1e-3 * np.eye(len(truth))
+    slopes = [(predicted(truth * np.exp(e), 1e-10)[0] - predicted(truth * np.exp(-e), 1e-10)[0]) / 2e-3 for e in steps]
+    weighted = np.stack([np.ravel(slope / values.std(0)) for slope in slopes], 1) / np.sqrt(values.size)
+    assert np.linalg.svd(weighted, compute_uv=False)[-1] > 2e-3
+
+
+def test_first_guesses_of_every_measurement_are_around_the_truth():
+    assert tuple(identification.CASES) == table.IDENTIFIED
+    for case in identification.CASES:
+        m = identification.made(case, {})
+        starts = m.starts(50, 0.5) / m.unknowns.start
+        assert 3 <= starts.shape[1] <= 8 and 0.5 <= starts.min() < 0.55 and 1.45 < starts.max() <= 1.5
+        assert len(m.ts) == round(m.end * m.rate) + 1
 
 
 def test_the_command_writes_figures_table_and_page(tmp_path):
