@@ -107,7 +107,7 @@ def triangle():
 def test_a_tie_that_is_legal_at_one_position_only_is_refused(monkeypatch):
     """A larger plate with cranks just long enough to reach it at the first angle, where their lines then meet in one point.
 
-    There the mechanism closes, and its rank is what it was: nothing is wrong if that is the only position that is looked at.
+    There the mechanism closes, and its rank is what it was: to first order, at that position, nothing is wrong.
     """
     mechanism, arms, angle = triangle()
     assert mechanism.left_out is not None and len(mechanism.left_out) == 1
@@ -120,6 +120,8 @@ def test_a_tie_that_is_legal_at_one_position_only_is_refused(monkeypatch):
 
     (problem,) = illegal(mechanism, apply, [0.0], ["larger"])
     assert "larger cannot move by itself" in problem
+    monkeypatch.setattr(legality.Loops, "_closes", lambda *_: True)
+    assert illegal(mechanism, apply, [0.0], ["larger"]) == [problem]
     monkeypatch.setattr(legality, "positions_of", lambda rows, q: [rows.close(0.0, q)])
     assert illegal(mechanism, apply, [0.0], ["larger"]) == []
 

@@ -25,11 +25,12 @@ from udkjax.study.identify.directions import COEFFICIENT, connected, listed, nul
 # Of what a parameter does to Psi at all, the part along N that counts as none. Central differences leave 1e-10, positions closed
 # to 1e-11 with singular values above ORDINARY 1e-9, a direction that opens a loop leaves a tenth or more.
 ALONG = 1e-6
-DIFFERENCE = 1e-5  # of a parameter's size: the step of the central differences
-# Of a parameter's size: the step after which a mechanism must close again. What opens to second order does so by 1e-4 of the
-# size, ten million times what closing attains (redundancy.CLOSED).
+DIFFERENCE = 1e-5  # of a parameter's value: the step of the central differences
+# Of a parameter's size, which is its value, or less where that changes a row by more than the row's own size: the step after
+# which a mechanism must close again. What opens to second order does so by 1e-4 of the size, ten million times what is left of
+# closing (redundancy.CLOSED).
 STEP = 1e-2
-SMALL = 1e-3  # of the mechanism's size: a coordinate as small as this counts as zero, and has no size of its own
+SMALL = 1e-5  # of the size by effect: a value as small as this, such as that of a coordinate, counts as zero
 FEW = 4  # positions that are closed again
 
 
@@ -45,22 +46,24 @@ def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], 
     # that the graph is there already.
     placed = jax.jit(lambda x: apply(mechanism, x).with_left_out(None))
     x = np.asarray(x, float)
-    guess = np.asarray(placed(x).q0, float)
-    size = min(float(np.ptp(guess[:, :2], axis=0).max()), 1.0) or 1.0
-    sizes = np.where(np.abs(x) > SMALL * size, np.abs(x), 0.1 * size)
-    steps = DIFFERENCE * np.diag(sizes)
-    moving = [i for i, step in enumerate(steps) if _constraints(placed(x + step)) != _constraints(placed(x - step))]
+    steps = DIFFERENCE * np.where(x != 0.0, np.abs(x), min(_spread(placed(x)), 1.0))
+    moving = [i for i, step in enumerate(np.diag(steps)) if _constraints(placed(x + step)) != _constraints(placed(x - step))]
     if not moving:  # masses, forces
         return []
     names = [names[i] for i in moving]
     at = np.eye(len(x))[moving]
-    loops = Loops(mechanism, lambda change: placed(x + change @ at), x[moving], sizes[moving])
+    loops = Loops(mechanism, lambda change: placed(x + change @ at), x[moving], steps[moving])
     if mechanism.left_out and loops.redundant < len(mechanism.left_out):
         return [
             f"the first guesses of {listed(names)} open a loop that closes with the scene's own values: it has more "
             "constraints than it needs, and only certain values satisfy all of them; start from such values"
         ]
     return loops.problems(names) if loops.redundant else []
+
+
+def _spread(mechanism: Mechanism) -> float:
+    """How far its bodies are apart (m); 1 where there is one."""
+    return float(np.ptp(np.asarray(mechanism.q0, float)[:, :2], axis=0).max()) or 1.0
 
 
 def _constraints(mechanism: Mechanism) -> list[bytes]:
@@ -71,13 +74,13 @@ def _constraints(mechanism: Mechanism) -> list[bytes]:
 class Loops:
     """The positions of a mechanism with redundant rows, and what parameters do to these rows there.
 
-    `changed` maps changes (P,) of the parameters, whose values are x and whose typical `sizes` are given, to mechanisms.
+    `changed` maps changes (P,) of the parameters, whose values are x, to mechanisms; `steps` (P,) are those of differences.
     """
 
-    def __init__(self, mechanism: Mechanism, changed: Callable[[np.ndarray], Mechanism], x: np.ndarray, sizes: np.ndarray):
+    def __init__(self, mechanism: Mechanism, changed: Callable[[np.ndarray], Mechanism], x: np.ndarray, steps: np.ndarray):
         self._rows = lambda change: rows_of(changed(change))
         here = changed(np.zeros(len(x)))
-        self.x, self._size, rows = x, sizes, rows_of(here)
+        self.x, rows = x, rows_of(here)
         with np.errstate(all="ignore"):
             found = positions_of(rows, np.asarray(here.q0, float).ravel())
         self.redundant = rows.count - found[0].rank if found else 0
@@ -87,23 +90,28 @@ class Loops:
         self._positions = [p for p in found if p.smallest > ORDINARY] or found
         self._names = [name for name, _ in rows.names]
         self._left_out = list(chosen_rows(rows, found))
-        self._measure(rows)
+        self._measure(rows, steps, _spread(here))
 
-    def _measure(self, rows: Any):
-        """What each parameter, changed by its own size, does to Psi, and how much of it no motion makes up for."""
-        lengths = [rows.at(p.t, p.q)[1] for p in self._positions]
+    def _measure(self, rows: Any, steps: np.ndarray, spread: float):
+        """What each parameter does to Psi, and how much of it no motion makes up for."""
+        at = [rows.at(p.t, p.q) for p in self._positions]
         columns = []
-        for unit in np.eye(len(self.x)):
-            step = DIFFERENCE * self._size * unit
+        for step in np.diag(steps):
             ahead, behind = self._rows(step), self._rows(-step)
             moved = [ahead.at(p.t, p.q)[0] - behind.at(p.t, p.q)[0] for p in self._positions]
-            columns.append([m / (2 * DIFFERENCE * length) for m, length in zip(moved, lengths, strict=True)])
-        effect = np.moveaxis(np.array(columns), 0, -1)  # (positions, rows, P)
+            columns.append(np.array(moved) / (2 * step.sum()))
+        slope = np.stack(columns, -1)  # (positions, rows, P)
+        # The natural size of a row: the longest arm at which it turns a body, which is 1 for rows of angles.
+        arms = np.max([length * np.abs(dense(D[:, 2::3]) / rows.root[2::3]).max(1) for _, length, D in at], axis=0)
+        most = np.abs(slope / np.where(arms > 0.0, arms, spread)[:, None]).max((0, 1))
+        by_effect = 1.0 / np.where(most > 0.0, most, np.inf)
+        own = np.abs(self.x)
+        self._size = np.where(own < SMALL * by_effect, by_effect, np.minimum(own, by_effect))
+        effect = slope / np.array([length for _, length, _ in at])[:, :, None]
         total = np.sqrt((effect**2).sum((0, 1)) / len(effect))
-        # In units in which each parameter has an effect of one.
-        self._unit = self._size / np.where(total > 0, total, 1.0)
-        self._effect = effect / np.where(total > 0, total, 1.0)
-        null_spaces = [np.asarray(getattr(N, "toarray", lambda N=N: N)()) for N in (p.null_space for p in self._positions)]
+        self._unit = 1.0 / np.where(total > 0, total, 1.0)  # of each parameter, in which it has an effect of one
+        self._effect = effect * self._unit
+        null_spaces = [dense(p.null_space) for p in self._positions]
         self._along = np.concatenate([N.T @ e for N, e in zip(null_spaces, self._effect, strict=True)])
         # One combination of rows for each row left out: that row as the others make it up.
         self._circuits = np.array([N @ np.linalg.inv(N[self._left_out]) for N in null_spaces])
@@ -186,7 +194,7 @@ class Loops:
                 f"{who} cannot move, each by itself or together: {self._loop(members)} that only holds for the values that they "
                 "have; leave them fixed"
             )
-        condition = ", ".join(tie(own, x, u) for u in ties)
+        condition = ", for ".join(tie(own, x, u) for u in ties)
         leave = f"tie them, and leave {listed(stuck)} fixed" if stuck else "tie them, or leave them fixed"
         return f"{who} cannot move each by itself: {self._loop(members)} that only holds for {condition}; {leave}"
 
@@ -199,6 +207,11 @@ class Loops:
         constraints = list(dict.fromkeys(name for name, there in zip(self._names, involved, strict=True) if there))
         what = "constraints" if set(constraints) & set(self._drivers) else "joints"
         return f"{what} {listed([quoted(name) for name in constraints])} close a loop"
+
+
+def dense(matrix: Any) -> np.ndarray:
+    """A matrix that may be sparse."""
+    return matrix.toarray() if hasattr(matrix, "toarray") else matrix
 
 
 def tie(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:
