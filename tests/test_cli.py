@@ -22,7 +22,7 @@ def udkjax(*arguments) -> int:
     return 0
 
 
-@pytest.mark.parametrize("command", [[], ["report"], ["simulate"], ["sweep"], ["check"], ["doctor"]])
+@pytest.mark.parametrize("command", [[], ["report"], ["simulate"], ["sweep"], ["identify"], ["check"], ["doctor"]])
 def test_help_is_printed_without_importing_jax(command):
     code = (
         "import sys, atexit; from udkjax.cli import main\n"

@@ -241,12 +241,8 @@ def convergence(data: Any) -> Figure:
         _plain(axes)
     panels[-1].set_xlabel("trial")
     panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    _title(
-        figure,
-        data,
-        "how the fit settled",
-        "a gap: another guess, part of the records, or weight of channels" if fits[1:] else "",
-    )
+    gaps = "a gap: another guess, part of the records, tolerance or weight of channels"
+    _title(figure, data, "how the fit settled", gaps if fits[1:] else "")
     return figure
 
 

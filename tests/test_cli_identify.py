@@ -1,0 +1,189 @@
+import csv
+import inspect
+import json
+from pathlib import Path
+from typing import Any, get_args
+
+import jax
+import numpy as np
+import pytest
+import xarray
+
+import udkjax as udk
+from udkjax.cli import main
+from udkjax.cli.identify import Estimated, Loss
+from udkjax.cli.identify import identify as command
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PENDULUM = EXAMPLES / "compound_pendulum.toml"
+TRUTH, NOISE = 0.5, 0.3  # inertia of the rod, kg m2; of the measurements, degrees
+MASS, INERTIA, CHANNEL = "body.rod.mass", "body.rod.inertia", "body.rod.angle"
+PICTURES = {"fit.png", "residuals.png", "convergence.png", "correlation.png"}
+FILES = {"identified.toml", "estimate.json", "estimate.csv", "fit.nc", *PICTURES}
+
+
+def udkjax(*arguments) -> int:
+    """Run the command line here, and return its exit code."""
+    try:
+        main([str(argument) for argument in arguments])
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 0 if end.code is None else 1
+    return 0
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    """Two runs of a pendulum whose inertia is not the scene's; mass and inertia by a common factor change nothing."""
+    ts = np.linspace(0.0, 1.5, 31)
+    q = np.asarray(udk.simulate(udk.load(PENDULUM).with_parameters({INERTIA: TRUTH}), ts).q)[:, 0, 2]
+    rng = np.random.default_rng(5)
+    runs = [np.degrees(q) + NOISE * rng.normal(size=q.shape) for _ in range(2)]
+    lines = [f"{1e3 * t:.0f},{angle:.4f},{name},x" for name, run in zip("ab", runs, strict=True) for t, angle in zip(ts, run)]
+    file = tmp_path_factory.mktemp("data") / "swings.csv"
+    file.write_text("\n".join([f"time [ms],{CHANNEL} [deg],record,remark", *lines]))
+    return file
+
+
+def test_what_the_data_cannot_tell_is_said_and_all_is_written(tmp_path, capsys, data):
+    out = tmp_path / "found"
+    assert udkjax("identify", PENDULUM, data, "--parameters", MASS, INERTIA, "--ignore", "remark", "--out", out, "--quiet") == 1
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    for part in ("2 parameters from 62 numbers in 2 records", "unknown", "body.rod.mass and body.rod.inertia by a common factor"):
+        assert part in shown.out
+    assert {file.name for file in out.iterdir()} == FILES
+    found = json.loads((out / "estimate.json").read_text())
+    assert found["converged"] and not found["success"]
+    assert found["parameters"][MASS]["standard_error"] is None
+    assert (out / "fit.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_known_before_makes_it_known(tmp_path, capsys, data):
+    out = tmp_path / "found"
+    options = ["--prior", f"{MASS}=2.0,0.002", "--bounds", f"{INERTIA} = 0.2,0.9", "--noise", CHANNEL + f"={np.radians(NOISE)}"]
+    arguments = ["identify", PENDULUM, data, "--parameters", MASS, "--parameters", INERTIA, "--ignore", "remark", *options]
+    assert udkjax(*arguments, "--out", out) == 0
+    assert "every parameter is known" in capsys.readouterr().out
+    found = json.loads((out / "estimate.json").read_text())
+    inertia = found["parameters"][INERTIA]
+    assert found["success"] and inertia["units"] == "kg m2"
+    assert abs(inertia["value"] - TRUTH) < 4 * inertia["standard_error"] < 0.05 * TRUTH
+    assert found["settings"] | {"parameters": [MASS, INERTIA], "prior": [f"{MASS}=2.0,0.002"], "seed": 0} == found["settings"]
+    assert found["scene"] == PENDULUM.read_text() and found["data"][0]["file"] == str(data)
+    assert len(found["data"][0]["sha256"]) == 64 and found["versions"]["jax"] == jax.__version__
+    placed = udk.load(out / "identified.toml")
+    assert float(placed.bodies["rod"].inertia) == inertia["value"]
+    with (out / "estimate.csv").open() as file:
+        (mass, row) = csv.DictReader(file)
+    assert float(row["value"]) == inertia["value"] and row["parameter"] == INERTIA and float(mass["first_guess"]) == 2.0
+    with xarray.open_dataset(out / "fit.nc", engine="h5netcdf") as fit:
+        assert fit.measured.dims == ("record", "sample", "channel") and list(fit.record.values) == ["a", "b"]
+        np.testing.assert_allclose(fit.time[1], np.linspace(0.0, 1.5, 31), atol=1e-12)
+        np.testing.assert_allclose(fit.measured - fit.predicted, fit.residual, atol=1e-12)
+        np.testing.assert_allclose(fit.noise, np.radians(NOISE))
+        np.testing.assert_allclose(float(fit.residual.std()), np.radians(NOISE), rtol=0.3)
+        assert fit.attrs["success"] == 1 and fit.channel_units.values == ["rad"]
+
+
+def test_options_reach_the_identification(tmp_path, monkeypatch, data):
+    asked: dict[str, Any] = {}
+
+    def interrupted(mech, records, parameters, **settings):
+        asked.update(settings, records=records, parameters=parameters)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(udk, "identify", interrupted)
+    tied, length = "body.coupler.mass = body.rocker.mass", "length( crank )"
+    file = tmp_path / "run.csv"
+    file.write_text("t,joint.A.angle,joint.D.omega\n0,1,0\n1,2,0")
+    arguments = ["identify", EXAMPLES / "four_bar.toml", file, "--parameters", tied, length, "--out", tmp_path / "found"]
+    arguments += ["--prior", "body.rocker.mass=2,0.5", "--guess", "length(crank)=0.9", "--bounds", "length(crank)=0.5,2"]
+    arguments += ["--noise", "0.1", "--noise", "joint.D.omega=0.5", "--estimate-start", "both", "--loss", "huber", "--quiet"]
+    assert udkjax(*arguments, "--starts", 3, "--tol", 1e-9, "--seed", 7) == 130
+    one, two = asked["parameters"]
+    assert (one.of, one.prior, one.bounds, one.start) == (tied, (2.0, 0.5), None, None)
+    assert (two.of, two.prior, two.bounds, two.start) == (length, None, (0.5, 2.0), 0.9)
+    (record,) = asked["records"]
+    assert record.start.estimate == "both" and record.name == "run"
+    np.testing.assert_array_equal([record.noise[name] for name in record.values], [[0.1, 0.1], [0.5, 0.5]])
+    assert {k: asked[k] for k in ("loss", "starts", "tol", "seed", "progress")} == {
+        "loss": "huber",
+        "starts": 3,
+        "tol": 1e-9,
+        "seed": 7,
+        "progress": False,
+    }
+    assert not (tmp_path / "found").exists()
+
+
+def test_choices_and_defaults_are_those_of_the_library():
+    from udkjax.study.identify import identify, losses, records
+
+    mine, theirs = (inspect.signature(function).parameters for function in (command, identify))
+    for name in ("loss", "starts", "tol", "seed"):
+        assert mine[name].default == theirs[name].default
+    assert get_args(Estimated) == get_args(records.Estimated)
+    for name in get_args(Loss):
+        losses.loss_of(name, 1)
+
+
+GOOD = {"--parameters": [MASS, INERTIA], "--out": ["found"], "--ignore": ["remark"]}
+
+
+@pytest.mark.parametrize(
+    ("option", "values", "problem"),
+    [
+        ("--out", ["nowhere/found"], "there is no folder nowhere"),
+        ("--out", ["swings.csv"], "--out swings.csv is no folder"),
+        ("--parameters", ["body.rod.mas"], 'no parameter "body.rod.mas"; did you mean "body.rod.mass"?'),
+        ("--parameters", [], "--parameters: name at least one"),
+        ("--ignore", ["nothing"], '"remark"'),
+        ("--bounds", [f"{MASS}=3,1"], "the lower bound must be below the upper one"),
+        ("--bounds", [f"{MASS}=3,4"], "the first guess 2 must be between the bounds"),
+        ("--bounds", [f"{MASS}=1,2,3"], f'--bounds "{MASS}=1,2,3": must be NAME=LOW,HIGH'),
+        ("--prior", ["1,2"], '--prior "1,2": must be NAME=MEAN,DEVIATION'),
+        ("--prior", ["body.rod.mas=1,2"], '"body.rod.mas" is not among --parameters; did you mean "body.rod.mass"?'),
+        ("--guess", [f"{MASS}=1", f"{MASS}=2"], f'--guess "{MASS}=2": is there twice'),
+        ("--guess", [f"{MASS}=heavy"], "must be NAME=VALUE"),
+        ("--noise", ["-1"], '--noise "-1": must be NUMBER or CHANNEL=NUMBER, in SI units, and positive'),
+        ("--noise", ["body.rod.omega=1"], '"body.rod.omega" is measured in no record'),
+        ("--starts", ["-1"], "--starts -1: must not be negative"),
+        ("--tol", ["0"], "--tol 0: must be between 0 and 1"),
+        ("--seed", ["-1"], "--seed -1: must not be negative"),
+    ],
+)
+def test_wrong_input_is_refused_before_anything_is_run(tmp_path, monkeypatch, capsys, data, option, values, problem):
+    monkeypatch.chdir(tmp_path)
+    Path("swings.csv").write_text(data.read_text())
+    given = GOOD | {option: values}
+    options = [word for name, words in given.items() for word in ([f"{name}={words[0]}"] if len(words) == 1 else [name, *words])]
+    options = [word for word in options if word != "--parameters"] if not values else options
+    assert udkjax("identify", PENDULUM, "swings.csv", *options) == 2
+    shown = capsys.readouterr()
+    assert problem in shown.err and "Traceback" not in shown.err and shown.out == ""
+    assert [file.name for file in Path().iterdir()] == ["swings.csv"]
+
+
+def test_all_mistakes_are_named_at_once(tmp_path, capsys, data):
+    arguments = [
+        "--parameters",
+        "body.rod.mas",
+        INERTIA,
+        "--noise",
+        "loud",
+        "--tol",
+        2,
+        "--prior",
+        "x=1,2",
+        "--out",
+        tmp_path / "o",
+    ]
+    assert udkjax("identify", PENDULUM, data, "nowhere.csv", *arguments) == 2
+    shown = capsys.readouterr().err
+    for part in ("6 mistakes", '"body.rod.mas"', '"loud"', "--tol 2", '"x=1,2"', '"remark"', "nowhere.csv"):
+        assert part in shown
+    assert udkjax("identify", PENDULUM, "--parameters", MASS, "--out", tmp_path / "o") == 2
+    assert "name a file of measurements" in capsys.readouterr().err
+    assert udkjax("identify", "nowhere.toml", data, "--parameters", MASS, "--out", tmp_path / "o") == 2
+    assert "cannot read nowhere.toml" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
