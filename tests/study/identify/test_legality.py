@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from udkjax.equations.redundancy import rows_of
 from udkjax.scene.joints import Gear, Revolute
 from udkjax.study.identify import legality
 from udkjax.study.identify.legality import illegal, tie
@@ -46,6 +47,14 @@ ALL = 'joints "A1", "A2", "A3", "B1", "B2" and "B3" close a loop'
 def test_three_cranks_must_stay_equal(linkage):
     (problem,) = illegal(linkage, lengths("link1", "link2", "link3"), [1.0, 1.0, 1.0], ["a", "b", "c"])
     assert problem == f"a, b and c cannot move each by itself: {ALL} that only holds for a = b = c; tie them, or leave them fixed"
+
+
+def test_sparse_arithmetic_says_the_same(linkage, monkeypatch):
+    choices = [lengths("link1", "link2", "link3"), lengths(("link1", "link2", "link3"))]
+    plain = [illegal(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(choices, (3, 1), strict=True)]
+    monkeypatch.setattr(legality, "rows_of", lambda mechanism: rows_of(mechanism, large=True))
+    assert [illegal(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(choices, (3, 1), strict=True)] == plain
+    assert len(plain[0]) == 1 and plain[1] == []
 
 
 @pytest.mark.parametrize("groups", [(("link1", "link2"), "link3"), (("link1", "link3"), "link2")])
