@@ -1,0 +1,107 @@
+"""Tables and texts of an estimate that is made up; what an identification writes is tested with the command line."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from udkjax.study.identify.results import labels, rounded, rows, text
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "said"),
+    [
+        (3.1194645, 0.0188, "3.119"),
+        (3.1194645, 0.00012, "3.11946"),
+        (-0.0368209, 0.00012, "-0.03682"),
+        (1234.567, 20.0, "1235"),
+        (0.5, 3.0, "0.50"),
+        (1.0, 1e-18, "1.00000000000"),
+        (2.0, np.inf, "2"),
+        (2.0, np.nan, "2"),
+        (0.0, 0.1, "0"),
+        (1 / 3, 0.0, "0.333333"),
+    ],
+)
+def test_values_are_said_as_far_as_they_are_known(value, error, said):
+    assert rounded(value, error) == said
+
+
+def test_records_without_a_name_of_their_own_are_numbered():
+    assert labels([SimpleNamespace(name=name) for name in ("push", "", "push", "pull", "")]) == [
+        "push 1",
+        "record 2",
+        "push 3",
+        "pull",
+        "record 5",
+    ]
+
+
+@pytest.fixture
+def estimate() -> Any:
+    """Four parameters, of which one does not show, and two only together; and a start."""
+    names = ("a", "b", "c", "d")
+    channels = [SimpleNamespace(name=f"y{k}", units="rad") for k in range(8)]
+    where = np.array([[0, t, c] for t in range(5) for c in range(8)])
+    problem = SimpleNamespace(
+        unknowns=SimpleNamespace(start=np.array([1.0, 2.0, 3.0, 4.0])),
+        all_names=(*names, "start: angle"),
+        all_units=("kg", "kg", "m", "1", "rad"),
+        channels=channels,
+        records=[SimpleNamespace(name="run")],
+        where=where,
+        known=where[:, 2] == 0,
+    )
+    known = SimpleNamespace(
+        standard_errors=np.array([np.inf, np.inf, np.inf, 2.5]),
+        dead=("c",),
+        flat=(SimpleNamespace(names=("a", "b")),),
+        poor=("d",),
+        chi2=39.5,
+        degrees_of_freedom=35,
+    )
+    return SimpleNamespace(
+        mechanism=SimpleNamespace(name="linkage"),
+        names=names,
+        units=("kg", "kg", "m", "1"),
+        values=np.array([1.5, 2.5, 3.0, 4.5]),
+        knowledge=known,
+        problem=problem,
+        at_bounds=("d",),
+        start_values={"start: angle": (0.1, 0.01)},
+        noise=({channel.name: np.array([np.nan, 0.02, 0.02]) for channel in channels},),
+        converged=False,
+        agreeing=3,
+        guesses=16,
+        evaluations=1,
+        seconds=2.0,
+        message="what is to be said",
+    )
+
+
+def test_each_row_says_what_is_wrong_with_it(estimate):
+    found = rows(estimate)
+    assert [row.note for row in found] == [
+        "cannot be told from others",
+        "cannot be told from others",
+        "shows in nothing that was measured",
+        "poorly known, at a bound",
+        "added to the guess of the start",
+    ]
+    assert [row.first_guess for row in found] == [1.0, 2.0, 3.0, 4.0, 0.0]
+    assert found[-1][:4] == ("start: angle", 0.1, 0.01, "rad")
+
+
+def test_the_text_says_how_the_fit_ended_and_what_the_noise_was(estimate):
+    lines = text(estimate).splitlines()
+    assert lines[0] == "linkage: 4 parameters from 40 numbers in 1 record"
+    assert lines[2].split() == "a 1.5 unknown kg 1 cannot be told from others".split()
+    assert lines[5].split() == "d 4.5 2.5 1 4 poorly known, at a bound".split()
+    assert [len(line) - len(line.lstrip()) for line in lines[1:-1]] == [2] * 9
+    assert lines[7:] == [
+        "  fit               not settled after 1 evaluation in 2.0 s, 3 of 16 first guesses led here",
+        "  chi^2             39.5 with 35 degrees of freedom",
+        "  noise, estimated  " + ", ".join(f"y{k} 0.02 rad" for k in range(1, 7)) + ", and 1 more",
+        "what is to be said",
+    ]
