@@ -93,7 +93,7 @@ def test_unknowns_of_starts_are_eliminated():
 def test_a_common_factor_is_found_and_said():
     """J (1, 1, 0) = 0 up to the errors of derivatives: of two masses their ratio is known; the third is as if one were fixed."""
     J, r = problem()
-    J[:, 1] = -J[:, 0] + 1e-8 * RNG(3).standard_normal(60)
+    J[:, 1] = -J[:, 0] + 1e-9 * RNG(3).standard_normal(60)
     known = knowledge(J, r, positive("body.link1.mass", "body.coupler.mass", "c", x=[1.0, 4.0, 2.0]))
     (flat,) = known.flat
     assert flat.text == "body.link1.mass and body.coupler.mass by a common factor"

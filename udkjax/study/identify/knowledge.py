@@ -19,9 +19,9 @@ from jaxtyping import ArrayLike, Float
 
 from udkjax.study.identify.directions import listed, null_space, reduced
 
-# Of the largest singular value: what cannot be told from none. Derivatives of runs at tolerances of 1e-9 have errors of 1e-8 to
-# 1e-7 of the largest ones; and a direction known a million times worse than another one is hardly ever known.
-FLAT = 1e-6
+# Of the largest singular value: what cannot be told from none. A change that leaves the equations of motion as they are has
+# 1e-16, whatever the tolerance; derivatives at tolerances of 1e-7 have errors of 1e-8, far smaller ones at 1e-11.
+FLAT = 1e-8
 PART = 1e-3  # of the largest coefficient of a flat direction: unknowns with less of it take no part
 ALIKE = 1e-2  # by how much the factors of a common one may differ
 POOR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
