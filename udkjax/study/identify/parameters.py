@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from udkjax.scene.checks import SceneError, quoted, suggestion
 from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
@@ -137,8 +137,8 @@ class Unknowns:
         return tuple(name for name, at, kind in zip(self.names, near, self.kinds, strict=True) if at and kind == "bounded")
 
 
-def applied(mechanism: Mechanism, targets: Sequence[Target], x: Float[ArrayLike, "P"] | Any) -> Mechanism:
-    """The mechanism with the values x in, in the order of the parameters. Pure; x may be traced."""
+def applied(mechanism: Mechanism, targets: Sequence[Target], x: Any) -> Mechanism:
+    """The mechanism with the values x (P,) in, in the order of the parameters. Pure; x may be traced."""
     left_out, base, values = mechanism.left_out, parameters_of(mechanism), {}
     for k, target in enumerate(targets):
         if target.function is not None:

@@ -1,0 +1,253 @@
+"""Parameters found from records: exactly without noise, within their errors with it, and not at all where nobody can."""
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
+from udkjax.study.identify import program
+from udkjax.study.identify.identify import identify
+from udkjax.study.identify.parameters import unknowns_of
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.search import beside, horizons
+
+TRUE = {"body.rod.inertia": 0.375, "force.spring.damping": 0.2}
+
+
+def found(first, data, parameters=NAMES, **choices):
+    return identify(first, data, parameters, progress=False, **choices)
+
+
+def off(estimate):
+    return max(abs(estimate.parameters[name] / value - 1.0) for name, value in TRUE.items() if name in estimate.parameters)
+
+
+# --- without noise
+
+
+@pytest.mark.parametrize("factors", [(1.5, 0.5), (0.5, 1.5), (0.6, 0.6)])
+def test_values_are_found_again(measured, factors):
+    first = pendulum(0.375 * factors[0], 0.2 * factors[1])
+    estimate = found(first, {"time": TS, ANGLE: measured[1]})
+    assert off(estimate) < 1e-10
+    assert estimate.success and estimate.converged and estimate.ways == ("whole records",)
+    assert estimate.message == "every parameter is known from the records"
+    assert estimate.mechanism.parameters()["body.rod.inertia"] == estimate.values[0]
+    assert np.abs(estimate.residuals[0][ANGLE]).max() < 1e-10
+
+
+def test_a_long_record_from_far_away():
+    """Twenty swings: from twice the inertia the guess falls many of them behind, and a fit of the whole record loses its way."""
+    ts = np.linspace(0.0, 40.0, len(TS))
+    truth = pendulum(damping=0.005)
+    data = {"time": ts, ANGLE: swing(truth, ts)}
+    first = pendulum(0.75, 0.01)
+    estimate = found(first, data, starts=0)
+    assert estimate.ways == ("whole records", "growing records")
+    assert abs(estimate.values[0] / 0.375 - 1.0) < 1e-8 and abs(estimate.values[1] / 0.005 - 1.0) < 1e-8
+
+
+def test_gaps_are_left_out(measured):
+    angle = measured[1].copy()
+    angle[7:30:2] = np.nan
+    estimate = found(pendulum(0.5, 0.1), {"time": TS, ANGLE: angle})
+    assert off(estimate) < 1e-9 and np.isnan(estimate.residuals[0][ANGLE]).sum() == 12
+    assert estimate.knowledge.degrees_of_freedom == pytest.approx(len(TS) - 12 - 2)
+
+
+def test_several_guesses_in_one_call(measured):
+    guesses = [[0.3, 0.1], [0.5, 0.3], [0.2, 0.4]]
+    estimate = found(pendulum(5.0, 2.0), {"time": TS, ANGLE: measured[1]}, starts=guesses)
+    assert off(estimate) < 1e-9 and estimate.guesses == 4 and estimate.agreeing >= 3
+
+
+# --- with noise
+
+
+def test_errors_are_as_large_as_said(measured):
+    sigma, inside, repetitions = 0.01 * measured[1].std(), [], 60
+    for seed in range(repetitions):
+        noise = sigma * np.random.default_rng(seed).standard_normal(len(TS))
+        estimate = found(measured[0], {"time": TS, ANGLE: measured[1] + noise})
+        inside.append([abs(estimate.parameters[n] - TRUE[n]) <= 2.0 * estimate.standard_errors[n] for n in NAMES])
+        assert estimate.success
+    assert 0.88 < np.mean(inside) <= 0.995  # of 120: 0.954 is expected, and three times its deviation is 0.057
+
+
+def test_noise_that_is_given_and_noise_that_is_estimated(measured):
+    sigma = 0.02
+    data = {"time": TS, ANGLE: measured[1] + sigma * np.random.default_rng(5).standard_normal(len(TS))}
+    given, estimated = found(measured[0], data, noise=sigma), found(measured[0], data)
+    assert given.values == pytest.approx(estimated.values, rel=1e-6)
+    assert given.noise[0][ANGLE] == pytest.approx([sigma] * len(TS))
+    assert estimated.noise[0][ANGLE][0] == pytest.approx(sigma, rel=0.3)
+    ratio = estimated.noise[0][ANGLE][0] / sigma
+    assert estimated.knowledge.standard_errors == pytest.approx(ratio * given.knowledge.standard_errors, rel=1e-6)
+
+
+def test_wrong_numbers_count_less_by_huber(measured):
+    angle = measured[1] + 0.003 * np.random.default_rng(6).standard_normal(len(TS))
+    angle[5::9] += 0.5
+    data = {"time": TS, ANGLE: angle}
+    squares, robust = found(measured[0], data, noise=0.003), found(measured[0], data, noise=0.003, loss="huber")
+    assert off(robust) < 0.2 * off(squares) and off(robust) < 0.03
+
+
+def test_what_the_mechanism_lacks_is_told(measured):
+    estimate = found(measured[0], {"time": TS, ANGLE: measured[1] + 0.02 * np.sin(2.0 * TS)}, starts=0)
+    assert "not noise" in estimate.message
+
+
+def test_a_prior_counts_as_one_more_measurement(measured):
+    mean, sigma = 0.385, 0.003
+    data = {"time": TS, ANGLE: measured[1] + 0.05 * np.random.default_rng(8).standard_normal(len(TS))}
+    parameters = [udk.Parameter(NAMES[0], prior=(mean, sigma)), NAMES[1]]
+    with_prior, without = found(measured[0], data, parameters, noise=0.05), found(measured[0], data, noise=0.05)
+    error = without.standard_errors[NAMES[0]]
+    assert error > sigma
+    expected = (without.values[0] / error**2 + mean / sigma**2) / (1 / error**2 + 1 / sigma**2)
+    assert with_prior.values[0] == pytest.approx(expected, abs=0.02 * sigma)  # the problem is not quite linear
+    assert with_prior.standard_errors[NAMES[0]] < sigma
+
+
+# --- what cannot be known
+
+
+def test_a_common_factor_of_masses_is_not_known(measured):
+    """Of a pendulum without a spring the motion shows the ratio of mass and inertia, and the force on its pin the mass."""
+    mech = udk.library.compound_pendulum()
+    ts = np.linspace(0.0, 3.0, 40)
+    solution = udk.simulate(mech, ts, rtol=1e-12, atol=1e-12)
+    data = {"time": ts, ANGLE: np.asarray(solution.q)[:, 0, 2]}
+    names = ["body.rod.mass", "body.rod.inertia"]
+    first = mech.with_parameters({names[0]: 1.4, names[1]: 0.2})
+    estimate = found(first, data, names)
+    assert not estimate.success and "common factor" in estimate.message and all(name in estimate.message for name in names)
+    assert np.isinf(estimate.knowledge.standard_errors).all()
+    true = [float(mech.parameters()[name]) for name in names]
+    assert estimate.values[1] / estimate.values[0] == pytest.approx(true[1] / true[0], rel=1e-8)
+    known = found(first, data, [udk.Parameter(names[0], prior=(2.0, 0.1)), names[1]])
+    assert known.success and known.values == pytest.approx(true, rel=1e-7)
+    data["joint.pin.fy"] = np.asarray(udk.reactions(mech, solution)["pin"]["rod"])[:, 1]
+    assert found(first, data, names).values == pytest.approx(true, rel=1e-9)
+
+
+# --- the problem
+
+
+@pytest.fixture(scope="module")
+def two_records(measured):
+    """A record from an estimated start, and a shorter one from the scene's with another spring."""
+    stiffer = measured[0].with_parameters({"force.spring.stiffness": 4.0})
+    records = [
+        udk.Record(TS[3:], {ANGLE: measured[1][3:]}, noise=0.01, t0=0.0, start=udk.Start(estimate="both")),
+        udk.Record(TS[:9], {ANGLE: swing(stiffer)[:9]}, noise=0.02, conditions={"force.spring.stiffness": 4.0}),
+    ]
+    return Problem(measured[0], unknowns_of(measured[0], NAMES), records)
+
+
+def test_residuals_vanish_at_the_truth(two_records):
+    assert two_records.all_names[2:] == ("record 1: body.rod.angle", "record 1: body.rod.omega")
+    found = two_records.evaluate(np.zeros((1, 4)), (1e-12, 1e-12))
+    assert found.ok.all() and found.r.shape == (1, len(TS) - 3 + 9) and np.abs(found.r).max() < 1e-8
+
+
+def test_jacobian_against_differences(two_records):
+    tol, h = (1e-12, 1e-12), 1e-5
+    z = np.array([[0.1, -0.2, 0.05, 0.1]])
+    J = two_records.evaluate(z, tol).J[0]
+    for k in range(4):
+        e = h * np.eye(4)[k]
+        ahead, behind = (two_records.evaluate(z + s * e, tol).r[0] for s in (1.0, -1.0))
+        assert J[:, k] == pytest.approx((ahead - behind) / (2 * h), abs=2e-6 * np.abs(J[:, k]).max())
+
+
+def test_a_part_of_the_records(two_records):
+    z, tol = np.full((1, 4), 0.1), (1e-10, 1e-10)
+    whole, part = two_records.evaluate(z, tol), two_records.evaluate(z, tol, horizon=0.4)
+    early = two_records.ts[tuple(two_records.where[:, :2].T)] <= 0.4 * np.array([TS[-1], TS[8]])[two_records.where[:, 0]]
+    assert 0 < early.sum() < len(early)
+    assert part.r[0, early] == pytest.approx(whole.r[0, early], abs=1e-6) and (part.r[0, ~early] == 0.0).all()
+    parts = horizons(two_records)
+    assert parts[-1] == 1.0 and parts == sorted(parts) and 0.0 < parts[0] < 1.0
+
+
+def test_guesses_beside_the_first():
+    u = unknowns_of(pendulum(), [NAMES[0], udk.Parameter(NAMES[1], bounds=(0.1, 0.6)), "body.rod.angle"])
+    x = u.values(beside(u, np.zeros(3), 16, 0))
+    low, high = x.min(0), x.max(0)
+    assert (np.abs(x[:, [0, 2]] - u.start[[0, 2]]) <= 0.5 * np.abs(u.start[[0, 2]])).all()
+    assert 0.1 < low[1] < 0.15 and 0.5 < high[1] < 0.6
+    assert (x == u.values(beside(u, np.zeros(3), 16, 0))).all()
+
+
+# --- bad input
+
+
+def test_every_mistake_is_told(measured):
+    with pytest.raises(udk.IdentificationError) as error:
+        identify(measured[0], {"time": TS, "body.rot.angle": measured[1]}, ["body.rod.mas"], solvr=None)
+    told = str(error.value)
+    assert all(part in told for part in ("body.rod.mass", "rod", "solver")) and len(error.value.problems) == 3
+
+
+@pytest.mark.parametrize(
+    ("choices", "told"),
+    [
+        ({"loss": "cauchy"}, "huber"),
+        ({"starts": -1}, "from 0 on"),
+        ({"starts": [[1.0]]}, r"\(B, 2\)"),
+        ({"starts": [[-1.0, 1.0]]}, "not positive"),
+        ({"rtol": 1e-3}, "rtol"),
+    ],
+)
+def test_settings_that_cannot_be(measured, choices, told):
+    with pytest.raises(udk.IdentificationError, match=told):
+        found(measured[0], {"time": TS, ANGLE: measured[1]}, **choices)
+
+
+def test_parameters_that_would_open_a_loop():
+    linkage = udk.library.parallelogram()
+    with pytest.raises(udk.IdentificationError, match=r"length\(link1\) = length\(link2\) = length\(link3\)"):
+        found(linkage, {"time": TS, "body.link1.angle": TS}, ["length(link1)", "length(link2)", "length(link3)"])
+
+
+def test_a_mechanism_that_cannot_be_closed_at_all():
+    apart = udk.with_length(udk.library.four_bar(), "coupler", 20.0)
+    with pytest.raises(udk.AssemblyError, match="open"):
+        found(apart, {"time": TS, "body.crank.angle": TS}, ["body.crank.mass"])
+
+
+# --- what takes long to compile
+
+
+@pytest.mark.slow
+def test_members_in_lanes_are_those_one_by_one(two_records, monkeypatch):
+    z = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 4))
+    single = two_records.evaluate(z, (1e-10, 1e-10))
+    monkeypatch.setattr(program, "MANY", 1)
+    lanes = two_records.evaluate(z, (1e-10, 1e-10))
+    assert np.abs(lanes.r - single.r).max() < 1e-6 and np.abs(lanes.J - single.J).max() < 1e-4
+
+
+@pytest.mark.slow
+def test_through_a_singular_configuration():
+    mech = udk.library.parallelogram(angle=np.pi / 3)
+    ts = np.linspace(0.0, 5.0, 101)
+    solution = udk.simulate(mech, ts, rtol=1e-12, atol=1e-12)
+    data = {"time": ts, "body.link1.angle": np.asarray(solution.q)[:, 0, 2]}
+    names = ["length(link1, link2, link3)", "body.link1.mass = body.link2.mass = body.link3.mass"]
+    first = udk.with_length(mech, ["link1", "link2", "link3"], 1.3)
+    estimate = found(first, data, names)
+    assert estimate.values == pytest.approx([1.0, 1.0], rel=1e-8)
+
+
+@pytest.mark.slow
+def test_a_first_guess_that_cannot_be_closed():
+    mech = udk.library.four_bar()
+    ts = np.linspace(0.0, 3.0, 60)
+    q = np.asarray(udk.simulate(mech, ts, rtol=1e-12, atol=1e-12).q)
+    data = {"time": ts, "body.crank.angle": q[:, 0, 2], "body.rocker.angle": q[:, 2, 2]}
+    first = udk.with_length(mech, "coupler", 0.9)
+    estimate = found(first, data, ["length(coupler)", "body.rocker.mass"])
+    assert estimate.values == pytest.approx([2.5, 2.0], rel=1e-8)
