@@ -1,6 +1,9 @@
 import csv
 import inspect
 import json
+import re
+import runpy
+import shlex
 from pathlib import Path
 from typing import Any, get_args
 
@@ -187,3 +190,35 @@ def test_all_mistakes_are_named_at_once(tmp_path, capsys, data):
     assert udkjax("identify", "nowhere.toml", data, "--parameters", MASS, "--out", tmp_path / "o") == 2
     assert "cannot read nowhere.toml" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_the_example_of_the_readme_finds_what_its_data_was_made_with(tmp_path, monkeypatch, capsys):
+    made = runpy.run_path(str(EXAMPLES / "data" / "four_bar.py"))
+    text = (EXAMPLES / "data" / "four_bar.csv").read_text()
+    made["main"](tmp_path)
+    assert (tmp_path / "four_bar.csv").read_text() == text
+
+    monkeypatch.chdir(EXAMPLES.parent)
+    (code,) = [
+        block for block in Path("README.md").read_text().split("```python\n") if "udk.identify" in block.partition("```")[0]
+    ]
+    names: dict[str, Any] = {"udk": udk}
+    exec(code.partition("```")[0], names)
+    estimate = names["estimate"]
+    truth = {**made["TRUTH"], "length(coupler)": made["LENGTH"]}
+    errors = estimate.standard_errors
+    assert estimate.success and truth.keys() == errors.keys()
+    for name, value in estimate.parameters.items():
+        assert abs(value - truth[name]) < 3 * errors[name] < 0.03 * truth[name]
+    shown = capsys.readouterr().out
+    (comment,) = [line for line in code.splitlines() if "# length(coupler)" in line]
+    for number in re.findall(r"length\(coupler\) ([\d.]+) m, standard error ([\d.]+);", comment)[0]:
+        assert number in shown
+
+    (command,) = re.findall(r"udkjax (identify .*?)\n```", Path("README.md").read_text(), re.DOTALL)
+    arguments = shlex.split(command.replace("\\\n", " "))
+    assert udkjax(*arguments[:-1], tmp_path / "identified", "--quiet") == 0
+    found = json.loads((tmp_path / "identified" / "estimate.json").read_text())
+    for name, value in estimate.parameters.items():
+        assert found["parameters"][name]["value"] == pytest.approx(value, rel=1e-6)

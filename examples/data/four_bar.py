@@ -1,4 +1,4 @@
-"""Makes four_bar.csv: what encoders at the two pins of examples/four_bar.toml would show, of a linkage that is not quite as drawn.
+"""Makes four_bar.csv: what encoders at two pins of examples/four_bar.toml would show, of a linkage that is not quite as drawn.
 
 The coupler is heavier and longer than the scene says, the rocker is lighter, and the crank is released from another angle.
 """
@@ -12,12 +12,12 @@ import udkjax as udk
 HERE = Path(__file__).parent
 TRUTH = {"body.coupler.mass": 3.1, "body.rocker.mass": 1.6}
 LENGTH = 2.53  # of the coupler, m
-ANGLE = np.radians(58.0)  # of the crank at its release
+ANGLE = np.radians(58.0)  # of the crank at its release, before the loop is closed
 NOISE = 0.2  # standard deviation, degrees
 SEED = 1
 
 
-def main() -> None:
+def main(folder: Path = HERE) -> None:
     """Simulate three seconds, sampled fifty times a second, and add noise."""
     mech = udk.load(HERE.parent / "four_bar.toml").with_parameters(TRUTH)
     mech = udk.with_angle(udk.with_length(mech, "coupler", LENGTH), "crank", ANGLE)
@@ -30,7 +30,7 @@ def main() -> None:
         "time [ms],joint.A.angle [deg],joint.D.angle [deg]",
         *(f"{1e3 * t:.0f},{a:.2f},{d:.2f}" for t, (a, d) in zip(ts, angles, strict=True)),
     ]
-    (HERE / "four_bar.csv").write_text("\n".join(lines) + "\n")
+    (folder / "four_bar.csv").write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":
