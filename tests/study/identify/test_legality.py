@@ -190,11 +190,17 @@ def test_loops_side_by_side_are_told_apart(linkage):
             ends = tuple(b if b == "ground" else f"{b}/{k}" for b in joint.bodies)
             joints[f"{name}/{k}"] = Revolute(ends, joint.points)
     both = udk.Mechanism(bodies, joints)
-    names = [f"link{i}/{k}" for i in (1, 2, 3) for k in (0, 1)]
-    problems = illegal(both, lengths(*names), [1.0] * 6, names)
+    cranks = [f"{i}/{k}" for i in (1, 2, 3) for k in (0, 1)]
+
+    def apply(mechanism, x):
+        ends = {"A": -0.5, "B": 0.5}
+        half = {f"joint.{pin}{n}.points[1][0]": end * x[i] for i, n in enumerate(cranks) for pin, end in ends.items()}
+        return mechanism.with_parameters(half)
+
+    problems = illegal(both, apply, [1.0] * 6, cranks)
     assert len(problems) == 2
     for k, problem in enumerate(problems):
-        assert f"only holds for link1/{k} = link2/{k} = link3/{k};" in problem
+        assert f"only holds for 1/{k} = 2/{k} = 3/{k};" in problem
         assert f'"A1/{k}"' in problem and f'"A1/{1 - k}"' not in problem
 
 
