@@ -200,11 +200,11 @@ def test_the_example_of_the_readme_finds_what_its_data_was_made_with(tmp_path, m
     assert (tmp_path / "four_bar.csv").read_text() == text
 
     monkeypatch.chdir(EXAMPLES.parent)
-    (code,) = [
-        block for block in Path("README.md").read_text().split("```python\n") if "udk.identify" in block.partition("```")[0]
-    ]
+    readme = Path("README.md").read_text(encoding="utf-8")
+    (code,) = [code for code in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "udk.identify" in code]
+    (command,) = re.findall(r"udkjax (identify .*?)\n```", readme, re.DOTALL)
     names: dict[str, Any] = {"udk": udk}
-    exec(code.partition("```")[0], names)
+    exec(code, names)
     estimate = names["estimate"]
     truth = {**made["TRUTH"], "length(coupler)": made["LENGTH"]}
     errors = estimate.standard_errors
@@ -213,10 +213,9 @@ def test_the_example_of_the_readme_finds_what_its_data_was_made_with(tmp_path, m
         assert abs(value - truth[name]) < 3 * errors[name] < 0.03 * truth[name]
     shown = capsys.readouterr().out
     (comment,) = [line for line in code.splitlines() if "# length(coupler)" in line]
-    for number in re.findall(r"length\(coupler\) ([\d.]+) m, standard error ([\d.]+);", comment)[0]:
+    for number in re.findall(r"[\d.]{3,}", comment):
         assert number in shown
 
-    (command,) = re.findall(r"udkjax (identify .*?)\n```", Path("README.md").read_text(), re.DOTALL)
     arguments = shlex.split(command.replace("\\\n", " "))
     assert udkjax(*arguments[:-1], tmp_path / "identified", "--quiet") == 0
     found = json.loads((tmp_path / "identified" / "estimate.json").read_text())
