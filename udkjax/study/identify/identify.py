@@ -23,7 +23,7 @@ from udkjax.study.identify.losses import Loss, loss_of
 from udkjax.study.identify.parameters import Unknowns, applied, unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.reading import records_of
-from udkjax.study.identify.search import GUESSES, Found, beside, search
+from udkjax.study.identify.search import GUESSES, SETTLED, Found, beside, search
 from udkjax.study.progress import Line
 
 TOL = 1e-11  # relative and absolute, of the integration: what parameters are known to where there is no noise
@@ -122,7 +122,7 @@ def _placed(unknowns: Unknowns, mechanism: Mechanism, x: Any) -> Mechanism:
 def _settled(problem: Problem, found: Found, tol: float, tell: Callable, choices: Mapping[str, Any]) -> tuple[Fit, list]:
     """The fit to the end, each channel weighted by the noise that it has turned out to have."""
     fit, history = found.fit, list(found.history)
-    end = partial(descend, problem, tol=(tol, tol), steps=POLISHED, near=True, tell=tell, **choices)
+    end = partial(_polished, problem, tol=(tol, tol), tell=tell, **choices)
     fit = end(fit.z)
     history += fit.history
     unknown = {problem.names[c] for c in np.unique(problem.where[~problem.known, 2])}
@@ -131,6 +131,15 @@ def _settled(problem: Problem, found: Found, tol: float, tell: Callable, choices
         fit = end(fit.z)
         history += fit.history
     return fit, history
+
+
+def _polished(problem: Problem, z: np.ndarray, **choices: Any) -> Fit:
+    """A fit from beside its minimum; with damped steps where other weights have moved it far along what is hardly known."""
+    near = descend(problem, z, steps=POLISHED, near=True, **choices)
+    if near.settled[0] or near.history[-1][1] <= SETTLED:
+        return near
+    fit = descend(problem, near.z, **choices)
+    return fit._replace(history=near.history + fit.history)
 
 
 def weigh(problem: Problem, z: np.ndarray, tol: float, loss: Loss, least: float = 0.0) -> None:
