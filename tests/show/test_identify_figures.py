@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray
 
-from udkjax.show import identify_figures
+from udkjax.show import fit_figures, identify_figures
 from udkjax.show.identify_figures import pictures, save_pictures
 
 N, NOISE = 60, 0.02
@@ -95,8 +95,8 @@ def test_what_is_left_is_held_against_the_noise():
 
 
 def test_of_many_channels_those_are_shown_that_look_least_like_noise(monkeypatch):
-    monkeypatch.setattr(identify_figures, "ROWS", 2)
-    monkeypatch.setattr(identify_figures, "PANELS", 4)
+    monkeypatch.setattr(fit_figures, "ROWS", 2)
+    monkeypatch.setattr(fit_figures, "PANELS", 4)
     data = made(channels=5)
     data["correlated"][0, 3], data["correlated"][1, 1] = 1e-6, 1e-9
     found = pictures(data)

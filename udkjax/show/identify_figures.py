@@ -1,41 +1,19 @@
 """Pictures of an identification, from its dataset alone: the fit, what it leaves, what is known, and how it settled."""
 
 from collections.abc import Iterator
-from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from udkjax.show.fit_figures import fit, plain, residuals, title
 from udkjax.show.plots import COLOURS
 
-PANELS = 24  # of the picture of the fit, each a channel of a record; those beyond are only in the dataset
-COLUMNS = 3
-ROWS = 8  # of the picture of residuals, each a channel: those that look least like noise
-NAMED = 7  # records that are told apart by colours
-BINS = 40  # at most, of a distribution
-LAGS = 30  # at most, of an autocorrelation
-DEVIATIONS = 4.0  # standard deviations of noise that a distribution shows
-PAIRS = 4  # samples per lag at least
 WRITTEN = 14  # parameters up to which correlations are written as numbers too
 WORST = 1e3  # percent: standard errors that are larger are drawn as this
 ROUNDING = 1e-18  # what is zero is drawn as this where an axis is logarithmic
-
-
-class Series(NamedTuple):
-    """A channel of a record: the samples of it that there are."""
-
-    record: str
-    channel: str
-    units: str
-    time: Float[np.ndarray, "N"]
-    measured: Float[np.ndarray, "N"]
-    predicted: Float[np.ndarray, "N"]
-    residual: Float[np.ndarray, "N"]
-    noise: Float[np.ndarray, "N"]
 
 
 def pictures(data: Any) -> dict[str, Figure]:
@@ -51,139 +29,9 @@ def save_pictures(data: Any, folder: Any) -> Iterator[str]:
         yield f"{name}.png"
 
 
-def series(data: Any) -> list[Series]:
-    """All channels of all records, in this order; those that a record does not have are left out."""
-    found = []
-    for c, r in product(range(data.sizes["channel"]), range(data.sizes["record"])):
-        one = data.isel(record=r, channel=c)
-        there = np.isfinite(one["measured"].values)
-        if there.any():
-            columns = (one[name].values[there] for name in ("time", "measured", "predicted", "residual", "noise"))
-            found.append(Series(str(one["record"].values), str(one["channel"].values), _unit(one), *columns))
-    return found
-
-
-def fit(data: Any) -> Figure:
-    """Draw what was measured as points, and what the mechanism shows as lines."""
-    every, records = series(data), data.sizes["record"]
-    columns, panels = _panels(data, every)
-    rows = 1 + max(panels) // columns
-    figure = Figure(figsize=(1.0 + (6.5 if columns == 1 else 4.2) * columns, 1.1 + 1.9 * rows), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for place, axes in enumerate(grid):
-        if place not in panels:
-            axes.set_axis_off()
-            continue
-        one = panels[place]
-        axes.plot(one.time, one.measured, "o", ms=4, mew=0, alpha=0.5, color=COLOURS[5], label="measured")
-        axes.plot(one.time, one.predicted, color=COLOURS[0], lw=1.1, label="predicted")
-        axes.set_title(one.channel if records == 1 else f"{one.channel}, {one.record}", fontsize="small", loc="left")
-        axes.set_ylabel(one.units)
-        axes.set_xlabel("time (s)" if not any(place + columns * k in panels for k in range(1, rows)) else "")
-        axes.margins(x=0.01)
-        _plain(axes)
-    _key(figure, grid[min(panels)])
-    few = f"{len(panels)} of {len(every)}; all are in the dataset" if len(panels) < len(every) else ""
-    _title(figure, data, "measured and predicted", few)
-    return figure
-
-
-def _panels(data: Any, every: list[Series]) -> tuple[int, dict[int, Series]]:
-    """How many columns of panels there are, and the place of each series that is shown: a few records stand side by side."""
-    records, channels = list(data["record"].values), list(data["channel"].values)
-    columns, places = min(COLUMNS, -(-len(every) // 4)), list(range(len(every)))
-    if 1 < len(records) <= COLUMNS:
-        columns, places = len(records), [channels.index(one.channel) * len(records) + records.index(one.record) for one in every]
-    return columns, {place: one for place, one in zip(places, every, strict=True) if place < PANELS}
-
-
-def residuals(data: Any) -> Figure:
-    """Draw what is left of each channel: over time, its distribution beside that of the noise, and its correlation in time."""
-    every = series(data)
-    channels = _least_white(data)
-    shown = channels[:ROWS]
-    records = {str(name): k for k, name in enumerate(data["record"].values)}
-    figure = Figure(figsize=(11, 1.1 + 2.0 * len(shown)), layout="constrained")
-    grid = figure.subplots(len(shown), 3, squeeze=False, width_ratios=(3, 1, 1.2))
-    for (over_time, spread, correlated), channel in zip(grid, shown, strict=True):
-        mine = [one for one in every if one.channel == channel]
-        for one in mine:
-            colour = COLOURS[records[one.record] % len(COLOURS)] if len(mine) <= NAMED else COLOURS[0]
-            _over_time(over_time, one, colour)
-        _distribution(spread, mine)
-        _autocorrelation(correlated, mine)
-        over_time.set_title(channel, fontsize="small", loc="left")
-        over_time.set_ylabel(mine[0].units)
-        spread.sharey(over_time)
-        spread.tick_params(labelleft=False)
-    for axes, words in zip(grid[-1], ("time (s)", "density", "lag (samples)"), strict=True):
-        axes.set_xlabel(words)
-    for axes, words in zip(grid[0, 1:], ("distribution", "autocorrelation"), strict=True):
-        axes.set_title(words, fontsize="small", loc="left")
-    if 1 < len(records) <= NAMED:
-        _key(figure, grid[0, 0])
-    few = f"the {ROWS} of {len(channels)} channels that look least like noise" if len(channels) > ROWS else ""
-    _title(figure, data, "measured minus predicted; grey: two standard deviations of the noise", few)
-    return figure
-
-
-def _least_white(data: Any) -> list[str]:
-    """The channels: as they are, or, where there are too many, those that look least like noise."""
-    names = [str(name) for name in data["channel"].values]
-    if len(names) <= ROWS:
-        return names
-    doubt = np.nan_to_num(data["correlated"].transpose("record", "channel").values, nan=1.0).min(0)
-    kept = set(np.argsort(doubt, kind="stable")[:ROWS])
-    return [name for k, name in enumerate(names) if k in kept] + [name for k, name in enumerate(names) if k not in kept]
-
-
-def _over_time(axes: Axes, one: Series, colour: str) -> None:
-    axes.fill_between(one.time, -2 * one.noise, 2 * one.noise, color="0.9", lw=0, zorder=0)
-    axes.plot(one.time, one.residual, "o-", ms=2, lw=0.5, color=colour, label=one.record)
-    axes.axhline(0, color="0.6", lw=0.6, zorder=1)
-    axes.margins(x=0.01)
-    _plain(axes)
-
-
-def _distribution(axes: Axes, mine: list[Series]) -> None:
-    """A histogram of all records, and the density of Gaussian noise of the size that it is taken to have."""
-    left = np.concatenate([one.residual for one in mine])
-    noise = np.concatenate([one.noise for one in mine])
-    if np.ptp(left) > 0:
-        count = int(np.clip(np.sqrt(len(left)), 5, BINS))
-        axes.hist(left, count, density=True, orientation="horizontal", color=COLOURS[4], alpha=0.7, lw=0)
-    sizes = noise[np.isfinite(noise) & (noise > 0)]
-    if sizes.size:
-        levels = np.unique(np.quantile(sizes, np.linspace(0, 1, BINS)))  # of noise that differs from sample to sample
-        y = DEVIATIONS * sizes.max() * np.linspace(-1, 1, 201)
-        density = np.exp(-0.5 * (y[:, None] / levels) ** 2) / (np.sqrt(2 * np.pi) * levels)
-        axes.plot(density.mean(1), y, color="black", lw=1)
-    axes.locator_params(axis="x", nbins=3)
-    axes.set_xlim(left=0)
-    _plain(axes)
-
-
-def _autocorrelation(axes: Axes, mine: list[Series]) -> None:
-    """That of the residuals divided by the noise, of all records, and the band in which 19 of 20 values of white noise are."""
-    parts = [one.residual / np.where(one.noise > 0, one.noise, 1.0) for one in mine]
-    parts = [part for part in parts if np.isfinite(part).all()]
-    count = min(LAGS, max((len(part) for part in parts), default=0) // PAIRS)
-    power = sum(float(part @ part) for part in parts)
-    if count and power > 0:
-        lags = np.arange(1, count + 1)
-        values = [sum(float(part[lag:] @ part[:-lag]) for part in parts if len(part) > lag) / power for lag in lags]
-        band = 1.96 / np.sqrt(sum(map(len, parts)))
-        axes.axhspan(-band, band, color="0.9", lw=0, zorder=0)
-        axes.vlines(lags, 0, values, color=COLOURS[0], lw=1.4)
-        axes.axhline(0, color="0.6", lw=0.6)
-        axes.set_ylim(min(-0.5, 1.1 * min(values)), max(0.5, 1.1 * max(values)))
-    axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    _plain(axes)
-
-
 def correlation(data: Any) -> Figure:
     """Draw the correlations of the parameters' errors, and how large these are; grey: what the records do not tell."""
-    names = [str(name) for name in data["parameter"].values]
+    names = [_short(str(name)) for name in data["parameter"].values]
     values, count = data["correlation"].values, len(names)
     size = 0.42 if count <= WRITTEN else 0.26
     figure = Figure(figsize=(4.5 + 0.055 * max(map(len, names)) + size * count, 1.9 + size * count), layout="constrained")
@@ -196,12 +44,12 @@ def correlation(data: Any) -> Figure:
             matrix.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=6.5, color=colour)
     place = np.arange(count)
     matrix.set_xticks(place, [str(k + 1) for k in place], fontsize="small")
-    matrix.set_yticks(place, [f"{_short(name)}  {k + 1}" for k, name in enumerate(names)], fontsize="small")
+    matrix.set_yticks(place, [f"{name}  {k + 1}" for k, name in enumerate(names)], fontsize="small")
     matrix.set_title("correlation of errors", fontsize="small", loc="left")
     _errors(errors, data)
     errors.set_ylim(matrix.get_ylim())
     figure.colorbar(drawn, ax=matrix, location="bottom", aspect=30, shrink=0.8, pad=0.02)
-    _title(figure, data, "what is known of the parameters")
+    title(figure, data, "what is known of the parameters")
     return figure
 
 
@@ -219,7 +67,7 @@ def _errors(axes: Axes, data: Any) -> None:
         axes.text(0.04, k, "unknown", transform=axes.get_yaxis_transform(), va="center", fontsize="small", color=COLOURS[1])
     axes.set_yticks([])
     axes.set_title("standard error (% of value)", fontsize="small", loc="left")
-    _plain(axes)
+    plain(axes)
 
 
 def convergence(data: Any) -> Figure:
@@ -238,34 +86,15 @@ def convergence(data: Any) -> Figure:
         for one in fits:
             axes.semilogy(one, np.maximum(values[one - 1], ROUNDING), "o-", ms=3, lw=1, color=COLOURS[0])
         axes.set_ylabel(words[name])
-        _plain(axes)
+        plain(axes)
     panels[-1].set_xlabel("trial")
     panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     gaps = "a gap: another guess, part of the records, tolerance or weight of channels"
-    _title(figure, data, "how the fit settled", gaps if fits[1:] else "")
+    title(figure, data, "how the fit settled", gaps if fits[1:] else "")
     return figure
-
-
-def _title(figure: Figure, data: Any, words: str, remark: str = "") -> None:
-    figure.suptitle(f"{data.attrs.get('title') or 'mechanism'}: {words}" + (f"\n({remark})" if remark else ""), fontsize="medium")
-
-
-def _key(figure: Figure, axes: Axes) -> None:
-    """Name the curves of all panels by those of one."""
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=NAMED, fontsize="small", frameon=False)
-
-
-def _unit(one: Any) -> str:
-    units = str(one["channel_units"].values)
-    return "" if units == "1" else units
 
 
 def _short(name: str) -> str:
     """The name of a parameter; of one that is tied, its first part, and how many there are."""
     first, *others = name.split(" = ")
     return f"{first} = ... ({len(others) + 1} tied)" if others else first
-
-
-def _plain(axes: Axes) -> None:
-    axes.grid(color="0.93", lw=0.6)
-    axes.set_axisbelow(True)
