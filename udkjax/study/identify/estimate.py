@@ -33,7 +33,6 @@ class Estimate:
     `print` shows a table.
     """
 
-    mechanism: Mechanism  # with the values in
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Float[np.ndarray, "P"]
@@ -73,14 +72,17 @@ class Estimate:
             np.concatenate([unknowns.slopes(z[:P]), np.ones(problem.K - P)]),
             (*unknowns.kinds, *["free"] * (problem.K - P)),
         )
-        known = knowledge(counted.J[0], counted.r[0], values, groups, P)
-        every = knowledge(counted.J[0], counted.r[0], values, groups).standard_errors if problem.K > P else known.standard_errors
+        known = knowledge(counted.J[0], counted.r[0], values, groups, P, priors=len(problem.priors))
+        every = (
+            knowledge(counted.J[0], counted.r[0], values, groups, priors=len(problem.priors)).standard_errors
+            if problem.K > P
+            else known.standard_errors
+        )
         scale = np.append(known.noise, 1.0)[groups]
         rows = len(problem.where)
         sigma = problem.sigma * scale[:rows]
         left = -plain.r[0, :rows] * problem.sigma
         tables = [_by_record(problem, part) for part in (problem.y[problem.there] - left, left, sigma)]
-        placed = applied(problem.mechanism, unknowns.targets, jnp.asarray(x))
         white = {}
         for places in problem.series():
             record, _, channel = problem.where[places[0]]
@@ -89,13 +91,15 @@ class Estimate:
                 seen = (counted.r[0, :rows] / scale[:rows])[places]
                 white[int(record), problem.names[channel]] = whiteness(ts, seen, known.projection[places])
         return cls(
-            mechanism=placed,
             names=unknowns.names,
             units=unknowns.units,
             values=x,
             knowledge=known,
             at_bounds=unknowns.at_bounds(x),
-            start_values={name: (float(z[P + k]), float(every[P + k])) for k, name in enumerate(problem.all_names[P:])},
+            start_values={
+                name: (float(z[P + k]), float(every[P + k]))
+                for k, name in enumerate(name for start in problem.starts for name in start.names)
+            },
             predicted=tables[0],
             residuals=tables[1],
             noise=tables[2],
@@ -112,6 +116,11 @@ class Estimate:
             problem=problem,
             loss=loss,
         )
+
+    @cached_property
+    def mechanism(self) -> Mechanism:
+        """The mechanism with the values in."""
+        return applied(self.problem.mechanism, self.problem.unknowns.targets, jnp.asarray(self.values))
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -217,7 +226,7 @@ def _groups(problem: Problem) -> np.ndarray:
     unknown = np.where(problem.known, -1, problem.where[:, 2])
     _, group = np.unique(unknown, return_inverse=True)
     group = group - 1 if problem.known.any() else group
-    return np.concatenate([group, np.full(len(problem.priors), -1)])
+    return np.concatenate([group, np.full(problem.more, -1)])
 
 
 def _by_record(problem: Problem, rows: np.ndarray) -> tuple[dict[str, np.ndarray], ...]:

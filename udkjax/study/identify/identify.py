@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import jax
 import numpy as np
 
-from udkjax.equations.assembly import close, is_closed, require_closed
+from udkjax.equations.assembly import AssemblyError, close, is_closed, require_closed
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import CAUSES, Result
@@ -23,6 +24,7 @@ from udkjax.study.identify.losses import Loss, loss_of
 from udkjax.study.identify.parameters import Unknowns, applied, unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.reading import records_of
+from udkjax.study.identify.records import Record
 from udkjax.study.identify.search import GUESSES, SETTLED, Found, beside, search
 from udkjax.study.progress import Line
 
@@ -31,6 +33,8 @@ WEIGHED = 2  # fits, each with noise as the one before left it
 EVEN = 1e-6  # of what a channel shows: residuals below it count alike, since they are not of measurements
 POLISHED = 15  # steps at the end
 NEARBY = 64  # guesses that are tried where the first cannot be closed
+GLANCE, BRIEF = (1e-6, 1e-6), 1e-6  # tolerances, and the part of the records, of a run that shows whether a guess closes
+KNOWN = 256  # structures of mechanisms whose parameters were found legal
 PATIENCE = 2.0  # s: what is done before then needs no line to say so
 DECIDED = (
     "ts",
@@ -86,11 +90,7 @@ def identify(
         lambda: unknowns_of(mechanism, parameters),
         lambda: records_of(mechanism, data, noise, ignore),
     )[1:]
-    mechanism, unknowns = _closable(mechanism, unknowns, seed)
-    wrong = illegal(mechanism, partial(_placed, unknowns), unknowns.start, unknowns.names)
-    if wrong:
-        raise IdentificationError(wrong)
-    problem = Problem(mechanism, unknowns, records, settings)
+    problem = _begun(mechanism, unknowns, records, settings, seed)
     lost = loss_of(loss, len(problem.where))
     tell = _teller(progress)
     guesses, more = _guesses(problem, starts)
@@ -115,8 +115,39 @@ def _gathered(*steps: Callable[[], Any]) -> list[Any]:
     return found
 
 
-def _placed(unknowns: Unknowns, mechanism: Mechanism, x: Any) -> Mechanism:
-    return applied(mechanism, unknowns.targets, x)
+def _begun(
+    mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any], seed: int
+) -> Problem:
+    """The problem from the first guess; where that cannot be closed, from the nearest that can. Raises `IdentificationError`.
+
+    Whether a mechanism without redundant rows closes is seen by the first run: to look before costs more than the run.
+    """
+    if unknowns.own and mechanism.left_out == ():
+        try:
+            problem = Problem(mechanism, unknowns, records, settings)
+            if problem.evaluate(np.zeros((1, problem.K)), GLANCE, BRIEF).code[0] != Result.could_not_assemble:
+                return problem
+        except AssemblyError:
+            pass
+    mechanism, unknowns = _closable(mechanism, unknowns, seed)
+    _require_legal(mechanism, unknowns)
+    return Problem(mechanism, unknowns, records, settings)
+
+
+def _require_legal(mechanism: Mechanism, unknowns: Unknowns) -> None:
+    """Raise where the parameters would open a loop. What is legal is so for other numbers too with the same redundant rows."""
+    structure = jax.tree.structure(mechanism), unknowns.targets
+    if not mechanism.left_out or structure in _legal:
+        return
+    wrong = illegal(mechanism, lambda mech, x: applied(mech, unknowns.targets, x), unknowns.start, unknowns.names)
+    if wrong:
+        raise IdentificationError(wrong)
+    if len(_legal) >= KNOWN:
+        _legal.clear()
+    _legal.add(structure)
+
+
+_legal: set[Any] = set()
 
 
 def _settled(problem: Problem, found: Found, tol: float, tell: Callable, choices: Mapping[str, Any]) -> tuple[Fit, list]:
@@ -189,14 +220,16 @@ def _guesses(problem: Problem, starts: Any) -> tuple[np.ndarray, int]:
 
 def _closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tuple[Mechanism, Unknowns]:
     """The mechanism with the redundant rows of its first guess, or, where that cannot be closed, of the nearest that can."""
-    tried = [unknowns.start, *_nearby(unknowns, seed)]
-    for x in tried:
+    for k, x in enumerate([unknowns.start, *_nearby(unknowns, seed)]):
         try:
-            placed = applied(mechanism, unknowns.targets, x)
+            placed = mechanism if k == 0 and unknowns.own else applied(mechanism, unknowns.targets, x)
         except SceneError:
             continue
-        if is_closed(close(placed)):
-            rows = redundant_rows(placed) if mechanism.left_out != () else ()
+        closure = close(placed)
+        if is_closed(closure):
+            rows = mechanism.left_out
+            if rows is None or int(closure.rank) != len(closure.psi) - len(rows):
+                rows = redundant_rows(placed)
             return mechanism.with_left_out(rows), dataclasses.replace(unknowns, start=np.asarray(x, float))
     placed = applied(mechanism, unknowns.targets, unknowns.start)
     require_closed(placed, close(placed))

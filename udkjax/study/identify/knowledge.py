@@ -111,23 +111,27 @@ def knowledge(
     known_noise: bool | ArrayLike = True,
     parameters: int | None = None,
     flat: float = FLAT,
+    priors: int = 0,
 ) -> Knowledge:
     """Say what weighted residuals and their Jacobian tell of the first `parameters` unknowns (default: all).
 
     `known_noise` is True or False for all residuals; or, for each of them, the group of residuals (0, 1, ...) whose common noise
-    is to be estimated, or -1 where it is known. Rows of priors belong to what is known.
+    is to be estimated, or -1 where it is known. The last rows may be those of `priors`, whose noise is known: what only they tell
+    is as known as they say, however much better other directions are measured.
     """
     K = len(values.names)
     P = K if parameters is None else parameters
-    size = np.linalg.norm(J, axis=0)
-    alive = np.flatnonzero(size > flat * size.max(initial=0.0))
+    size, before = np.linalg.norm(J, axis=0), J[len(J) - priors :]
+    alive = np.flatnonzero((size > flat * size.max(initial=0.0)) | np.any(before != 0.0, axis=0))
     group = np.full(len(r), -1 if known_noise else 0) if isinstance(known_noise, bool) else np.asarray(known_noise, int)
     noise = _noise(J[:, alive], r, group, flat)
     scale = np.append(noise, 1.0)[group]
     known = np.isfinite(scale).all()
     u, sigma, vt = np.linalg.svd(J[:, alive] / (scale[:, None] if known else 1.0), full_matrices=False)
     kept = sigma > flat * sigma.max(initial=0.0)
-    directions, flats = (_spread(rows, alive, K) for rows in (vt, reduced(null_space(vt[kept], 0.5), PART)))
+    sigma, vt, u, kept = _told_before(before[:, alive], sigma, vt, u, kept, flat)
+    free = null_space(vt[kept], 0.5)
+    directions, flats = (_spread(rows, alive, K) for rows in (vt, _flats(free, values, alive)))
     lost = np.any(flats != 0.0, axis=0)
     lost[np.setdiff1d(np.arange(K), alive)] = True
     root = directions[kept].T / sigma[kept] * np.asarray(values.dx_dz)[:, None]  # (K, D)
@@ -151,6 +155,34 @@ def knowledge(
         noise=noise,
         projection=u[:, kept],
     )
+
+
+def _told_before(before: np.ndarray, sigma: np.ndarray, vt: np.ndarray, u: np.ndarray, kept: np.ndarray, flat: float) -> tuple:
+    """Singular values and directions with those that no measurement tells, but priors do: by their own size."""
+    none = null_space(vt[kept], 0.5)
+    if not len(none) or not len(before):
+        return sigma, vt, u, kept
+    _, told, w = np.linalg.svd(before @ none.T, full_matrices=False)
+    some = told > flat * np.linalg.norm(before, axis=1).max(initial=0.0)
+    rows = np.concatenate([np.zeros((len(u) - len(before), int(some.sum()))), (before @ none.T @ w[some].T) / told[some]])
+    sigma, vt = np.concatenate([sigma[kept], told[some]]), np.concatenate([vt[kept], w[some] @ none])
+    return sigma, vt, np.concatenate([u[:, kept], rows], axis=1), np.ones(len(sigma), bool)
+
+
+def _flats(free: np.ndarray, values: Values, alive: np.ndarray) -> np.ndarray:
+    """Directions that span what no measurement shows, each of few unknowns; first a common factor of several, if there is one."""
+    found = reduced(free, PART)
+    x, change = (np.asarray(a, float)[alive] for a in (values.x, values.dx_dz))
+    relative = np.array([values.kinds[k] != "free" for k in alive], bool) & (x != 0.0) & np.any(found != 0.0, axis=0)
+    if len(found) < 2 or not relative.any():
+        return found
+    factor = np.where(relative, x / change, 0.0)
+    outside = factor - free.T @ (free @ factor)
+    if np.linalg.norm(outside) > PART * np.linalg.norm(factor):
+        return found
+    # It stands for the direction that is most of it.
+    share = np.abs(np.linalg.lstsq(found.T, factor, rcond=None)[0]) * np.linalg.norm(found, axis=1)
+    return np.concatenate([factor[None], np.delete(found, int(np.argmax(share)), axis=0)])
 
 
 def _spread(rows: np.ndarray, columns: np.ndarray, count: int) -> np.ndarray:

@@ -22,8 +22,8 @@ from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.directions import COEFFICIENT, connected, listed, null_space, ratio, reduced, row_space
 
-# Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions that
-# are closed to 1e-11 leave 5e-12 of it; a parameter that opens a loop leaves a tenth or more.
+# Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions
+# that are closed to 1e-11 leave 5e-12 of it; a parameter that opens a loop leaves a tenth or more.
 ALONG = 1e-6
 DIFFERENCE = 1e-5  # of a parameter's value: the step of the central differences
 # Of a parameter's size, which is its value, or less where that changes a row by more than the row's own size: the step after

@@ -95,6 +95,7 @@ class Unknowns:
     scale: Float[np.ndarray, "P"]
     mean: Float[np.ndarray, "P"]  # of the prior; not a number: none
     sigma: Float[np.ndarray, "P"]
+    own: bool = False  # whether all first guesses are the scene's values
 
     def values(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
         """x of z."""
@@ -167,7 +168,12 @@ def unknowns_of(mechanism: Mechanism, given: Sequence[Any] | str) -> Unknowns:
     columns = {key: [row[key] for row in rows] for key in rows[0]}
     arrays = {key: np.array(columns[key], float) for key in ("start", "low", "high", "scale", "mean", "sigma")}
     return Unknowns(
-        tuple(columns["name"]), tuple(columns["units"]), tuple(columns["target"]), kinds=tuple(columns["kind"]), **arrays
+        tuple(columns["name"]),
+        tuple(columns["units"]),
+        tuple(columns["target"]),
+        kinds=tuple(columns["kind"]),
+        own=all(columns["own"]),
+        **arrays,
     )
 
 
@@ -191,11 +197,11 @@ def _rows(mechanism: Mechanism, item: Any, problems: list[str]) -> list[dict[str
         problems.append(str(problem) if not p.name else f"{quoted(p.name)}: {problem}")
         return []
     found = []
-    for target, first in targets:
+    for target, first, same in targets:
         name = p.name + (target.names[0][len(_whole(target.names[0])) :] if p.name and len(targets) > 1 else "")
         name = name or _name(target)
         try:
-            found.append(_row(mechanism, p, name, target, first))
+            found.append(_row(mechanism, p, name, target, first, same))
         except (TypeError, ValueError) as problem:
             problems.append(f"{quoted(name)}: {problem}")
     return found
@@ -211,7 +217,7 @@ def _name(target: Target) -> str:
     return f"scale({', '.join(target.names)})" if target.scaled else " = ".join(target.names)
 
 
-def _row(mechanism: Mechanism, p: Parameter, name: str, target: Target, first: float | None) -> dict[str, Any]:
+def _row(mechanism: Mechanism, p: Parameter, name: str, target: Target, first: float | None, same: bool) -> dict[str, Any]:
     start = p.start if p.start is not None else first
     if start is None:
         raise ValueError("needs a first guess: Parameter(..., start=...)")
@@ -233,7 +239,8 @@ def _row(mechanism: Mechanism, p: Parameter, name: str, target: Target, first: f
     if not scale > 0:
         raise ValueError(f"scale must be > 0, is {scale}")
     numbers = {"start": start, "low": low, "high": high, "scale": scale, "mean": mean, "sigma": sigma}
-    return {"name": name, "target": target, "kind": kind, "units": _units(mechanism, target), **numbers}
+    own = same and start == first
+    return {"name": name, "target": target, "kind": kind, "units": _units(mechanism, target), "own": own, **numbers}
 
 
 def _units(mechanism: Mechanism, target: Target) -> str:
@@ -265,17 +272,18 @@ def _required_positive(mechanism: Mechanism, name: str) -> bool:
 # --- what a parameter is of
 
 
-def _targets(mechanism: Mechanism, p: Parameter) -> list[tuple[Target, float | None]]:
-    """The targets of a parameter, one of each entry where it is an array, and what the scene has there."""
+def _targets(mechanism: Mechanism, p: Parameter) -> list[tuple[Target, float | None, bool]]:
+    """The targets of a parameter, one of each entry where it is an array; what the scene has there, and whether everywhere."""
     of, scaled = p.of, p.share == "scale"
     if p.share not in ("value", "scale"):
         raise ValueError(f'share must be "value" or "scale", is {p.share!r}')
     if isinstance(of, str):
         of, scaled = _read(mechanism, of, scaled)
     if isinstance(of, Length):
-        return [(Target(function=of), float(length_of(mechanism, of.bodies[0] if of.bodies else "")))]
+        lengths = [float(length_of(mechanism, body)) for body in of.bodies or ("",)]
+        return [(Target(function=of), lengths[0], len(set(lengths)) == 1)]
     if callable(of):
-        return [(Target(function=of), None)]
+        return [(Target(function=of), None, False)]
     known = parameters_of(mechanism)
     names = tuple(of)
     problems = []
@@ -291,9 +299,15 @@ def _targets(mechanism: Mechanism, p: Parameter) -> list[tuple[Target, float | N
     if len({v.shape for v in values}) > 1:
         raise ValueError(f"cannot be tied: their shapes are {', '.join(str(v.shape) for v in values)}")
     if scaled:
-        return [(Target(names, True), 1.0)]
-    entries = ["".join(f"[{i}]" for i in at) for at in np.ndindex(values[0].shape)]
-    return [(Target(tuple(name + e for name in names)), float(v)) for e, v in zip(entries, values[0].ravel(), strict=True)]
+        return [(Target(names, True), 1.0, True)]
+    return [
+        (
+            Target(tuple(name + "".join(f"[{i}]" for i in at) for name in names)),
+            float(values[0][at]),
+            all(v[at] == values[0][at] for v in values),
+        )
+        for at in np.ndindex(values[0].shape)
+    ]
 
 
 def _read(mechanism: Mechanism, text: str, scaled: bool) -> tuple[Length | tuple[str, ...], bool]:

@@ -109,6 +109,11 @@ class Problem:
         """Which parameters have a prior."""
         return np.flatnonzero(np.isfinite(self.unknowns.sigma))
 
+    @property
+    def more(self) -> int:
+        """Rows that follow those of what was measured."""
+        return len(self.priors)
+
     def members(self, z: Float[np.ndarray, "B K"], horizon: float | None = None) -> Members:
         """The members of B sets of unknowns: all records of the first, then of the next."""
         sets, P, records = len(z), len(self.unknowns.names), len(self.records)
@@ -294,8 +299,8 @@ def start_unknowns(mechanism: Mechanism, unknowns: Unknowns, record: Record, lab
     try:
         mech = applied(mech, unknowns.targets, unknowns.start)
         state = assemble(mech, record.t0, record.start.state)
-    except (SceneError, ValueError) as problem:
-        raise IdentificationError([f"{_of(record)}its start cannot be closed: {problem}"]) from None
+    except SceneError as problem:
+        raise IdentificationError([f"{_of(record)}{problem}"]) from None
     rows: Any = rows_of(mech)
     q = np.asarray(state.q, float).ravel()
     free = np.eye(len(q))
