@@ -17,7 +17,11 @@ Loss = Literal["least_squares", "huber"]
 Estimated = Literal["nothing", "position", "velocity", "both"]
 
 Several = tuple[tuple[str, ...], ...]  # of an option that may be given again
-Data = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DATA.csv [DATA2.nc ...]")]
+Data = Annotated[
+    tuple[Path, ...],
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="DATA.csv [DATA2.nc ...]", help_behavior_hint="(required)"),
+]
 Names = Annotated[Several, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME [NAME ...]")]
 Noise = Annotated[Several, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NUMBER|CHANNEL=NUMBER [...]")]
 Guesses = Annotated[Several, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE [...]")]
@@ -29,7 +33,7 @@ def identify(
     scene: Scene,
     data: Data,
     /,
-    parameters: Names,
+    parameters: Annotated[Names, tyro.conf.arg(metavar="NAME [NAME ...]", help_behavior_hint="(required, repeatable)")],
     out: Path,
     noise: Noise = (),
     guess: Guesses = (),
@@ -54,9 +58,8 @@ def identify(
 
     Args:
         scene: the mechanism, with first guesses.
-        data: measurements.
-        parameters: what is to be found: `body.a.mass`, `length(a)`, ties such as "length(a) = length(b)", a common factor
-            "scale(body.a.mass, body.b.mass)".
+        data: measurements, in .csv or .nc files.
+        parameters: `body.a.mass`, `length(a)`, a tie "length(a) = length(b)", a common factor "scale(body.a.mass, body.b.mass)".
         out: folder for the results.
         noise: standard deviation, in SI units, of what was measured: of all channels, or of one; else it is estimated.
         guess: a first guess other than the scene's value.
