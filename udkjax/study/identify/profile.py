@@ -79,11 +79,11 @@ def profile(
     Where the noise was estimated, it is `noise` times what residuals were divided by, and with its `degrees_of_freedom` the
     quantile is that of F with 1 and so many. `bounds` are those of z_k; `value` is x of z_k, which increases.
     """
-    quantile = _quantile(level, degrees_of_freedom)
-    rise = quantile * noise**2
+    limit = quantile(level, degrees_of_freedom)
+    rise = limit * noise**2
     ways = []
     for sign, bound in zip((-1.0, 1.0), bounds, strict=True):
-        length = min(np.sqrt(quantile) * (step if 0 < step < np.inf else FIRST), abs(bound - z[index]))
+        length = min(np.sqrt(limit) * (step if 0 < step < np.inf else FIRST), abs(bound - z[index]))
         ways.append(_walk(fit, index, np.asarray(z, float), cost, sign * length, bound, rise, steps))
     low, high = ways
     held = np.array([*low.held[::-1], z[index], *high.held])
@@ -99,7 +99,8 @@ def profile(
     return Profile(name, values, costs, every, ends, best if better else len(low.held), text)
 
 
-def _quantile(level: float, degrees_of_freedom: float | None) -> float:
+def quantile(level: float, degrees_of_freedom: float | None) -> float:
+    """What psi^2 is at the ends of the interval: of chi^2 with one degree of freedom; of F, where the noise was estimated."""
     from scipy.stats import chi2, f
 
     return float(chi2.ppf(level, 1) if degrees_of_freedom is None else f.ppf(level, 1, degrees_of_freedom))

@@ -74,7 +74,7 @@ def text(estimate: "Estimate") -> str:
     if not problem.known.all():
         facts["noise, estimated"] = ", ".join(_noises(estimate))
     width = max(map(len, facts))
-    lines = [head, *_laid_out(cells), *(f"  {name:<{width}}  {said}" for name, said in facts.items())]
+    lines = [head, *laid_out(cells), *(f"  {name:<{width}}  {said}" for name, said in facts.items())]
     return "\n".join([*lines, estimate.message])
 
 
@@ -98,7 +98,8 @@ def rounded(value: float, error: float) -> str:
     return f"{value:#.{min(max(digits, 2), MOST)}g}".rstrip(".")
 
 
-def _laid_out(cells: Sequence[Sequence[str]]) -> list[str]:
+def laid_out(cells: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table, its columns below each other."""
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  " + "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip() for row in cells]
 
