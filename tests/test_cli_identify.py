@@ -65,12 +65,16 @@ def test_what_is_known_before_makes_it_known(tmp_path, capsys, data):
     out = tmp_path / "found"
     options = ["--prior", f"{MASS}=2.0,0.002", "--bounds", f"{INERTIA} = 0.2,0.9", "--noise", CHANNEL + f"={np.radians(NOISE)}"]
     arguments = ["identify", PENDULUM, data, "--parameters", MASS, "--parameters", INERTIA, "--ignore", "remark", *options]
-    assert udkjax(*arguments, "--out", out) == 0
-    assert "every parameter is known" in capsys.readouterr().out
+    assert udkjax(*arguments, "--profile", INERTIA, "--out", out) == 0
+    shown = capsys.readouterr().out
+    assert "every parameter is known" in shown and f"{INERTIA} is between" in shown
+    assert {file.name for file in out.iterdir()} == {*FILES, "profiles.png"}
     found = json.loads((out / "estimate.json").read_text())
     inertia = found["parameters"][INERTIA]
     assert found["success"] and inertia["units"] == "kg m2"
     assert abs(inertia["value"] - TRUTH) < 4 * inertia["standard_error"] < 0.05 * TRUTH
+    interval = inertia["value"] + 1.96 * inertia["standard_error"] * np.array([-1, 1])
+    np.testing.assert_allclose(found["intervals"][INERTIA], interval, atol=0.1 * inertia["standard_error"])
     assert found["settings"] | {"parameters": [MASS, INERTIA], "prior": [f"{MASS}=2.0,0.002"], "seed": 0} == found["settings"]
     assert found["scene"] == PENDULUM.read_text() and found["data"][0]["file"] == str(data)
     assert len(found["data"][0]["sha256"]) == 64 and found["versions"]["jax"] == jax.__version__
@@ -85,6 +89,7 @@ def test_what_is_known_before_makes_it_known(tmp_path, capsys, data):
         np.testing.assert_allclose(fit.measured - fit.predicted, fit.residual, atol=1e-12)
         np.testing.assert_allclose(fit.noise, np.radians(NOISE))
         np.testing.assert_allclose(float(fit.residual.std()), np.radians(NOISE), rtol=0.3)
+        np.testing.assert_allclose(fit.rise[0, [0, -1]], fit.interval.attrs["limit"], rtol=0.01)
         assert fit.attrs["success"] == 1 and fit.channel_units.values == ["rad"]
 
 
@@ -148,6 +153,7 @@ GOOD = {"--parameters": [MASS, INERTIA], "--out": ["found"], "--ignore": ["remar
         ("--prior", ["body.rod.mas=1,2"], '"body.rod.mas" is not among --parameters; did you mean "body.rod.mass"?'),
         ("--guess", [f"{MASS}=1", f"{MASS}=2"], f'--guess "{MASS}=2": is there twice'),
         ("--guess", [f"{MASS}=heavy"], "must be NAME=VALUE"),
+        ("--profile", ["body.rod.mas"], '"body.rod.mas": is not among --parameters; did you mean "body.rod.mass"?'),
         ("--noise", ["-1"], '--noise "-1": must be NUMBER or CHANNEL=NUMBER, in SI units, and positive'),
         ("--noise", ["body.rod.omega=1"], '"body.rod.omega" is measured in no record'),
         ("--starts", ["-1"], "--starts -1: must not be negative"),

@@ -124,6 +124,27 @@ def test_a_cost_that_rises_begins_another_fit():
     assert [list(line.get_ydata()) for line in change.lines] == [[1.0, 0.1, identify_figures.ROUNDING], [0.2, 1e-9]]
 
 
+def test_profiles_are_drawn_beside_what_the_standard_error_says():
+    data = made()
+    data["parameter_units"] = "parameter", ["kg", "kg", "m"]
+    x = np.array([[1.98, 2.0, 2.03, np.nan], [1.0, 2.0, 3.0, 4.0]])
+    more = xarray.Dataset(
+        {
+            "profile_value": (("profile", "point"), x),
+            "rise": (("profile", "point"), [[4.0, 0.0, 4.0, np.nan], [1.0, 0.0, 1.0, 2.0]]),
+            "interval": (("profile", "end"), [[1.98, 2.03], [-np.inf, np.inf]], {"level": 0.95, "limit": 3.84}),
+        },
+        {"profile": ["body.b.mass", "body.a.mass"]},
+    )
+    one, two = shown(pictures(data.merge(more))["profiles"])
+    curve, line, limit = one.lines
+    np.testing.assert_array_equal(curve.get_xdata(), x[0, :3])
+    np.testing.assert_allclose(line.get_ydata(), ((line.get_xdata() - 2.0) / 0.01) ** 2)
+    assert limit.get_ydata()[0] == 3.84 and (one.get_title(loc="left"), one.get_xlabel()) == ("body.b.mass", "kg")
+    assert len(two.lines) == 2  # its standard error is not known
+    assert two.patches[0].get_width() == 3.0  # of an interval that is open, what was looked at
+
+
 def test_single_samples_and_exact_fits_can_be_drawn(tmp_path):
     data = made(records=("one",), channels=1).isel(sample=slice(1))
     assert shown(pictures(data)["fit"])[0].get_title(loc="left") == "body.link0.angle"

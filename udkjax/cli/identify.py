@@ -1,6 +1,7 @@
 """`udkjax identify`."""
 
 import hashlib
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,6 +12,7 @@ from udkjax.cli.common import BAD_RUN, INTERRUPTED, Scene, load, refuse
 
 if TYPE_CHECKING:
     from udkjax import Estimate
+    from udkjax.study.identify.profile import Profile
 
 # The names of udkjax.study.identify, which cannot be imported before a command is known: it imports JAX.
 Loss = Literal["least_squares", "huber"]
@@ -45,6 +47,7 @@ def identify(
     starts: int = 15,
     tol: float = 1e-11,
     seed: int = 0,
+    profile: Names = (),
     quiet: bool = False,
 ) -> None:
     """Find numbers of a scene from measured motion: values, standard errors, and what the measurements cannot tell.
@@ -71,6 +74,7 @@ def identify(
         starts: how many more first guesses may be tried.
         tol: tolerance of the integration.
         seed: of the first guesses.
+        profile: parameters whose confidence intervals are to be found by profile likelihood, which needs no linear model.
         quiet: do not show how far it is.
     """
     if out.exists() and not out.is_dir():
@@ -81,41 +85,46 @@ def identify(
 
     import udkjax as udk
     from udkjax.cli.identify_texts import Texts
+    from udkjax.study.identify.held import profile_of
 
     settings = {"loss": loss, "starts": starts, "tol": tol, "seed": seed}
     asked = Texts(mech, parameters, {"start": guess, "bounds": bounds, "prior": prior})
     asked.check(settings)
     records = asked.records(data, noise, ignore, estimate_start)
+    profiled = asked.profiled(profile)
     if asked.problems:
         refuse(str(udk.IdentificationError(asked.problems)))
     try:
         estimate = udk.identify(mech, records, asked.parameters, progress=False if quiet else None, **settings)
+        profiles = [profile_of(estimate, name) for name in profiled]
     except (udk.IdentificationError, udk.AssemblyError) as problem:
         refuse(str(problem))
     except KeyboardInterrupt:
         print("\nudkjax: stopped; nothing was written", file=sys.stderr)
         sys.exit(INTERRUPTED)
-    given = {"parameters": parameters, "noise": noise, "guess": guess, "bounds": bounds, "prior": prior, "ignore": ignore}
-    options = {name: [item for group in groups for item in group] for name, groups in given.items()}
+    several = {"parameters": parameters, "noise": noise, "guess": guess, "bounds": bounds, "prior": prior, "ignore": ignore}
+    options = {name: [item for group in groups for item in group] for name, groups in several.items()}
     facts = {
         "settings": {**options, "estimate_start": estimate_start, **settings},
+        "intervals": {found.name: [end if math.isfinite(end) else None for end in found.interval] for found in profiles},
         "data": [{"file": str(file), "sha256": hashlib.sha256(file.read_bytes()).hexdigest()} for file in data],
         "scene_file": str(scene),
         "scene": text,
     }
-    print(estimate)
-    print(f"wrote {', '.join(_written(estimate, facts, out))} to {out}")
+    print("\n".join([str(estimate), *(found.text for found in profiles)]))
+    print(f"wrote {', '.join(_written(estimate, profiles, facts, out))} to {out}")
     if not estimate.success:
         sys.exit(BAD_RUN)
 
 
-def _written(estimate: "Estimate", facts: dict[str, Any], out: Path) -> list[str]:
+def _written(estimate: "Estimate", profiles: list["Profile"], facts: dict[str, Any], out: Path) -> list[str]:
     """Write everything, and return the names of the files."""
     import csv
     import json
 
     import udkjax as udk
     from udkjax.show.identify_figures import save_pictures
+    from udkjax.study.identify.held import with_profiles
     from udkjax.study.identify.results import Row, rows
 
     out.mkdir(exist_ok=True)
@@ -124,5 +133,6 @@ def _written(estimate: "Estimate", facts: dict[str, Any], out: Path) -> list[str
     with (out / "estimate.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file).writerows([Row._fields, *rows(estimate)])
     found = estimate.to_xarray()
+    found = with_profiles(found, estimate, profiles) if profiles else found
     found.to_netcdf(out / "fit.nc", engine="h5netcdf")
     return ["identified.toml", "estimate.json", "estimate.csv", "fit.nc", *save_pictures(found, out)]

@@ -23,6 +23,7 @@ class Texts:
 
     def __init__(self, mechanism: Mechanism, parameters: Groups, options: Mapping[str, Groups]):
         self.mechanism, self.problems = mechanism, []
+        self.names: tuple[str, ...] = ()
         names = [name for group in parameters for name in group]
         said: dict[str, dict[str, Any]] = {name: {} for name in names}
         for option, groups in options.items():
@@ -35,7 +36,7 @@ class Texts:
     def check(self, settings: Mapping[str, Any]) -> None:
         """Look whether there are such parameters, and whether settings make sense."""
         if self.parameters:
-            self._tried(lambda: unknowns_of(self.mechanism, self.parameters), None)
+            self.names = self._tried(lambda: unknowns_of(self.mechanism, self.parameters).names, ())
         if settings["starts"] < 0:
             self.problems.append(f"--starts {settings['starts']}: must not be negative")
         if not 0 < settings["tol"] < 1:
@@ -53,6 +54,18 @@ class Texts:
         found = self._tried(lambda: records_of(self.mechanism, list(data), by_channel, left_out), ())
         found = self._tried(lambda: records_of(self.mechanism, found, everywhere), ()) if found else ()
         return [Record(r.times, r.values, r.noise, Start(estimate=start), r.t0, r.conditions, r.name) for r in found]
+
+    def profiled(self, groups: Groups) -> list[str]:
+        """The names of parameters, as the estimate has them, that are called by all of their names or one of them."""
+        known = {_plain(part): name for name in self.names for part in (name, *name.split("="))}
+        given = [text for group in groups for text in group]
+        if self.names:
+            self.problems += [
+                f"--profile {quoted(text)}: is not among --parameters{suggestion(text, self.names)}"
+                for text in given
+                if _plain(text) not in known
+            ]
+        return list(dict.fromkeys(known[_plain(text)] for text in given if _plain(text) in known))
 
     def _noise(self, groups: Groups) -> tuple[float | None, dict[str, float]]:
         """The standard deviation of all channels, and of those that have one of their own."""

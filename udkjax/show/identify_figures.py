@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from udkjax.show.fit_figures import fit, plain, residuals, title
 from udkjax.show.plots import COLOURS
+from udkjax.show.profile_figures import profiles
 
 WRITTEN = 14  # parameters up to which correlations are written as numbers too
 WORST = 1e3  # percent: standard errors that are larger are drawn as this
@@ -17,9 +18,10 @@ ROUNDING = 1e-18  # what is zero is drawn as this where an axis is logarithmic
 
 
 def pictures(data: Any) -> dict[str, Figure]:
-    """Draw what `Estimate.to_xarray` returns."""
+    """Draw what `Estimate.to_xarray` returns, with profile likelihoods or without."""
     found = {"fit": fit(data), "residuals": residuals(data), "convergence": convergence(data)}
-    return found | ({"correlation": correlation(data)} if data.sizes["parameter"] > 1 else {})
+    found |= {"correlation": correlation(data)} if data.sizes["parameter"] > 1 else {}
+    return found | ({"profiles": profiles(data)} if "profile" in data else {})
 
 
 def save_pictures(data: Any, folder: Any) -> Iterator[str]:

@@ -160,7 +160,8 @@ def _text(name: str, units: str, level: float, ends: tuple[float, float], sides:
     """The interval in words, with how far was looked where it is open."""
     unit = f" {units}" if units else ""
     if np.isfinite(ends).all():
-        return f"{name} is between {ends[0]:.4g} and {ends[1]:.4g}{unit} ({100 * level:g} %)"
+        low, high = (f"{end:.{_digits(ends)}g}" for end in ends)
+        return f"{name} is between {low} and {high}{unit} ({100 * level:g} %)"
     known = [f"{word} {end:.4g}{unit}" for word, end in zip(("above", "below"), ends, strict=True) if np.isfinite(end)]
     looked = [
         f"no {which} end as far as {value(side.end):.4g}{unit} ({side.open})"
@@ -168,3 +169,9 @@ def _text(name: str, units: str, level: float, ends: tuple[float, float], sides:
         if side.open
     ]
     return f"{name} {f'is {known[0]} ({100 * level:g} %)' if known else 'is not known'}: {', '.join(looked)}"
+
+
+def _digits(ends: tuple[float, float]) -> int:
+    """Digits that tell the ends of an interval apart."""
+    size, width = max(map(abs, ends)), ends[1] - ends[0]
+    return max(4, 2 + int(np.ceil(np.log10(size / width)))) if width > 0 else 4
