@@ -14,10 +14,12 @@ from udkjax.equations.assembly import State, assemble
 from udkjax.integrate.solution import versions
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.fitting import Fit
+from udkjax.study.identify.held import profile_of
 from udkjax.study.identify.knowledge import Knowledge, Values, knowledge
 from udkjax.study.identify.losses import Loss
 from udkjax.study.identify.parameters import applied
 from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.profile import LEVEL, Profile
 from udkjax.study.identify.results import dataset, labels, text
 from udkjax.study.identify.search import Found
 from udkjax.study.identify.whiteness import Whiteness, whiteness
@@ -168,6 +170,13 @@ class Estimate:
 
     def __repr__(self) -> str:
         return f"Estimate({', '.join(f'{name}: {value:.6g}' for name, value in self.parameters.items())})"
+
+    def profile(self, name: str, level: float = LEVEL) -> Profile:
+        """Return the profile likelihood of a parameter: its confidence interval at this level, without a linear model.
+
+        It is held at values beside the estimate, and all others are fitted anew. Raises `IdentificationError`.
+        """
+        return profile_of(self, name, level=level)
 
     def to_xarray(self) -> Any:
         """Return an xarray Dataset: what was measured, what the mechanism shows, and what is known of the parameters."""
