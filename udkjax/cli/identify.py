@@ -85,7 +85,6 @@ def identify(
 
     import udkjax as udk
     from udkjax.cli.identify_texts import Texts
-    from udkjax.study.identify.held import profile_of
 
     settings = {"loss": loss, "starts": starts, "tol": tol, "seed": seed}
     asked = Texts(mech, parameters, {"start": guess, "bounds": bounds, "prior": prior})
@@ -96,7 +95,7 @@ def identify(
         refuse(str(udk.IdentificationError(asked.problems)))
     try:
         estimate = udk.identify(mech, records, asked.parameters, progress=False if quiet else None, **settings)
-        profiles = [profile_of(estimate, name) for name in profiled]
+        profiles = [estimate.profile(name) for name in profiled]
     except (udk.IdentificationError, udk.AssemblyError) as problem:
         refuse(str(problem))
     except KeyboardInterrupt:
