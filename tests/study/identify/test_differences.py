@@ -1,0 +1,80 @@
+"""Differences and their errors, of functions whose derivatives are known."""
+
+import numpy as np
+import pytest
+
+from udkjax.study.identify.differences import STEPS, differences, sizes
+
+TS = np.linspace(0.5, 3.0, 40)
+SERIES = [np.arange(25), np.arange(25, 40)]
+SLOPE = -TS * np.sin(TS)
+
+
+def seen(h):
+    """cos((1 + h) t), at all steps of the ladder."""
+    return np.cos((1.0 + h[:, None]) * TS)
+
+
+def ladder(function):
+    return np.stack([function(STEPS), function(-STEPS)], axis=1)
+
+
+def chosen(found):
+    """The size of what differences at the best step are off by, in each series, and the errors predicted there."""
+    errors = found.noise + found.truncation
+    best = np.nanargmin(errors, axis=0)
+    off = np.array([sizes(found.values[k] - SLOPE, SERIES)[s] for s, k in enumerate(best)])
+    return off, errors[best, np.arange(len(SERIES))], found.steps[best]
+
+
+def test_of_a_smooth_function_they_are_as_exact_as_rounding_lets_them_be():
+    y = ladder(seen)
+    off, errors, steps = chosen(differences(y, np.zeros_like(y), SERIES))
+    assert (off < errors).all() and (errors < 1e-11).all() and (steps > 1e-3).all()
+
+
+@pytest.mark.parametrize("level", [1e-12, 1e-8, 1e-4])
+@pytest.mark.parametrize("kind", ["jumping", "moving"])
+def test_noise_is_told_before_they_are_compared(level, kind):
+    """Errors that are other ones at each step, as where step control decides otherwise; and such as move with the parameter."""
+    random = np.random.default_rng(0)
+    errors = level * random.standard_normal((len(STEPS), 2, len(TS)))
+    if kind == "moving":
+        errors = ladder(lambda h: level * np.sin(TS + 30.0 * h[:, None]))
+    y = ladder(seen)
+    off, floor, _ = chosen(differences(y + errors, errors, SERIES))
+    assert (off < 3.0 * floor).all() and (floor < 100.0 * off).all()
+    if kind == "moving":
+        assert (floor > 10.0 * level).all()  # no step is small enough to get rid of them
+
+
+def test_truncation_is_told_before_they_are_compared():
+    y = ladder(seen)
+    found = differences(y, np.zeros_like(y), SERIES)
+    off = np.stack([sizes(R - SLOPE, SERIES) for R in found.values])
+    assert found.truncation[:3] == pytest.approx(off[:3], rel=0.05)
+
+
+def test_steps_where_runs_fail_are_left_out():
+    y = ladder(seen)
+    y[:3, 0], y[5, 1] = np.nan, np.nan
+    found = differences(y, np.zeros_like(y), SERIES)
+    assert np.isnan(found.noise[:3]).all() and np.isnan(found.noise[4:6]).all() and np.isfinite(found.noise[[3, 6, 7]]).all()
+    off, errors, _ = chosen(found)
+    assert (off < errors).all()
+    assert np.isnan(differences(np.full_like(y, np.nan), y, SERIES).noise).all()
+
+
+def test_a_jump_has_no_derivative():
+    y = ladder(lambda h: seen(h) + np.sign(h)[:, None])
+    assert np.isnan(differences(y, np.zeros_like(y), SERIES).truncation).all()
+
+
+def test_what_moves_by_rounding_only_is_no_derivative():
+    random = np.random.default_rng(1)
+    errors = 1e-16 * random.standard_normal((len(STEPS), 2, len(TS)))
+    y = 1.0 + errors
+    found = differences(y, errors, SERIES)
+    errors = found.noise + found.truncation
+    best = np.nanargmin(errors, axis=0)
+    assert (sizes(found.values, SERIES)[best, [0, 1]] < errors[best, [0, 1]]).all() and (errors[best, [0, 1]] < 1e-13).all()
