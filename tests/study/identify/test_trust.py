@@ -1,0 +1,179 @@
+"""Derivatives against differences: those that are right agree at any tolerance, wrong ones are found, with their place."""
+
+import jax
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
+from udkjax.integrate.solution import Result
+from udkjax.study.identify.identify import identify
+from udkjax.study.identify.parameters import unknowns_of
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.trust import compare
+
+DATA = {"time": TS, ANGLE: np.zeros(len(TS))}
+FIRST = 0.5, 0.15
+
+
+def exact():
+    """The derivatives of the pendulum's angle, as exact as they can be integrated."""
+    mech = pendulum(*FIRST)
+    problem = Problem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
+    return problem.evaluate(np.zeros((1, 2)), (1e-13, 1e-13)).J[0]
+
+
+@pytest.mark.parametrize("tol", [1e-3, 1e-5, 1e-8, 1e-11, 1e-13])
+def test_right_derivatives_agree_at_any_tolerance(tol):
+    check = udk.check_gradients(pendulum(*FIRST), DATA, NAMES, tol=tol)
+    assert check.ok and check.agrees.shape == (5, 1)
+    assert check.message == "derivatives agree with differences as far as differences can tell"
+    slopes = check.directions @ exact().T
+    assert check.size[:, 0] == pytest.approx(np.sqrt(np.mean(slopes**2, 1)), rel=0.03)
+    # The floor is no higher than it has to be, and known before anything is compared.
+    relative = check.floor / check.size
+    assert (relative < max(300.0 * tol, 1e-8)).all() and (relative > 1e-12).all()
+    assert (check.at_best(check.differs) < 2.0 * check.floor).all()
+
+
+def test_errors_of_the_derivatives_themselves_are_measured():
+    check = udk.check_gradients(pendulum(*FIRST), DATA, NAMES, tol=1e-7)
+    mech = pendulum(*FIRST)
+    problem = Problem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
+    off = problem.evaluate(np.zeros((1, 2)), (1e-7, 1e-7)).J[0] - exact()
+    assert check.own[:, 0] == pytest.approx(np.sqrt(np.mean((check.directions @ off.T) ** 2, 1)), rel=0.05)
+
+
+def test_at_an_estimate_nothing_is_compiled(measured, compilations):
+    estimate = identify(pendulum(*FIRST), {"time": TS, ANGLE: measured[1]}, NAMES, progress=False)
+    found = []
+    assert compilations(lambda: found.append(estimate.check_gradients())) == []
+    assert found[0].ok and found[0].tol == estimate.tol and found[0].names[:2] == NAMES
+
+
+def test_a_table_says_it(measured):
+    check = udk.check_gradients(pendulum(*FIRST), DATA, NAMES)
+    lines = str(check).splitlines()
+    assert "1e-11" in lines[0] and lines[1].split()[:2] == ["direction", "size"] and "worst in" not in lines[1]
+    assert [line.split()[0] for line in lines[2:4]] == list(NAMES) and all(line.endswith("agrees") for line in lines[2:7])
+    assert lines[7:] == [check.message]
+
+
+# --- wrong ones
+
+
+def wrong(by):
+    """x -> x, whose derivative is another."""
+
+    @jax.custom_jvp
+    def function(x):
+        return x
+
+    @function.defjvp
+    def _(primals, tangents):
+        return primals[0], by(tangents[0])
+
+    return function
+
+
+# Off by 1e-5 everywhere, which takes a small tolerance to be seen; and at one time only.
+SLIGHTLY, AT_ONE_TIME = wrong(lambda t: 1.00001 * t), wrong(lambda t: t.at[17].mul(1.01))
+
+
+def _inertia(mechanism, value):
+    return mechanism.with_parameters({NAMES[0]: SLIGHTLY(value)})
+
+
+WRONG = udk.Quantity("wrong", lambda mechanism, solution: AT_ONE_TIME(solution.q[:, 0, 2]), "rad")
+
+
+@pytest.fixture(scope="module")
+def wrong_problem():
+    mech = pendulum(*FIRST)
+    parameters = [udk.Parameter(_inertia, "mine", start=FIRST[0], transform="positive"), NAMES[1]]
+    return Problem(mech, unknowns_of(mech, parameters), [udk.Record(TS, {ANGLE: DATA[ANGLE], WRONG: DATA[ANGLE]})])
+
+
+def test_wrong_derivatives_are_found(wrong_problem):
+    check = compare(wrong_problem, np.zeros(2), (1e-11, 1e-11))
+    assert not check.ok and check.series == ((0, ANGLE), (0, "wrong"))
+    assert check.agrees.tolist() == [[False, False], [True, False], *[[False, False]] * 3]
+    assert check.worst[1] == 1 and check.places[1][1].time == TS[17] and check.places[1][1].channel == "wrong"
+    place = check.places[1][1]
+    assert place.derivative == pytest.approx(1.01 * place.difference, rel=1e-6)
+    first = check.differs[0, 0] / check.size[0, 0]
+    assert first[2:5] == pytest.approx([1e-5] * 3, rel=1e-2)
+    told = str(check)
+    assert f"{NAMES[1]}: at t = {TS[17]:.6g} s of wrong the derivative is" in told and "DIFFERS" in told
+
+
+def test_what_is_below_the_floor_is_not_said_to_be_wrong(wrong_problem):
+    check = compare(wrong_problem, np.zeros(2), (1e-4, 1e-4))
+    assert check.agrees[:, 0].all() and (check.floor > 2e-5 * check.size)[:, 0].all()
+
+
+# --- runs that fail
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """A problem whose runs fail beyond some distance."""
+    mech = pendulum(*FIRST)
+    problem = Problem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
+    evaluate = problem.evaluate
+
+    def beyond(distance):
+        def limited(z, tol):
+            found, fails = evaluate(z, tol), np.linalg.norm(z, axis=1) > distance
+            r = np.where(fails[:, None], np.nan, found.r)
+            return found._replace(r=r, code=np.where(fails, int(Result.step_limit), found.code))
+
+        monkeypatch.setattr(problem, "evaluate", limited)
+        return problem
+
+    return beyond
+
+
+def test_steps_that_fail_are_left_out(failing):
+    check = compare(failing(1e-3), np.zeros(2), (1e-10, 1e-10))
+    assert check.ok and (check.step < 1e-3).all() and np.isnan(check.differs[:, :, check.steps > 1e-3]).all()
+
+
+def test_where_all_steps_fail_nothing_is_claimed(failing):
+    check = compare(failing(1e-8), np.zeros(2), (1e-10, 1e-10))
+    assert not check.ok and "do not come to their end" in check.message and "not known" in str(check)
+
+
+def test_where_the_motion_fails_there_is_nothing_to_check(failing):
+    with pytest.raises(udk.IdentificationError, match="no derivatives to be checked"):
+        compare(failing(-1.0), np.zeros(2), (1e-10, 1e-10))
+
+
+def test_mistakes_are_those_of_an_identification():
+    with pytest.raises(udk.IdentificationError, match=r"body.rod.inertia"):
+        udk.check_gradients(pendulum(), DATA, ["body.rod.inrtia"])
+
+
+# --- what takes long to compile
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("angle", [-np.pi / 4, np.pi / 3])
+def test_redundant_linkages_and_singular_configurations(angle):
+    """From pi/3 the parallelogram passes through the configuration where it could change over to its other branch."""
+    ts = np.linspace(0.0, 5.0, 101)
+    names = ["length(link1, link2, link3)", "body.link1.mass = body.link2.mass = body.link3.mass"]
+    data = {"time": ts, "body.link1.angle": 0.0 * ts}
+    for tol, most in ((1e-3, 0.1), (1e-5, 1e-3), (1e-7, 1e-4), (1e-9, 1e-5), (1e-11, 1e-6)):
+        check = udk.check_gradients(udk.library.parallelogram(angle=angle), data, names, tol=tol)
+        assert check.ok and (check.floor < most * check.size).all(), str(check)
+
+
+@pytest.mark.slow
+def test_along_chaotic_motion_nothing_is_claimed():
+    """Derivatives of 1e8: what differs in the ninth digit ends elsewhere."""
+    names = ["body.lower.mass", "body.upper.inertia"]
+    for end, ok in ((3.0, True), (20.0, False)):
+        ts = np.linspace(0.0, end, 200)
+        check = udk.check_gradients(udk.library.double_pendulum(), {"time": ts, "body.lower.angle": 0.0 * ts}, names)
+        assert check.ok is ok and (ok or "do not settle" in check.message), str(check)
