@@ -62,49 +62,71 @@ def test_a_table_says_it(measured):
 # --- wrong ones
 
 
-def wrong(by):
-    """x -> x, whose derivative is another."""
-
-    @jax.custom_jvp
-    def function(x):
-        return x
+def wrong(by, value=lambda x: x):
+    """A function that has another derivative than it should have."""
+    function = jax.custom_jvp(value)
 
     @function.defjvp
     def _(primals, tangents):
-        return primals[0], by(tangents[0])
+        return value(primals[0]), by(tangents[0])
 
     return function
 
 
-# Off by 1e-5 everywhere, which takes a small tolerance to be seen; and at one time only.
-SLIGHTLY, AT_ONE_TIME = wrong(lambda t: 1.00001 * t), wrong(lambda t: t.at[17].mul(1.01))
+SLIGHTLY = wrong(lambda t: 1.00001 * t)  # which takes a small tolerance to be seen
+AT_ONE_TIME, NO_NUMBER = wrong(lambda t: t.at[17].mul(1.01)), wrong(lambda t: t.at[5].set(np.nan))
+MADE_UP = wrong(lambda t: t, lambda x: 0.0 * x)
 
 
 def _inertia(mechanism, value):
     return mechanism.with_parameters({NAMES[0]: SLIGHTLY(value)})
 
 
-WRONG = udk.Quantity("wrong", lambda mechanism, solution: AT_ONE_TIME(solution.q[:, 0, 2]), "rad")
+def _angle(solution):
+    return solution.q[:, 0, 2]
+
+
+QUANTITIES = [
+    udk.Quantity("wrong", lambda mechanism, solution: AT_ONE_TIME(_angle(solution)), "rad"),
+    udk.Quantity("still", lambda mechanism, solution: 0.0 * _angle(solution)),
+    udk.Quantity("made up", lambda mechanism, solution: MADE_UP(_angle(solution))),
+    udk.Quantity("no number", lambda mechanism, solution: NO_NUMBER(_angle(solution))),
+]
 
 
 @pytest.fixture(scope="module")
 def wrong_problem():
     mech = pendulum(*FIRST)
     parameters = [udk.Parameter(_inertia, "mine", start=FIRST[0], transform="positive"), NAMES[1]]
-    return Problem(mech, unknowns_of(mech, parameters), [udk.Record(TS, {ANGLE: DATA[ANGLE], WRONG: DATA[ANGLE]})])
+    return Problem(mech, unknowns_of(mech, parameters), [udk.Record(TS, dict.fromkeys([ANGLE, *QUANTITIES], DATA[ANGLE]))])
 
 
 def test_wrong_derivatives_are_found(wrong_problem):
     check = compare(wrong_problem, np.zeros(2), (1e-11, 1e-11))
-    assert not check.ok and check.series == ((0, ANGLE), (0, "wrong"))
-    assert check.agrees.tolist() == [[False, False], [True, False], *[[False, False]] * 3]
-    assert check.worst[1] == 1 and check.places[1][1].time == TS[17] and check.places[1][1].channel == "wrong"
-    place = check.places[1][1]
-    assert place.derivative == pytest.approx(1.01 * place.difference, rel=1e-6)
-    first = check.differs[0, 0] / check.size[0, 0]
-    assert first[2:5] == pytest.approx([1e-5] * 3, rel=1e-2)
-    told = str(check)
-    assert f"{NAMES[1]}: at t = {TS[17]:.6g} s of wrong the derivative is" in told and "DIFFERS" in told
+    assert not check.ok and [name for _, name in check.series] == [ANGLE, "wrong", "still", "made up", "no number"]
+    assert (
+        check.agrees.tolist()
+        == [[False, False, True, False, False], [True, False, True, False, False]] + [[False, False, True, False, False]] * 3
+    )
+    inertia = check.differs[0, 0] / check.size[0, 0]
+    assert inertia[2:5] == pytest.approx([1e-5] * 3, rel=1e-2)
+    for s, time, factor in ((1, 17, 1.01), (4, 5, np.nan)):
+        place = check.places[1][s]
+        assert place[:3] == (0, check.series[s][1], TS[time])
+        assert place.derivative == pytest.approx(factor * place.difference, rel=1e-6, nan_ok=True)
+    assert check.places[1][3].difference == 0.0 != check.places[1][3].derivative
+    assert np.isnan(check.ratio[1]).tolist() == [False, False, False, False, True] and check.worst[1] == 4
+
+
+def test_what_is_wrong_is_told_with_its_place(wrong_problem, monkeypatch):
+    """Of the series that agrees worst: here of two."""
+    series = wrong_problem.series()[:2]
+    monkeypatch.setattr(wrong_problem, "series", lambda: series)
+    check = compare(wrong_problem, np.zeros(2), (1e-11, 1e-11))
+    lines = str(check).splitlines()
+    assert lines[1].split()[1:3] == ["worst", "in"] and all(line.endswith("DIFFERS") for line in lines[2:7])
+    assert lines[3].split()[:2] == [NAMES[1], "wrong"]
+    assert f"{NAMES[1]}: at t = {TS[17]:.6g} s of wrong the derivative is" in check.message
 
 
 def test_what_is_below_the_floor_is_not_said_to_be_wrong(wrong_problem):
