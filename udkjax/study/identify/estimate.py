@@ -13,6 +13,7 @@ from jaxtyping import Float
 from udkjax.equations.assembly import State, assemble
 from udkjax.integrate.solution import versions
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.agreement import GradientCheck
 from udkjax.study.identify.fitting import Fit
 from udkjax.study.identify.held import profile_of
 from udkjax.study.identify.knowledge import Knowledge, Values, knowledge
@@ -22,6 +23,7 @@ from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.profile import LEVEL, Profile
 from udkjax.study.identify.results import dataset, labels, text
 from udkjax.study.identify.search import Found
+from udkjax.study.identify.shooting import Shooting
 from udkjax.study.identify.whiteness import Whiteness, whiteness
 
 ROUNDING = 1e-8  # of what a channel shows: residuals below it are errors of the integration, which are not noise and need not be
@@ -54,14 +56,21 @@ class Estimate:
     seconds: float
     tol: tuple[float, float]
     z: Float[np.ndarray, "K"]
-    problem: Problem
+    problem: Problem | Shooting
     loss: Loss
 
     @classmethod
     def of(
-        cls, problem: Problem, fit: Fit, found: Found, history: list, tol: tuple[float, float], loss: Loss, seconds: float
+        cls,
+        fit: Fit,
+        found: Found,
+        history: list,
+        tol: tuple[float, float],
+        loss: Loss,
+        seconds: float,
     ) -> "Estimate":
         """What a fit has found."""
+        problem = found.problem
         unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z[0]
         x = unknowns.values(z[:P])
         plain = problem.evaluate(fit.z, tol)
@@ -178,6 +187,12 @@ class Estimate:
         """
         return profile_of(self, name, level=level)
 
+    def check_gradients(self) -> GradientCheck:
+        """Compare the derivatives at the estimate with differences: see `udkjax.check_gradients`."""
+        from udkjax.study.identify.trust import compare
+
+        return compare(self.problem, self.z, self.tol)
+
     def to_xarray(self) -> Any:
         """Return an xarray Dataset: what was measured, what the mechanism shows, and what is known of the parameters."""
         return dataset(self)
@@ -230,7 +245,7 @@ def _plain(x: Any) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 
-def _groups(problem: Problem) -> np.ndarray:
+def _groups(problem: Problem | Shooting) -> np.ndarray:
     """Of each residual, which noise it shares that is to be estimated: that of its channel; -1 where it is known."""
     unknown = np.where(problem.known, -1, problem.where[:, 2])
     _, group = np.unique(unknown, return_inverse=True)
@@ -238,7 +253,7 @@ def _groups(problem: Problem) -> np.ndarray:
     return np.concatenate([group, np.full(problem.more, -1)])
 
 
-def _by_record(problem: Problem, rows: np.ndarray) -> tuple[dict[str, np.ndarray], ...]:
+def _by_record(problem: Problem | Shooting, rows: np.ndarray) -> tuple[dict[str, np.ndarray], ...]:
     """Numbers of all residuals as tables: of each record, its channels at its times."""
     full = np.full(problem.y.shape, np.nan)
     full[problem.there] = rows

@@ -5,7 +5,7 @@ import inspect
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import numpy as np
@@ -25,12 +25,14 @@ from udkjax.study.identify.parameters import Unknowns, applied, unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.reading import records_of
 from udkjax.study.identify.records import Record
-from udkjax.study.identify.search import GUESSES, SETTLED, Found, beside, search
+from udkjax.study.identify.search import GUESSES, SETTLED, Found, Strategy, beside, search
+from udkjax.study.identify.shooting import Shooting
 from udkjax.study.progress import Line
 
 TOL = 1e-11  # relative and absolute, of the integration: what parameters are known to where there is no noise
 WEIGHED = 2  # fits, each with noise as the one before left it
 EVEN = 1e-6  # of what a channel shows: residuals below it count alike, since they are not of measurements
+EQUAL = 1.05  # weights that differ by less, compared with each other, move no estimate by what counts beside its error
 POLISHED = 15  # steps at the end
 NEARBY = 64  # guesses that are tried where the first cannot be closed
 GLANCE, BRIEF = (1e-6, 1e-6), 1e-6  # tolerances, and the part of the records, of a run that shows whether a guess closes
@@ -58,6 +60,7 @@ def identify(
     starts: int | Any = GUESSES,
     loss: str = "least_squares",
     optimizer: Any = None,
+    strategy: Strategy = "auto",
     tol: float = TOL,
     seed: int = 0,
     ignore: Sequence[str] = (),
@@ -76,7 +79,8 @@ def identify(
     Levenberg-Marquardt with exact forward derivatives, through the closure of all loops; `loss="huber"` lets single wrong
     numbers count less, `optimizer` is another least-squares solver of optimistix. Where the first guess does not lead to a fit
     that explains the records, it is looked for along growing parts of them, and from other guesses: `starts` is how many more
-    there may be (0: none), or an array of guesses (B, P) to try besides the first.
+    there may be (0: none), or an array of guesses (B, P) to try besides the first. Where these do not agree either, as along
+    chaotic motion, the records are cut into pieces that are held together; `strategy="pieces"` does so at once.
 
     `tol` is the tolerance of the integration at the end; `settings` are others of `simulate`. `progress`: None shows a line,
     False nothing.
@@ -85,21 +89,35 @@ def identify(
     than it needs. What the records cannot tell is no error: `Estimate.success` is false, and `Estimate.message` says what.
     """
     begun = time.perf_counter()
-    unknowns, records = _gathered(
-        lambda: _check(settings),
-        lambda: unknowns_of(mechanism, parameters),
-        lambda: records_of(mechanism, data, noise, ignore),
-    )[1:]
-    problem = _begun(mechanism, unknowns, records, settings, seed)
+    problem = posed(mechanism, data, parameters, settings, noise, ignore, seed, strategy)
     lost = loss_of(loss, len(problem.where))
     tell = _teller(progress)
     guesses, more = _guesses(problem, starts)
     choices = {"loss": lost, "method": optimizer}
-    found = search(problem, guesses, (tol, tol), more, seed, tell, **choices)
+    found = search(problem, guesses, (tol, tol), more, seed, tell, strategy, **choices)
     _require_some(problem, found)
-    fit, history = _settled(problem, found, tol, tell, choices)
+    fit, history = _settled(found, tol, tell, choices)
     tell("")
-    return Estimate.of(problem, fit, found, history, (tol, tol), lost, time.perf_counter() - begun)
+    return Estimate.of(fit, found, history, (tol, tol), lost, time.perf_counter() - begun)
+
+
+def posed(
+    mechanism: Mechanism,
+    data: Any,
+    parameters: Sequence[Any] | str,
+    settings: Mapping[str, Any],
+    noise: Any = None,
+    ignore: Sequence[str] = (),
+    seed: int = 0,
+    strategy: Strategy = "auto",
+) -> Problem:
+    """The problem that arguments of `identify` pose. Raises `IdentificationError`, which lists every mistake."""
+    unknowns, records = _gathered(
+        lambda: _check(settings, strategy),
+        lambda: unknowns_of(mechanism, parameters),
+        lambda: records_of(mechanism, data, noise, ignore),
+    )[1:]
+    return _begun(mechanism, unknowns, records, settings, seed)
 
 
 def _gathered(*steps: Callable[[], Any]) -> list[Any]:
@@ -150,21 +168,22 @@ def _require_legal(mechanism: Mechanism, unknowns: Unknowns) -> None:
 _legal: set[Any] = set()
 
 
-def _settled(problem: Problem, found: Found, tol: float, tell: Callable, choices: Mapping[str, Any]) -> tuple[Fit, list]:
+def _settled(found: Found, tol: float, tell: Callable, choices: Mapping[str, Any]) -> tuple[Fit, list]:
     """The fit to the end, each channel weighted by the noise that it has turned out to have."""
-    fit, history = found.fit, list(found.history)
+    problem, fit, history = found.problem, found.fit, list(found.history)
     end = partial(_polished, problem, tol=(tol, tol), tell=tell, **choices)
     fit = end(fit.z)
     history += fit.history
     unknown = {problem.names[c] for c in np.unique(problem.where[~problem.known, 2])}
     for _ in range(WEIGHED if len(unknown) + problem.known.any() > 1 else 0):
-        weigh(problem, fit.z, tol, choices["loss"], EVEN)
+        if not weigh(problem, fit.z, tol, choices["loss"], EVEN):
+            break
         fit = end(fit.z)
         history += fit.history
     return fit, history
 
 
-def _polished(problem: Problem, z: np.ndarray, **choices: Any) -> Fit:
+def _polished(problem: Problem | Shooting, z: np.ndarray, **choices: Any) -> Fit:
     """A fit from beside its minimum; with damped steps where other weights have moved it far along what is hardly known."""
     near = descend(problem, z, steps=POLISHED, near=True, **choices)
     if near.settled[0] or near.history[-1][1] <= SETTLED:
@@ -173,8 +192,12 @@ def _polished(problem: Problem, z: np.ndarray, **choices: Any) -> Fit:
     return fit._replace(history=near.history + fit.history)
 
 
-def weigh(problem: Problem, z: np.ndarray, tol: float, loss: Loss, least: float = 0.0) -> None:
-    """Take as the noise of each channel whose noise is not known what a fit leaves of it, and `least` of what it shows."""
+def weigh(problem: Problem | Shooting, z: np.ndarray, tol: float, loss: Loss, least: float = 0.0) -> bool:
+    """Take as the noise of each channel whose noise is not known what a fit leaves of it, and `least` of what it shows.
+
+    Return whether residuals weigh otherwise now, compared with each other.
+    """
+    before = problem.sigma.copy()
     found = problem.evaluate(z, (tol, tol))
     found = found if loss is None else loss(found)
     rows = len(problem.where)
@@ -182,18 +205,23 @@ def weigh(problem: Problem, z: np.ndarray, tol: float, loss: Loss, least: float 
     for c in range(len(problem.channels)):
         mine = (problem.where[:, 2] == c) & ~problem.known
         if mine.any():
-            free = mine.sum() - problem.K * mine.sum() / rows  # unknowns take their part of each channel's freedom
+            # Unknowns take their part of each channel's freedom.
+            free = mine.sum() * (1.0 - (problem.K - problem.tied) / rows)
             size = np.sqrt(left[mine] @ left[mine] / max(free, 1.0))
             problem.sigma[mine] = max(size, least * problem.spread[c], np.finfo(float).tiny ** 0.25 * problem.spread[c])
+    ratio = problem.sigma / before
+    return bool(ratio.max() > EQUAL * ratio.min()) or loss is not None or bool(len(problem.priors))
 
 
-def _check(settings: Mapping[str, Any]) -> None:
+def _check(settings: Mapping[str, Any], strategy: str) -> None:
     known = [name for name in inspect.signature(simulate).parameters if name not in DECIDED]
     problems = [
         f"{name}: no setting of simulate that can be given here{suggestion(name, known)}"
         for name in settings
         if name not in known
     ]
+    if strategy not in get_args(Strategy):
+        problems.append(f"strategy must be one of {', '.join(get_args(Strategy))}, is {strategy!r}")
     if problems:
         raise IdentificationError(problems)
 

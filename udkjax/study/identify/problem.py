@@ -114,6 +114,11 @@ class Problem:
         """Rows that follow those of what was measured."""
         return len(self.priors)
 
+    @property
+    def tied(self) -> int:
+        """Unknowns that further rows decide about, and not what was measured."""
+        return 0
+
     def members(self, z: Float[np.ndarray, "B K"], horizon: float | None = None) -> Members:
         """The members of B sets of unknowns: all records of the first, then of the next."""
         sets, P, records = len(z), len(self.unknowns.names), len(self.records)

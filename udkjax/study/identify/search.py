@@ -2,11 +2,12 @@
 
 A long record has many minima: one for each number of swings by which a guess can be wrong. So a fit that does not explain the
 whole record from its first guess begins with the first few samples, which have one minimum, and takes more and more of the
-record, each time from where it was; and where that fails too, from other guesses beside the first.
+record, each time from where it was; and where that fails too, from other guesses beside the first. What is left are records
+of chaotic motion: see shooting.py.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,10 +15,13 @@ from jaxtyping import Float
 from udkjax.study.identify.fitting import Fit, descend
 from udkjax.study.identify.parameters import Unknowns
 from udkjax.study.identify.problem import Evaluated, Problem
+from udkjax.study.identify.shooting import Lost, Shooting, shoot
 
 # Tolerance of the integration on the way, and the change of an unknown below which it decides: what is left is polished away at
 # the end.
 LOOSE, SETTLED = 1e-7, 1e-5
+SHOTS = 4  # guesses from which the records are looked at in pieces
+PIECEWISE = 1e-9  # tolerance of the integration of pieces: what holds them together is no better
 TRIED = 25  # steps from a first guess along the whole record: a fit that does not settle in them is on its way to nowhere
 ON_THE_WAY = 15, 1e-3  # steps along a part of a record, and the change of an unknown at which they are enough
 SAMPLES = 3.0  # residuals per unknown in the first part of a record that is looked at
@@ -29,6 +33,8 @@ LIKELY = 2.0  # mean square of residuals whose noise is known, at which they are
 WHITE = 4.0  # standard deviations of the correlation of neighbouring residuals, up to which they are taken for noise
 SAME = 1e-4  # of an unknown: fits this near are at one minimum
 
+Strategy = Literal["auto", "pieces"]
+
 
 class Found(NamedTuple):
     """The best fit, how many of how many first guesses led there, and what was done, in words."""
@@ -38,6 +44,7 @@ class Found(NamedTuple):
     guesses: int
     ways: tuple[str, ...]
     history: list[tuple[float, ...]]
+    problem: Problem | Shooting  # that the unknowns of the fit are of
 
 
 def search(
@@ -47,17 +54,26 @@ def search(
     more: int = GUESSES,
     seed: int = 0,
     tell: Callable[[str], None] = lambda text: None,
+    strategy: Strategy = "auto",
     **choices: Any,
 ) -> Found:
-    """Find the unknowns that explain the records best, from first guesses (B, K) and, if needed, `more` beside the first."""
+    """Find the unknowns that explain the records best, from first guesses (B, K) and, if needed, `more` beside the first.
+
+    Where all that fails and the guesses do not agree, the records are cut into pieces; with the strategy "pieces" at once.
+    """
     loose = max(tol[0], LOOSE), max(tol[1], LOOSE)
-    ways, history = ["whole records"], []
+    if strategy == "pieces":
+        along = growing(problem, z, loose, tell, **choices)
+        if found := in_pieces(problem, np.concatenate([along.z, z]), tol, tell, **choices):
+            return found._replace(history=along.history + found.history)
+    ways, history, tried = ["whole records"], [], [z]
     fit = descend(problem, z, loose, None, TRIED, SETTLED, tell=_telling(tell, "whole records"), **choices)
     history += fit.history
     if not explains(problem, fit, loose, choices.get("loss")):
         ways.append("growing records")
         other = growing(problem, z, loose, tell, **choices)
         history += other.history
+        tried = [other.z, z]
         fit = _better(fit, other)
     if more and not explains(problem, fit, loose, choices.get("loss")):
         ways.append(f"{more} more first guesses")
@@ -65,12 +81,48 @@ def search(
         other = growing(problem, guesses, loose, tell, **choices)
         history += other.history
         z = np.concatenate([z, guesses])
+        tried.append(other.z)
         fit = _together(fit, other)
     best = int(np.argmin(fit.cost))
     there = np.abs(fit.z - fit.z[best]).max(1) <= SAME * (1.0 + np.abs(fit.z[best]).max())
     agreeing = int((there & np.isfinite(fit.cost)).sum())
     only = Fit(fit.z[best : best + 1], fit.cost[best : best + 1], fit.settled[best : best + 1], fit.evaluations, fit.history)
-    return Found(only, agreeing, len(z), tuple(ways), history)
+    if more and 2 * agreeing < len(z) and not explains(problem, only, loose, choices.get("loss")):
+        found = in_pieces(problem, np.concatenate(tried), tol, tell, **choices)
+        if found:
+            return found._replace(guesses=len(z), ways=(*ways, *found.ways), history=history + found.history)
+    return Found(only, agreeing, len(z), tuple(ways), history, problem)
+
+
+def in_pieces(
+    problem: Problem, z: Float[np.ndarray, "B K"], tol: tuple[float, float], tell: Callable[[str], None], **choices: Any
+) -> Found | None:
+    """Fit the records in pieces, from the most promising guesses until one explains them; None: none does.
+
+    Where the motion is not so chaotic that whole records are beyond the errors of their integration, the fit is of these.
+    """
+    loose = max(tol[0], PIECEWISE), max(tol[1], PIECEWISE)
+    for k, guess in enumerate(promising(problem, z, loose)[:SHOTS]):
+        try:
+            pieces, fit = shoot(problem, guess, loose, tell=tell, **choices)
+        except Lost:
+            continue
+        if explains(pieces, fit, loose, choices.get("loss")):
+            history = fit.history
+            found = Found(fit, 1, k + 1, ("records in pieces",), history, pieces)
+            say = _telling(tell, "whole records")
+            whole = descend(problem, fit.z[:, : problem.K], tol, None, TRIED, SETTLED, near=True, tell=say, **choices)
+            if explains(problem, whole, tol, choices.get("loss")):
+                return found._replace(fit=whole, history=history + whole.history, problem=problem)
+            return found
+    return None
+
+
+def promising(problem: Problem, z: Float[np.ndarray, "B K"], tol: tuple[float, float]) -> Float[np.ndarray, "B K"]:
+    """Guesses, the best first: those that leave least of the records and of their first parts, which all count alike."""
+    with np.errstate(divide="ignore"):
+        logs = [np.log(np.sum(np.square(problem.evaluate(z, tol, part).r), axis=1)) for part in horizons(problem)]
+    return z[np.argsort(np.nan_to_num(np.sum(logs, axis=0), nan=np.inf), kind="stable")]
 
 
 def growing(
@@ -120,7 +172,7 @@ def beside(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int) -> Flo
     return np.concatenate([u.unknowns(low + (high - low) * inside), starts], axis=1)
 
 
-def explains(problem: Problem, fit: Fit, tol: tuple[float, float], loss: Any) -> bool:
+def explains(problem: Problem | Shooting, fit: Fit, tol: tuple[float, float], loss: Any) -> bool:
     """Whether the best of some fits leaves nothing but noise."""
     best = int(np.argmin(fit.cost))
     if not (np.isfinite(fit.cost[best]) and fit.settled[best]):

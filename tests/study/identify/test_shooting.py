@@ -1,0 +1,105 @@
+"""Records in pieces: exact derivatives, the fit of whole records where that exists, and a fit of chaos where it does not."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
+from udkjax.study.identify.fitting import descend
+from udkjax.study.identify.identify import identify
+from udkjax.study.identify.parameters import unknowns_of
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.records import Record
+from udkjax.study.identify.search import explains, growing, search
+from udkjax.study.identify.shooting import Shooting, cut, shoot
+
+TOL = 1e-10, 1e-10
+NOISE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def problem(measured):
+    noisy = measured[1] + NOISE * np.random.default_rng(1).standard_normal(len(TS))
+    first = pendulum(0.5, 0.1)
+    return Problem(first, unknowns_of(first, NAMES), [Record(TS, {ANGLE: noisy}, noise=NOISE)])
+
+
+@pytest.fixture(scope="module")
+def pieces(problem):
+    return Shooting(problem, np.zeros(problem.K), TOL, samples=6)
+
+
+def test_each_number_is_in_one_piece(problem, pieces):
+    parts = cut(problem, 12)
+    assert parts == pieces.pieces and len(parts) == 5
+    assert parts[0].first == 0 and parts[-1].end == len(TS) - 1
+    assert all(one.end == two.first for one, two in pairwise(parts))
+    assert np.array_equal(pieces.times[pieces.piece, pieces.time], TS)
+    assert np.array_equal(pieces.times[1:, 0], pieces.times[:-1, -1]) and (np.diff(pieces.times) > 0).all()
+    assert pieces.K == 2 + 4 * 2 == len(pieces.all_names) == len(pieces.all_units)
+
+
+def test_derivatives(pieces):
+    z = pieces.guess + 0.1 * np.random.default_rng(0).standard_normal(pieces.K)
+    h = 1e-5
+    moved = np.concatenate([z + h * np.eye(pieces.K), z - h * np.eye(pieces.K)])
+    r = pieces.evaluate(moved, TOL).r
+    by_differences = (r[: pieces.K] - r[pieces.K :]).T / (2.0 * h)
+    J = pieces.evaluate(z[None], TOL).J[0]
+    assert np.abs(J - by_differences).max() < 1e-5 * np.abs(J).max()
+    assert J.shape == (len(TS) + pieces.more, pieces.K)
+
+
+def test_a_first_guess_follows_what_was_measured(pieces):
+    """With an inertia that is a third too large, each piece begins beside where the motion was then."""
+    found = pieces.evaluate(pieces.guess[None], TOL)
+    assert np.sqrt(np.mean(found.r[0, : len(TS)] ** 2)) < 30.0  # 0.03 rad of 1.2
+    assert 1e-3 < pieces.gaps(pieces.guess[None], TOL)[0] < 1.0
+
+
+def test_the_fit_is_that_of_the_whole_record(problem):
+    pieces, fit = shoot(problem, np.zeros(problem.K), TOL, samples=6)
+    assert fit.settled[0] and explains(pieces, fit, TOL, None)
+    assert pieces.gaps(fit.z, TOL)[0] < 1e-7
+    whole = descend(problem, fit.z[:, :2], TOL, near=True)
+    assert np.abs(fit.z[0, :2] - whole.z[0]).max() < 1e-5
+    assert np.all(np.abs(problem.unknowns.values(fit.z[0, :2]) / [0.375, 0.2] - 1.0) < 0.02)
+    # Errors of the integration, 1e-9, count in defects, which weigh 1e7.
+    assert fit.cost[0] == pytest.approx(whole.cost[0], rel=1e-3)
+
+
+def test_whole_records_end_the_fit_where_they_can(problem):
+    found = search(problem, np.zeros((1, problem.K)), TOL, strategy="pieces")
+    assert found.ways == ("records in pieces",) and found.problem is problem and found.fit.settled[0]
+    assert found.fit.z.shape == (1, 2)
+
+
+def test_an_unknown_strategy_is_refused(problem):
+    with pytest.raises(udk.IdentificationError, match="strategy must be one of auto, pieces, is 'shoot'"):
+        identify(pendulum(), problem.records[0], NAMES, strategy="shoot")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.slow
+def test_chaos():
+    """A double pendulum for 25 s, in which errors grow by 1e12: no whole run stays with what was measured, however exact."""
+    noise, ts = 0.01, np.linspace(0.0, 25.0, 501)
+    truth = udk.library.double_pendulum(angles=(np.pi / 2, 0.0))
+    names = ("body.lower.mass", "length(upper)", "joint.elbow.points[1][0]")
+    values = np.array([1.0, 1.0, -0.5])
+    q = np.asarray(udk.simulate(truth, ts, rtol=1e-12, atol=1e-12).q)[:, :, 2]
+    q = q + noise * np.random.default_rng(0).standard_normal(q.shape)
+    record = Record(ts, {"body.upper.angle": q[:, 0], "body.lower.angle": q[:, 1]}, noise=noise)
+    for factors in ((1.4, 0.6, 1.5), (0.55, 1.45, 0.6)):
+        first = truth.with_parameters({names[0]: factors[0], names[2]: values[2] * factors[2]})
+        first = udk.with_length(first, "upper", factors[1])
+        whole = Problem(first, unknowns_of(first, names), [record])
+        along = growing(whole, np.zeros((1, 3)), TOL, lambda text: None)
+        assert along.cost[0] > 1e3 * q.size  # half of it would be noise
+        estimate = identify(first, record, names, progress=False)
+        assert estimate.ways[-1] == "records in pieces" and isinstance(estimate.problem, Shooting)
+        assert estimate.success
+        errors = estimate.knowledge.standard_errors
+        assert np.all(errors < 2e-4) and np.all(np.abs(estimate.values - values) < 4.0 * errors)
+        assert estimate.knowledge.chi2 / estimate.knowledge.degrees_of_freedom == pytest.approx(1.0, abs=0.15)
