@@ -79,11 +79,13 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import with_angle as with_angle
     from udkjax.scene import with_length as with_length
     from udkjax.study.identify import Estimate as Estimate
+    from udkjax.study.identify import GradientCheck as GradientCheck
     from udkjax.study.identify import IdentificationError as IdentificationError
     from udkjax.study.identify import Parameter as Parameter
     from udkjax.study.identify import Quantity as Quantity
     from udkjax.study.identify import Record as Record
     from udkjax.study.identify import Start as Start
+    from udkjax.study.identify import check_gradients as check_gradients
     from udkjax.study.identify import identify as identify
     from udkjax.study.identify import length as length
     from udkjax.study.sweep import Axis as Axis
@@ -107,7 +109,8 @@ _NAMES = {
     "udkjax.equations": """
         ConstrainedSystem Baumgarte accelerations check violation energy reactions
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
-    "udkjax.study.identify": "identify Record Start Parameter length Quantity Estimate IdentificationError",
+    "udkjax.study.identify": """
+        identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck""",
     "udkjax.study.sweep": "sweep Axis Zipped Sobol LatinHypercube Random SweepError",
     "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }

@@ -116,7 +116,8 @@ def _sentences(check: GradientCheck) -> list[str]:
     for d, (name, s) in enumerate(zip(check.names, check.worst, strict=True)):
         if sentence := _sentence(check, d, s):
             found.setdefault(sentence, []).append(name)
-    return [f"{listed(names)}: {sentence}" for sentence, names in found.items()]
+    every = len(check.names)
+    return [f"{'all directions' if len(of) == every > 1 else listed(of)}: {sentence}" for sentence, of in found.items()]
 
 
 def _sentence(check: GradientCheck, d: int, s: int) -> str:

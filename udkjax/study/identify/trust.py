@@ -76,7 +76,7 @@ def compare(problem: Problem | Shooting, z: Float[np.ndarray, "K"], tol: tuple[f
     of = [f"{label}, " for label in labels(problem.records)] if len(problem.records) > 1 else [""]
     return GradientCheck(
         title=problem.mechanism.name or "mechanism",
-        names=(*names, *(f"all together, at random ({k + 1})" for k in range(len(random)))),
+        names=(*names, *(f"random direction {k + 1}" for k in range(len(random)))),
         directions=directions,
         series=tuple((k, channel.name) for k, channel in keys),
         said=tuple(of[k] + channel.name for k, channel in keys),
