@@ -78,6 +78,8 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import save as save
     from udkjax.scene import with_angle as with_angle
     from udkjax.scene import with_length as with_length
+    from udkjax.study.identify import Candidate as Candidate
+    from udkjax.study.identify import Design as Design
     from udkjax.study.identify import Estimate as Estimate
     from udkjax.study.identify import GradientCheck as GradientCheck
     from udkjax.study.identify import IdentificationError as IdentificationError
@@ -86,6 +88,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.study.identify import Record as Record
     from udkjax.study.identify import Start as Start
     from udkjax.study.identify import check_gradients as check_gradients
+    from udkjax.study.identify import design_experiment as design_experiment
     from udkjax.study.identify import identify as identify
     from udkjax.study.identify import length as length
     from udkjax.study.sweep import Axis as Axis
@@ -110,7 +113,8 @@ _NAMES = {
         ConstrainedSystem Baumgarte accelerations check violation energy reactions
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
     "udkjax.study.identify": """
-        identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck""",
+        identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck
+        design_experiment Candidate Design""",
     "udkjax.study.sweep": "sweep Axis Zipped Sobol LatinHypercube Random SweepError",
     "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }

@@ -75,7 +75,7 @@ class Estimate:
         x = unknowns.values(z[:P])
         plain = problem.evaluate(fit.z, tol)
         counted = plain if loss is None else loss(plain)
-        groups = _groups(problem)
+        groups = groups_of(problem)
         values = Values(
             problem.all_names,
             problem.all_units,
@@ -245,7 +245,7 @@ def _plain(x: Any) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 
-def _groups(problem: Problem | Shooting) -> np.ndarray:
+def groups_of(problem: Problem | Shooting) -> np.ndarray:
     """Of each residual, which noise it shares that is to be estimated: that of its channel; -1 where it is known."""
     unknown = np.where(problem.known, -1, problem.where[:, 2])
     _, group = np.unique(unknown, return_inverse=True)

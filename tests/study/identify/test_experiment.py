@@ -1,0 +1,125 @@
+"""Experiments are ranked by what they tell: as differences say, and as everybody knows of pendulums."""
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax.scene.drivers import Sine
+from udkjax.study.identify.experiment import Candidate, design_experiment
+from udkjax.study.identify.records import Start
+
+NAMES = ("body.lower.inertia", "force.damper.damping")
+CHANNEL, NOISE = "body.lower.angle", 0.01
+AMPLITUDE, FREQUENCY = "driver.motor.motion.amplitude", "driver.motor.motion.frequency"
+TS = np.linspace(0.0, 4.0, 41)
+ANGLES = (0.0, 0.3, 1.0)
+
+
+def scene(angle: float = 0.0) -> udk.Mechanism:
+    """A pendulum with a damped pin, hung on a rod that a motor swings."""
+    rods = udk.library.double_pendulum(angles=(0.0, angle))
+    motor = udk.Driver(("ground", "upper"), "angle", Sine(0.2, 3.0, offset=-np.pi / 2))
+    damper = udk.TorsionSpring(("upper", "lower"), stiffness=0.0, damping=0.1)
+    return udk.Mechanism(rods.bodies, rods.joints, {"motor": motor}, {"damper": damper}, rods.gravity)
+
+
+def released(angle: float) -> Start:
+    mech = scene(angle)
+    return Start(udk.State(mech.q0, mech.v0))
+
+
+def prediction(inertia: float, damping: float, angle: float, amplitude: float) -> np.ndarray:
+    mech = scene(angle).with_parameters({NAMES[0]: inertia, NAMES[1]: damping, AMPLITUDE: amplitude})
+    return np.asarray(udk.simulate(mech, TS, rtol=1e-11, atol=1e-11).q)[:, 1, 2]
+
+
+@pytest.fixture(scope="module")
+def candidates():
+    """Released from angles without the motor, and from the middle one with it."""
+    still = [Candidate({AMPLITUDE: 0.0}, released(angle), f"{angle:g} rad") for angle in ANGLES]
+    return [*still, Candidate({AMPLITUDE: 0.2}, released(ANGLES[1]), "driven")]
+
+
+@pytest.fixture(scope="module")
+def design(candidates):
+    return design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, pick=2)
+
+
+def test_what_does_not_move_tells_nothing(design):
+    assert design.scores[0] == -np.inf and np.all(np.isinf(design.standard_errors[0])) and design.order[-1] == 0
+
+
+def test_the_higher_it_is_released_the_more_it_tells(design):
+    assert design.scores[2] > design.scores[1] > design.scores[0]
+    assert np.all(design.standard_errors[2] < design.standard_errors[1])
+
+
+def test_ranking_and_errors_are_those_of_differences(design):
+    x = np.array([float(scene().parameters()[name]) for name in NAMES])
+    scores, errors = [], []
+    for angle, amplitude in ((ANGLES[1], 0.0), (ANGLES[2], 0.0), (ANGLES[1], 0.2)):
+        columns = []
+        for k in range(2):
+            moved = np.exp([[1e-4 * (k == 0), 1e-4 * (k == 1)], [-1e-4 * (k == 0), -1e-4 * (k == 1)]]) * x
+            one, two = (prediction(inertia, damping, angle, amplitude) for inertia, damping in moved)
+            columns.append((one - two) / 2e-4 / NOISE)
+        J = np.stack(columns, axis=1)
+        scores.append(np.linalg.slogdet(J.T @ J)[1])
+        errors.append(np.sqrt(np.diag(np.linalg.inv(J.T @ J))) * x)
+    assert design.scores[1:] == pytest.approx(scores, abs=1e-4)
+    assert design.standard_errors[1:] == pytest.approx(np.array(errors), rel=1e-4)
+    assert design.order[:3] == tuple(1 + k for k in np.argsort(scores)[::-1])
+
+
+def test_those_that_are_made_together(design, candidates):
+    assert design.chosen[0] == design.best and len(set(design.chosen)) == 2
+    information = sum(1.0 / design.together[0] ** 2)
+    assert sum(1.0 / design.together[1] ** 2) > information
+    assert "driven" in str(design) and str(design).splitlines()[1].startswith(candidates[design.best].name)
+
+
+@pytest.mark.parametrize("criterion", ["A", "E"])
+def test_other_criteria(candidates, criterion):
+    found = design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, criterion)
+    assert found.order[-1] == 0 and found.scores[2] > found.scores[1]
+    known = np.argsort(-found.scores)
+    assert tuple(known) == found.order
+
+
+def test_parameters_that_do_not_matter(candidates, design):
+    """What is not asked for is eliminated: errors stay as they are, and the score is that of one parameter."""
+    found = design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, of=NAMES[:1])
+    assert found.names == NAMES[:1]
+    assert found.standard_errors[1:, 0] == pytest.approx(design.standard_errors[1:, 0], rel=1e-6)
+    inertia = float(scene().parameters()[NAMES[0]])
+    assert found.scores[1:] == pytest.approx(-2.0 * np.log(found.standard_errors[1:, 0] / inertia), abs=1e-6)
+
+
+def test_what_a_prior_tells_counts(candidates):
+    known = udk.Parameter(NAMES[0], prior=(1 / 12, 1e-9))
+    found = design_experiment(scene(), candidates, [known, NAMES[1]], [CHANNEL], TS, NOISE)
+    alone = design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE)
+    assert found.standard_errors[0, 0] == pytest.approx(1e-9, rel=1e-6) and np.isinf(found.standard_errors[0, 1])
+    assert np.all(found.standard_errors[1:, 1] <= alone.standard_errors[1:, 1] * (1.0 + 1e-9))
+
+
+def test_an_estimate_counts_as_made(candidates):
+    """Its records add their information: with the standard errors that it tells, a candidate that says nothing changes none."""
+    q = prediction(1 / 12, 0.1, ANGLES[1], 0.0) + NOISE * np.random.default_rng(0).standard_normal(len(TS))
+    data = udk.Record(TS, {CHANNEL: q}, NOISE, released(ANGLES[1]), conditions={AMPLITUDE: 0.0})
+    estimate = udk.identify(scene(), data, NAMES, progress=False)
+    found = design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, given=estimate)
+    assert found.standard_errors[0] == pytest.approx(estimate.knowledge.standard_errors, rel=1e-5)
+    assert found.standard_errors[1] == pytest.approx(estimate.knowledge.standard_errors / np.sqrt(2.0), rel=0.02)
+    assert found.order[-1] == 0
+
+
+def test_mistakes_are_told(candidates):
+    with pytest.raises(udk.IdentificationError, match="criterion must be one of D, A, E, is 'X'"):
+        design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, "X")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(udk.IdentificationError, match="candidates: there is none"):
+        design_experiment(scene(), [], NAMES, [CHANNEL], TS, NOISE)
+    with pytest.raises(udk.IdentificationError, match="candidate 1: must be a Candidate, conditions or a start, is int"):
+        design_experiment(scene(), [3], NAMES, [CHANNEL], TS, NOISE)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(udk.IdentificationError, match="of: mass is not among the parameters"):
+        design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, of=["mass"])
