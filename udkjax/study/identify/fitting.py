@@ -20,8 +20,9 @@ from udkjax.study.identify.problem import Evaluated
 STEPS = 60
 SETTLED = 1e-10  # of an unknown, dimensionless: a Gauss-Newton step below it changes nothing that can be told
 # Cosine of the angle between residuals and what the unknowns can change of them: times the root of their number it is a
-# Gauss-Newton step in standard errors, of which a hundred-thousandth changes nothing either.
-NOTHING = 1e-6
+# Gauss-Newton step in standard errors, of which a thousandth changes nothing either.
+NOTHING = 1e-5
+ROUNDED, TWICE = 1e-6, 2  # a Gauss-Newton step as short as this that is refused twice is lost in the errors of the integration
 FLAT = 1e-9  # of the largest singular value: directions that a step is not expected to be known in
 FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
 # What residuals are multiplied by, over the largest singular value: the method's first damping is 1 / FIRST^2 of its square.
@@ -93,7 +94,7 @@ def descend(
         at, best = np.where(better[:, None], trial, at), np.where(better, costs, best)
         reduced = np.where(better[:, None, None], triangles, reduced)
         size, cosine = _newton(reduced)
-        ended |= going & ((size <= settled) | (cosine <= NOTHING))
+        ended |= going & ((size <= settled) | (cosine <= NOTHING) | ((size <= ROUNDED) & (refused >= TWICE)))
         leader = int(np.argmin(best))
         history.append((float(best[leader]), float(size[leader])))
         tell(f"step {count + 1}, cost {best.min():.4g}, {int(going.sum())} going")
