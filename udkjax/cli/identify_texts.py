@@ -53,7 +53,7 @@ class Texts:
         left_out = [name for group in ignore for name in group]
         found = self._tried(lambda: records_of(self.mechanism, list(data), by_channel, left_out), ())
         found = self._tried(lambda: records_of(self.mechanism, found, everywhere), ()) if found else ()
-        return [Record(r.times, r.values, r.noise, Start(estimate=start), r.t0, r.conditions, r.name) for r in found]
+        return [record.starting(Start(estimate=start)) for record in found]
 
     def profiled(self, groups: Groups) -> list[str]:
         """The names of parameters, as the estimate has them, that are called by all of their names or one of them."""

@@ -251,3 +251,12 @@ def test_a_first_guess_that_cannot_be_closed():
     first = udk.with_length(mech, "coupler", 0.9)
     estimate = found(first, data, ["length(coupler)", "body.rocker.mass"])
     assert estimate.values == pytest.approx([2.5, 2.0], rel=1e-8)
+
+
+@pytest.mark.slow
+def test_a_start_for_all_records(measured):
+    data = {"time": TS, ANGLE: measured[1]}
+    turned = pendulum(0.5, 0.1, angle=1.1)
+    estimate = found(turned, data, start="position")
+    assert off(estimate) < 1e-9 and [name.endswith("body.rod.angle") for name in estimate.start_values] == [True]
+    assert float(estimate.starts[0].q[0, 2]) == pytest.approx(measured[1][0], abs=1e-10)

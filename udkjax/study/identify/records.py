@@ -86,6 +86,10 @@ class Record:
             where = f"record {quoted(name)}: " if name else ""
             raise IdentificationError([where + problem for problem in problems])
 
+    def starting(self, start: Start) -> "Record":
+        """The same with another start."""
+        return Record(self.times, self.values, self.noise, start, self.t0, self.conditions, self.name)
+
     def __repr__(self) -> str:
         return f"Record({len(self.times)} times, {', '.join(map(str, self.values))})"
 
