@@ -16,6 +16,7 @@ from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.scene.checks import SceneError, suggestion
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.descent import method_of
 from udkjax.study.identify.errors import IdentificationError
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.fitting import Fit, descend
@@ -24,7 +25,7 @@ from udkjax.study.identify.losses import Loss, loss_of
 from udkjax.study.identify.parameters import Unknowns, applied, unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.reading import records_of
-from udkjax.study.identify.records import Record
+from udkjax.study.identify.records import Estimated, Record, Start
 from udkjax.study.identify.search import GUESSES, SETTLED, Found, Strategy, beside, search
 from udkjax.study.identify.shooting import Shooting
 from udkjax.study.progress import Line
@@ -57,8 +58,9 @@ def identify(
     parameters: Sequence[Any] | str,
     *,
     noise: Any = None,
+    start: Start | Estimated | None = None,
     starts: int | Any = GUESSES,
-    loss: str = "least_squares",
+    loss: str | Callable[[Any], Any] = "least_squares",
     optimizer: Any = None,
     strategy: Strategy = "auto",
     tol: float = TOL,
@@ -73,14 +75,18 @@ def identify(
     NetCDF file, or a sequence of these: records, each with a start of its own. `parameters` are names of numbers of the scene,
     `length`s, ties in text (`body.a.mass = body.b.mass`), or `Parameter`s with bounds and priors. `noise` is the standard
     deviation of all channels, or maps channels to theirs; where none is given it is estimated from what the fit leaves. `ignore`
-    names columns of tables that are not looked at.
+    names columns of tables that are not looked at. `start` is the `Start` of every record, or what of it is to be estimated
+    ("position", "velocity", "both"); by default the records' own, and for those of tables the scene's.
 
     With y what was measured and yhat(z) what the mechanism shows, sum ((yhat(z) - y) / sigma)^2 is minimized, by
     Levenberg-Marquardt with exact forward derivatives, through the closure of all loops; `loss="huber"` lets single wrong
-    numbers count less, `optimizer` is another least-squares solver of optimistix. Where the first guess does not lead to a fit
-    that explains the records, it is looked for along growing parts of them, and from other guesses: `starts` is how many more
-    there may be (0: none), or an array of guesses (B, P) to try besides the first. Where these do not agree either, as along
-    chaotic motion, the records are cut into pieces that are held together; `strategy="pieces"` does so at once.
+    numbers count less, and a function of the weighted residuals (R,) by JAX is minimized itself (standard errors stay those of
+    squares). `optimizer` is another least-squares solver of optimistix, or any optimizer of optax.
+
+    Where the first guess does not lead to a fit that explains the records, it is looked for along growing parts of them, and
+    from other guesses: `starts` is how many more there may be (0: none), or an array of guesses (B, P) to try besides the first.
+    Where these do not lead to one either, as along chaotic motion, the records are cut into pieces that are held together;
+    `strategy="pieces"` does so at once.
 
     `tol` is the tolerance of the integration at the end; `settings` are others of `simulate`. `progress`: None shows a line,
     False nothing.
@@ -89,11 +95,11 @@ def identify(
     than it needs. What the records cannot tell is no error: `Estimate.success` is false, and `Estimate.message` says what.
     """
     begun = time.perf_counter()
-    problem = posed(mechanism, data, parameters, settings, noise, ignore, seed, strategy)
-    lost = loss_of(loss, len(problem.where))
+    problem = posed(mechanism, data, parameters, settings, noise, ignore, seed, strategy, start)
+    lost = None if callable(loss) else loss_of(loss, len(problem.where))
     tell = _teller(progress)
     guesses, more = _guesses(problem, starts)
-    choices = {"loss": lost, "method": optimizer}
+    choices = {"loss": lost, "method": method_of(optimizer, loss)}
     found = search(problem, guesses, (tol, tol), more, seed, tell, strategy, **choices)
     _require_some(problem, found)
     fit, history = _settled(found, tol, tell, choices)
@@ -110,14 +116,22 @@ def posed(
     ignore: Sequence[str] = (),
     seed: int = 0,
     strategy: Strategy = "auto",
+    start: Start | Estimated | None = None,
 ) -> Problem:
     """The problem that arguments of `identify` pose. Raises `IdentificationError`, which lists every mistake."""
     unknowns, records = _gathered(
         lambda: _check(settings, strategy),
         lambda: unknowns_of(mechanism, parameters),
-        lambda: records_of(mechanism, data, noise, ignore),
+        lambda: _started(records_of(mechanism, data, noise, ignore), start),
     )[1:]
     return _begun(mechanism, unknowns, records, settings, seed)
+
+
+def _started(records: Sequence[Record], start: Start | Estimated | None) -> Sequence[Record]:
+    if start is None:
+        return records
+    given = start if isinstance(start, Start) else Start(estimate=start)
+    return [record.starting(given) for record in records]
 
 
 def _gathered(*steps: Callable[[], Any]) -> list[Any]:

@@ -20,6 +20,7 @@ from udkjax.study.identify.shooting import Lost, Shooting, shoot
 # Tolerance of the integration on the way, and the change of an unknown below which it decides: what is left is polished away at
 # the end.
 LOOSE, SETTLED = 1e-7, 1e-5
+CHAOTIC = 100.0  # times larger derivatives in the second halves of records than in the first: t^2 makes 4 of it
 SHOTS = 4  # guesses from which the records are looked at in pieces
 PIECEWISE = 1e-9  # tolerance of the integration of pieces: what holds them together is no better
 TRIED = 25  # steps from a first guess along the whole record: a fit that does not settle in them is on its way to nowhere
@@ -59,7 +60,8 @@ def search(
 ) -> Found:
     """Find the unknowns that explain the records best, from first guesses (B, K) and, if needed, `more` beside the first.
 
-    Where all that fails and the guesses do not agree, the records are cut into pieces; with the strategy "pieces" at once.
+    Where all that fails, and the guesses do not agree or the motion is chaotic, the records are cut into pieces; with the
+    strategy "pieces" at once.
     """
     loose = max(tol[0], LOOSE), max(tol[1], LOOSE)
     if strategy == "pieces":
@@ -87,7 +89,8 @@ def search(
     there = np.abs(fit.z - fit.z[best]).max(1) <= SAME * (1.0 + np.abs(fit.z[best]).max())
     agreeing = int((there & np.isfinite(fit.cost)).sum())
     only = Fit(fit.z[best : best + 1], fit.cost[best : best + 1], fit.settled[best : best + 1], fit.evaluations, fit.history)
-    if more and 2 * agreeing < len(z) and not explains(problem, only, loose, choices.get("loss")):
+    lost = 2 * agreeing < len(z) or chaotic(problem, only.z, loose)  # else it is the mechanism that does not move like that
+    if more and lost and not explains(problem, only, loose, choices.get("loss")):
         found = in_pieces(problem, np.concatenate(tried), tol, tell, **choices)
         if found:
             return found._replace(guesses=len(z), ways=(*ways, *found.ways), history=history + found.history)
@@ -116,6 +119,15 @@ def in_pieces(
                 return found._replace(fit=whole, history=history + whole.history, problem=problem)
             return found
     return None
+
+
+def chaotic(problem: Problem, z: Float[np.ndarray, "1 K"], tol: tuple[float, float]) -> bool:
+    """Whether what a change does grows along a record as it does not where motions only fall out of step: like t or t^2."""
+    record, time, _ = problem.where.T
+    late = problem.ts[record, time] > 0.5 * (problem.ts[record, 0] + problem.ts[record, -1])
+    J = np.abs(problem.evaluate(z, tol).J[0, : len(problem.where), : len(problem.unknowns.names)])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return bool((J[late].max(0, initial=0.0) / J[~late].max(0, initial=0.0) > CHAOTIC).any())
 
 
 def promising(problem: Problem, z: Float[np.ndarray, "B K"], tol: tuple[float, float]) -> Float[np.ndarray, "B K"]:

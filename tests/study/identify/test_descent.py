@@ -1,0 +1,66 @@
+"""Fits by optimizers of optax: the minimum of least squares, and those of other losses."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
+from udkjax.study.identify.descent import descend_by
+from udkjax.study.identify.errors import IdentificationError
+from udkjax.study.identify.fitting import descend
+from udkjax.study.identify.identify import identify
+from udkjax.study.identify.parameters import unknowns_of
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.records import Record
+
+optax = pytest.importorskip("optax")
+TOL, NOISE = (1e-9, 1e-9), 1e-3
+
+
+def posed(angle: np.ndarray) -> Problem:
+    first = pendulum(0.4, 0.15)
+    return Problem(first, unknowns_of(first, NAMES), [Record(TS, {ANGLE: angle}, noise=NOISE)])
+
+
+@pytest.fixture(scope="module")
+def noisy(measured):
+    return measured[1] + NOISE * np.random.default_rng(1).standard_normal(len(TS))
+
+
+def test_lbfgs_ends_where_least_squares_do(noisy):
+    problem = posed(noisy)
+    fit = descend_by(optax.lbfgs(), problem, np.zeros((1, 2)), TOL, steps=100)
+    squares = descend(problem, np.zeros((1, 2)), TOL)
+    assert fit.settled[0] and len(fit.history) < 40
+    assert np.abs(fit.z - squares.z).max() < 1e-5
+    assert fit.cost[0] == pytest.approx(squares.cost[0], rel=1e-8)
+
+
+def test_adam_ends_there_too(noisy):
+    problem = posed(noisy)
+    optimizer = optax.adam(optax.exponential_decay(0.05, 30, 0.6))
+    fit = descend_by(optimizer, problem, np.zeros((1, 2)), TOL, steps=600, settled=1e-5)
+    squares = descend(problem, np.zeros((1, 2)), TOL)
+    assert fit.settled[0] and np.abs(fit.z - squares.z).max() < 1e-4
+
+
+def test_a_loss_of_the_users_own(noisy):
+    """Absolute residuals, rounded off at zero, are not moved by what is a hundred standard deviations wrong; squares are."""
+    noisy = noisy.copy()
+    noisy[5::10] += 0.1
+    problem = posed(noisy)
+    fit = descend_by(optax.lbfgs(), problem, np.zeros((1, 2)), TOL, steps=200, loss=lambda r: jnp.sum(jnp.sqrt(1.0 + r**2)))
+    squares = descend(problem, np.zeros((1, 2)), TOL)
+    truth = problem.unknowns.unknowns(np.array([0.375, 0.2]))
+    assert fit.settled[0] and np.abs(fit.z[0] - truth).max() < 0.02
+    assert np.abs(squares.z[0] - truth).max() > 3.0 * np.abs(fit.z[0] - truth).max()
+
+
+def test_identify_takes_them(noisy):
+    first, record = pendulum(0.4, 0.15), Record(TS, {ANGLE: noisy}, noise=NOISE)
+    squares = identify(first, record, NAMES, progress=False)
+    for choices in ({"optimizer": optax.lbfgs()}, {"loss": lambda r: 0.5 * jnp.sum(r**2)}):
+        estimate = identify(first, record, NAMES, progress=False, **choices)
+        assert estimate.converged and estimate.values == pytest.approx(squares.values, rel=1e-5)
+    with pytest.raises(IdentificationError, match="give an optimizer of optax"):
+        identify(first, record, NAMES, progress=False, loss=jnp.sum, optimizer=3)
