@@ -3,6 +3,9 @@
 With r the weighted residuals, J their Jacobian and rho(r) the loss (by default r.r / 2), an optimizer gets the value rho and the
 gradient J^T d rho / dr, both of one call of the compiled program; so does a line search at each point that it tries. A fit has
 settled, as in `descend`, where the step (J^T J)^-1 J^T d rho / dr is small: that of Gauss and Newton.
+
+Derivatives are taken forward here too. One gradient in reverse mode costs less (chains of 4 and 10 rods with 8 and 20 unknowns,
+2 s: 1.5 and 5.8 ms of CPU against 3.3 and 24 ms), but its program takes 17 and 37 s more to compile: thousands of steps.
 """
 
 from collections.abc import Callable
