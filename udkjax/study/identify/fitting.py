@@ -107,8 +107,8 @@ def descend(
         bad = ~np.isfinite(costs)
         seen = np.where(bad[:, None, None], 0.0, triangles * unit[:, None, None])
         seen[bad, -1, -1] = 10.0 * unit[bad] * np.sqrt(2.0 * best[bad] + 1.0)
-        y, state = step(state, y, jnp.asarray(trial), jnp.asarray(seen))
-        trial = np.array(state.y_eval)
+        y, state, following = step(state, y, trial, seen)
+        trial = np.array(following)
     return Fit(at, best, ended, problem.program.calls, history)
 
 
@@ -142,7 +142,7 @@ def _linear(y: Any, known: Any) -> tuple[Any, None]:
 
 @lru_cache(maxsize=32)
 def _machine(method: Any, K: int, sets: int) -> tuple[Any, Callable]:
-    """The method's first state and its step, of `sets` fits at once."""
+    """The method's first state, of arrays alone, and its step, of `sets` fits at once."""
     import optimistix
 
     solver = method
@@ -155,15 +155,16 @@ def _machine(method: Any, K: int, sets: int) -> tuple[Any, Callable]:
     def begun(y: Any, known: Any) -> Any:
         return solver.init(_linear, y, known, {}, residual, None, frozenset())
 
-    first = eqx.filter_vmap(begun)(*given)
+    first, fixed = eqx.partition(eqx.filter_vmap(begun)(*given), eqx.is_array)
 
-    @eqx.filter_jit
-    def step(state: Any, y: Any, trial: Any, triangles: Any) -> tuple[Any, Any]:
+    @jax.jit
+    def step(state: Any, y: Any, trial: Any, triangles: Any) -> tuple[Any, Any, Any]:
         def one(state: Any, y: Any, trial: Any, T: Any) -> tuple[Any, Any]:
             state = eqx.tree_at(lambda s: s.y_eval, state, trial)
             y, state, _ = solver.step(_linear, y, (trial, T), {}, state, frozenset())
             return y, state
 
-        return eqx.filter_vmap(one)(state, y, trial, triangles)
+        y, state = eqx.filter_vmap(one)(eqx.combine(state, fixed), y, trial, triangles)
+        return y, eqx.filter(state, eqx.is_array), state.y_eval
 
     return first, step

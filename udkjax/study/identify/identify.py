@@ -26,7 +26,7 @@ from udkjax.study.identify.parameters import Unknowns, applied, unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.reading import records_of
 from udkjax.study.identify.records import Estimated, Record, Start
-from udkjax.study.identify.search import GUESSES, SETTLED, Found, Strategy, beside, search
+from udkjax.study.identify.search import GUESSES, LOOSE, SETTLED, Found, Strategy, beside, search
 from udkjax.study.identify.shooting import Shooting
 from udkjax.study.progress import Line
 
@@ -36,7 +36,6 @@ EVEN = 1e-6  # of what a channel shows: residuals below it count alike, since th
 EQUAL = 1.05  # weights that differ by less, compared with each other, move no estimate by what counts beside its error
 POLISHED = 15  # steps at the end
 NEARBY = 64  # guesses that are tried where the first cannot be closed
-GLANCE, BRIEF = (1e-6, 1e-6), 1e-6  # tolerances, and the part of the records, of a run that shows whether a guess closes
 KNOWN = 256  # structures of mechanisms whose parameters were found legal
 PATIENCE = 2.0  # s: what is done before then needs no line to say so
 DECIDED = (
@@ -95,7 +94,7 @@ def identify(
     than it needs. What the records cannot tell is no error: `Estimate.success` is false, and `Estimate.message` says what.
     """
     begun = time.perf_counter()
-    problem = posed(mechanism, data, parameters, settings, noise, ignore, seed, strategy, start)
+    problem = posed(mechanism, data, parameters, settings, noise, ignore, seed, strategy, start, tol)
     lost = None if callable(loss) else loss_of(loss, len(problem.where))
     tell = _teller(progress)
     guesses, more = _guesses(problem, starts)
@@ -117,6 +116,7 @@ def posed(
     seed: int = 0,
     strategy: Strategy = "auto",
     start: Start | Estimated | None = None,
+    tol: float = TOL,
 ) -> Problem:
     """The problem that arguments of `identify` pose. Raises `IdentificationError`, which lists every mistake."""
     unknowns, records = _gathered(
@@ -124,7 +124,7 @@ def posed(
         lambda: unknowns_of(mechanism, parameters),
         lambda: _started(records_of(mechanism, data, noise, ignore), start),
     )[1:]
-    return _begun(mechanism, unknowns, records, settings, seed)
+    return _begun(mechanism, unknowns, records, settings, seed, tol)
 
 
 def _started(records: Sequence[Record], start: Start | Estimated | None) -> Sequence[Record]:
@@ -148,16 +148,18 @@ def _gathered(*steps: Callable[[], Any]) -> list[Any]:
 
 
 def _begun(
-    mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any], seed: int
+    mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any], seed: int, tol: float
 ) -> Problem:
     """The problem from the first guess; where that cannot be closed, from the nearest that can. Raises `IdentificationError`.
 
-    Whether a mechanism without redundant rows closes is seen by the first run: to look before costs more than the run.
+    Whether a mechanism without redundant rows closes is seen by the first run, which the fit begins with: to look before would
+    cost more than the run.
     """
     if unknowns.own and mechanism.left_out == ():
         try:
             problem = Problem(mechanism, unknowns, records, settings)
-            if problem.evaluate(np.zeros((1, problem.K)), GLANCE, BRIEF).code[0] != Result.could_not_assemble:
+            first = problem.evaluate(np.zeros((1, problem.K)), (max(tol, LOOSE), max(tol, LOOSE)))
+            if first.code[0] != Result.could_not_assemble:
                 return problem
         except AssemblyError:
             pass

@@ -229,7 +229,7 @@ def _row(mechanism: Mechanism, p: Parameter, name: str, target: Target, first: f
         raise ValueError(f"transform must be one of {', '.join(get_args(Transform))}, is {kind!r}")
     low, high = p.bounds if p.bounds is not None else (np.nan, np.nan)
     if p.bounds is not None and not np.isfinite(p.bounds).all():
-        raise ValueError(f"bounds must be two finite numbers, are ({low}, {high}); what has no upper one can be \"positive\"")
+        raise ValueError(f'bounds must be two finite numbers, are ({low}, {high}); what has no upper one can be "positive"')
     if kind == "bounded" and not low < start < high:
         raise ValueError(f"the first guess {start:g} must be between the bounds ({low}, {high}): move the one or the others")
     if kind == "positive" and not start > 0:

@@ -67,6 +67,7 @@ class Problem:
         self.starts, self.columns = _starts(mechanism, unknowns, self.records)
         self.K = len(unknowns.names) + sum(len(start.names) for start in self.starts)
         self._numbers()
+        self._conditions = _conditions(mechanism, self.records)
         self.program = Program(mechanism, unknowns.targets, self.channels, settings or {})
 
     @property
@@ -138,7 +139,7 @@ class Problem:
             mech = self.mechanism
             q = np.stack([np.asarray(mech.q0 if state is None else state.q) for state in states])
             v = np.stack([np.asarray(mech.v0 if state is None else state.v) for state in states])
-        one = ts, q, v, bases, _conditions(self.mechanism, self.records)
+        one = ts, q, v, bases, self._conditions
         ts, q, v, bases, conditions = _tiled(one, sets)
         return Members(x, shift.reshape(sets * records, S), ts, q, v, bases, conditions)
 

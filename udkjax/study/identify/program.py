@@ -9,6 +9,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -73,6 +74,9 @@ class Program:
         self.settings = dict(settings)
         self.calls = 0
         self._latest: OrderedDict[bytes, Predicted] = OrderedDict()
+        self._arrays, fixed = eqx.partition((mechanism, self.settings), eqx.is_array)
+        self._static = Static(fixed, targets, channels, ends)
+        self._careful = False  # few runs meet a singular configuration: only these compile what it takes there, most of a program
 
     def __call__(self, members: Members, tol: tuple[float, float]) -> Predicted:
         """Compute members, by relative and absolute tolerances of the integration."""
@@ -103,15 +107,32 @@ class Program:
         return state.q, state.v
 
     def _piece(self, members: Members, tol: tuple[float, float]) -> tuple:
-        tols = tuple(np.asarray(x, float) for x in tol)
-        rest = self.settings, self.targets, self.channels, self.ends
-        found = jax.tree.map(np.asarray, _computed(self.mechanism, members, tols, *rest, False))
-        again = found[2] == Result.needs_care
-        if not again.any():
+        found = jax.tree.map(np.asarray, _computed(self._static, self._careful, self._arrays, members, tol))
+        if self._careful or not (found[2] == Result.needs_care).any():
             return found
-        # Few runs meet a singular configuration: only these compile what it takes there, which is most of a program.
-        better = jax.tree.map(np.asarray, _computed(self.mechanism, members, tols, *rest, True))
-        return jax.tree.map(lambda x, y: np.where(again.reshape(-1, *[1] * (x.ndim - 1)), y, x), found, better)
+        self._careful = True
+        return self._piece(members, tol)
+
+
+class Static:
+    """What a program is compiled for; of two that are equal the second compiles nothing."""
+
+    def __init__(self, fixed: Any, *rest: Any):
+        leaves, structure = jax.tree.flatten(fixed)
+        self.rest, self._key = rest, (structure, tuple(leaves), rest)
+        self._hash = hash(self._key)  # once: it takes as long as a short run
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Static) and self._key == other._key)
+
+    @property
+    def fixed(self) -> Any:
+        """What is not an array, in its place."""
+        structure, leaves, _ = self._key
+        return jax.tree.unflatten(structure, leaves)
 
 
 def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
@@ -119,8 +140,10 @@ def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
     return x[np.minimum(np.arange(first, first + count), len(x) - 1)]
 
 
-@eqx.filter_jit
-def _computed(mechanism, members, tol, settings, targets, channels, ends, careful):
+@partial(jax.jit, static_argnums=(0, 1))
+def _computed(static, careful, arrays, members, tol):
+    mechanism, settings = eqx.combine(arrays, static.fixed)
+    targets, channels, ends = static.rest
     several = len(members.x) > 1
 
     def along(e):
