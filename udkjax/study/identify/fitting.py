@@ -29,6 +29,7 @@ FAR = 20.0  # of an unknown: a positive parameter a hundred million times too la
 # Where a minimum is near there is none to speak of. With these and the trust region below fits from 10 % off take 10 evaluations,
 # from 50 % off 16, and as many of them settle at once, as with no other numbers that were tried (10 to 1000, growth 3.5 or 10).
 FIRST, NEAR = 30.0, 1e8
+BOLD = 0.3  # of an unknown: where the first Gauss-Newton step is no longer, a minimum is taken to be near
 GOOD, GROWTH = 0.75, 10.0  # part of the decrease promised from which on the damping falls, and by how much
 STUCK = 8  # steps refused one after another
 
@@ -91,7 +92,9 @@ def descend(
         better = costs < best
         if count == 0:
             going &= np.isfinite(costs)
-            unit = np.array([(NEAR if near else FIRST) / max(np.linalg.norm(t[:-1, :-1], 2), 1e-300) for t in triangles])
+            largest = np.array([max(np.linalg.norm(t[:-1, :-1], 2), 1e-300) for t in triangles])
+            bold = near | (_newton(triangles)[0] <= BOLD)
+            unit = np.where(bold, NEAR, FIRST) / largest
         refused = np.where(better, 0, refused + 1)
         at, best = np.where(better[:, None], trial, at), np.where(better, costs, best)
         reduced = np.where(better[:, None, None], triangles, reduced)
@@ -103,6 +106,15 @@ def descend(
         going &= ~ended & (refused < STUCK)
         if not going.any():
             break
+        again = bold & (refused == 1) & ~np.asarray(near)  # it was not near, after all: from the best point on with damped steps
+        if again.any():
+            bold, unit = bold & ~again, np.where(again, FIRST / largest, unit)
+            state = jax.tree.map(lambda x, y, w=again: np.where(w.reshape(-1, *[1] * (x.ndim - 1)), y, x), state, start)
+            trial, triangles, costs = (
+                np.where(again.reshape(-1, *[1] * (x.ndim - 1)), y, x)
+                for x, y in ((trial, at), (triangles, reduced), (costs, best))
+            )
+            y = np.where(again[:, None], at, y)
         # What cannot be computed is a step to be refused: it costs a hundred times more than where we are.
         bad = ~np.isfinite(costs)
         seen = np.where(bad[:, None, None], 0.0, triangles * unit[:, None, None])
