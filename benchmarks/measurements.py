@@ -14,7 +14,8 @@ import numpy as np
 
 import udkjax as udk
 from udkjax.study.identify.channels import channel_of, measured
-from udkjax.study.identify.parameters import Unknowns, applied, unknowns_of
+from udkjax.study.identify.parameters import unknowns_of
+from udkjax.study.identify.unknowns import Unknowns, applied
 
 LINKS = ("link1", "link2", "link3")
 CYLINDERS = ("boom cylinder", "stick cylinder", "bucket cylinder")

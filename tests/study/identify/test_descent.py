@@ -27,6 +27,7 @@ def noisy(measured):
     return measured[1] + NOISE * np.random.default_rng(1).standard_normal(len(TS))
 
 
+@pytest.mark.slow
 def test_lbfgs_ends_where_least_squares_do(noisy):
     problem = posed(noisy)
     fit = descend_by(optax.lbfgs(), problem, np.zeros((1, 2)), TOL, steps=100)
@@ -36,6 +37,7 @@ def test_lbfgs_ends_where_least_squares_do(noisy):
     assert fit.cost[0] == pytest.approx(squares.cost[0], rel=1e-8)
 
 
+@pytest.mark.slow
 def test_adam_ends_there_too(noisy):
     problem = posed(noisy)
     optimizer = optax.adam(optax.exponential_decay(0.05, 30, 0.6))

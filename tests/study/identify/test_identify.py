@@ -212,6 +212,7 @@ def test_parameters_that_would_open_a_loop():
         found(linkage, {"time": TS, "body.link1.angle": TS}, ["length(link1)", "length(link2)", "length(link3)"])
 
 
+@pytest.mark.slow
 def test_a_mechanism_that_cannot_be_closed_at_all():
     apart = udk.with_length(udk.library.four_bar(), "coupler", 20.0)
     with pytest.raises(udk.AssemblyError, match="open"):

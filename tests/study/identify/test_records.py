@@ -10,13 +10,13 @@ TS = np.linspace(0.0, 1.0, 5)
 
 def test_a_record():
     record = Record(TS, {"body.a.angle": np.arange(5.0)}, noise={"body.a.angle": 0.1}, t0=-1.0)
-    assert record.t0 == -1.0 and record.noise["body.a.angle"].tolist() == [0.1] * 5
+    assert record.t0 == -1.0 and np.array_equal(record.noise["body.a.angle"], [0.1] * 5)
     assert record.start.estimate == "nothing" and repr(record) == "Record(5 times, body.a.angle)"
 
 
 def test_noise_of_all_channels_or_of_none():
     values = {"body.a.x": TS, "body.a.y": TS}
-    assert [noise[0] for noise in Record(TS, values, noise=0.5).noise.values()] == [0.5, 0.5]
+    assert all(np.array_equal(noise, [0.5] * 5) for noise in Record(TS, values, noise=0.5).noise.values())
     assert list(Record(TS, values).noise.values()) == [None, None]
 
 

@@ -70,6 +70,7 @@ def test_the_fit_is_that_of_the_whole_record(problem):
     assert fit.cost[0] == pytest.approx(whole.cost[0], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_whole_records_end_the_fit_where_they_can(problem):
     found = search(problem, np.zeros((1, problem.K)), TOL, strategy="pieces")
     assert found.ways == ("records in pieces",) and found.problem is problem and found.fit.settled[0]

@@ -7,8 +7,9 @@ import pytest
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
 from udkjax.integrate.solution import Result
-from udkjax.study.identify.identify import identify, posed
+from udkjax.study.identify.identify import identify
 from udkjax.study.identify.parameters import unknowns_of
+from udkjax.study.identify.posing import posed
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.shooting import Shooting
 from udkjax.study.identify.trust import compare

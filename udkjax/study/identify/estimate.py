@@ -18,12 +18,12 @@ from udkjax.study.identify.fitting import Fit
 from udkjax.study.identify.held import profile_of
 from udkjax.study.identify.knowledge import Knowledge, Values, knowledge
 from udkjax.study.identify.losses import Loss
-from udkjax.study.identify.parameters import applied
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.profile import LEVEL, Profile
 from udkjax.study.identify.results import dataset, labels, text
 from udkjax.study.identify.search import Found
 from udkjax.study.identify.shooting import Shooting
+from udkjax.study.identify.unknowns import applied
 from udkjax.study.identify.whiteness import Whiteness, whiteness
 
 ROUNDING = 1e-8  # of what a channel shows: residuals below it are errors of the integration, which are not noise and need not be

@@ -19,7 +19,7 @@ from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.errors import IdentificationError
 from udkjax.study.identify.estimate import Estimate, groups_of
-from udkjax.study.identify.identify import posed
+from udkjax.study.identify.posing import posed
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import Record, Start
 

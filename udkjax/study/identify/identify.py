@@ -1,54 +1,31 @@
 """Identify: from a mechanism, records and the names of parameters to an estimate."""
 
-import dataclasses
-import inspect
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, get_args
+from typing import Any
 
-import jax
 import numpy as np
 
-from udkjax.equations.assembly import AssemblyError, close, is_closed, require_closed
-from udkjax.equations.redundancy import redundant_rows
-from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import CAUSES, Result
-from udkjax.scene.checks import SceneError, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.descent import method_of
 from udkjax.study.identify.errors import IdentificationError
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.fitting import Fit, descend
-from udkjax.study.identify.legality import illegal
 from udkjax.study.identify.losses import Loss, loss_of
-from udkjax.study.identify.parameters import Unknowns, applied, unknowns_of
+from udkjax.study.identify.posing import TOL, posed
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.reading import records_of
-from udkjax.study.identify.records import Estimated, Record, Start
-from udkjax.study.identify.search import GUESSES, LOOSE, SETTLED, Found, Strategy, beside, search
+from udkjax.study.identify.records import Estimated, Start
+from udkjax.study.identify.search import GUESSES, SETTLED, Found, Strategy, search
 from udkjax.study.identify.shooting import Shooting
 from udkjax.study.progress import Line
 
-TOL = 1e-11  # relative and absolute, of the integration: what parameters are known to where there is no noise
 WEIGHED = 2  # fits, each with noise as the one before left it
 EVEN = 1e-6  # of what a channel shows: residuals below it count alike, since they are not of measurements
 EQUAL = 1.05  # weights that differ by less, compared with each other, move no estimate by what counts beside its error
 POLISHED = 15  # steps at the end
-NEARBY = 64  # guesses that are tried where the first cannot be closed
-KNOWN = 256  # structures of mechanisms whose parameters were found legal
 PATIENCE = 2.0  # s: what is done before then needs no line to say so
-DECIDED = (
-    "ts",
-    "mechanism",
-    "state",
-    "rtol",
-    "atol",
-    "adjoint",
-    "throw",
-    "progress",
-    "careful",
-)  # not settings that one may give
 
 
 def identify(
@@ -106,84 +83,6 @@ def identify(
     return Estimate.of(fit, found, history, (tol, tol), lost, time.perf_counter() - begun)
 
 
-def posed(
-    mechanism: Mechanism,
-    data: Any,
-    parameters: Sequence[Any] | str,
-    settings: Mapping[str, Any],
-    noise: Any = None,
-    ignore: Sequence[str] = (),
-    seed: int = 0,
-    strategy: Strategy = "auto",
-    start: Start | Estimated | None = None,
-    tol: float = TOL,
-) -> Problem:
-    """The problem that arguments of `identify` pose. Raises `IdentificationError`, which lists every mistake."""
-    unknowns, records = _gathered(
-        lambda: _check(settings, strategy),
-        lambda: unknowns_of(mechanism, parameters),
-        lambda: _started(records_of(mechanism, data, noise, ignore), start),
-    )[1:]
-    return _begun(mechanism, unknowns, records, settings, seed, tol)
-
-
-def _started(records: Sequence[Record], start: Start | Estimated | None) -> Sequence[Record]:
-    if start is None:
-        return records
-    given = start if isinstance(start, Start) else Start(estimate=start)
-    return [record.starting(given) for record in records]
-
-
-def _gathered(*steps: Callable[[], Any]) -> list[Any]:
-    """What some steps give; if any of them finds mistakes, those of all."""
-    found, problems = [], []
-    for step in steps:
-        try:
-            found.append(step())
-        except IdentificationError as error:
-            problems += error.problems
-    if problems:
-        raise IdentificationError(problems)
-    return found
-
-
-def _begun(
-    mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any], seed: int, tol: float
-) -> Problem:
-    """The problem from the first guess; where that cannot be closed, from the nearest that can. Raises `IdentificationError`.
-
-    Whether a mechanism without redundant rows closes is seen by the first run, which the fit begins with: to look before would
-    cost more than the run.
-    """
-    if unknowns.own and mechanism.left_out == ():
-        try:
-            problem = Problem(mechanism, unknowns, records, settings)
-            first = problem.evaluate(np.zeros((1, problem.K)), (max(tol, LOOSE), max(tol, LOOSE)))
-            if first.code[0] != Result.could_not_assemble:
-                return problem
-        except AssemblyError:
-            pass
-    mechanism, unknowns = _closable(mechanism, unknowns, seed)
-    _require_legal(mechanism, unknowns)
-    return Problem(mechanism, unknowns, records, settings)
-
-
-def _require_legal(mechanism: Mechanism, unknowns: Unknowns) -> None:
-    """Raise where the parameters would open a loop. What is legal is so for other numbers too with the same redundant rows."""
-    structure = jax.tree.structure(mechanism), unknowns.targets
-    if not mechanism.left_out or structure in _legal:
-        return
-    wrong = illegal(mechanism, lambda mech, x: applied(mech, unknowns.targets, x), unknowns.start, unknowns.names)
-    if wrong:
-        raise IdentificationError(wrong)
-    if len(_legal) >= KNOWN:
-        _legal.clear()
-    _legal.add(structure)
-
-
-_legal: set[Any] = set()
-
-
 def _settled(found: Found, tol: float, tell: Callable, choices: Mapping[str, Any]) -> tuple[Fit, list]:
     """The fit to the end, each channel weighted by the noise that it has turned out to have."""
     problem, fit, history = found.problem, found.fit, list(found.history)
@@ -229,19 +128,6 @@ def weigh(problem: Problem | Shooting, z: np.ndarray, tol: float, loss: Loss, le
     return bool(ratio.max() > EQUAL * ratio.min()) or loss is not None or bool(len(problem.priors))
 
 
-def _check(settings: Mapping[str, Any], strategy: str) -> None:
-    known = [name for name in inspect.signature(simulate).parameters if name not in DECIDED]
-    problems = [
-        f"{name}: no setting of simulate that can be given here{suggestion(name, known)}"
-        for name in settings
-        if name not in known
-    ]
-    if strategy not in get_args(Strategy):
-        problems.append(f"strategy must be one of {', '.join(get_args(Strategy))}, is {strategy!r}")
-    if problems:
-        raise IdentificationError(problems)
-
-
 def _guesses(problem: Problem, starts: Any) -> tuple[np.ndarray, int]:
     """First guesses (B, K), and how many more may be made."""
     first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
@@ -260,30 +146,6 @@ def _guesses(problem: Problem, starts: Any) -> tuple[np.ndarray, int]:
         wrong = problem.unknowns.names[int(np.argmax(~np.isfinite(z).all(0)))]
         raise IdentificationError([f"starts: a guess of {wrong} is not between its bounds, or not positive"])
     return np.concatenate([first, np.concatenate([z, np.zeros((len(z), problem.K - P))], 1)]), 0
-
-
-def _closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tuple[Mechanism, Unknowns]:
-    """The mechanism with the redundant rows of its first guess, or, where that cannot be closed, of the nearest that can."""
-    for k, x in enumerate([unknowns.start, *_nearby(unknowns, seed)]):
-        try:
-            placed = mechanism if k == 0 and unknowns.own else applied(mechanism, unknowns.targets, x)
-        except SceneError:
-            continue
-        closure = close(placed)
-        if is_closed(closure):
-            rows = mechanism.left_out
-            if rows is None or int(closure.rank) != len(closure.psi) - len(rows):
-                rows = redundant_rows(placed)
-            return mechanism.with_left_out(rows), dataclasses.replace(unknowns, start=np.asarray(x, float))
-    placed = applied(mechanism, unknowns.targets, unknowns.start)
-    require_closed(placed, close(placed))
-    raise AssertionError
-
-
-def _nearby(unknowns: Unknowns, seed: int) -> list[np.ndarray]:
-    """Values beside the first guesses, the nearest first."""
-    z = beside(unknowns, np.zeros(len(unknowns.names)), NEARBY, seed)
-    return list(unknowns.values(z[np.argsort(np.linalg.norm(z, axis=1))]))
 
 
 def _require_some(problem: Problem, found: Found) -> None:

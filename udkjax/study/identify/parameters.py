@@ -1,18 +1,11 @@
-"""Parameters to be identified: what of a mechanism each of them is, and the values that it may take.
-
-An unknown z is dimensionless, zero at the first guess x0, and may be any number: a positive parameter is x = x0 exp(z), one
-between bounds is x = low + (high - low) / (1 + (1 / u0 - 1) exp(-z)) with u0 the place of x0 between them, and any other one is
-x = x0 + scale z.
-"""
+"""Parameters to be identified: how they are asked for, and what of a mechanism each of them is."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from udkjax.scene.checks import SceneError, quoted, suggestion
 from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
@@ -21,10 +14,8 @@ from udkjax.scene.parameters import parameters_of, split
 from udkjax.scene.reshaping import length_of, with_length
 from udkjax.scene.schema import keys
 from udkjax.study.identify.errors import IdentificationError
+from udkjax.study.identify.unknowns import Target, Transform, Unknowns, entry_of
 from udkjax.study.units import units_of
-
-Transform = Literal["positive", "bounded", "free"]
-AT_BOUND = 1e-3  # of the distance of the bounds: what counts as being at one of them
 
 
 @dataclass(frozen=True)
@@ -71,84 +62,6 @@ class Parameter:
     transform: Transform | None = None
     scale: float | None = None
     share: Literal["value", "scale"] = "value"
-
-
-class Target(NamedTuple):
-    """What a value is put into: hashable, so that what is compiled for it serves all values."""
-
-    names: tuple[str, ...] = ()
-    scaled: bool = False
-    function: Callable[[Mechanism, Any], Mechanism] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Unknowns:
-    """All parameters: their names and targets, first guesses, transforms and priors; arrays (P,)."""
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    targets: tuple[Target, ...]
-    start: Float[np.ndarray, "P"]
-    kinds: tuple[Transform, ...]
-    low: Float[np.ndarray, "P"]
-    high: Float[np.ndarray, "P"]
-    scale: Float[np.ndarray, "P"]
-    mean: Float[np.ndarray, "P"]  # of the prior; not a number: none
-    sigma: Float[np.ndarray, "P"]
-    own: bool = False  # whether all first guesses are the scene's values
-
-    def values(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """x of z."""
-        return self._by_kind(z)[0]
-
-    def slopes(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """dx/dz."""
-        return self._by_kind(z)[1]
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def _by_kind(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, slope = np.empty_like(z), np.empty_like(z)
-        for k, kind in enumerate(self.kinds):
-            x0, low, high = self.start[k], self.low[k], self.high[k]
-            if kind == "positive":
-                x[..., k] = slope[..., k] = x0 * np.exp(z[..., k])
-            elif kind == "bounded":
-                part = 1.0 / (1.0 + ((high - x0) / (x0 - low)) * np.exp(-z[..., k]))
-                x[..., k], slope[..., k] = low + (high - low) * part, (high - low) * part * (1.0 - part)
-            else:
-                x[..., k], slope[..., k] = x0 + self.scale[k] * z[..., k], self.scale[k]
-        return x, slope
-
-    def unknowns(self, x: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """z of x."""
-        z = np.empty_like(x)
-        for k, kind in enumerate(self.kinds):
-            x0, low, high = self.start[k], self.low[k], self.high[k]
-            if kind == "positive":
-                z[..., k] = np.log(x[..., k] / x0)
-            elif kind == "bounded":
-                z[..., k] = np.log((x[..., k] - low) / (high - x[..., k]) * ((high - x0) / (x0 - low)))
-            else:
-                z[..., k] = (x[..., k] - x0) / self.scale[k]
-        return z
-
-    def at_bounds(self, x: Float[np.ndarray, "P"]) -> tuple[str, ...]:
-        """The names of those that are at one of their bounds."""
-        near = np.minimum(x - self.low, self.high - x) <= AT_BOUND * (self.high - self.low)
-        return tuple(name for name, at, kind in zip(self.names, near, self.kinds, strict=True) if at and kind == "bounded")
-
-
-def applied(mechanism: Mechanism, targets: Sequence[Target], x: Any) -> Mechanism:
-    """The mechanism with the values x (P,) in, in the order of the parameters. Pure; x may be traced."""
-    left_out, base, values = mechanism.left_out, parameters_of(mechanism), {}
-    for k, target in enumerate(targets):
-        if target.function is not None:
-            mechanism = target.function(mechanism.with_parameters(values) if values else mechanism, x[k])
-            values = {}
-        else:
-            values |= {name: x[k] * _at(base, name) if target.scaled else x[k] for name in target.names}
-    mechanism = mechanism.with_parameters(values) if values else mechanism
-    return mechanism.with_left_out(left_out) if mechanism.left_out is None else mechanism
 
 
 def unknowns_of(mechanism: Mechanism, given: Sequence[Any] | str) -> Unknowns:
@@ -297,7 +210,7 @@ def _targets(mechanism: Mechanism, p: Parameter) -> list[tuple[Target, float | N
             problems.append(f"{quoted(name)} is absent from the scene: set it there first")
     if problems or not names:
         raise ValueError("; ".join(problems) or "names nothing")
-    values = [np.asarray(_at(known, name)) for name in names]
+    values = [np.asarray(entry_of(known, name)) for name in names]
     if len({v.shape for v in values}) > 1:
         raise ValueError(f"cannot be tied: their shapes are {', '.join(str(v.shape) for v in values)}")
     if scaled:
@@ -332,8 +245,3 @@ def _length(mechanism: Mechanism, text: str) -> tuple[str, ...]:
         return tuple(body.strip().strip("\"'") for body in text[7:-1].split(","))
     owner, dot, field = text.rpartition(".")
     return (owner,) if dot and field == "length" and owner in mechanism.body_names else ()
-
-
-def _at(known: Mapping[str, Any], name: str) -> Array:
-    owner, index = split(name, known)
-    return jnp.asarray(known[owner].value)[index]

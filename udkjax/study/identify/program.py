@@ -25,7 +25,7 @@ from udkjax.integrate.solution import Result, Solution
 from udkjax.integrate.solvers import forward_mode
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.channels import Channel, Quantity, measured
-from udkjax.study.identify.parameters import Target, applied
+from udkjax.study.identify.unknowns import Target, applied
 
 # Members from which on lanes pay for the half minute that their program takes to compile; fewer are computed one by one. Forward
 # derivatives of one member take 2 ms alone, 0.6 ms in lanes.

@@ -83,8 +83,12 @@ class Record:
                     f"{quoted(str(channel))}: entry {int(np.flatnonzero(np.isinf(value))[0])} is infinite; a gap is nan"
                 )
         if problems:
-            where = f"record {quoted(name)}: " if name else ""
-            raise IdentificationError([where + problem for problem in problems])
+            raise IdentificationError([self.where + problem for problem in problems])
+
+    @property
+    def where(self) -> str:
+        """What messages about it begin with."""
+        return f"record {quoted(self.name)}: " if self.name else ""
 
     def starting(self, start: Start) -> "Record":
         """The same with another start."""

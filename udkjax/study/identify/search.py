@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.study.identify.fitting import Fit, descend
-from udkjax.study.identify.parameters import Unknowns
 from udkjax.study.identify.problem import Evaluated, Problem
 from udkjax.study.identify.shooting import Lost, Shooting, shoot
+from udkjax.study.identify.unknowns import Unknowns
 
 # Tolerance of the integration on the way, and the change of an unknown below which it decides: what is left is polished away at
 # the end.

@@ -22,9 +22,10 @@ from jaxtyping import Float
 
 from udkjax.equations.assembly import State
 from udkjax.study.identify.fitting import Fit, descend
-from udkjax.study.identify.problem import Evaluated, Problem, start_unknowns
+from udkjax.study.identify.problem import Evaluated, Problem
 from udkjax.study.identify.program import Members, Predicted, Program
 from udkjax.study.identify.records import Record, Start
+from udkjax.study.identify.starts import start_unknowns
 
 SAMPLES = 3.0  # residuals of a piece, per unknown of its start
 PIECES = 60  # of all records at most: the algebra is that of dense matrices

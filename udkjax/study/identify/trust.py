@@ -22,7 +22,7 @@ from udkjax.study.identify import program
 from udkjax.study.identify.agreement import GradientCheck, Place, best_of
 from udkjax.study.identify.differences import STEPS, Differences, differences, sizes
 from udkjax.study.identify.errors import IdentificationError
-from udkjax.study.identify.identify import TOL, posed
+from udkjax.study.identify.posing import TOL, posed
 from udkjax.study.identify.problem import Evaluated, Problem
 from udkjax.study.identify.results import labels
 from udkjax.study.identify.shooting import Shooting
