@@ -10,7 +10,7 @@ pytest.importorskip("experiments", reason="not in a source tree")
 from experiments.common import HERE, NAMES, described, load, run, tracked
 
 # studies whose small runs compile for long
-SLOW: set[str] = {"singular_crossing", "inconsistent_starts", "precision", "gains", "threshold_map"}
+SLOW: set[str] = {"singular_crossing", "inconsistent_starts", "precision", "gains", "threshold_map", "tune_gains"}
 README = (HERE / "README.md").read_text(encoding="utf-8")
 
 
