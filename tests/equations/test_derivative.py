@@ -108,6 +108,7 @@ def test_a_state_that_elimination_cannot_solve_spoils_no_derivative(linkage, pla
     np.testing.assert_allclose(tangent, 2.0 * jnp.tile(v, 3), rtol=1e-15)
 
 
+@pytest.mark.barriers
 def test_batches_of_states_and_of_directions(linkage, placed):
     """In any nesting, forward and reverse, the same numbers."""
     equations = prepare(linkage, udk.Auto()).quick

@@ -97,6 +97,7 @@ def test_the_form_for_other_devices(pendulum, batch, monkeypatch):
     assert_allclose(found.stats["steps"], batch.stats["steps"])
 
 
+@pytest.mark.barriers
 def test_a_member_that_fails_is_data(pendulum):
     name = pendulum.body_names[0]
 
