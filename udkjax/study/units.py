@@ -54,7 +54,8 @@ def units_of(mechanism: Mechanism, name: str) -> str:
     """Return the unit of a parameter or of a setting; an empty text where it is not known."""
     if name in NUMBERS:
         return NUMBERS[name]
-    found = parameters_of(mechanism).get(split(name, parameters_of(mechanism))[0])
+    known = parameters_of(mechanism)
+    found = known.get(split(name, known)[0])
     if found is None:
         return ""
     if not found.path:
