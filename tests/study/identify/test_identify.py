@@ -240,6 +240,9 @@ def test_through_a_singular_configuration():
     data = {"time": ts, "body.link1.angle": np.asarray(solution.q)[:, 0, 2]}
     names = ["length(link1, link2, link3)", "body.link1.mass = body.link2.mass = body.link3.mass"]
     first = udk.with_length(mech, ["link1", "link2", "link3"], 1.3)
+    alone = found(first, data, names)
+    assert not alone.success and len(alone.knowledge.flat) == 1  # angles tell one number, the period
+    data["body.coupler.x"] = np.asarray(solution.q)[:, 3, 0]
     estimate = found(first, data, names)
     assert estimate.values == pytest.approx([1.0, 1.0], rel=1e-8)
 
