@@ -181,3 +181,18 @@ def test_no_start_is_lost_at_singular_configurations():
     for k, scene in enumerate(scenes):
         exact = exact_coordinates(scene, ts, scene.q0, scene.v0)
         assert np.abs(np.reshape(found.q[k], (len(ts), -1)) - np.reshape(exact, (len(ts), -1))).max() < 1e-5
+
+
+@pytest.mark.barriers
+def test_one_direction_for_all_members(pendulum):
+    """Values are batched, and the direction is not."""
+    ts = jnp.linspace(0.0, 1.0, 5)
+
+    def angle(inertia):
+        placed = pendulum.with_parameters({"body.rod.inertia": inertia})
+        return udk.simulate(placed, ts, adjoint=diffrax.ForwardMode(), careful=False).q[-1, 0, 2]
+
+    inertias = jnp.linspace(0.3, 0.5, 3)
+    _, slopes = jax.vmap(lambda x: jax.jvp(angle, (x,), (1.0,)))(inertias)
+    ahead, behind = (jax.vmap(angle)(inertias + h) for h in (1e-4, -1e-4))
+    assert_allclose(slopes, (ahead - behind) / 2e-4, rtol=1e-4)

@@ -69,7 +69,27 @@ def _batched(problem: Problem, single: Callable[[Problem], Raw], many: Callable[
         axes = [0 if b else None for b in batched]
         return jax.vmap(lambda *leaves: single(eqx.combine(tree.unflatten(leaves), static)), axes)(*leaves), every
 
-    return one(*leaves)
+    moving = sum(x.ravel()[0] for x in leaves if _has_tangents(x) and x.size)
+    return one(*[_with_its_tangent(x, moving) if _has_tangents(x) else x for x in leaves])
+
+
+def _has_tangents(x: Array) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+@jax.custom_jvp
+def _with_its_tangent(x: Array, moving: Array) -> Array:
+    """The same, whose tangent is batched wherever it is itself, if there are tangents: `moving` has one if anything has.
+
+    The rule of `custom_vmap` gives wrong shapes where of some arguments only the values are batched, of others the tangents too.
+    """
+    return x
+
+
+@_with_its_tangent.defjvp
+def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    x, dx = primals[0], tangents[0]
+    return x, jnp.where(x == x, dx, dx)
 
 
 def _single(problem: Problem) -> Raw:
