@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
@@ -13,7 +14,6 @@ from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import Record
 
-optax = pytest.importorskip("optax")
 TOL, NOISE = (1e-9, 1e-9), 1e-3
 
 
