@@ -7,19 +7,10 @@ import numpy as np
 import pytest
 import xarray
 
-from udkjax.cli import main
+from tests.command_line import udkjax
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PARALLELOGRAM = EXAMPLES / "parallelogram.toml"
-
-
-def udkjax(*arguments) -> int:
-    """Run the command line here, and return its exit code."""
-    try:
-        main([str(argument) for argument in arguments])
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else 0 if end.code is None else 1
-    return 0
 
 
 @pytest.mark.parametrize("command", [[], ["report"], ["simulate"], ["sweep"], ["identify"], ["check"], ["doctor"]])

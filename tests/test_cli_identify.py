@@ -13,7 +13,7 @@ import pytest
 import xarray
 
 import udkjax as udk
-from udkjax.cli import main
+from tests.command_line import udkjax
 from udkjax.cli.identify import Estimated, Loss
 from udkjax.cli.identify import identify as command
 
@@ -23,15 +23,6 @@ TRUTH, NOISE = 0.5, 0.3  # inertia of the rod, kg m2; of the measurements, degre
 MASS, INERTIA, CHANNEL = "body.rod.mass", "body.rod.inertia", "body.rod.angle"
 PICTURES = {"fit.png", "residuals.png", "convergence.png", "correlation.png"}
 FILES = {"identified.toml", "estimate.json", "estimate.csv", "fit.nc", *PICTURES}
-
-
-def udkjax(*arguments) -> int:
-    """Run the command line here, and return its exit code."""
-    try:
-        main([str(argument) for argument in arguments])
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else 0 if end.code is None else 1
-    return 0
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 import xarray
 
 import udkjax as udk
-from udkjax.cli import main
+from tests.command_line import udkjax
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PENDULUM, EXAMPLE = EXAMPLES / "compound_pendulum.toml", EXAMPLES / "grids" / "parallelogram.toml"
@@ -21,15 +21,6 @@ tol = { from = 1e-8, to = 1e-4, num = 3, scale = "log", of = ["rtol", "atol"] }
 method = "elimination"
 max_steps = 5
 """
-
-
-def udkjax(*arguments) -> int:
-    """Run the command line here, and return its exit code."""
-    try:
-        main([str(argument) for argument in arguments])
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else 0 if end.code is None else 1
-    return 0
 
 
 @pytest.fixture
