@@ -34,6 +34,12 @@ def parameters_of(mechanism: Any) -> dict[str, Parameter]:
     return found
 
 
+def holder_of(mechanism: Any, parameter: Parameter) -> Any:
+    """The element, or the motion law or profile in it, whose field the parameter is."""
+    element = getattr(mechanism, _SECTIONS[parameter.section])[parameter.owner]
+    return _at(element, parameter.path[:-1])
+
+
 def replaced(mechanism: Any, values: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], Any]:
     """Return the elements of a mechanism by section and name, and gravity, with the values in; raise `SceneError`."""
     known, problems = parameters_of(mechanism), []

@@ -1,4 +1,4 @@
-"""What an axis can be the quantity of, besides parameters: functions of a mechanism and a value, which files can name."""
+"""Quantities of a mechanism that are no single number of it: functions of a mechanism and a value, which texts can name."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from udkjax.scene.reshaping import with_angle, with_length
 
 @dataclass(frozen=True)
 class Length:
-    """Gives bodies another length (m): `with_length` as the quantity of an axis."""
+    """Gives bodies another length (m), all the same: see `with_length`."""
 
     bodies: tuple[str, ...]
     as_rod: bool = False
@@ -18,10 +18,13 @@ class Length:
     def __call__(self, mechanism: Mechanism, value: Any) -> Mechanism:
         return with_length(mechanism, self.bodies, value, self.as_rod)
 
+    def __str__(self) -> str:
+        return " = ".join(f"length({body})" for body in self.bodies)
+
 
 @dataclass(frozen=True)
 class Angle:
-    """Gives bodies another initial angle (rad): `with_angle` as the quantity of an axis."""
+    """Gives bodies another initial angle (rad): see `with_angle`."""
 
     bodies: tuple[str, ...]
 

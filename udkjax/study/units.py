@@ -1,9 +1,7 @@
 """Units of parameters and of the settings of a run."""
 
-from typing import Any
-
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.parameters import parameters_of, split
+from udkjax.scene.parameters import holder_of, parameters_of, split
 
 # The settings of a run that are numbers: one program serves all their values.
 NUMBERS = {
@@ -60,15 +58,8 @@ def units_of(mechanism: Mechanism, name: str) -> str:
         return ""
     if not found.path:
         return _FIELDS[name.partition("[")[0]]
-    element = _element(mechanism, found.section, found.owner)
-    for part in found.path[:-1]:
-        element = getattr(element, part)
+    element = holder_of(mechanism, found)
     field = found.path[-1]
     if field in _FOLLOWS:
         return "rad" if getattr(mechanism.drivers.get(found.owner), "coordinate", "") == "angle" else "m"
     return _OF_TYPE.get((type(element).__name__, field), _FIELDS.get(field, ""))
-
-
-def _element(mechanism: Mechanism, section: str, owner: str) -> Any:
-    plural = {"body": mechanism.bodies, "joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
-    return plural[section][owner]

@@ -8,10 +8,10 @@ import xarray
 from scipy import stats
 
 import udkjax as udk
+from udkjax.study.quantities import Angle, Length, Scaled
 from udkjax.study.sweep.axes import Axis, Zipped
 from udkjax.study.sweep.designs import LatinHypercube, Sobol
 from udkjax.study.sweep.grid import load_grid, loads_grid
-from udkjax.study.sweep.quantities import Angle, Length, Scaled
 from udkjax.study.sweep.reading import GridError
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "grids" / "parallelogram.toml"

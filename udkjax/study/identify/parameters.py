@@ -10,26 +10,13 @@ import numpy as np
 from udkjax.scene.checks import SceneError, quoted, suggestion
 from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.parameters import parameters_of, split
-from udkjax.scene.reshaping import length_of, with_length
+from udkjax.scene.parameters import holder_of, parameters_of, split
+from udkjax.scene.reshaping import length_of
 from udkjax.scene.schema import keys
 from udkjax.study.identify.errors import IdentificationError
 from udkjax.study.identify.unknowns import Target, Transform, Unknowns, entry_of
+from udkjax.study.quantities import Length
 from udkjax.study.units import units_of
-
-
-@dataclass(frozen=True)
-class Length:
-    """The length of some links, all of which have the same: see `udkjax.with_length`."""
-
-    bodies: tuple[str, ...]
-    as_rod: bool = False
-
-    def __call__(self, mechanism: Mechanism, value: Any) -> Mechanism:
-        return with_length(mechanism, self.bodies, value, self.as_rod)
-
-    def __str__(self) -> str:
-        return " = ".join(f"length({body})" for body in self.bodies)
 
 
 def length(*bodies: str, as_rod: bool = False) -> Length:
@@ -176,11 +163,7 @@ def _required_positive(mechanism: Mechanism, name: str) -> bool:
     found = known[split(name, known)[0]]
     if not found.path:
         return False
-    plural = {"body": mechanism.bodies, "joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
-    element: Any = plural[found.section][found.owner]
-    for part in found.path[:-1]:
-        element = getattr(element, part)
-    metadata = keys(type(element))[found.path[-1]].metadata
+    metadata = keys(type(holder_of(mechanism, found)))[found.path[-1]].metadata
     return any(rule in metadata.get("require", ()) for rule in POSITIVE["require"] + NOT_NEGATIVE["require"])
 
 
