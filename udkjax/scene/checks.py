@@ -14,17 +14,25 @@ from udkjax.scene.joints import Revolute
 from udkjax.scene.schema import PLAIN, TYPES, in_files, keys, table_of
 
 
-class SceneError(ValueError):
-    """A scene cannot be what it says. `problems` lists every mistake, each with the path of the offending entry."""
+class Mistakes(ValueError):
+    """Everything that is wrong with something: `problems` lists every mistake, `source` says where it stands, if anywhere."""
+
+    of = ""  # what it is that is wrong
 
     def __init__(self, problems: Sequence[str], source: str = ""):
         self.problems, self.source = list(problems), source
         head = f"{source}: " if source else ""
-        count = f"{len(self.problems)} mistakes in the scene:\n  "
+        count = f"{len(self.problems)} mistakes in the {self.of}:\n  "
         super().__init__(head + (self.problems[0] if len(self.problems) == 1 else count + "\n  ".join(self.problems)))
 
     def __reduce__(self):
         return type(self), (self.problems, self.source)
+
+
+class SceneError(Mistakes):
+    """A scene cannot be what it says. `problems` lists every mistake, each with the path of the offending entry."""
+
+    of = "scene"
 
 
 class Entry(NamedTuple):

@@ -1,26 +1,19 @@
 """Reads values of a TOML file, and gathers what is wrong with them, each mistake under the path of its entry."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from udkjax.scene.checks import quoted, shown, suggestion
+from udkjax.scene.checks import Mistakes, quoted, shown, suggestion
 from udkjax.study.choices import choice
 
 
-class GridError(ValueError):
+class GridError(Mistakes):
     """A file cannot be the grid of a sweep. `problems` lists every mistake, each with the path of the offending entry."""
 
-    def __init__(self, problems: Sequence[str], source: str = ""):
-        self.problems, self.source = list(problems), source
-        head = f"{source}: " if source else ""
-        count = f"{len(self.problems)} mistakes in the grid:\n  "
-        super().__init__(head + (self.problems[0] if len(self.problems) == 1 else count + "\n  ".join(self.problems)))
-
-    def __reduce__(self):
-        return type(self), (self.problems, self.source)
+    of = "grid"
 
 
 class Reader:
