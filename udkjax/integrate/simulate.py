@@ -69,7 +69,7 @@ def simulate(
     step that is tried, in s; by default it is chosen. `formulation` finds the accelerations in
     another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`, `NullSpaceSVD` or `CoordinatePartitioning`;
     `method` then serves projection and derivatives. `progress=True` prints how far the run is. `careful=False` leaves out what
-    steps beside singular configurations take, which is more than half of what there is to compile: a run that comes to one ends
+    steps beside singular configurations take, a fifth to three fifths of what there is to compile: a run that comes to one ends
     there (`Result.needs_care`).
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and

@@ -26,8 +26,8 @@ ROUNDED, TWICE = 1e-6, 2  # a Gauss-Newton step as short as this that is refused
 FLAT = 1e-9  # of the largest singular value: directions that a step is not expected to be known in
 FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
 # What residuals are multiplied by, over the largest singular value: the method's first damping is 1 / FIRST^2 of its square.
-# Where a minimum is near there is none to speak of. With these and the trust region below fits from 10 % off take 10 evaluations,
-# from 50 % off 16, and as many of them settle at once, as with no other numbers that were tried (10 to 1000, growth 3.5 or 10).
+# Where a minimum is near there is none to speak of. Of FIRST from 10 to 1000 and growth 3.5 or 10, with these the most fits from
+# 50 % off settle along the whole record.
 FIRST, NEAR = 30.0, 1e8
 BOLD = 0.3  # of an unknown: where the first Gauss-Newton step is no longer, a minimum is taken to be near
 GOOD, GROWTH = 0.75, 10.0  # part of the decrease promised from which on the damping falls, and by how much

@@ -76,7 +76,7 @@ class Program:
         self._latest: OrderedDict[bytes, Predicted] = OrderedDict()
         self._arrays, fixed = eqx.partition((mechanism, self.settings), eqx.is_array)
         self._static = Static(fixed, targets, channels, ends)
-        self._careful = False  # few runs meet a singular configuration: only these compile what it takes there, most of a program
+        self._careful = False  # few runs meet a singular configuration: only these compile what it takes there
 
     def __call__(self, members: Members, tol: tuple[float, float]) -> Predicted:
         """Compute members, by relative and absolute tolerances of the integration."""
