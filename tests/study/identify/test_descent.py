@@ -1,5 +1,7 @@
 """Fits by optimizers of optax: the minimum of least squares, and those of other losses."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -62,7 +64,8 @@ def test_a_loss_of_the_users_own(noisy):
 def test_identify_takes_them(noisy):
     first, record = pendulum(0.4, 0.15), Record(TS, {ANGLE: noisy}, noise=NOISE)
     squares = identify(first, record, NAMES, progress=False)
-    for choices in ({"optimizer": optax.lbfgs()}, {"loss": lambda r: 0.5 * jnp.sum(r**2)}):
+    several: list[dict[str, Any]] = [{"optimizer": optax.lbfgs()}, {"loss": lambda r: 0.5 * jnp.sum(r**2)}]
+    for choices in several:
         estimate = identify(first, record, NAMES, progress=False, **choices)
         assert estimate.converged and estimate.values == pytest.approx(squares.values, rel=1e-5)
     with pytest.raises(IdentificationError, match="give an optimizer of optax"):
