@@ -84,17 +84,19 @@ def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
             meets.setdefault(k, set()).add(i)
     near = [set().union(*(meets[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
     order: list[int] = []
-    queue, left = [(len(others), i) for i, others in enumerate(near)], set(range(len(rows)))
+    wait = [0] * len(rows)  # how many others, one after the other, come before
+    queue, left = [(len(others), 0, i) for i, others in enumerate(near)], set(range(len(rows)))
     heapify(queue)
     while left:
-        degree, i = heappop(queue)
-        if i not in left or degree != len(near[i]):  # counted anew since
+        *known, i = heappop(queue)
+        if i not in left or known != [len(near[i]), wait[i]]:  # counted anew since
             continue
         left.remove(i)
         order.append(i)
         for k in near[i]:
             near[k] = (near[k] | near[i]) - {i, k}
-            heappush(queue, (len(near[k]), k))
+            wait[k] = max(wait[k], wait[i] + 1)
+            heappush(queue, (len(near[k]), wait[k], k))
     return order
 
 
@@ -155,7 +157,7 @@ def multipliers(factors: Factors, b: Sequence[Scalar]) -> list[Scalar]:
             y[i] = y[i] - entry * y[j]
     for j in reversed(range(m)):
         y[j] = y[j] * factors.inverse_pivots[j]
-        for i, entry in factors.lower[j].items():
+        for i, entry in reversed(factors.lower[j].items()):
             y[j] = y[j] - entry * y[i]
     result: list[Scalar] = [b[0]] * m
     for j, i in enumerate(factors.order):
