@@ -39,12 +39,13 @@ def test_barriers_change_nothing_but_their_number(emit, every):
 
 
 def test_a_barrier_holds_only_what_is_used_later(emit):
-    """A chain: each operation uses the one before, so that no barrier needs more than one value."""
+    """A chain: each operation uses the one before, so that no barrier needs more than one value. A batch has twice as many."""
     program = emit(lambda x: jnp.sin(jnp.cos(jnp.sin(jnp.cos(jnp.sin(x))))), 0.3, cut_every=1)
-    text = without_pair(jax.jit(program.__call__).lower(0.3).as_text())
-    lines = [s for s in text.splitlines() if "optimization_barrier" in s]
-    assert len(lines) == 5
-    assert all(line.count("tensor<f64>") == 1 for line in lines)
+    for run, x, number in ((program.__call__, 0.3, 2), (jax.vmap(program.__call__), jnp.ones(3), 5)):
+        text = without_pair(jax.jit(run).lower(x).as_text())
+        lines = [s for s in text.splitlines() if "optimization_barrier" in s]
+        assert len(lines) == number
+        assert all(line.count("tensor<") == 1 for line in lines)
 
 
 def test_floats_are_evaluated_without_compiling():

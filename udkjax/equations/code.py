@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from udkjax.equations.derivative import Derivative
 from udkjax.equations.expressions import Expressions, expressions
-from udkjax.pinv.sparse import Row, absolute, all_of, factorize, greater, multipliers, pattern, transpose_times
+from udkjax.pinv.sparse import Factors, Row, absolute, all_of, factorize, greater, multipliers, pattern, transpose_times
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Program, Scalar, frontier, vector
 
@@ -73,25 +73,31 @@ class Code:
         """The equation for rows that are independent: a = a_F + M^(-1) Psi_q^T y with D D^T y = b."""
         graph, e = self.graph, self.equations
         self.compliance = [graph.constant(1.0) / m for m in e.mass]
-        self._gram = factorize([self.D[i] for i in self.kept], self.drop)
-        safe = all_of(self._gram.kept, graph)
+        rows = [self.D[i] for i in self.kept]
+        self._dropping = factorize(rows, graph, self.drop)
+        self._gram = factorize(rows, graph) if self.elimination == "check" else self._dropping
         self.y = self.solved([self.b(i) for i in self.kept])
         self.a = [f + s for f, s in zip(e.free, self.spread(self.y), strict=True)]
+        safe = self._safe(self._gram)  # looked at when all else is done: nothing waits for it
         self.outputs["accelerations"] = [*self.a, safe]
         watched = all_of([safe, *(self._satisfied(i, self.a) for i in self.left_out)], graph)
         self.outputs["accelerations_watched"] = [*self.a, watched]
         self.residual = [graph.input(f"r{k}", "residual") for k in range(len(self.kept))]
-        self.outputs["step"] = self.spread(self.solved(self.residual))
+        self.outputs["step"] = self.spread(self.solved(self.residual, dropping=True))
         self.changes = [graph.input(f"d{k}", "change") for k in range(2 * self.n)]
-        far = all_of([greater(pivot, diagonal * NEAR) for pivot, diagonal in self._gram.pivots], graph)
+        far = all_of(self._gram.above(NEAR), graph)
         self.outputs["tangential"] = [*self._tangential(self.changes[: self.n]), *self._tangential(self.changes[self.n :]), far]
         early = frontier(graph, self.outputs["step"], lambda node: "residual" not in node.depends)
         self.factors = [s for s in early if not s.node.depends <= {"parameter"}]
-        self.outputs["factor"] = [*self.factors, safe]
+        self.outputs["factor"] = [*self.factors, self._safe(self._dropping)]
 
-    def solved(self, b: Sequence[Scalar]) -> list[Scalar]:
-        """y with D D^T y = b, of the rows kept; zero where a row was dropped."""
-        return multipliers(self._gram, b) if b else []
+    def _safe(self, factors: Factors) -> Scalar:
+        """Whether no pivot is too small to be trusted; a method that drops such rows does not ask."""
+        return all_of(factors.above(self.drop) if self.elimination == "check" else [], self.graph)
+
+    def solved(self, b: Sequence[Scalar], dropping: bool = False) -> list[Scalar]:
+        """y with D D^T y = b, of the rows kept; zero where a row was dropped, if `dropping` is asked for or the method drops."""
+        return multipliers(self._dropping if dropping else self._gram, b) if b else []
 
     def pulled(self, y: Sequence[Scalar]) -> list[Scalar]:
         """Psi_q^T y, of the rows kept."""

@@ -126,8 +126,8 @@ class _Projection:
         for x, d, outputs in ((e.q, self.of_psi, self.psi), (e.v, self.of_rate, self.rate)):
             moved = d.along(known)
             residual = [product(d.row(s), moved, code.graph) for s in outputs]
-            before = [known.get(s.index, zero) for s in x]
-            known |= {s.index: t for s, t in zip(x, _less(before, code.spread(code.solved(residual))), strict=True)}
+            before, dy = [known.get(s.index, zero) for s in x], code.solved(residual, dropping=True)
+            known |= {s.index: t for s, t in zip(x, _less(before, code.spread(dy)), strict=True)}
         return [known[s.index] for s in (*e.q, *e.v)]
 
     def reverse(self, w: Sequence[Scalar]) -> list[Scalar]:
@@ -135,7 +135,7 @@ class _Projection:
         total: Row = {s.index: c for s, c in zip((*e.q, *e.v), w, strict=True)}
         for x, d, outputs in ((e.v, self.of_rate, self.rate), (e.q, self.of_psi, self.psi)):
             moved = [c * total[s.index] for c, s in zip(code.compliance, x, strict=True)]
-            u = code.solved([_times(row, moved, code.graph) for row in self.rows])
+            u = code.solved([_times(row, moved, code.graph) for row in self.rows], dropping=True)
             found: Row = {}
             for output, seed in zip(outputs, u, strict=True):
                 accumulate(found, d.row(output), -seed)

@@ -3,6 +3,7 @@
 from typing import Any
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -10,9 +11,11 @@ from jaxtyping import Array, Float
 from udkjax.equations.motion import Motion
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
+from udkjax.integrate.explicit import GROW, SAFETY, SHRINK
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.problem import DONE, STEP_LIMIT, STEP_TOO_SMALL, Problem, Raw
-from udkjax.integrate.projection import project_all
+from udkjax.integrate.projection import project_all, violation
+from udkjax.integrate.tableau import is_explicit
 from udkjax.integrate.undifferentiated import undifferentiated
 
 
@@ -42,12 +45,13 @@ def by_diffrax(
     ys = jnp.where(reached[:, None], ys, y0)  # a run without any accepted step has saved nothing
     if problem.projected:
         ys = jnp.concatenate([ys[:1], project_all(problem.equations, ts[1:], ys[1:])])
+    violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, STEP_LIMIT, STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, DONE, status)
     found = evaluations(run.controller_state)
     right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (problem.h is None))  # one chooses the first step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
-    return Raw(ys, reached, status, t_end[0], end[0], *steps, right_hand_sides)
+    return Raw(ys, violated, reached, status, t_end[0], end[0], *steps, right_hand_sides)
 
 
 def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array, "2n"]:
@@ -63,4 +67,6 @@ def _first_step(problem: Problem, y0: Array) -> Array:
 def _controller(problem: Problem) -> diffrax.PIDController:
     # Every coordinate and velocity meets its tolerance: the mean over a large mechanism would hide one that does not.
     settings: dict[str, Any] = {"norm": optx.max_norm, "dtmin": problem.smallest, "force_dtmin": False}
+    if is_explicit(problem.solver):  # the same steps as in lanes
+        settings |= {"safety": SAFETY, "factormin": SHRINK, "factormax": GROW}
     return diffrax.PIDController(rtol=problem.rtol, atol=problem.atol, **settings)

@@ -31,10 +31,12 @@ from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.straightline import when
 from udkjax.straightline.emit import cut
 
-SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0  # of the step's size: diffrax's own, so that both take the same steps
+# Of the step's size. With 0.9 every tenth step of an ordinary run is rejected, and runs take 5 to 15 % more steps at equal error.
+SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
 # A stage on a singular configuration, or an end beside it, whose accelerations are not good enough to interpolate with, is there
 # by chance: a step that is a little shorter misses it, and costs less than care. Where a few do not help, one is on it.
 DODGE, DODGES = 0.8, 3
+CHAINS = 4
 BLOCK = 4  # output times that are interpolated together
 
 
@@ -120,7 +122,8 @@ def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: 
 
 def _combine(weights: Array, a: Array) -> Array:
     """sum_j weights_j a_j. Not a product of matrices, for which XLA writes a loop that does not vectorize."""
-    return cut([sum(w * x for w, x in zip(weights, a, strict=True))])[0]
+    terms = [w * x for w, x in zip(weights, a, strict=True)]
+    return cut([sum(sum(terms[k::CHAINS]) for k in range(min(CHAINS, len(terms))))])[0]
 
 
 def _relative(task: Task, error: Array, y0: Array, y1: Array) -> Array:
@@ -164,7 +167,8 @@ def march(task: Task, q: Array, v: Array) -> March:
         return _decide(task, m, trial, last, m.doubt, careful=True)._replace(doubt=jnp.zeros(lanes, bool))
 
     def rounds(m: March) -> March:
-        return again(jax.lax.while_loop(lambda m: running(m) & ~jnp.any(m.doubt), quick, m))
+        m = jax.lax.while_loop(lambda m: running(m) & ~jnp.any(m.doubt), quick, m)
+        return jax.lax.cond(jnp.any(m.doubt), again, lambda m: m, m)
 
     return jax.lax.while_loop(running, rounds, first)
 

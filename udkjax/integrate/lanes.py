@@ -19,14 +19,17 @@ from udkjax.equations.motion import Motion, Tangential
 from udkjax.integrate.explicit import March, Task, Trial, judged, march, stage_state
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
-from udkjax.integrate.projection import lasting, project
+from udkjax.integrate.projection import lasting, project, violation
 from udkjax.integrate.tableau import is_explicit, method_of
+from udkjax.straightline.vector import BARRIERS_HOLD
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
 FAR = 1e-8  # m, rad, m/s, rad/s: a projection leaves rounding errors of what is nearer to the manifold
 PASSES = 6  # projections of an output: where two branches of the manifold meet, Newton's method halves the distance in a step
 LANES = 64  # with 16 or 32 a lane of the paper's linkage takes longer, with 128 no less
+# A single run has its outputs projected side by side, too, where that fills vectors and does not take long to compile.
+FEW_OUTPUTS, FEW_BODIES = 16, 12
 
 
 def serves(problem: Problem) -> bool:
@@ -187,12 +190,13 @@ def _all_of_it(t: Array, q: Array, v: Array, dq: Array, dv: Array) -> Tangential
 def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
     """What a march leaves behind, with the outputs on the manifold."""
     inner, end = len(problem.ts) - 2, jnp.concatenate([m.here.q, m.here.v])
-    ys = jnp.concatenate([m.outputs[:inner], end[None]])
-    ys = _projected(lanes, problem.ts[1:], ys) if problem.projected else ys
-    ys = jnp.concatenate([jnp.concatenate([problem.q, problem.v])[None], ys])
+    start, ys = jnp.concatenate([problem.q, problem.v]), jnp.concatenate([m.outputs[:inner], end[None]])
+    first = lanes.over(violation, jnp.broadcast_to(problem.ts[0], lanes.shape), start)
+    ys, violated = _each_output(lanes, partial(_output, problem.projected), problem.ts[1:], ys, wide=problem.careful)
+    ys, violated = jnp.concatenate([start[None], ys]), jnp.concatenate([first[None], violated])
     number = jnp.arange(inner + 2).reshape(-1, *[1] * len(lanes.shape))
     reached = (number <= m.written) & (number <= inner) | (m.code == DONE)
-    return Raw(ys, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
+    return Raw(ys, violated, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
 
 
 # --- with care
@@ -224,21 +228,38 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
     return lanes.each(doubt, one, nothing, here, h, t1, begin, *tolerances)
 
 
-def _projected(lanes: Lanes, ts: Array, ys: Array) -> Array:
-    """Interpolated states (T, 2n, *lanes), each returned to the manifold."""
-    if ts.ndim <= len(lanes.shape):
-        ts = jnp.broadcast_to(ts[:, None], (len(ts), *lanes.shape))
+# --- outputs
+
+
+def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], ts: Array, ys: Array, wide: bool) -> Any:
+    """`function(lanes, t, y)` of states ys (T, 2n, *lanes), one time after another: that is faster than all at once.
+
+    `wide` takes the times of a single run as so many lanes, which takes longer to compile.
+    """
+    count, n = ys.shape[:2]
+    few = count < FEW_OUTPUTS or n > 6 * FEW_BODIES or jax.__version_info__ < BARRIERS_HOLD
+    if lanes.size is not None or few or not wide or jax.default_backend() not in CHUNKED:
+        if ts.ndim <= len(lanes.shape):
+            ts = jnp.broadcast_to(ts[:, None], (len(ts), *lanes.shape))
+        return jax.lax.map(lambda x: function(lanes, *x), (ts, ys))
+    chunks = -(-count // LANES)
+    width = -(-count // (chunks * ROUND)) * ROUND
+    places = jnp.minimum(jnp.arange(chunks * width), count - 1).reshape(chunks, width)
+    times = Lanes(lanes.equations, None, width)
+    found = jax.lax.map(lambda places: function(times, ts[places], ys[places].T), places)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 1).reshape(-1, *x.shape[1:-1])[:count], found)
+
+
+def _output(projected: bool, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array]:
+    """Interpolated states (2n, *lanes), returned to the manifold, and how they violate the constraints."""
     over = partial(lanes.over, lambda e, t, y: project(e.forgiving, t, y))
 
-    def one(x: tuple[Array, Array]) -> Array:
-        t, y = x
+    def again(carry: Any) -> Any:
+        k, y, far = carry
+        nearer = over(t, y)
+        return k + 1, jnp.where(far, nearer, y), far & jnp.any(jnp.abs(nearer - y) > FAR, axis=0)
 
-        def again(carry: Any) -> Any:
-            k, y, far = carry
-            nearer = over(t, y)
-            return k + 1, jnp.where(far, nearer, y), far & jnp.any(jnp.abs(nearer - y) > FAR, axis=0)
-
+    if projected:
         start = 0, y, jnp.ones(lanes.shape, bool)  # no lane's result depends on those beside it
-        return jax.lax.while_loop(lambda c: jnp.any(c[2]) & (c[0] < PASSES), again, start)[1]
-
-    return jax.lax.map(one, (ts, ys))  # one time after another is faster, and compiles faster, than all at once
+        y = jax.lax.while_loop(lambda c: jnp.any(c[2]) & (c[0] < PASSES), again, start)[1]
+    return y, lanes.over(violation, t, y)

@@ -15,12 +15,11 @@ AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one lo
 
 
 class Run(eqx.Module):
-    """A run as the integrator leaves it, with outputs on the manifold."""
+    """A run as the integrator leaves it."""
 
     equations: Any
     raw: Raw
     ts: Float[Array, "T"]
-    ys: Float[Array, "T 2n"]
     closed: Bool[Array, ""]
     missed: Bool[Array, ""]  # the closed state takes rows that the method leaves out
     drift_tol: Float[Array, ""]
@@ -52,14 +51,7 @@ def _stopped(run: Run) -> Array:
 
 def _drift(run: Run, code: Array) -> tuple[Array, Array, Bool[Array, "T"]]:
     """The first output time at which a row of Psi is violated, also one that the method leaves out, ends the solution."""
-    if not run.equations.constrained:
-        return code, run.raw.t, run.raw.reached
-
-    def violation(x: tuple[Array, Array]) -> Array:
-        t, y = x
-        return jnp.max(jnp.abs(run.equations.violation(t, *jnp.split(y, 2))[0]), initial=0.0)
-
-    lost = run.raw.reached & ~(jax.lax.map(violation, (run.ts, run.ys)) <= run.drift_tol)
+    lost = run.raw.reached & ~(run.raw.violation <= run.drift_tol)
     drifted, first = jnp.any(lost), jnp.argmax(lost)
     reached = run.raw.reached & (~drifted | (jnp.arange(len(run.ts)) <= first))
     return jnp.where(drifted, Result.drift, code), jnp.where(drifted, run.ts[first], run.raw.t), reached

@@ -38,6 +38,14 @@ def lasting(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array)
     return Tangential(left_q + TAKEN_BACK * (dq - left_q), left_v + TAKEN_BACK * (dv - left_v), jnp.asarray(far))
 
 
+def violation(equations: Motion, t: Any, y: Float[Array, "2n"]) -> Float[Array, ""]:
+    """The largest of any row of Psi, also of those that the method leaves out."""
+    if not equations.constrained:
+        return jnp.zeros(())
+    equations, t, y = undifferentiated((equations, t, y))
+    return jnp.max(jnp.abs(equations.violation(t, *jnp.split(y, 2))[0]), initial=0.0)
+
+
 def project_all(equations: Any, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:
     """States at many times, each returned to the manifold.
 

@@ -149,7 +149,7 @@ def _simulate(
     else:
         raw = _by_diffrax(problem, adjoint, meter)
     ys = jnp.where(raw.reached[:, None], raw.ys, jnp.concatenate([q, v])).at[0].set(jnp.concatenate([q, v]))
-    seen = undifferentiated(Run(equations, raw, ts, ys, closed, missed, drift_tol))
+    seen = undifferentiated(Run(equations, raw, ts, closed, missed, drift_tol))
     code, time, reached = outcome(seen)
     ys = jnp.where(reached[:, None], ys, jnp.nan)
     q, v = (y.reshape(len(ts), *start.q.shape) for y in jnp.split(ys, 2, axis=1))

@@ -106,16 +106,18 @@ class Factors(NamedTuple):
     order: list[int]
     lower: list[dict[int, Scalar]]  # by columns, without the unit diagonal
     inverse_pivots: list[Scalar]
-    kept: list[Scalar]  # booleans, in the order of elimination
     pivots: list[tuple[Scalar, Scalar]]  # each with its row's diagonal entry
 
+    def above(self, fraction: Scalar | float) -> list[Scalar]:
+        """Which pivots exceed this fraction of their row's diagonal entry: booleans, in the order of elimination."""
+        return [greater(pivot, diagonal * fraction) for pivot, diagonal in self.pivots]
 
-def factorize(rows: Sequence[Row], drop: Scalar) -> Factors:
-    """D D^T = L diag(p) L^T. A pivot is kept if it exceeds `drop` times its row's diagonal entry.
 
-    Zero stands for the reciprocal of the others, which takes their rows out.
+def factorize(rows: Sequence[Row], graph: Graph, drop: Scalar | None = None) -> Factors:
+    """D D^T = L diag(p) L^T. A pivot that does not exceed `drop` times its row's diagonal entry takes its row out.
+
+    Zero stands for its reciprocal. Without `drop` no pivot is looked at, and no other waits for that.
     """
-    graph = drop.graph
     order = minimum_degree([set(row) for row in rows])
     place = {row: j for j, row in enumerate(order)}
     meets: dict[int, list[int]] = {}
@@ -131,12 +133,10 @@ def factorize(rows: Sequence[Row], drop: Scalar) -> Factors:
                     target = column[place[j]]
                     target[place[i]] = target.get(place[i], zero) + rows[i][k] * rows[j][k]
     diagonal = [column[j].get(j, zero) for j in range(len(rows))]
-    inverse, kept, pivots = [], [], []
+    inverse, pivots = [], []
     for j in range(len(rows)):
         d = column[j].get(j, zero)
-        keep = greater(d, drop * diagonal[j])
-        inverse.append(where(keep, one / d, zero))
-        kept.append(keep)
+        inverse.append(one / d if drop is None else where(greater(d, diagonal[j] * drop), one / d, zero))
         pivots.append((d, diagonal[j]))
         below = sorted(i for i in column[j] if i > j)
         lower = {i: column[j][i] * inverse[j] for i in below}
@@ -145,7 +145,7 @@ def factorize(rows: Sequence[Row], drop: Scalar) -> Factors:
                 if k <= i:
                     column[k][i] = column[k].get(i, zero) - lower[i] * column[j][k]
         column[j] = lower
-    return Factors(order, column, inverse, kept, pivots)
+    return Factors(order, column, inverse, pivots)
 
 
 def multipliers(factors: Factors, b: Sequence[Scalar]) -> list[Scalar]:
@@ -211,10 +211,10 @@ class EliminationProgram:
         rows: list[Row] = [{} for _ in b]
         for e in pattern.entries:
             rows[e.row][e.column] = values[e.slot] if e.sign > 0 else -values[e.slot]
-        factors = factorize(rows, tol * tol)
+        factors = factorize(rows, graph, tol * tol)
         y = multipliers(factors, b)
         lower = frontier(graph, y, lambda node: "right" not in node.depends)
-        self._factor = Program(graph, [*values, tol], [*lower, *factors.kept])
+        self._factor = Program(graph, [*values, tol], [*lower, *factors.above(tol * tol)])
         self._solve = Program(graph, [*lower, *b], y)
         self._lower = len(lower)
 

@@ -4,7 +4,7 @@ On JAX scalars it is traced (under vmap each scalar becomes one vector over the 
 floats it is evaluated at once, which is how a scene is analysed without compiling anything.
 
 XLA would fuse each output with a copy of everything before it. `cut_every` places an optimization barrier after that many
-operations; a barrier stops the duplication and changes no value.
+operations in a batch, after twice as many outside of one; a barrier stops the duplication and changes no value.
 """
 
 import math
@@ -22,6 +22,8 @@ from udkjax.straightline.graph import Details, Graph, Node, Scalar
 from udkjax.straightline.trigonometry import sincos_of_each
 
 # Operations between two optimization barriers. Without any, XLA repeats everything for each output; with too many it cannot fuse.
+# What passes a barrier goes through memory, for which a single run waits: there half of them are a tenth faster. In lanes, whose
+# numbers fill vectors, they are as much slower.
 CUT_EVERY = 48
 
 _PAIR = ("sin", "cos")
@@ -68,20 +70,23 @@ class Program:
         known: dict[int, Any] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
         pairs: dict[int, tuple[Any, Any]] = {}
         recent: list[int] = []
+        cuts = 0
         for k, index in enumerate(self.order):
             node = self.graph.nodes[index]
             known[index] = _evaluate(node, known, pairs, self.angles)
             if node.kind not in ("constant", "call"):
                 recent.append(index)
-            if self.cut_every and len(recent) >= self.cut_every:
-                self._cut(known, [i for i in recent if self.last_use[i] > k])
-                recent = []
+            if self.cut_every and len(recent) >= (cuts % 2 + 1) * self.cut_every:
+                cuts += 1
+                batch = cuts % 2 == 1
+                self._cut(known, [i for i in recent if self.last_use[i] > k], only_batches=batch)
+                recent = recent if batch else []
         return [_signed(known, s) for s in self.outputs]
 
-    def _cut(self, known: dict[int, Any], live: list[int]):
+    def _cut(self, known: dict[int, Any], live: list[int], only_batches: bool):
         traced = [i for i in live if isinstance(known[i], jax.Array)]
         if traced:
-            known.update(zip(traced, cut([known[i] for i in traced]), strict=True))
+            known.update(zip(traced, cut([known[i] for i in traced], only_batches), strict=True))
 
     def count(self) -> dict[str, int]:
         """How many operations of each kind the program holds; the sine and cosine of one angle are one."""
@@ -94,24 +99,27 @@ class Program:
         return counts | ({"sincos": len(self.angles)} if self.angles else {})
 
 
-def cut(values: Sequence[Any]) -> list[Any]:
-    """Keep XLA from fusing across this point: the identity, with the identity's derivative."""
-    return cut_p.bind(*values)
+def cut(values: Sequence[Any], only_batches: bool = False) -> list[Any]:
+    """Keep XLA from fusing across this point, or only where there are batches: the identity, with the identity's derivative."""
+    return cut_p.bind(*values, only_batches=only_batches)
 
 
-def _derivative(primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+def _derivative(primals: Sequence[Any], tangents: Sequence[Any], only_batches: bool) -> tuple[list[Any], list[Any]]:
     # One by one: a barrier of which only a part depends on what is differentiated has no transpose in jax 0.12.
-    return cut_p.bind(*primals), [t if isinstance(t, ad.Zero) else jax.lax.optimization_barrier(t) for t in tangents]
+    kept = [t if only_batches or isinstance(t, ad.Zero) else jax.lax.optimization_barrier(t) for t in tangents]
+    return cut(primals, only_batches), kept
 
 
 # A primitive: programs hold hundreds, and a function with a derivative of its own takes ten times as long to trace.
 cut_p = Primitive("cut")
 cut_p.multiple_results = True
-cut_p.def_impl(lambda *xs: list(xs))
-cut_p.def_abstract_eval(lambda *xs: list(xs))
-batching.primitive_batchers[cut_p] = lambda xs, axes: (cut_p.bind(*xs), axes)
+cut_p.def_impl(lambda *xs, only_batches: list(xs))
+cut_p.def_abstract_eval(lambda *xs, only_batches: list(xs))
+batching.primitive_batchers[cut_p] = lambda xs, axes, only_batches: (cut(xs), axes)
 ad.primitive_jvps[cut_p] = _derivative
-mlir.register_lowering(cut_p, mlir.lower_fun(lambda *xs: jax.lax.optimization_barrier(list(xs))))
+mlir.register_lowering(
+    cut_p, mlir.lower_fun(lambda *xs, only_batches: list(xs) if only_batches else jax.lax.optimization_barrier(list(xs)))
+)
 
 
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:
