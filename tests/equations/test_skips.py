@@ -370,15 +370,12 @@ def test_a_duplicated_joint_adds_no_operation_to_the_projection(linkage):
         assert counts[0] == counts[1], name
 
 
-PIVOTS = 11
-
-
 def test_rows_left_out_are_watched_only_where_asked_for(linkage):
     auto = prepare(linkage, udk.Auto()).code
     watched, plain = (sum(auto.program(name).count().values()) for name in ("accelerations_watched", "accelerations"))
     assert plain < watched < plain + 100
     dropping = prepare(linkage, ELIMINATION).code.program("accelerations").count()  # which chooses at each pivot
-    assert plain == sum(dropping.values()) - dropping["select_n"] + PIVOTS - 1
+    assert plain == sum(dropping.values()) - dropping["select_n"] + dropping["gt"] - 1  # and asks about all of them
 
 
 def test_auto_is_elimination_and_a_branch(linkage, plain):
@@ -392,6 +389,22 @@ def test_auto_is_elimination_and_a_branch(linkage, plain):
 
 
 # --- structure
+
+
+@pytest.mark.parametrize(
+    "mechanism, pivots, most",
+    [(udk.library.parallelogram(), 11, 7), (udk.library.chain(10), 20, 12), (udk.library.excavator(), 12, 8)],
+    ids=["parallelogram", "chain", "excavator"],
+)
+def test_pivots_that_need_not_wait_for_each_other_do_not(mechanism, pivots, most):
+    """A division takes several times as long as what is between two of them: those in a row are what a single run waits for."""
+    code = prepare(mechanism, udk.Auto()).code
+    program, row = code.program("accelerations"), {}
+    for index in program.order:
+        node = program.graph.nodes[index]
+        row[index] = max((row.get(a.index, 0) for a in node.arguments), default=0) + (node.kind == "div")
+    assert len(code.kept) == pivots <= program.count()["div"]
+    assert max(row[s.index] for s in program.outputs) <= most
 
 
 def test_parts_that_do_not_touch_are_solved_apart(rod):

@@ -36,7 +36,7 @@ SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
 # A stage on a singular configuration, or an end beside it, whose accelerations are not good enough to interpolate with, is there
 # by chance: a step that is a little shorter misses it, and costs less than care. Where a few do not help, one is on it.
 DODGE, DODGES = 0.8, 3
-CHAINS = 4
+CHAINS = 4  # sums that a sum over stages is made of, none of which waits for another
 BLOCK = 4  # output times that are interpolated together
 
 

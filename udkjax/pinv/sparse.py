@@ -77,7 +77,10 @@ def pattern(rows: Sequence[Row], columns: int) -> tuple[Pattern, list[Scalar]]:
 
 
 def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
-    """Order rows so that eliminating D D^T fills little: always the row that meets the fewest others (ties: the first)."""
+    """Order rows so that eliminating D D^T fills little: always the row that meets the fewest others.
+
+    Of several the one that waits for the fewest before it (ties: the first): what does not wait is computed side by side.
+    """
     meets: dict[int, set[int]] = {}
     for i, row in enumerate(rows):
         for k in row:
@@ -157,7 +160,7 @@ def multipliers(factors: Factors, b: Sequence[Scalar]) -> list[Scalar]:
             y[i] = y[i] - entry * y[j]
     for j in reversed(range(m)):
         y[j] = y[j] * factors.inverse_pivots[j]
-        for i, entry in reversed(factors.lower[j].items()):
+        for i, entry in reversed(factors.lower[j].items()):  # what was found last comes last: nothing else waits for it
             y[j] = y[j] - entry * y[i]
     result: list[Scalar] = [b[0]] * m
     for j, i in enumerate(factors.order):
