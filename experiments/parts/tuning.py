@@ -67,7 +67,7 @@ def scene(name: str) -> Scene:
         sol = udk.simulate(mechanism, jnp.stack([0.0, end]), state, tol, tol, method, gains, **choices)
         return udk.violation(mechanism, sol)[-1], (sol.stats["right_hand_sides"], sol.stats["accepted"])
 
-    # the derivative of the batch: a batch of derivatives along one direction, not batched itself, is refused by `custom_vmap`
+    # the derivative of the batch, which takes less than a batch of derivatives
     def adaptive(z, state, ends, tol):
         runs = lambda z: jax.vmap(psi, in_axes=(0, None, 0, None))(z, state, ends, tol)  # noqa: E731
         return jax.jvp(runs, (z,), (jnp.ones_like(z),), has_aux=True)

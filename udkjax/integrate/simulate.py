@@ -70,7 +70,7 @@ def simulate(
     another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`, `NullSpaceSVD` or `CoordinatePartitioning`;
     `method` then serves projection and derivatives. `progress=True` prints how far the run is. `careful=False` leaves out what
     steps beside singular configurations take, a fifth to three fifths of what there is to compile: a run that comes to one ends
-    there (`Result.needs_care`).
+    there (`Result.needs_care`). It also projects outputs one by one, not side by side, which is slower and compiles faster.
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. For forward mode give `adjoint=diffrax.ForwardMode()`; reverse mode works as it is. Explicit Runge-Kutta methods
