@@ -17,7 +17,6 @@ if OWN_CACHE:
     os.environ["UDKJAX_COMPILATION_CACHE"] = OWN_CACHE
 
 import udkjax as udk
-from udkjax.straightline.vector import BARRIERS_HOLD
 from udkjax.study.cases import Case, Scope, plan
 from udkjax.study.drift_law import growth_rate, swing_of
 from udkjax.study.record import dataset
@@ -34,14 +33,6 @@ SCOPE = Scope(
 )
 INSTANTS = 81
 LOST = {1e-8: 10.0, 1e-6: 13.0}  # s
-
-
-@pytest.hookimpl(tryfirst=True)  # before what is slow is left out
-def pytest_collection_modifyitems(items):
-    if jax.__version_info__ < BARRIERS_HOLD:
-        for item in items:
-            if item.get_closest_marker("barriers"):
-                item.add_marker("slow")
 
 
 def pytest_unconfigure():

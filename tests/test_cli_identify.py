@@ -38,7 +38,6 @@ def data(tmp_path_factory) -> Path:
     return file
 
 
-@pytest.mark.barriers
 def test_what_the_data_cannot_tell_is_said_and_all_is_written(tmp_path, capsys, data):
     out = tmp_path / "found"
     assert udkjax("identify", PENDULUM, data, "--parameters", MASS, INERTIA, "--ignore", "remark", "--out", out, "--quiet") == 1

@@ -53,6 +53,24 @@ def test_the_environment_decides(tmp_path, choice, expected):
     assert python(PRINT.replace("jax, udkjax", "udkjax, jax"), HOME=tmp_path, **choice) == expected.format(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("installed", "given", "expected"),
+    [
+        ("0.10.2", None, "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"),
+        ("0.11.2", "--xla_a=1", "--xla_a=1 --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"),
+        ("0.11.2", "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=7", None),
+        ("0.12.0", None, None),
+        ("0.12.0", "--xla_a=1", None),
+        ("our own", None, None),
+    ],
+)
+def test_loops_are_compiled_whole(monkeypatch, installed, given, expected):
+    monkeypatch.setenv("XLA_FLAGS", given or "")
+    monkeypatch.setattr(environment, "version", {"jax": installed}.get)
+    environment.enable_whole_loops()
+    assert os.environ["XLA_FLAGS"] == (expected or given or "")
+
+
 def test_a_cache_configured_before_stays(tmp_path):
     mine = str(tmp_path / "mine")
     code = f"import jax; jax.config.update('jax_compilation_cache_dir', {mine!r});" + PRINT

@@ -2,13 +2,14 @@
 
 Nothing is imported before it is used, so that the command line answers at once. Importing this package turns float64 on in
 JAX, unless the environment says `JAX_ENABLE_X64=0`, and lets JAX keep compiled programs in the user's cache folder, unless it
-says `UDKJAX_COMPILATION_CACHE=0`, or names another folder there.
+says `UDKJAX_COMPILATION_CACHE=0`, or names another folder there. Before JAX 0.12 it also adds to `XLA_FLAGS` that loops are
+compiled whole on the CPU.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from udkjax.environment import enable_compilation_cache, enable_float64
+from udkjax.environment import enable_compilation_cache, enable_float64, enable_whole_loops
 
 if TYPE_CHECKING:  # the public names, for type checkers and editors; a test compares them with those below
     from udkjax import equations as equations
@@ -142,4 +143,5 @@ def __dir__():
 
 
 enable_float64()
+enable_whole_loops()
 enable_compilation_cache()

@@ -1,4 +1,4 @@
-"""What importing this package sets up in JAX: float64, and a cache of compiled programs on disk.
+"""What importing this package sets up in JAX: float64, a cache of compiled programs on disk, and loops that are compiled whole.
 
 Only the standard library is imported, so that the command line answers at once: before JAX is, its environment variables are set;
 afterwards, its configuration.
@@ -8,12 +8,16 @@ import atexit
 import os
 import sys
 import time
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 FLOAT64 = "JAX_ENABLE_X64"
 CACHE = "UDKJAX_COMPILATION_CACHE"
 NO = ("0", "n", "no", "f", "false", "off")
 YES = ("", "1", "y", "yes", "t", "true", "on")
+XLA_FLAGS = "XLA_FLAGS"
+WHOLE_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
+WHOLE_BELOW = 10**9  # bytes that a round of the loop touches; JAX's own choice from 0.12 on, before that it is 1024
 
 # JAX can bound the cache itself only where the package filelock is installed, and then it looks at every file for each program.
 LARGEST = 512 * 2**20  # bytes; a simulation's program is about one megabyte
@@ -25,6 +29,21 @@ def enable_float64() -> None:
     os.environ[FLOAT64] = os.environ.get(FLOAT64) or "1"
     if os.environ[FLOAT64].lower() not in NO and "jax" in sys.modules:  # it has read its environment already
         sys.modules["jax"].config.update("jax_enable_x64", True)
+
+
+def enable_whole_loops() -> None:
+    """Let XLA make one function of a loop on the CPU, as it does by itself from JAX 0.12 on.
+
+    Before, it starts each operation of each round by itself, for 50 to 150 ns, unless the loop is tiny: a run takes 20 to 40 times
+    as long. XLA reads its flags when it is first used; what they say of this already stays.
+    """
+    flags = os.environ.get(XLA_FLAGS, "")
+    try:
+        old = tuple(map(int, version("jax").split(".")[:2])) < (0, 12)
+    except (PackageNotFoundError, ValueError):  # a version of somebody's own
+        return
+    if old and WHOLE_LOOPS not in flags:
+        os.environ[XLA_FLAGS] = f"{flags} --xla_backend_extra_options={WHOLE_LOOPS}={WHOLE_BELOW}".strip()
 
 
 def enable_compilation_cache() -> None:

@@ -223,7 +223,6 @@ def central(function, p, step):
 
 
 @pytest.mark.parametrize("start", STARTS)
-@pytest.mark.barriers
 def test_derivatives_of_the_assembled_state(assembled, start):
     """With redundant rows, of tied lengths, masses and the guess: forward and reverse."""
     p = jnp.array(STARTS[start])

@@ -37,7 +37,7 @@ def inner(a, b):
 @pytest.mark.parametrize(
     ("scene", "method", "baumgarte"),
     [
-        pytest.param("driven", ELIMINATION, BAUMGARTE, marks=pytest.mark.barriers),
+        ("driven", ELIMINATION, BAUMGARTE),
         pytest.param("parallelogram", udk.Auto(), None, marks=pytest.mark.slow),
         *(pytest.param(scene, udk.Auto(), BAUMGARTE, marks=pytest.mark.slow) for scene in SCENES),
     ],
@@ -108,7 +108,6 @@ def test_a_state_that_elimination_cannot_solve_spoils_no_derivative(linkage, pla
     np.testing.assert_allclose(tangent, 2.0 * jnp.tile(v, 3), rtol=1e-15)
 
 
-@pytest.mark.barriers
 def test_batches_of_states_and_of_directions(linkage, placed):
     """In any nesting, forward and reverse, the same numbers."""
     equations = prepare(linkage, udk.Auto()).quick

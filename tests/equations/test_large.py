@@ -119,7 +119,6 @@ def whole():
     return mech, mech.q0.ravel() + 0.1 * random.standard_normal(33), random.standard_normal(33)
 
 
-@pytest.mark.barriers
 def test_everything_agrees_with_the_equation_written_down_plainly(whole, twin):
     mech, q, v = whole
     t = jnp.array(0.3)

@@ -11,7 +11,6 @@ import math
 import re
 from collections import Counter
 from functools import cache
-from importlib import import_module
 
 import equinox as eqx
 import jax
@@ -126,14 +125,6 @@ def joined(mechanism, *, joints=None, drivers=None, forces=None, name=""):
     )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_operation_a_number():
-    """Results are stacked, not selected into one kernel: that is a matter of the compiler, and not counted."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(import_module("udkjax.straightline.vector"), "BARRIERS_HOLD", (0, 0))
-        yield
-
-
 @pytest.fixture(scope="module")
 def linkage():
     return udk.library.parallelogram()
@@ -230,10 +221,6 @@ def test_the_lowered_program_is_the_counted_one(linkage, plain):
     assert found["negate"] <= 12
 
 
-BARRIERS_HOLD = tuple(map(int, jax.__version__.split(".")[:2])) >= (0, 12)
-
-
-@pytest.mark.skipif(not BARRIERS_HOLD, reason="earlier versions ignore barriers on the CPU")
 def test_the_compiler_repeats_little_of_it(linkage, plain):
     """Without barriers it computes everything before an output anew for each of them: ten times the operations."""
     equations = prepare(linkage, ELIMINATION)

@@ -336,7 +336,7 @@ def test_a_mechanism_made_of_traced_numbers():
 # --- derivatives
 
 
-DIFFERENTIATED = [udk.Auto(), udk.SVD(), pytest.param(udk.Elimination(), marks=pytest.mark.barriers)]
+DIFFERENTIATED = [udk.Auto(), udk.SVD(), udk.Elimination()]
 
 
 @pytest.mark.parametrize("method", DIFFERENTIATED, ids=["Auto", "SVD", "Elimination"])

@@ -11,12 +11,11 @@ from experiments.common import HERE, NAMES, described, load, run, tracked
 
 # studies whose small runs compile for long
 SLOW: set[str] = {"singular_crossing", "inconsistent_starts", "precision", "gains", "threshold_map", "tune_gains"}
-LONG = {"convergence", "long_runs"}  # and those that do so before jax 0.11
 README = (HERE / "README.md").read_text(encoding="utf-8")
 
 
 def marks(name):
-    return [pytest.mark.slow] if name in SLOW else [pytest.mark.barriers] if name in LONG else []
+    return [pytest.mark.slow] if name in SLOW else []
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in NAMES])

@@ -42,7 +42,6 @@ STARTS = {  # angle, angular velocity, bound: the last four cross singular confi
 
 
 @pytest.mark.parametrize(("angle", "rate", "bound"), STARTS.values(), ids=STARTS)
-@pytest.mark.barriers
 def test_linkage(angle, rate, bound):
     """All coordinates at all times, and all joints closed."""
     mech = udk.library.parallelogram(np.deg2rad(angle), rate)
@@ -82,7 +81,6 @@ def test_outputs_beside_singular_configurations():
         assert np.abs(energy - energy[0]).max() < 1e3 * tol
 
 
-@pytest.mark.barriers
 def test_many_starts_cross_singular_configurations(linkage, placed):
     """One start flatters: 64 spread by 5 degrees about each of three, every one of which crosses."""
 
@@ -149,7 +147,6 @@ def test_small_gains_hold_it(unstable, gain):
 
 
 @pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.slow)])
-@pytest.mark.barriers
 def test_n_four_bar(data, table, n):
     known = data("iftomm_A02_n_four_bar")["cases"][f"N={n}"]
     ts, row = table({"0": {"B0x": 0, "B0y": 1, "B0vx": 1, "B0vy": 0}, **known["reference"]}, (0, 0.5, 1, 2, 4, 5, 10))

@@ -247,7 +247,6 @@ def test_batch_equals_single_runs(reacted):
         assert batch.stats["num_steps"][i] == single.stats["num_steps"]
 
 
-@pytest.mark.barriers
 def test_gradients(reacted):
     """By rate and initial state, in both modes; of x exactly, of z by differences."""
     k, h = 3.0, 1e-3

@@ -122,7 +122,6 @@ def test_derivatives_agree_with_differences():
 
 
 @pytest.mark.parametrize("method", fast("Elimination", "Auto"))
-@pytest.mark.barriers
 def test_projection_has_derivatives(method):
     """A closed state stays; its change along the manifold stays too, and a change that opens the loop is taken back."""
     equations = prepare(LINKAGE, method)
@@ -189,12 +188,10 @@ def check(value, gradient):
 
 
 @pytest.mark.parametrize("method", fast("Elimination"))
-@pytest.mark.barriers
 def test_gradient_of_a_trajectory_forward(method):
     check(*forward(method=method))
 
 
-@pytest.mark.barriers
 @pytest.mark.parametrize("method", fast("Elimination"))
 def test_gradient_of_a_trajectory_reverse(method):
     check(*reverse(method=method))

@@ -63,7 +63,6 @@ def test_reverse_mode_by_checkpoints(gradient):
 
 
 @pytest.mark.parametrize("kept", [8, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.barriers
 def test_steps_that_were_not_kept_are_taken_again(gradient, monkeypatch, kept):
     monkeypatch.setattr(record, "KEPT", kept)
     assert udk.simulate(PENDULUM, TS, **CHOICES).stats["accepted"] > 2 * kept
@@ -111,7 +110,6 @@ def test_second_derivatives(gradient):
     assert_same(second, jax.tree.map(lambda a, b: (a - b) / (2 * h), *moved), 1e-5)
 
 
-@pytest.mark.barriers
 def test_a_run_that_stops(gradient):
     """What was reached has its derivatives; what was not has none."""
     few = lambda x: angles(x, max_steps=15)  # noqa: E731

@@ -107,7 +107,6 @@ def test_natural_spline_goes_on_straight():
     assert_allclose(splines.natural(0.25, jnp.array([0.0, 1.0]), jnp.array([1.0, 3.0])), 1.5, rtol=1e-15)  # two knots: a line
 
 
-@pytest.mark.barriers
 def test_cam_depends_smoothly_on_its_profile(everything, at):
     def row(radius):
         return evaluate(everything.with_parameters({"joint.cam.profile.radius": radius}), "cam", at, everything.q0)[0]

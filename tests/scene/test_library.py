@@ -98,7 +98,6 @@ def test_the_excavator_is_in_equilibrium_on_its_cylinders(at):
 
 
 @pytest.mark.parametrize("driven", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.barriers
 def test_the_excavator_moves_for_20_s_without_a_singular_configuration(driven, psi):
     import udkjax
 

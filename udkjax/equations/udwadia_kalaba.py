@@ -27,15 +27,13 @@ from udkjax.equations.plain import plain_accelerations
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline.vector import BARRIERS_HOLD
 
 # Far above rounding and drift, far below the singular values of a mechanism in ordinary positions: with the states returned to
 # the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
 RANK_TOL = 1e-4
 # Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
-# longer to trace and compile, the larger the scene (see the scaling benchmark), and where XLA ignores optimization barriers,
-# minutes from a few joints on.
-LARGE = 150 if jax.__version_info__ >= BARRIERS_HOLD else 32
+# longer to trace and compile, the larger the scene (see the scaling benchmark).
+LARGE = 150
 NOTHING_LEFT = 1e-14  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
 ORDINARY = 100.0  # the ratio of masses up to which that holds: see `rank_tolerance`
 

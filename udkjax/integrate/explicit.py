@@ -28,8 +28,7 @@ from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TO
 from udkjax.integrate.record import Record, blank, noted
 from udkjax.integrate.tableau import Method
 from udkjax.integrate.undifferentiated import undifferentiated
-from udkjax.straightline import when
-from udkjax.straightline.emit import cut
+from udkjax.straightline import cut, when
 
 # Of the step's size. With 0.9 every tenth step of an ordinary run is rejected, and most runs take 4 to 15 % more at equal error.
 SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0

@@ -21,7 +21,6 @@ from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import lasting, project, violation
 from udkjax.integrate.tableau import is_explicit, method_of
-from udkjax.straightline.vector import BARRIERS_HOLD
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
@@ -237,7 +236,7 @@ def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], t
     `wide` takes the times of a single run as so many lanes, which takes longer to compile.
     """
     count, n = ys.shape[:2]
-    few = count < FEW_OUTPUTS or n > 6 * FEW_BODIES or jax.__version_info__ < BARRIERS_HOLD
+    few = count < FEW_OUTPUTS or n > 6 * FEW_BODIES
     if lanes.size is not None or few or not wide or jax.default_backend() not in CHUNKED:
         if ts.ndim <= len(lanes.shape):
             ts = jnp.broadcast_to(ts[:, None], (len(ts), *lanes.shape))

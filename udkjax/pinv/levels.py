@@ -20,6 +20,7 @@ from jax import Array, lax
 
 from udkjax.pinv.dissection import dissect
 from udkjax.pinv.fronts import Group, Plan, plan
+from udkjax.straightline import barrier
 
 # Up to so many rows are eliminated by code written out, more by a loop: code grows with the square of their number.
 UNROLLED = 8
@@ -32,9 +33,12 @@ class Factor(NamedTuple):
     inverse_pivots: Array  # (e, fronts)
 
 
-cut = lax.optimization_barrier  # between steps that XLA would otherwise repeat for every use
-
 Factors = tuple[tuple[Factor, ...], ...]
+
+
+def cut(x: Array) -> Array:
+    """Between steps that XLA would otherwise repeat for every use."""
+    return barrier.cut([x])[0]
 
 
 class Levels:

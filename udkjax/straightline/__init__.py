@@ -1,5 +1,6 @@
 """Straight-line programs: scalar expressions recorded once, with everything that is structurally zero or repeated left out."""
 
+from udkjax.straightline.barrier import cut as cut
 from udkjax.straightline.branching import when as when
 from udkjax.straightline.derivative import Differential as Differential
 from udkjax.straightline.derivative import cotangents as cotangents

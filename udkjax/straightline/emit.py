@@ -15,9 +15,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 
+from udkjax.straightline.barrier import cut
 from udkjax.straightline.graph import Details, Graph, Node, Scalar
 from udkjax.straightline.trigonometry import sincos_of_each
 
@@ -95,29 +94,6 @@ class Program:
             if name not in (*_PAIR, "constant", "pick", "input"):
                 counts[name] = counts.get(name, 0) + 1
         return counts | ({"sincos": len(self.angles)} if self.angles else {})
-
-
-def cut(values: Sequence[Any], only_batches: bool = False) -> list[Any]:
-    """Keep XLA from fusing across this point, or only where there are batches: the identity, with the identity's derivative."""
-    return cut_p.bind(*values, only_batches=only_batches)
-
-
-def _derivative(primals: Sequence[Any], tangents: Sequence[Any], only_batches: bool) -> tuple[list[Any], list[Any]]:
-    # One by one: a barrier of which only a part depends on what is differentiated has no transpose in jax 0.12.
-    kept = [t if only_batches or isinstance(t, ad.Zero) else jax.lax.optimization_barrier(t) for t in tangents]
-    return cut(primals, only_batches), kept
-
-
-# A primitive: programs hold hundreds, and a function with a derivative of its own takes ten times as long to trace.
-cut_p = Primitive("cut")
-cut_p.multiple_results = True
-cut_p.def_impl(lambda *xs, only_batches: list(xs))
-cut_p.def_abstract_eval(lambda *xs, only_batches: list(xs))
-batching.primitive_batchers[cut_p] = lambda xs, axes, only_batches: (cut(xs), axes)
-ad.primitive_jvps[cut_p] = _derivative
-mlir.register_lowering(
-    cut_p, mlir.lower_fun(lambda *xs, only_batches: list(xs) if only_batches else jax.lax.optimization_barrier(list(xs)))
-)
 
 
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:

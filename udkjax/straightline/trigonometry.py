@@ -20,6 +20,8 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from udkjax.straightline.barrier import cut
+
 # pi/2 in three parts of 33 bits, whose products with integers below 2^20 are exact, and a rest: fdlibm, e_rem_pio2.c.
 _PARTS = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624871116645580e-21, 8.47842766036889956997e-32)
 # (sin r - r) / r^3 and (cos r - 1 + r^2 / 2) / r^4 in powers of r^2, highest first, for |r| <= pi/4.
@@ -55,9 +57,10 @@ def sincos_of_each(xs: Sequence[Any]) -> list[tuple[Any, Any]]:
 
 def _by_polynomials(x: Any) -> tuple[Any, Any]:
     # Without the barriers XLA would compute what both results share once for each of them, and both for each of their uses.
-    n, r = jax.lax.optimization_barrier(_reduced(x))
-    s, c = jax.lax.optimization_barrier(_near_zero(r))
-    return jax.lax.optimization_barrier(_turned(n, s, c))
+    n, r = cut(_reduced(x))
+    s, c = cut(_near_zero(r))
+    s, c = cut(_turned(n, s, c))
+    return s, c
 
 
 def _reduced(x: Any) -> tuple[Any, Any]:

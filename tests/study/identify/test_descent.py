@@ -48,7 +48,6 @@ def test_adam_ends_there_too(noisy):
     assert fit.settled[0] and np.abs(fit.z - squares.z).max() < 1e-4
 
 
-@pytest.mark.barriers
 def test_a_loss_of_the_users_own(noisy):
     """Absolute residuals, rounded off at zero, are not moved by what is a hundred standard deviations wrong; squares are."""
     noisy = noisy.copy()

@@ -8,7 +8,6 @@ from udkjax.scene.drivers import Sine
 from udkjax.study.identify.experiment import Candidate, design_experiment
 from udkjax.study.identify.records import Start
 
-pytestmark = pytest.mark.barriers
 NAMES = ("body.lower.inertia", "force.damper.damping")
 CHANNEL, NOISE = "body.lower.angle", 0.01
 AMPLITUDE, FREQUENCY = "driver.motor.motion.amplitude", "driver.motor.motion.frequency"

@@ -113,7 +113,6 @@ def test_a_prior_counts_as_one_more_measurement(measured):
 # --- what cannot be known
 
 
-@pytest.mark.barriers
 def test_a_common_factor_of_masses_is_not_known(measured):
     """Of a pendulum without a spring the motion shows the ratio of mass and inertia, and the force on its pin the mass."""
     mech = udk.library.compound_pendulum()

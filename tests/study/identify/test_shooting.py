@@ -59,7 +59,6 @@ def test_a_first_guess_follows_what_was_measured(pieces):
     assert 1e-3 < pieces.gaps(pieces.guess[None], TOL)[0] < 1.0
 
 
-@pytest.mark.barriers
 def test_the_fit_is_that_of_the_whole_record(problem):
     pieces, fit = shoot(problem, np.zeros(problem.K), TOL, samples=6)
     assert fit.settled[0] and explains(pieces, fit, TOL, None)

@@ -103,7 +103,6 @@ def wrong_problem():
     return Problem(mech, unknowns_of(mech, parameters), [udk.Record(TS, dict.fromkeys([ANGLE, *QUANTITIES], DATA[ANGLE]))])
 
 
-@pytest.mark.barriers
 def test_wrong_derivatives_are_found(wrong_problem):
     check = compare(wrong_problem, np.zeros(2), (1e-11, 1e-11))
     assert not check.ok and [name for _, name in check.series] == [ANGLE, "wrong", "still", "made up", "no number"]
