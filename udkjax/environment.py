@@ -34,8 +34,8 @@ def enable_float64() -> None:
 def enable_whole_loops() -> None:
     """Let XLA make one function of a loop on the CPU, as it does by itself from JAX 0.12 on.
 
-    Before, it starts each operation of each round by itself, for 50 to 150 ns, unless the loop is tiny: a run takes 20 to 40 times
-    as long. XLA reads its flags when it is first used; what they say of this already stays.
+    Before, it starts each operation of each round by itself, for 50 to 150 ns, unless the loop is tiny: a run takes 20 to 40
+    times as long. XLA reads its flags when it is first used; what they say of this already stays.
     """
     flags = os.environ.get(XLA_FLAGS, "")
     try:

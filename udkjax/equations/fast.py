@@ -45,7 +45,7 @@ def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vecto
 @jax.custom_jvp
 def _projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
     """q and v, numbers in any case, and whether they can be trusted. Derivatives are taken where they are."""
-    if not equations.code.elimination:
+    if not equations.eliminates:
         return *plain_project(equations, t, q, v), jnp.array(True)
     *factors, safe = equations.run("factor", t, q, v)
     step = equations.code.program("step")
@@ -64,7 +64,7 @@ def _projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Ve
 
 def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
     """What projection at q leaves of small changes: for estimates of errors, which nobody differentiates, nor do they branch."""
-    if not equations.code.elimination:
+    if not equations.eliminates:
         return plain_tangential(equations, t, q, v, dq, dv)
     program = equations.code.program("tangential")
     *changes, far = program([*equations.constants, t, *scalars([q, dq, dv])])
@@ -128,7 +128,7 @@ def _correction(equations: "Equations", t: Any, q: Vector, v: Vector, tangents: 
     primals, moving = (equations, t, q, v), _moving(tangents)
     if not any(moving):
         return jnp.zeros_like(q), jnp.zeros_like(v)
-    if equations.branches or not equations.code.elimination:
+    if equations.branches or not equations.eliminates:
         return _by_plain_form("projection", primals, tangents)
     program = equations.code.derivative("projection", moving).evaluation("projection")
     kept = _run(program, *jax.lax.stop_gradient(primals))

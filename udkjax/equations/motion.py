@@ -41,6 +41,11 @@ class Motion(eqx.Module):
         """The same without a branch: what cannot be solved so is not a number."""
 
     @property
+    def careful(self) -> "Motion":
+        """The same for states of which `quick` says nothing. By default, what branches by itself."""
+        return self
+
+    @property
     def forgiving(self) -> "Motion":
         """The same without a branch, for states near the manifold: rows that depend on others are not asked to close further."""
         return self.quick

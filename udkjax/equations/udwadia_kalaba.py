@@ -24,7 +24,7 @@ from udkjax.equations import fast
 from udkjax.equations.code import Code, code, scalars, stacked
 from udkjax.equations.motion import MechanismMotion, Tangential, Vector
 from udkjax.equations.plain import plain_accelerations
-from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse
+from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, Varga
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -67,7 +67,7 @@ class Equations(MechanismMotion):
 
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
         """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
-        if not self.code.elimination:
+        if not self.eliminates:
             return plain_accelerations(self, t, q, v)
         return fast.accelerations(
             "accelerations_watched" if watch and isinstance(self.method, Auto) else "accelerations", self, t, q, v
@@ -140,7 +140,12 @@ class Equations(MechanismMotion):
 
     @property
     def branches(self) -> bool:
-        return self.branch and self.code.elimination == "check"
+        return self.branch and self.eliminates and self.code.elimination == "check"
+
+    @property
+    def eliminates(self) -> bool:
+        """Whether the programs for elimination are those of the method, and not of another that this one was before."""
+        return bool(self.code.elimination) and isinstance(self.method, Auto | Elimination)
 
     def run(self, name: str, t: Any, q: Any, v: Any) -> list[Any]:
         """Evaluate one of the programs."""
@@ -163,6 +168,11 @@ class Equations(MechanismMotion):
     def quick(self) -> "Equations":
         """The same without a branch: what `Auto` cannot solve by elimination is not a number."""
         return dataclasses.replace(self, branch=False)
+
+    @property
+    def careful(self) -> "Equations":
+        """The same by Varga's method on all rows."""
+        return eqx.tree_at(lambda e: e.method, self, Varga(self.method.rank_tol, self.method.relative))
 
     @property
     def forgiving(self) -> "Equations":

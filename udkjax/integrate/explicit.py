@@ -24,11 +24,12 @@ from jaxtyping import Array
 from udkjax.equations.motion import Tangential
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
+from udkjax.integrate.packing import Packing
 from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
 from udkjax.integrate.record import Record, blank, noted
 from udkjax.integrate.tableau import Method
 from udkjax.integrate.undifferentiated import undifferentiated
-from udkjax.straightline import cut, when
+from udkjax.straightline import apart, cut, when
 
 # Of the step's size. With 0.9 every tenth step of an ordinary run is rejected, and most runs take 4 to 15 % more at equal error.
 SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
@@ -156,20 +157,35 @@ def march(task: Task, q: Array, v: Array) -> March:
         m = _decide(task, m, trial, last, (m.code == RUNNING) & ~doubt, careful=False)
         return m._replace(doubt=doubt) if task.careful else m._replace(code=jnp.where(doubt, DOUBTED, m.code))
 
-    careful = task.careful
-    if careful is None:
-        return jax.lax.while_loop(running, quick, first)
-
     def again(m: March) -> March:
         t1, last = _end(task, m)
-        trial = careful(m.doubt, m.here, t1 - m.here.t, t1, m.tried < 0)
-        return _decide(task, m, trial, last, m.doubt, careful=True)._replace(doubt=jnp.zeros(lanes, bool))
+        trial = task.careful(m.doubt, m.here, t1 - m.here.t, t1, m.tried < 0)
+        m = _decide(task, m, trial, last, m.doubt, careful=True)
+        return m._replace(doubt=jnp.zeros(lanes, bool), tried=apart(m.tried))
 
-    def rounds(m: March) -> March:
-        m = jax.lax.while_loop(lambda m: running(m) & ~jnp.any(m.doubt), quick, m)
-        return jax.lax.cond(jnp.any(m.doubt), again, lambda m: m, m)
+    # What a round of a single run costs counts; lanes take a thousand times as long, and a little longer where they are packed.
+    packing = None if lanes else Packing(first._replace(outputs=None, record=None))
 
-    return jax.lax.while_loop(running, rounds, first)
+    def packed(m: March) -> Any:
+        return m if packing is None else (packing.pack(m._replace(outputs=None, record=None)), m.outputs, m.record)
+
+    def unpacked(state: Any) -> March:
+        if packing is None:
+            return state
+        small, outputs, record = state
+        m = packing.unpack(small)
+        return m._replace(h=undifferentiated(m.h), outputs=outputs, record=record)
+
+    def undoubted(state: Any) -> Any:
+        return packed(jax.lax.while_loop(lambda m: running(m) & ~jnp.any(m.doubt), quick, unpacked(state)))
+
+    def rounds(state: Any) -> Any:
+        if task.careful is None:
+            return undoubted(state)
+        state = undoubted(state) if packing is None else when(running(unpacked(state)), undoubted, state)
+        return jax.lax.cond(jnp.any(unpacked(state).doubt), lambda s: packed(again(unpacked(s))), lambda s: s, state)
+
+    return unpacked(jax.lax.while_loop(lambda s: running(unpacked(s)), rounds, packed(first)))
 
 
 def _end(task: Task, m: March) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import lasting, project, violation
 from udkjax.integrate.tableau import is_explicit, method_of
+from udkjax.straightline import apart, when, whole
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
@@ -106,6 +107,7 @@ def _many(arrays: Any, batched: Any, static: Any, size: int) -> Raw:
     axes = jax.tree.map(lambda b: 0 if b else None, batched)
 
     def chunk(places: Array) -> Raw:
+        places = apart(places)
         members = jax.tree.map(lambda x, b: x[places] if b else x, arrays, batched)
         return _in_lanes(eqx.combine(members, static), eqx.combine(axes, static), lanes)
 
@@ -189,10 +191,14 @@ def _all_of_it(t: Array, q: Array, v: Array, dq: Array, dv: Array) -> Tangential
 def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
     """What a march leaves behind, with the outputs on the manifold."""
     inner, end = len(problem.ts) - 2, jnp.concatenate([m.here.q, m.here.v])
-    start, ys = jnp.concatenate([problem.q, problem.v]), jnp.concatenate([m.outputs[:inner], end[None]])
-    first = lanes.over(violation, jnp.broadcast_to(problem.ts[0], lanes.shape), start)
-    ys, violated = _each_output(lanes, partial(_output, problem.projected), problem.ts[1:], ys, wide=problem.careful)
-    ys, violated = jnp.concatenate([start[None], ys]), jnp.concatenate([first[None], violated])
+
+    def outputs() -> tuple[Array, Array]:
+        start, ys = jnp.concatenate([problem.q, problem.v]), jnp.concatenate([m.outputs[:inner], end[None]])
+        first = lanes.over(violation, jnp.broadcast_to(problem.ts[0], lanes.shape), start)
+        ys, violated = _each_output(lanes, partial(_output, problem.projected), problem.ts[1:], ys, wide=problem.careful)
+        return jnp.concatenate([start[None], ys]), jnp.concatenate([first[None], violated])
+
+    ys, violated = whole(outputs, m.tried >= 0) if lanes.size is None else outputs()
     number = jnp.arange(inner + 2).reshape(-1, *[1] * len(lanes.shape))
     reached = (number <= m.written) & (number <= inner) | (m.code == DONE)
     return Raw(ys, violated, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
@@ -202,21 +208,31 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
 
 
 def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Point, h: Array, t1: Array, begin: Array) -> Trial:
-    """A step taken again, by equations that may branch, of the lanes in doubt."""
+    """A step taken again of the lanes in doubt: by singular values where elimination finds nothing, stage by stage."""
     stages = task.method.stages
 
     def one(equations: Motion, here: Point, h: Array, t1: Array, begin: Array, rtol: Array, atol: Array) -> Trial:
-        def stage(i, carry):
-            a, _, _ = carry
-            last = i == stages
+        def stage(equations: Motion, carry: Any) -> Any:
+            i, a, _, _, _ = carry
             t, q, v = stage_state(task.method, here, h, a[:stages], i)
-            t = jnp.where(last, t1, t)
-            if projected:  # one place for all evaluations: a branch to singular values takes long to compile
-                q, v = jax.lax.cond(last, lambda: equations.project(t, q, v), lambda: (q, v))
-            return a.at[i].set(equations.accelerations(t, q, v)), q, v
+            t = jnp.where(i == stages, t1, t)
+            if projected:
+                q, v = when(i == stages, lambda x: equations.project(t, *x), (q, v))
+            found = equations.accelerations(t, q, v)
+            return i + 1, jax.lax.dynamic_update_index_in_dim(a, found, i, 0), q, v, ~jnp.all(jnp.isfinite(found))
+
+        def more(carry: Any) -> Any:  # a loop that XLA compiles into one function, and what it cannot
+            carry = jax.lax.while_loop(lambda c: (c[0] <= stages) & ~c[-1], partial(stage, equations.quick), carry)
+            return jax.lax.cond(carry[-1], again, lambda c: c, carry)
+
+        def again(carry: Any) -> Any:
+            i, a, *state = carry
+            a = a.at[i - 1].set(0.0)  # what is not a number would be none with a weight of 0, too
+            return *stage(equations.careful, (i - 1, a, *state))[:-1], jnp.array(False)
 
         start, none = jnp.where(begin, stages, 0), jnp.zeros((stages + 1, *here.a.shape))
-        a, q1, v1 = jax.lax.fori_loop(start, stages + 1, stage, (none, here.q, here.v))
+        first = start, none, here.q, here.v, jnp.array(False)
+        _, a, q1, v1, _ = jax.lax.while_loop(lambda c: c[0] <= stages, more, first)
         mine, evaluations = task._replace(rtol=rtol, atol=atol), jnp.where(begin, 2, 2 * stages + 1)
         mine = mine._replace(lasting=partial(lasting, equations)) if projected else mine
         return judged(mine, here._replace(a=a[0]), Point(t1, q1, v1, a[stages]), h, a[:stages], evaluations)

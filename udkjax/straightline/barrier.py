@@ -1,7 +1,7 @@
 """Barriers that keep XLA from fusing what lies before them with what comes after.
 
-XLA fuses each result with a copy of everything before it that it takes. Between two barriers it can repeat but little. What passes
-one goes through memory; no value changes.
+XLA fuses each result with a copy of everything before it that it takes. Between two barriers it can repeat but little. What
+passes one goes through memory; no value changes.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""A branch for programs that run in loops."""
+"""What of a program XLA compiles into one function: loops, unless there is something in them that it cannot compile so."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -8,6 +8,20 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 Tree = TypeVar("Tree")
+
+
+def apart(x: Array) -> Array:
+    """The whole number x, in a form that keeps XLA from compiling the loop that it is in into one function: for a microsecond.
+
+    Loops inside of that one are functions all the same, which are compiled side by side, and in less time than all as one.
+    """
+    return jax.lax.sort(jnp.stack([x, jnp.full_like(x, jnp.iinfo(x.dtype).max)]), dimension=0)[0]
+
+
+def whole(function: Callable[[], Tree], holds: Array) -> Tree:
+    """`function()`, compiled into one function. The condition `holds`, always, but XLA must not know."""
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function))
+    return when(holds, lambda _: function(), nothing)
 
 
 def when(condition: Array, function: Callable[[Tree], Tree], x: Tree) -> Tree:
