@@ -42,7 +42,7 @@ class Motion(eqx.Module):
 
     @property
     def careful(self) -> "Motion":
-        """The same for states of which `quick` says nothing. By default, what branches by itself."""
+        """The same for states of which `quick` says nothing. By default, equations that branch themselves."""
         return self
 
     @property

@@ -171,7 +171,7 @@ class Equations(MechanismMotion):
 
     @property
     def careful(self) -> "Equations":
-        """The same by Varga's method on all rows."""
+        """The same by Varga's method on all rows: without LAPACK it is compiled into one function with what is around it."""
         return eqx.tree_at(lambda e: e.method, self, Varga(self.method.rank_tol, self.method.relative))
 
     @property

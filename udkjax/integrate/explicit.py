@@ -158,6 +158,7 @@ def march(task: Task, q: Array, v: Array) -> March:
         return m._replace(doubt=doubt) if task.careful else m._replace(code=jnp.where(doubt, DOUBTED, m.code))
 
     def again(m: March) -> March:
+        assert task.careful is not None
         t1, last = _end(task, m)
         trial = task.careful(m.doubt, m.here, t1 - m.here.t, t1, m.tried < 0)
         m = _decide(task, m, trial, last, m.doubt, careful=True)

@@ -208,7 +208,7 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
 
 
 def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Point, h: Array, t1: Array, begin: Array) -> Trial:
-    """A step taken again of the lanes in doubt: by singular values where elimination finds nothing, stage by stage."""
+    """A step taken again of the lanes in doubt: by a method that looks at all rows where elimination finds nothing."""
     stages = task.method.stages
 
     def one(equations: Motion, here: Point, h: Array, t1: Array, begin: Array, rtol: Array, atol: Array) -> Trial:

@@ -101,7 +101,7 @@ def simulate(
     solution, missed, doubted = run(mechanism, careful=traced and careful)
     if isinstance(solution.code, Tracer):
         return solution if traced or not careful else run(mechanism, careful=True)[0]
-    if doubted and careful:  # few runs meet what it takes singular values for: only these compile them
+    if doubted and careful:  # few runs meet what elimination cannot solve: only these compile what can
         solution, missed, _ = run(mechanism, careful=True)
     if isinstance(mechanism, Mechanism) and missed:  # the numbers made rows independent that were left out: choose again
         mechanism = mechanism.with_left_out(redundant_rows(mechanism))

@@ -34,7 +34,7 @@ CAUSES = {
     "(and, with `Augmented()`, at its redundant joints: plain LU cannot do with them)",
     Result.drift: "the constraints are violated by more than `drift_tol`: stabilize (`Projection()`), or, where the numbers "
     "of the scene make rows independent that were found redundant when it was built, build it anew or take method=SVD()",
-    Result.needs_care: "a step beside a singular configuration takes singular values, which `careful=False` leaves out",
+    Result.needs_care: "a step beside a singular configuration takes care, which `careful=False` leaves out",
     Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for the joints that stay open",
 }
 
