@@ -54,7 +54,9 @@ class March(NamedTuple):
     accepted: Array
     evaluations: Array
     written: Array  # how many of the inner output times are behind
-    outputs: Array  # (T - 2 + BLOCK, 2n, *lanes): q and v at the output times between the first and the last
+    outputs: (
+        Array  # (*lanes, T - 2 + BLOCK, 2n): q and v at the output times between the first and the last; each lane's in one place
+    )
     record: Record | None  # of one run alone
 
 
@@ -136,7 +138,7 @@ def march(task: Task, q: Array, v: Array) -> March:
     lanes = q.shape[1:]
     start = Point(jnp.broadcast_to(task.ts[0], lanes), q, v, jnp.zeros_like(q))
     none, inner = jnp.zeros(lanes, int), len(task.ts) - 2
-    outputs = jnp.zeros((inner + BLOCK if inner else 0, 2 * len(start.q), *lanes), start.q.dtype)
+    outputs = jnp.zeros((*lanes, inner + BLOCK if inner else 0, 2 * len(start.q)), start.q.dtype)
     # The first round is no step: it finds the accelerations, and with them the first step, where the others have their code.
     back, no = (start,) * (POINTS - 2), jnp.zeros(lanes, bool)
     record = blank(start, task.method.stages, task.max_steps) if task.recorded else None
@@ -255,8 +257,8 @@ def _write(task: Task, m: March, points: tuple[Point, ...], until: Array) -> Mar
             return m._replace(written=written, outputs=jax.lax.dynamic_update_slice(m.outputs, states, (m.written, 0)))
 
         def lane(k, outputs):
-            block = jax.lax.dynamic_slice_in_dim(states, k, 1, axis=-1)
-            return jax.lax.dynamic_update_slice(outputs, block, (m.written[k], 0, k))
+            block = jax.lax.dynamic_index_in_dim(states, k, axis=-1, keepdims=False)
+            return jax.lax.dynamic_update_slice(outputs, block[None], (k, m.written[k], 0))
 
         return m._replace(written=written, outputs=jax.lax.fori_loop(0, lanes[0], lane, m.outputs))
 

@@ -193,10 +193,13 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
     inner, end = len(problem.ts) - 2, jnp.concatenate([m.here.q, m.here.v])
 
     def outputs() -> tuple[Array, Array]:
-        start, ys = jnp.concatenate([problem.q, problem.v]), jnp.concatenate([m.outputs[:inner], end[None]])
+        start = jnp.concatenate([problem.q, problem.v])
         first = lanes.over(violation, jnp.broadcast_to(problem.ts[0], lanes.shape), start)
+        ys = jnp.concatenate([m.outputs[..., :inner, :], end.T[..., None, :]], axis=-2)
         ys, violated = _each_output(lanes, partial(_output, problem.projected), problem.ts[1:], ys, wide=problem.careful)
-        return jnp.concatenate([start[None], ys]), jnp.concatenate([first[None], violated])
+        ys = jnp.concatenate([start.T[..., None, :], ys], axis=-2)
+        violated = jnp.concatenate([first[..., None], violated], axis=-1)
+        return (ys, violated) if lanes.size is None else (jnp.moveaxis(ys, 0, -1), violated.T)
 
     ys, violated = whole(outputs, m.tried >= 0) if lanes.size is None else outputs()
     number = jnp.arange(inner + 2).reshape(-1, *[1] * len(lanes.shape))
@@ -247,16 +250,23 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
 
 
 def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], ts: Array, ys: Array, wide: bool) -> Any:
-    """`function(lanes, t, y)` of states ys (T, 2n, *lanes), one time after another: that is faster than all at once.
+    """`function(lanes, t, y)` of states ys (*lanes, T, 2n), one time after another: that is faster than all at once.
 
     `wide` takes the times of a single run as so many lanes, which takes longer to compile.
     """
-    count, n = ys.shape[:2]
+    count, n = ys.shape[-2:]
     few = count < FEW_OUTPUTS or n > 6 * FEW_BODIES
     if lanes.size is not None or few or not wide or jax.default_backend() not in CHUNKED:
-        if ts.ndim <= len(lanes.shape):
-            ts = jnp.broadcast_to(ts[:, None], (len(ts), *lanes.shape))
-        return jax.lax.map(lambda x: function(lanes, *x), (ts, ys))
+
+        def one(k: Array, found: Any) -> Any:
+            y = jax.lax.dynamic_index_in_dim(found[0], k, axis=-2, keepdims=False)
+            y, violated = function(lanes, jnp.broadcast_to(ts[k], lanes.shape), y.T)
+            return (
+                jax.lax.dynamic_update_index_in_dim(found[0], y.T, k, axis=-2),
+                jax.lax.dynamic_update_index_in_dim(found[1], violated, k, axis=-1),
+            )
+
+        return jax.lax.fori_loop(0, count, one, (ys, jnp.zeros((*lanes.shape, count), ys.dtype)))
     chunks = -(-count // LANES)
     width = -(-count // (chunks * ROUND)) * ROUND
     places = jnp.minimum(jnp.arange(chunks * width), count - 1).reshape(chunks, width)
