@@ -226,6 +226,23 @@ def test_the_fast_form_is_the_plain_form(nearby, method, name):
         assert jnp.abs(one - state).max() > 1e-9  # it moved
 
 
+@pytest.mark.parametrize(("angle", "slack"), [(1.0, 1e-12), (1e-3, 1e-11), (1e-5, 1e-8), (1e-8, 1e-12), (0.0, 1e-12)])
+def test_the_careful_form_is_that_by_singular_values(linkage, placed, angle, slack):
+    """Far from the position in line, beside it, and in it; where a direction is dropped that is not quite lost, by its square."""
+
+    @eqx.filter_jit
+    def both(q, v):
+        equations, off = prepare(linkage), 1e-6 * jnp.sin(jnp.arange(12.0))
+        forms = equations.careful, equations.exact()
+        return [(form.accelerations(0.0, q, v), *form.project(0.0, q + off, v + off)) for form in forms], (q + off, v + off)
+
+    (careful, exact), off = both(*(x.ravel() for x in placed(angle, 1.3)))
+    assert_allclose(careful[0], exact[0], atol=slack)
+    for one, other, start in zip(careful[1:], exact[1:], off, strict=True):
+        assert_allclose(one, other, atol=1e-4 * slack + 1e-14)
+        assert jnp.abs(one - start).max() > 1e-7  # it moved
+
+
 @pytest.mark.parametrize("name", ["parallelogram", "scissor_lift", "slider_crank"])
 def test_projection_is_the_smallest_change(nearby, twin, name):
     mech, qs, vs = nearby(name)

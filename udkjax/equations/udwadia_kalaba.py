@@ -37,7 +37,7 @@ LARGE = 150
 NOTHING_LEFT = 1e-14  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
 # Varga's method compares diagonal entries of R, which are larger than singular values, with the largest norm of a column, which
 # is less than the largest of them. With this many times the threshold runs that cross singular configurations take as many steps
-# as by singular values (medians of 20 starts); with less up to two fifths more, with ten times N-four-bars are 1e-6 off.
+# as by singular values (medians of 20 starts); with less up to two fifths more, with ten times N-four-bars are 3e-6 off.
 ROUGHLY = 3.0
 ORDINARY = 100.0  # the ratio of masses up to which that holds: see `rank_tolerance`
 

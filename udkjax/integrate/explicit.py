@@ -54,9 +54,7 @@ class March(NamedTuple):
     accepted: Array
     evaluations: Array
     written: Array  # how many of the inner output times are behind
-    outputs: (
-        Array  # (*lanes, T - 2 + BLOCK, 2n): q and v at the output times between the first and the last; each lane's in one place
-    )
+    outputs: Array  # (*lanes, T - 2 + BLOCK, 2n): q and v at the inner output times
     record: Record | None  # of one run alone
 
 
@@ -164,6 +162,7 @@ def march(task: Task, q: Array, v: Array) -> March:
         t1, last = _end(task, m)
         trial = task.careful(m.doubt, m.here, t1 - m.here.t, t1, m.tried < 0)
         m = _decide(task, m, trial, last, m.doubt, careful=True)
+        # Rare: as a part of the function of ordinary steps they would take half as long again to compile.
         return m._replace(doubt=jnp.zeros(lanes, bool), tried=apart(m.tried))
 
     # What a round of a single run costs counts; lanes take a thousand times as long, and a little longer where they are packed.
