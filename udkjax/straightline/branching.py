@@ -13,7 +13,8 @@ Tree = TypeVar("Tree")
 def apart(x: Array) -> Array:
     """The whole number x, in a form that keeps XLA from compiling the loop that it is in into one function.
 
-    It costs to sort two numbers. Loops inside of that one are functions all the same, which are compiled side by side, and in less time than all as one.
+    It costs to sort two numbers. Loops inside of that one are functions all the same, which are compiled side by side, and in
+    less time than all as one.
     """
     return jax.lax.sort(jnp.stack([x, jnp.full_like(x, jnp.iinfo(x.dtype).max)]), dimension=0)[0]
 
