@@ -71,6 +71,14 @@ def test_loops_are_compiled_whole(monkeypatch, installed, given, expected):
     assert os.environ["XLA_FLAGS"] == (expected or given or "")
 
 
+@pytest.mark.parametrize("order", ["import jax, udkjax as udk", "import udkjax as udk, jax"], ids=["jax first", "udkjax first"])
+@pytest.mark.parametrize("then", [False, True], ids=["as it is", "changed"])
+def test_programs_run_in_the_thread_that_calls_them(tmp_path, order, then):
+    code = order + "; udk.library"
+    code += "; jax.config.update('jax_cpu_enable_async_dispatch', True)" if then else ""
+    assert python(code + "; udk.simulate; print(jax.config.read('jax_cpu_enable_async_dispatch'))", HOME=tmp_path) == str(then)
+
+
 def test_a_cache_configured_before_stays(tmp_path):
     mine = str(tmp_path / "mine")
     code = f"import jax; jax.config.update('jax_compilation_cache_dir', {mine!r});" + PRINT

@@ -2,14 +2,14 @@
 
 Nothing is imported before it is used, so that the command line answers at once. Importing this package turns float64 on in
 JAX, unless the environment says `JAX_ENABLE_X64=0`, and lets JAX keep compiled programs in the user's cache folder, unless it
-says `UDKJAX_COMPILATION_CACHE=0`, or names another folder there. Before JAX 0.12 it also adds to `XLA_FLAGS` that loops are
-compiled whole on the CPU.
+says `UDKJAX_COMPILATION_CACHE=0`, or names another folder there. On the CPU programs run in the thread that calls them, until
+`jax.config.update("jax_cpu_enable_async_dispatch", True)`; before JAX 0.12, `XLA_FLAGS` also says that loops are compiled whole.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from udkjax.environment import enable_compilation_cache, enable_float64, enable_whole_loops
+from udkjax.environment import disable_async_dispatch, enable_compilation_cache, enable_float64, enable_whole_loops
 
 if TYPE_CHECKING:  # the public names, for type checkers and editors; a test compares them with those below
     from udkjax import equations as equations
@@ -128,6 +128,7 @@ __all__ = [*_MODULES, *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 def __getattr__(name: str):
     if name in _MODULES or name in _HOME:
         import_module("udkjax.equations")  # with it, mechanisms find their redundant rows when they are built
+        disable_async_dispatch()
     if name in _MODULES:
         value = import_module(_MODULES[name])
     elif name in _HOME:
@@ -143,5 +144,6 @@ def __dir__():
 
 
 enable_float64()
+disable_async_dispatch()
 enable_whole_loops()
 enable_compilation_cache()

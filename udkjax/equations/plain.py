@@ -2,7 +2,9 @@
 
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from udkjax.equations.code import stacked
 from udkjax.equations.motion import Tangential, Vector
@@ -23,15 +25,20 @@ def plain_accelerations(equations: "Equations", t: Any, q: Vector, v: Vector) ->
 
 
 def plain_project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """Two Newton steps in position and one in velocity."""
+    """Two Newton steps in position and one in velocity: rounds of one loop, so that the method is compiled once."""
 
-    def step(plus: Plus, name: str) -> Vector:
-        _, residual, root = equations.arrays(name, t, q, v)
-        return -root * (plus @ residual)
+    def step(state: tuple[Vector, Vector], in_position: Array) -> tuple[tuple[Vector, Vector], None]:
+        q, v = state
 
-    q = q + _by_method(equations, step, "closure", t, q, v)
-    q = q + _by_method(equations, step, "closure", t, q, v)
-    return q, v + _by_method(equations, step, "rate", t, q, v)
+        def change(plus: Plus, name: str) -> Vector:
+            _, psi, root = equations.arrays(name, t, q, v)
+            psi_dot = stacked(equations.run("psi_dot" + name.removeprefix("closure"), t, q, v))
+            return -root * (plus @ jnp.where(in_position, psi, psi_dot))
+
+        found = _by_method(equations, change, "closure", t, q, v)
+        return (jnp.where(in_position, q + found, q), jnp.where(in_position, v, v + found)), None
+
+    return jax.lax.scan(step, (q, v), jnp.array([True, True, False]))[0]
 
 
 def plain_correction(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
