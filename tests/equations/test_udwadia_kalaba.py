@@ -282,6 +282,31 @@ def test_the_tangential_part_is_what_projection_leaves(mechanisms, nearby, metho
 # --- few constraints, and more than there seemed
 
 
+@pytest.mark.parametrize("method", [udk.Auto(), udk.SVD()], ids=["Auto", "SVD"])
+@pytest.mark.parametrize("name", ["parallelogram", "slider_crank"])
+def test_what_a_projection_knows_besides(nearby, method, name):
+    """How far its last step went, beyond which nothing is left; and the factors, with which the tangential part is the same."""
+    mech, (q, *_), (v, *_) = nearby(name)
+    dq, dv = 1e-7 * np.random.default_rng(4).standard_normal((2, len(q)))
+
+    @eqx.filter_jit
+    def found(mech, q, v):
+        equations, t = prepare(mech, method).quick, 0.0
+        *first, moved = equations.closed(t, q, v)
+        *second, still = equations.closed(t, *first)
+        *end, known = equations.kept(t, q, v)
+        parts = [equations.tangential(t, *end, dq, dv, k)[:2] for k in (known, None)]
+        return first, second, (moved, still), equations.violation(t, *first), parts, (end, equations.project(t, q, v))
+
+    for off in (1.0, 1e3):  # times 1e-7
+        first, second, (moved, still), violated, parts, ends = found(mech, q, v + (off - 1) * (v - mech.v0.ravel()))
+        assert still < 1e-14 and (moved < 1e-8 or method == udk.SVD())
+        assert_allclose(first, second, atol=1e-14)
+        assert_allclose(jnp.concatenate(violated), 0.0, atol=1e-13)
+        assert_allclose(parts[0], parts[1], atol=1e-12)
+        assert_allclose(*ends, atol=0)
+
+
 def test_bodies_without_constraints_fall_freely(twin):
     bodies = {"one": udk.Body(2.0, 0.3, [0.1, 0.2], 0.3), "two": udk.Body(1.0, 0.1, [1.0, -0.5], 0.0, [1.0, 2.0], 3.0)}
     forces = [udk.Spring(["one", "two"], [[0.1, 0.0], [0.0, 0.1]], 20.0, 0.5, 0.3), udk.Torque(["ground", "one"], 0.6)]

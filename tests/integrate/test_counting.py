@@ -132,7 +132,7 @@ class Branching(eqx.Module):
     def project(self, t, q, v):
         return q, v
 
-    def tangential(self, t, q, v, dq, dv):
+    def tangential(self, t, q, v, dq, dv, known=None):
         return Tangential(dq, dv)
 
     def held(self, t, q, v):

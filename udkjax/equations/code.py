@@ -33,7 +33,7 @@ class Code:
 
     and for elimination: `accelerations` (a, whether all pivots are safe), `factor` (the factors at (t, q), whether safe), `step`
     (the change of q or v that removes a residual, given the factors), `psi` and `psi_dot` (of the rows kept), `tangential` (of
-    changes of q and v, given after q in place of v, what projection leaves; whether all pivots are far from none).
+    changes of q and v, given the factors, what projection leaves; whether all pivots are far from none).
     """
 
     def __init__(self, equations: Expressions, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None):
@@ -85,9 +85,10 @@ class Code:
         self.residual = [graph.input(f"r{k}", "residual") for k in range(len(self.kept))]
         self.outputs["step"] = self.spread(self.solved(self.residual, dropping=True))
         self.changes = [graph.input(f"d{k}", "change") for k in range(2 * self.n)]
-        far = all_of(self._gram.above(NEAR), graph)
+        far = all_of(self._dropping.above(NEAR), graph)
         self.outputs["tangential"] = [*self._tangential(self.changes[: self.n]), *self._tangential(self.changes[self.n :]), far]
-        early = frontier(graph, self.outputs["step"], lambda node: "residual" not in node.depends)
+        late = self.outputs["step"] + self.outputs["tangential"]
+        early = frontier(graph, late, lambda node: not node.depends & {"residual", "change"})
         self.factors = [s for s in early if not s.node.depends <= {"parameter"}]
         self.outputs["factor"] = [*self.factors, self._safe(self._dropping)]
 
@@ -110,7 +111,7 @@ class Code:
     def _tangential(self, change: Sequence[Scalar]) -> list[Scalar]:
         rows, zero = (self.equations.psi_q[i] for i in self.kept), self.graph.constant(0.0)
         residual = [sum((entry * change[k] for k, entry in row.items()), zero) for row in rows]
-        return [c - s for c, s in zip(change, self.spread(self.solved(residual)), strict=True)]
+        return [c - s for c, s in zip(change, self.spread(self.solved(residual, dropping=True)), strict=True)]
 
     def b(self, i: int) -> Scalar:
         """gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F of one row."""
@@ -132,10 +133,8 @@ class Code:
     def program(self, name: str) -> Program:
         if name not in self._programs:
             e = self.equations
-            given = (
-                {"step": [*self.factors, *self.residual], "tangential": [e.t, *e.q, *self.changes]} if self.elimination else {}
-            )
-            state = given.get(name, [e.t, *e.q, *e.v])
+            given = {"step": "residual", "tangential": "changes"}
+            state = [*self.factors, *getattr(self, given[name])] if name in given else [e.t, *e.q, *e.v]
             self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name])
         return self._programs[name]
 

@@ -38,15 +38,36 @@ def accelerations(program: str, equations: "Equations", t: Any, q: Vector, v: Ve
 
 def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     """As the plain form, but with the factors of the first position kept: they differ by the residual, and so does the result."""
-    q, v, safe = _projected(equations, t, q, v)
-    return jnp.where(safe, q, jnp.nan), jnp.where(safe, v, jnp.nan)
+    found, _, safe = _projected(False, equations, t, q, v)
+    return _trusted(found, safe)
 
 
-@jax.custom_jvp
-def _projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
-    """q and v, numbers in any case, and whether they can be trusted. Derivatives are taken where they are."""
+def kept(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, list[Array]]:
+    """`project` by elimination without a branch, and the factors of the first position."""
+    found, (_, factors), safe = _projected(False, equations, t, q, v)
+    return *_trusted(found, safe), factors
+
+
+def closed(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Array]:
+    """By elimination without a branch: two Newton steps in position and velocity, and how far the last one went."""
+    found, (moved, _), safe = _projected(True, equations, t, q, v)
+    return *_trusted(found, safe), moved
+
+
+def _trusted(found: Sequence[Array], safe: Any) -> tuple[Array, Array]:
+    q, v = (jnp.where(safe, x, jnp.nan) for x in found)
+    return q, v
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _projected(both: bool, equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any, Any, Any]:
+    """q and v, numbers in any case; how far the last step went, and the factors; and whether all that can be trusted.
+
+    A second step goes in `both` position and velocity if the first moved either, or in position if it moved the position.
+    Derivatives are taken where q and v are then.
+    """
     if not equations.eliminates:
-        return *plain_project(equations, t, q, v), jnp.array(True)
+        return plain_project(equations, t, q, v), (jnp.nan, []), jnp.array(True)
     *factors, safe = equations.run("factor", t, q, v)
     step = equations.code.program("step")
 
@@ -54,20 +75,34 @@ def _projected(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Ve
         residual = equations.run(name, t, q, x)
         return x - stacked(step([*equations.constants, *factors, *residual]))
 
-    q1 = without(q, "psi_kept", q)
-    q2 = when(jnp.max(jnp.abs(q1 - q)) > FAR, lambda q1: without(q1, "psi_kept", q1), q1)
-    found = q2, without(v, "psi_dot_kept", q2)
+    def nearer(state: tuple[Vector, Vector, Any]) -> tuple[Vector, Vector, Any]:
+        q, v, _ = state
+        q1 = without(q, "psi_kept", q)
+        v1 = without(v, "psi_dot_kept", q1)
+        return q1, v1, jnp.maximum(jnp.max(jnp.abs(q1 - q)), jnp.max(jnp.abs(v1 - v)))
+
+    if both:
+        first = nearer((q, v, None))
+        *found, moved = when(first[-1] > FAR, nearer, first)
+    else:
+        q1 = without(q, "psi_kept", q)
+        moved = jnp.max(jnp.abs(q1 - q))
+        q2 = when(moved > FAR, lambda q1: without(q1, "psi_kept", q1), q1)
+        found = [q2, without(v, "psi_dot_kept", q2)]
     if equations.branches:
-        return *_branched(equations, safe, found, plain_project, t, q, v), jnp.array(True)
-    return *found, safe if _checks(equations) else jnp.array(True)
+        return _branched(equations, safe, tuple(found), plain_project, t, q, v), (moved, []), jnp.array(True)
+    return tuple(found), (moved, factors), safe if _checks(equations) else jnp.array(True)
 
 
-def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+def tangential(
+    equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, factors: list[Array] | None
+) -> Tangential:
     """What projection at q leaves of small changes: for estimates of errors, which nobody differentiates, nor do they branch."""
     if not equations.eliminates:
         return plain_tangential(equations, t, q, v, dq, dv)
-    program = equations.code.program("tangential")
-    *changes, far = program([*equations.constants, t, *scalars([q, dq, dv])])
+    if factors is None:
+        *factors, _ = equations.run("factor", t, q, v)
+    *changes, far = equations.code.program("tangential")([*equations.constants, *factors, *scalars([dq, dv])])
     return Tangential(stacked(changes[: len(q)]), stacked(changes[len(q) :]), far)
 
 
@@ -102,11 +137,11 @@ def _(program, primals, tangents):
 
 
 @partial(_projected.defjvp, symbolic_zeros=True)
-def _(primals, tangents):
-    equations, t, q, v = primals
-    q, v, safe = _projected(equations, t, q, v)
+def _(both, primals, tangents):
+    equations, t, _, _ = primals
+    (q, v), about, safe = _projected(both, *primals)
     dq, dv = _correction(equations, t, q, v, tangents)
-    return (q, v, safe), (dq, dv, np.zeros(jnp.shape(safe), jax.dtypes.float0))
+    return ((q, v), about, safe), ((dq, dv), *jax.tree.map(_no_tangent, (about, safe)))
 
 
 @jax.custom_jvp
@@ -259,6 +294,10 @@ def _plain(name: str, primals: Any, moving: tuple[bool, ...]) -> tuple[Any, list
         return list(plain_correction(equations, t, q, v))
 
     return function, _those(primals, moving)
+
+
+def _no_tangent(x: Any) -> Any:
+    return jnp.zeros_like(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else np.zeros(jnp.shape(x), jax.dtypes.float0)
 
 
 # --- lists of inputs: the constants, t, q, v

@@ -178,11 +178,17 @@ class Formulated(Rewritten):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.project(t, q, v)
 
+    def kept(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
+        return self.equations.kept(t, q, v)
+
+    def closed(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Array]:
+        return self.equations.closed(t, q, v)
+
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.as_projected(t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
-        return self.equations.tangential(t, q, v, dq, dv)
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, known: Any = None) -> Tangential:
+        return self.equations.tangential(t, q, v, dq, dv, known)
 
     @property
     def left_out(self) -> tuple[int, ...]:

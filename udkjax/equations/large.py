@@ -76,7 +76,7 @@ class LargeEquations(MechanismMotion):
         """A state on the manifold, with the derivatives that `project` has where it returns it."""
         return _compiled(_as_projected, self, t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, known: Any = None) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
         return _compiled(plain_tangential, self, t, q, v, dq, dv)
 

@@ -4,6 +4,7 @@ from abc import abstractmethod
 from typing import Any, NamedTuple, Self
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 Vector = Float[Array, "n"]
@@ -66,12 +67,24 @@ class Motion(eqx.Module):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """q and v returned to the constraint manifold."""
 
+    def kept(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
+        """`project`, and what it knows of the state that `tangential` need not find again. By default: nothing."""
+        return *self.project(t, q, v), None
+
+    def closed(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Array]:
+        """`project`, and how far its last step moved any coordinate or velocity. By default: all of it."""
+        q1, v1 = self.project(t, q, v)
+        return q1, v1, jnp.maximum(jnp.max(jnp.abs(q1 - q), initial=0.0), jnp.max(jnp.abs(v1 - v), initial=0.0))
+
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives of a projection that returns it. By default it is projected again."""
         return self.project(t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
-        """What projection at q leaves of small changes of positions and velocities. By default: all of them."""
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, known: Any = None) -> Tangential:
+        """What projection at q leaves of small changes of positions and velocities. By default: all of them.
+
+        `known`, if any, is what `kept` returned where it returned q.
+        """
         return Tangential(dq, dv)
 
     @abstractmethod

@@ -89,13 +89,21 @@ class Equations(MechanismMotion):
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
         return fast.project(self, t, q, v)
 
+    def kept(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
+        """`project`, and the factors that it found."""
+        return super().kept(t, q, v) if self.branches or not self.eliminates else fast.kept(self, t, q, v)
+
+    def closed(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Array]:
+        """`project`, with a second step in velocity, too, and how far the last step moved any coordinate or velocity."""
+        return super().closed(t, q, v) if self.branches or not self.eliminates else fast.closed(self, t, q, v)
+
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives that `project` has where it returns it."""
         return fast.as_projected(self, t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, known: Any = None) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
-        return fast.tangential(self, t, q, v, dq, dv)
+        return fast.tangential(self, t, q, v, dq, dv, known)
 
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""

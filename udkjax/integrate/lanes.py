@@ -19,13 +19,13 @@ from udkjax.equations.motion import Motion, Tangential
 from udkjax.integrate.explicit import March, Task, Trial, judged, march, stage_state
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
-from udkjax.integrate.projection import lasting, project, violation
+from udkjax.integrate.projection import lasting, violation
 from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.straightline import apart, when, whole
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
-FAR = 1e-8  # m, rad, m/s, rad/s: a projection leaves rounding errors of what is nearer to the manifold
+FAR = 1e-8  # m, rad, m/s, rad/s: a step of a projection leaves rounding errors of what is nearer to the manifold
 PASSES = 6  # projections of an output: where two branches of the manifold meet, Newton's method halves the distance in a step
 LANES = 64  # with 16 or 32 a lane of the paper's linkage takes longer, with 128 no less
 # A single run has its outputs projected side by side, too, where that fills vectors and does not take long to compile.
@@ -171,7 +171,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     """What to march along."""
     task = Task(
         partial(lanes.over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
-        partial(lanes.over, lambda e, t, q, v: e.quick.project(t, q, v)) if problem.projected else lambda t, q, v: (q, v),
+        partial(lanes.over, lambda e, t, q, v: e.quick.kept(t, q, v)) if problem.projected else lambda t, q, v: (q, v, None),
         partial(lanes.over, lasting) if problem.projected else _all_of_it,
         None,
         problem.equations.branches,
@@ -183,7 +183,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     return task
 
 
-def _all_of_it(t: Array, q: Array, v: Array, dq: Array, dv: Array) -> Tangential:
+def _all_of_it(t: Array, q: Array, v: Array, dq: Array, dv: Array, known: Any) -> Tangential:
     """Errors where nothing takes any of them back."""
     return Tangential(dq, dv, jnp.ones(t.shape, bool))
 
@@ -238,7 +238,7 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
         _, a, q1, v1, _ = jax.lax.while_loop(lambda c: c[0] <= stages, more, first)
         mine, evaluations = task._replace(rtol=rtol, atol=atol), jnp.where(begin, 2, 2 * stages + 1)
         mine = mine._replace(lasting=partial(lasting, equations)) if projected else mine
-        return judged(mine, here._replace(a=a[0]), Point(t1, q1, v1, a[stages]), h, a[:stages], evaluations)
+        return judged(mine, here._replace(a=a[0]), Point(t1, q1, v1, a[stages]), h, a[:stages], evaluations, None)
 
     tolerances = (jnp.broadcast_to(x, h.shape) for x in (task.rtol, task.atol))
     unknown = jnp.zeros((stages, *here.a.shape)) if task.recorded else None
@@ -277,12 +277,12 @@ def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], t
 
 def _output(projected: bool, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array]:
     """Interpolated states (2n, *lanes), returned to the manifold, and how they violate the constraints."""
-    over = partial(lanes.over, lambda e, t, y: project(e.forgiving, t, y))
+    over = partial(lanes.over, lambda e, t, y: e.forgiving.closed(t, *jnp.split(y, 2)))
 
     def again(carry: Any) -> Any:
         k, y, far = carry
-        nearer = over(t, y)
-        return k + 1, jnp.where(far, nearer, y), far & jnp.any(jnp.abs(nearer - y) > FAR, axis=0)
+        *nearer, moved = over(t, y)
+        return k + 1, jnp.where(far, jnp.concatenate(nearer), y), far & ~(moved <= FAR)
 
     if projected:
         start = 0, y, jnp.ones(lanes.shape, bool)  # no lane's result depends on those beside it
