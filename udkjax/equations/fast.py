@@ -75,15 +75,14 @@ def _projected(both: bool, equations: "Equations", t: Any, q: Vector, v: Vector)
         residual = equations.run(name, t, q, x)
         return x - stacked(step([*equations.constants, *factors, *residual]))
 
-    def nearer(state: tuple[Vector, Vector, Any]) -> tuple[Vector, Vector, Any]:
-        q, v, _ = state
+    def nearer(state: Any) -> Any:
+        k, q, v, _ = state
         q1 = without(q, "psi_kept", q)
         v1 = without(v, "psi_dot_kept", q1)
-        return q1, v1, jnp.maximum(jnp.max(jnp.abs(q1 - q)), jnp.max(jnp.abs(v1 - v)))
+        return k + 1, q1, v1, jnp.maximum(jnp.max(jnp.abs(q1 - q)), jnp.max(jnp.abs(v1 - v)))
 
-    if both:
-        first = nearer((q, v, None))
-        *found, moved = when(first[-1] > FAR, nearer, first)
+    if both:  # a loop: in two places the same would take twice as long to compile
+        _, *found, moved = jax.lax.while_loop(lambda s: (s[0] < 2) & ~(s[-1] <= FAR), nearer, (0, q, v, jnp.inf))
     else:
         q1 = without(q, "psi_kept", q)
         moved = jnp.max(jnp.abs(q1 - q))
