@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from udkjax.equations.code import Code
 from udkjax.integrate import lanes
 from udkjax.integrate.tableau import method_of
 from udkjax.study.exact import exact_coordinates
@@ -190,3 +191,18 @@ def test_one_direction_for_all_members(pendulum):
     _, slopes = jax.vmap(lambda x: jax.jvp(angle, (x,), (1.0,)))(inertias)
     ahead, behind = (jax.vmap(angle)(inertias + h) for h in (1e-4, -1e-4))
     assert_allclose(slopes, (ahead - behind) / 2e-4, rtol=1e-4)
+
+
+def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
+    """A link's mass stands in few of the constants of a linkage; no other has a derivative."""
+    moving, derivative = [], Code.derivative
+    monkeypatch.setattr(Code, "derivative", lambda self, name, moves: moving.append(moves) or derivative(self, name, moves))
+    linkage = udk.library.parallelogram(np.deg2rad(-45))
+
+    def angle(mass):
+        changed = linkage.with_parameters({"body.link1.mass": mass})
+        return udk.simulate(changed, jnp.linspace(0.0, 1.0, 3), adjoint=diffrax.ForwardMode(), careful=False).q[-1, 0, 2]
+
+    jax.jit(jax.jacfwd(angle)).lower(1.0)
+    assert moving and len(moving[0]) > 60  # the constants, t, q and v
+    assert max(sum(constants) for *constants, _, _, _ in moving) <= 8

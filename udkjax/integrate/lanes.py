@@ -5,7 +5,7 @@ for the slowest of its own chunk alone. The rare step that needs care is taken b
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from udkjax.equations.motion import Motion, Tangential
@@ -21,6 +22,7 @@ from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import lasting, violation
 from udkjax.integrate.tableau import is_explicit, method_of
+from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.straightline import apart, when, whole
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
@@ -58,22 +60,46 @@ def _batched(problem: Problem, single: Callable[[Problem], Raw], many: Callable[
     arrays, static = eqx.partition(problem, eqx.is_array)
     leaves, tree = jax.tree.flatten(arrays)
 
-    @custom_vmap
-    def one(*leaves):
-        return single(eqx.combine(tree.unflatten(leaves), static))
+    @jax.custom_jvp
+    def run(*leaves):
+        return along(map(_has_tangents, leaves), leaves)
 
-    @one.def_vmap
-    def _(size, batched, *leaves):
-        every = Raw(*[any(batched)] * len(Raw._fields))
-        if not any(batched):  # only tangents are
-            return single(eqx.combine(tree.unflatten(leaves), static)), every
-        if jax.default_backend() in CHUNKED:
-            return many(tree.unflatten(leaves), tree.unflatten(batched), static, size), every
-        axes = [0 if b else None for b in batched]
-        return jax.vmap(lambda *leaves: single(eqx.combine(tree.unflatten(leaves), static)), axes)(*leaves), every
+    @partial(run.defjvp, symbolic_zeros=True)
+    def _(primals, tangents):
+        moves = [not isinstance(dx, SymbolicZero) and dx.dtype != jax.dtypes.float0 for dx in tangents]
+        moving, dx = ([x for x, m in zip(values, moves, strict=True) if m] for values in (primals, tangents))
 
-    moving = sum(x.ravel()[0] for x in leaves if _has_tangents(x) and x.size)
-    return one(*[_with_its_tangent(x, moving) if _has_tangents(x) else x for x in leaves])
+        def function(*moving):
+            some = iter(moving)
+            return along(moves, [next(some) if m else x for x, m in zip(primals, moves, strict=True)])
+
+        return jax.jvp(function, moving, dx)
+
+    def along(moves: Iterable[bool], leaves: Sequence[Array]) -> Raw:
+        """The run, of which only those leaves have tangents that are moving. The rule of `custom_vmap` gives all of them some."""
+        moves = tuple(moves)
+
+        def problem_of(leaves: Sequence[Array]) -> Any:
+            return tree.unflatten([x if m else undifferentiated(x) for x, m in zip(leaves, moves, strict=True)])
+
+        @custom_vmap
+        def one(*leaves):
+            return single(eqx.combine(problem_of(leaves), static))
+
+        @one.def_vmap
+        def _(size, batched, *leaves):
+            every = Raw(*[any(batched)] * len(Raw._fields))
+            if not any(batched):  # only tangents are
+                return single(eqx.combine(problem_of(leaves), static)), every
+            if jax.default_backend() in CHUNKED:
+                return many(problem_of(leaves), tree.unflatten(batched), static, size), every
+            axes = [0 if b else None for b in batched]
+            return jax.vmap(lambda *leaves: single(eqx.combine(problem_of(leaves), static)), axes)(*leaves), every
+
+        moving = sum(x.ravel()[0] for x, m in zip(leaves, moves, strict=True) if m and x.size)
+        return one(*[_with_its_tangent(x, moving) if _has_tangents(x) else x for x in leaves])
+
+    return run(*leaves)
 
 
 def _has_tangents(x: Array) -> bool:
