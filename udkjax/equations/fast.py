@@ -38,19 +38,19 @@ def accelerations(program: str, equations: "Equations", t: Any, q: Vector, v: Ve
 
 def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     """As the plain form, but with the factors of the first position kept: they differ by the residual, and so does the result."""
-    found, _, safe = _projected(False, equations, t, q, v)
+    found, _, safe = _projected(None, equations, t, q, v)
     return _trusted(found, safe)
 
 
 def kept(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, list[Array]]:
     """`project` by elimination without a branch, and the factors of the first position."""
-    found, (_, factors), safe = _projected(False, equations, t, q, v)
+    found, (_, factors), safe = _projected(None, equations, t, q, v)
     return *_trusted(found, safe), factors
 
 
-def closed(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Array]:
-    """By elimination without a branch: two Newton steps in position and velocity, and how far the last one went."""
-    found, (moved, _), safe = _projected(True, equations, t, q, v)
+def closed(equations: "Equations", t: Any, q: Vector, v: Vector, steps: Any) -> tuple[Vector, Vector, Array]:
+    """By elimination without a branch: Newton steps in position and velocity, and how far the last one went."""
+    found, (moved, _), safe = _projected(steps, equations, t, q, v)
     return *_trusted(found, safe), moved
 
 
@@ -59,12 +59,12 @@ def _trusted(found: Sequence[Array], safe: Any) -> tuple[Array, Array]:
     return q, v
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _projected(both: bool, equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any, Any, Any]:
+@jax.custom_jvp
+def _projected(steps: Any, equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any, Any, Any]:
     """q and v, numbers in any case; how far the last step went, and the factors; and whether all that can be trusted.
 
-    A second step goes in `both` position and velocity if the first moved either, or in position if it moved the position.
-    Derivatives are taken where q and v are then.
+    At most so many `steps` go in position and velocity, until one moves neither; if None, one in velocity, and in position a
+    second if the first moved it. Derivatives are taken where q and v are then.
     """
     if not equations.eliminates:
         return plain_project(equations, t, q, v), (jnp.nan, []), jnp.array(True)
@@ -81,8 +81,8 @@ def _projected(both: bool, equations: "Equations", t: Any, q: Vector, v: Vector)
         v1 = without(v, "psi_dot_kept", q1)
         return k + 1, q1, v1, jnp.maximum(jnp.max(jnp.abs(q1 - q)), jnp.max(jnp.abs(v1 - v)))
 
-    if both:  # a loop: in two places the same would take twice as long to compile
-        _, *found, moved = jax.lax.while_loop(lambda s: (s[0] < 2) & ~(s[-1] <= FAR), nearer, (0, q, v, jnp.inf))
+    if steps is not None:
+        _, *found, moved = jax.lax.while_loop(lambda s: (s[0] < steps) & ~(s[-1] <= FAR), nearer, (0, q, v, jnp.inf))
     else:
         q1 = without(q, "psi_kept", q)
         moved = jnp.max(jnp.abs(q1 - q))
@@ -136,10 +136,10 @@ def _(program, primals, tangents):
 
 
 @partial(_projected.defjvp, symbolic_zeros=True)
-def _(both, primals, tangents):
-    equations, t, _, _ = primals
-    (q, v), about, safe = _projected(both, *primals)
-    dq, dv = _correction(equations, t, q, v, tangents)
+def _(primals, tangents):
+    equations, t, _, _ = primals[1:]
+    (q, v), about, safe = _projected(*primals)
+    dq, dv = _correction(equations, t, q, v, tangents[1:])
     return ((q, v), about, safe), ((dq, dv), *jax.tree.map(_no_tangent, (about, safe)))
 
 

@@ -181,8 +181,8 @@ class Formulated(Rewritten):
     def kept(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
         return self.equations.kept(t, q, v)
 
-    def closed(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Array]:
-        return self.equations.closed(t, q, v)
+    def closed(self, t: Any, q: Vector, v: Vector, steps: Any = 2) -> tuple[Vector, Vector, Array]:
+        return self.equations.closed(t, q, v, steps)
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.as_projected(t, q, v)

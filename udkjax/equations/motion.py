@@ -71,8 +71,11 @@ class Motion(eqx.Module):
         """`project`, and what it knows of the state that `tangential` need not find again. By default: nothing."""
         return *self.project(t, q, v), None
 
-    def closed(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Array]:
-        """`project`, and how far its last step moved any coordinate or velocity. By default: all of it."""
+    def closed(self, t: Any, q: Vector, v: Vector, steps: Any = 2) -> tuple[Vector, Vector, Array]:
+        """`project`, by at most so many steps where it counts them, and how far the last moved any coordinate or velocity.
+
+        By default: `project`, and how far that went.
+        """
         q1, v1 = self.project(t, q, v)
         return q1, v1, jnp.maximum(jnp.max(jnp.abs(q1 - q), initial=0.0), jnp.max(jnp.abs(v1 - v), initial=0.0))
 

@@ -93,9 +93,10 @@ class Equations(MechanismMotion):
         """`project`, and the factors that it found."""
         return super().kept(t, q, v) if self.branches or not self.eliminates else fast.kept(self, t, q, v)
 
-    def closed(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Array]:
-        """`project`, with a second step in velocity, too, and how far the last step moved any coordinate or velocity."""
-        return super().closed(t, q, v) if self.branches or not self.eliminates else fast.closed(self, t, q, v)
+    def closed(self, t: Any, q: Vector, v: Vector, steps: Any = 2) -> tuple[Vector, Vector, Array]:
+        """`project`, with further steps in velocity, too, and how far the last step moved any coordinate or velocity."""
+        by_elimination = self.eliminates and not self.branches
+        return fast.closed(self, t, q, v, steps) if by_elimination else super().closed(t, q, v, steps)
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives that `project` has where it returns it."""

@@ -303,11 +303,11 @@ def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], t
 
 def _output(projected: bool, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array]:
     """Interpolated states (2n, *lanes), returned to the manifold, and how they violate the constraints."""
-    over = partial(lanes.over, lambda e, t, y: e.forgiving.closed(t, *jnp.split(y, 2)))
 
     def again(carry: Any) -> Any:
         k, y, far = carry
-        *nearer, moved = over(t, y)
+        steps = jnp.where(k == 0, 2, 1)  # where two are not enough, those that follow want factors of their own
+        *nearer, moved = lanes.over(lambda e, t, y: e.forgiving.closed(t, *jnp.split(y, 2), steps), t, y)
         return k + 1, jnp.where(far, jnp.concatenate(nearer), y), far & ~(moved <= FAR)
 
     if projected:
