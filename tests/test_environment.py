@@ -71,6 +71,23 @@ def test_loops_are_compiled_whole(monkeypatch, installed, given, expected):
     assert os.environ["XLA_FLAGS"] == (expected or given or "")
 
 
+@pytest.mark.parametrize(
+    ("installed", "given", "expected"),
+    [
+        ("0.10.2", None, "--xla_cpu_prefer_vector_width=512"),
+        ("0.12.0.1", "--xla_a=1", "--xla_a=1 --xla_cpu_prefer_vector_width=512"),
+        ("0.12.0", "--xla_cpu_prefer_vector_width=128", None),
+        ("0.13.0", None, None),  # XLA ends the process on a flag that it no longer knows
+        ("our own", None, None),
+    ],
+)
+def test_vectors_are_as_wide_as_there_are(monkeypatch, installed, given, expected):
+    monkeypatch.setenv("XLA_FLAGS", given or "")
+    monkeypatch.setattr(environment, "version", {"jax": installed}.get)
+    environment.enable_wide_vectors()
+    assert os.environ["XLA_FLAGS"] == (expected or given or "")
+
+
 @pytest.mark.parametrize("order", ["import jax, udkjax as udk", "import udkjax as udk, jax"], ids=["jax first", "udkjax first"])
 @pytest.mark.parametrize("then", [False, True], ids=["as it is", "changed"])
 def test_programs_run_in_the_thread_that_calls_them(tmp_path, order, then):

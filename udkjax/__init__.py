@@ -3,13 +3,20 @@
 Nothing is imported before it is used, so that the command line answers at once. Importing this package turns float64 on in
 JAX, unless the environment says `JAX_ENABLE_X64=0`, and lets JAX keep compiled programs in the user's cache folder, unless it
 says `UDKJAX_COMPILATION_CACHE=0`, or names another folder there. On the CPU programs run in the thread that calls them, until
-`jax.config.update("jax_cpu_enable_async_dispatch", True)`; before JAX 0.12, `XLA_FLAGS` also says that loops are compiled whole.
+`jax.config.update("jax_cpu_enable_async_dispatch", True)`. `XLA_FLAGS` is told to use vectors of 512 bits where the CPU has them,
+unless it says something of `xla_cpu_prefer_vector_width`, and before JAX 0.12 to compile loops whole.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from udkjax.environment import disable_async_dispatch, enable_compilation_cache, enable_float64, enable_whole_loops
+from udkjax.environment import (
+    disable_async_dispatch,
+    enable_compilation_cache,
+    enable_float64,
+    enable_whole_loops,
+    enable_wide_vectors,
+)
 
 if TYPE_CHECKING:  # the public names, for type checkers and editors; a test compares them with those below
     from udkjax import equations as equations
@@ -146,4 +153,5 @@ def __dir__():
 enable_float64()
 disable_async_dispatch()
 enable_whole_loops()
+enable_wide_vectors()
 enable_compilation_cache()
