@@ -14,11 +14,12 @@ number, because elimination met a pivot that it must not trust, a lane takes a s
 waits, and the loop around takes the step again, by equations that may branch.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.motion import Tangential
@@ -95,8 +96,8 @@ def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial
         return t1, q, v, undifferentiated(known)
 
     def stage(i, carry):
-        a, _, _, known = carry
-        t, q, v = stage_state(task.method, here, h, a[:last], i)
+        a, *into, known = carry
+        t, q, v = stage_state(task.method, here, h, a, i, into)
         t, q, v, known = when(i == last, end, (t, q, v, known))
         return jax.lax.dynamic_update_index_in_dim(a, task.accelerations(t, q, v), i, 0), q, v, known
 
@@ -107,19 +108,33 @@ def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial
     return judged(task, here, Point(t1, q1, v1, a[last]), h, a[:last], jnp.where(begin, 1, last), known)
 
 
-def stage_state(method: Method, here: Point, h: Array, a: Array, i: Any) -> tuple[Array, Array, Array]:
-    """t, q and v of stage i, from the accelerations (stages, n, *lanes) of those before; the last is the end of the step."""
-    coefficients = (method.nodes, method.v, method.q)
-    node, row_v, row_q = (jax.lax.dynamic_index_in_dim(jnp.asarray(c), i, keepdims=False) for c in coefficients)
-    return here.t + node * h, here.q + h * (node * here.v + h * _combine(row_q, a)), here.v + h * _combine(row_v, a)
+def stage_state(method: Method, here: Point, h: Array, a: Array, i: Any, into: Sequence[Array] = ()) -> tuple[Array, Array, Array]:
+    """t, q and v of stage i > 0, from the accelerations (stages, n, *lanes) of those before; the last is the end of the step.
+
+    Two of three coefficients are zero. A single run takes all as they come; in lanes, where the accelerations do not fit into the
+    fastest memory, each stage has sums of its own. They replace what is in `into`.
+    """
+
+    def state(node: Any, row_q: Any, row_v: Any) -> tuple[Array, Array]:
+        stages = a[: method.stages]  # here, not before: what a branch takes from outside is made for each
+        return here.q + h * (node * here.v + h * _combine(row_q, stages)), here.v + h * _combine(row_v, stages)
+
+    tableau = (method.nodes, method.q, method.v)
+    node, *rows = (jax.lax.dynamic_index_in_dim(jnp.asarray(c), i, keepdims=False) for c in tableau)
+    if not here.t.shape:
+        return here.t + node * h, *state(node, *rows)
+    q, v = into
+    for k, row in enumerate(zip(*tableau, strict=True)):
+        q, v = when(i == k, lambda _, row=row: state(*row), (q, v)) if k else (q, v)
+    return here.t + node * h, q, v
 
 
 def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: Any, known: Any) -> Trial:
     """A step with its error; of a method whose last stage is the next step's first, that is the one after projection."""
     method = task.method
     a = a.at[-1].set(to.a) if method.ends else a
-    error_v = h * _combine(jnp.asarray(method.error_v), a)
-    error_q = h * (h * _combine(jnp.asarray(method.error_q), a))
+    error_v = h * _combine(method.error_v, a)
+    error_q = h * (h * _combine(method.error_q, a))
     error_q, error_v, far = task.lasting(to.t, to.q, to.v, error_q, error_v, known)
     size = jnp.maximum(_relative(task, error_q, here.q, to.q), _relative(task, error_v, here.v, to.v))
     size = jnp.where(jnp.all(jnp.isfinite(to.a), axis=0), size, jnp.nan)
@@ -127,9 +142,10 @@ def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: 
     return Trial(to, undifferentiated(size), far, evaluations, a if task.recorded else None)
 
 
-def _combine(weights: Array, a: Array) -> Array:
+def _combine(weights: Any, a: Array) -> Array:
     """sum_j weights_j a_j. Not a product of matrices, for which XLA writes a loop that does not vectorize."""
-    terms = [w * x for w, x in zip(weights, a, strict=True)]
+    known = isinstance(weights, np.ndarray)
+    terms = [w * x for w, x in zip(weights, a, strict=True) if not known or w != 0] or [jnp.zeros_like(a[0])]
     return cut([sum(sum(terms[k::CHAINS]) for k in range(min(CHAINS, len(terms))))])[0]
 
 
