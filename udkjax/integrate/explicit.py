@@ -14,6 +14,7 @@ number, because elimination met a pivot that it must not trust, a lane takes a s
 waits, and the loop around takes the step again, by equations that may branch.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -137,7 +138,7 @@ def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: 
     error_q = h * (h * _combine(method.error_q, a))
     error_q, error_v, far = task.lasting(to.t, to.q, to.v, error_q, error_v, known)
     size = jnp.maximum(_relative(task, error_q, here.q, to.q), _relative(task, error_v, here.v, to.v))
-    size = jnp.where(jnp.all(jnp.isfinite(to.a), axis=0), size, jnp.nan)
+    size = jnp.where(_over_all(jnp.logical_and, jnp.all, jnp.isfinite(to.a)), size, jnp.nan)
     evaluations = jnp.broadcast_to(jnp.asarray(evaluations), size.shape)
     return Trial(to, undifferentiated(size), far, evaluations, a if task.recorded else None)
 
@@ -151,7 +152,12 @@ def _combine(weights: Any, a: Array) -> Array:
 
 def _relative(task: Task, error: Array, y0: Array, y1: Array) -> Array:
     scale = task.atol + task.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
-    return jnp.max(jnp.abs(error) / scale, axis=0)
+    return _over_all(jnp.maximum, jnp.max, jnp.abs(error) / scale)
+
+
+def _over_all(pair: Callable, every: Callable, x: Array) -> Array:
+    """`every` of the coordinates. In lanes one after another: XLA writes a loop over lanes for it that does not vectorize."""
+    return cut([functools.reduce(pair, cut(list(x)))])[0] if x.ndim > 1 else every(x)
 
 
 def march(task: Task, q: Array, v: Array) -> March:
