@@ -16,6 +16,7 @@ SIZES = {"N-four-bar": (1, 2, 5, 10, 20, 40, 100, 200, 1000), "chain": (1, 10, 1
 STRAIGHT = (1, 2, 5, 10, 20)  # N-four-bars as straight-line code, whatever the size: compiling more takes minutes
 UP_TO = 200  # the exponents are those of N-four-bars of 1 to so many
 ROUNDS, AT_LEAST = 9, 0.05  # s
+EVALUATIONS = 40_000  # of one four-bar in a call: to hand over the numbers of twenty takes as long as fifty of their right-hand sides
 
 
 def n_four_bar(n: int) -> udk.Mechanism:
@@ -74,7 +75,7 @@ def main(smoke: bool = False, out: Path | None = None):
     cases += [("N-four-bar, by levels", n_four_bar, n, True) for n in ((1,) if smoke else STRAIGHT)]
     figures, timers = [], {}
     for k, (name, make, n, large) in enumerate(cases):
-        row, seconds = measured(name, make, n, large, 2 if smoke else max(10, 2000 // n))
+        row, seconds = measured(name, make, n, large, 2 if smoke else max(100, EVALUATIONS // n))
         figures.append(row)
         timers[k] = lambda seconds=seconds: seconds(0.0 if smoke else AT_LEAST)
     times = in_turn(timers, 1 if smoke else ROUNDS)
