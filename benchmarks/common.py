@@ -44,12 +44,16 @@ class Compiled:
         return time.perf_counter() - start
 
     def cpu_seconds(self, *arguments: Any, at_least: float = 0.02) -> float:
-        """CPU time of a run, of all threads: the mean of as many as take `at_least` seconds. What else runs matters less."""
-        start, runs = time.process_time(), 0
-        while runs == 0 or time.process_time() - start < at_least:
+        """CPU time of a run, of all threads: the median of as many as take `at_least` seconds, as the C++ program takes it.
+
+        What else runs matters less; nor do the first, in caches that another candidate has left behind.
+        """
+        times: list[float] = []
+        while not times or sum(times) < at_least:
+            start = time.process_time()
             self(*arguments)
-            runs += 1
-        return (time.process_time() - start) / runs
+            times.append(time.process_time() - start)
+        return statistics.median(times)
 
 
 def alternate(candidates: dict[str, Compiled], arguments: tuple, rounds: int) -> dict[str, list[float]]:

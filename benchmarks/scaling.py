@@ -16,7 +16,7 @@ SIZES = {"N-four-bar": (1, 2, 5, 10, 20, 40, 100, 200, 1000), "chain": (1, 10, 1
 STRAIGHT = (1, 2, 5, 10, 20)  # N-four-bars as straight-line code, whatever the size: compiling more takes minutes
 UP_TO = 200  # the exponents are those of N-four-bars of 1 to so many
 ROUNDS, AT_LEAST = 9, 0.05  # s
-EVALUATIONS = 40_000  # of one four-bar in a call: to hand over the numbers of twenty takes as long as fifty of their right-hand sides
+EVALUATIONS = 40_000  # of one four-bar in a call: to hand over the numbers of 20 takes as long as 50 of their right-hand sides
 
 
 def n_four_bar(n: int) -> udk.Mechanism:
@@ -58,9 +58,10 @@ def measured(name: str, make: Any, n: int, large: bool | None, evaluations: int)
     return figures, lambda at_least: program.cpu_seconds(equations, *y, at_least=at_least) / evaluations
 
 
-def exponent(rows: list[dict[str, Any]], key: str) -> float:
-    """The slope of a straight line through the logarithms."""
-    chosen = [(row["n"], row[key]) for row in rows if row["name"] == "N-four-bar" and row["n"] <= UP_TO and row[key] > 0]
+def exponent(rows: list[dict[str, Any]], key: str, form: str | None = None) -> float:
+    """The slope of a straight line through the logarithms; of one form of the equations, what was measured of it besides, too."""
+    named = [row for row in rows if row["name"].startswith("N-four-bar") and (form or row["name"] == "N-four-bar")]
+    chosen = [(row["n"], row[key]) for row in named if form in (None, row["form"]) and row["n"] <= UP_TO and row[key] > 0]
     n, cost = np.log(np.array(chosen, float).reshape(-1, 2)).T
     return float(np.polyfit(n, cost, 1)[0]) if len(chosen) > 1 else float("nan")
 
@@ -89,6 +90,8 @@ def main(smoke: bool = False, out: Path | None = None):
         print(f"{row['name']:32} {row['n']:5} {row['bodies']:6} {row['us']:9.2f} {row['flops']:9.0f} {kb:7.0f} {until}")
     exponents = {key: exponent(figures, key) for key in ("flops", "us", "temporary_bytes")}
     print("N-four-bar grows as N^" + ", N^".join(f"{value:.2f} ({key})" for key, value in exponents.items()))
+    forms = dict.fromkeys(row["form"] for row in figures)
+    print("of one form: " + ", ".join(f"{form} N^{exponent(figures, 'us', form):.2f} (us)" for form in forms))
     figures.append({"name": "exponents, N-four-bar", **exponents})
     report(about, figures, out)
     if out:

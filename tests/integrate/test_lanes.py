@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import udkjax as udk
 from udkjax.equations.code import Code
 from udkjax.integrate import lanes
+from udkjax.integrate.explicit import stage_state
+from udkjax.integrate.interpolation import Point
 from udkjax.integrate.tableau import method_of
 from udkjax.study.exact import exact_coordinates
 
@@ -135,6 +137,23 @@ def test_the_stages_of_second_order_are_those_of_the_tableau(solver):
     assert_allclose(y[1] + h * method.v[-1] @ a, expected[1], rtol=1e-14)
     assert_allclose(y[0] + h * (y[1] + h * method.q[-1] @ a), expected[0], rtol=1e-14)
     assert_allclose([h * h * method.error_q @ a, h * method.error_v @ a], error, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+@pytest.mark.parametrize("shape", [(), (3,)], ids=["one run", "lanes"])
+def test_a_stage_is_made_of_the_accelerations_before_it(solver, shape):
+    """In lanes by sums of its own for each: of what comes later, whatever it is, none is used."""
+    method, rng = method_of(solver), np.random.default_rng(0)
+    t, h = np.broadcast_to(0.3, shape), rng.uniform(0.1, 0.2, shape)
+    q, v, a = (rng.standard_normal((*n, *shape)) for n in ((2,), (2,), (method.stages + 1, 2)))
+    here, last = Point(*map(jnp.asarray, (t, q, v, a[0]))), (jnp.full_like(q, np.nan),) * 2
+    stage = jax.jit(lambda a, i: stage_state(method, here, jnp.asarray(h), a, i, last))
+    for i, c in enumerate(method.nodes[1:], 1):
+        before = np.where((np.arange(len(a)) < i).reshape(-1, 1, *[1] * len(shape)), a, np.nan if shape else 0.0)
+        found = stage(before, i)
+        of_v, of_q = (np.tensordot(row[i][:i], a[:i], 1) for row in (method.v, method.q))
+        for x, y in zip(found, (t + c * h, q + h * (c * v + h * of_q), v + h * of_v), strict=True):
+            assert_allclose(x, y, rtol=0, atol=1e-13)
 
 
 def test_outputs_are_as_exact_as_steps(pendulum):

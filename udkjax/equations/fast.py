@@ -71,34 +71,39 @@ def _projected(steps: Any, equations: "Equations", t: Any, q: Vector, v: Vector)
     *factors, safe = equations.run("factor", t, q, v)
     step = equations.code.program("step")
 
-    def without(xs: Any, name: str, qs: Any) -> Any:
+    # On scalars until all is done: vectors that a loop carries have the batch first under vmap, where the programs have it last.
+
+    def without(xs: Sequence[Array], name: str, qs: Sequence[Array]) -> list[Array]:
         residual = equations.code.program(name)([*equations.constants, t, *qs, *xs])
         return [x - y for x, y in zip(xs, step([*equations.constants, *factors, *residual]), strict=True)]
-
-    def far(xs: Any, ys: Any) -> Any:
-        ds = [jnp.abs(x - y) for x, y in zip(xs, ys, strict=True)]
-        while len(ds) > 1:
-            ds = [jnp.maximum(a, b) for a, b in zip(ds[::2], ds[1::2])] + ds[len(ds) // 2 * 2:]
-        return ds[0]
 
     def nearer(state: Any) -> Any:
         k, q, v, _ = state
         q1 = without(q, "psi_kept", q)
         v1 = without(v, "psi_dot_kept", q1)
-        return k + 1, q1, v1, jnp.maximum(far(q1, q), far(v1, v))
+        return k + 1, q1, v1, _largest_change([*q1, *v1], [*q, *v])
 
     qs, vs = scalars([q]), scalars([v])
     if steps is not None:
         _, *found, moved = jax.lax.while_loop(lambda s: (s[0] < steps) & ~(s[-1] <= FAR), nearer, (0, qs, vs, jnp.inf))
     else:
         q1 = without(qs, "psi_kept", qs)
-        moved = far(q1, qs)
+        moved = _largest_change(q1, qs)
         q2 = when(moved > FAR, lambda q1: without(q1, "psi_kept", q1), q1)
         found = [q2, without(vs, "psi_dot_kept", q2)]
     found = [stacked(x) for x in found]
     if equations.branches:
         return _branched(equations, safe, tuple(found), plain_project, t, q, v), (moved, []), jnp.array(True)
     return tuple(found), (moved, factors), safe if _checks(equations) else jnp.array(True)
+
+
+def _largest_change(new: Sequence[Array], old: Sequence[Array]) -> Array:
+    """Of any number; by halves, so that few wait for others."""
+    changes = [jnp.abs(x - y) for x, y in zip(new, old, strict=True)]
+    while len(changes) > 1:
+        pairs = zip(changes[::2], changes[1::2], strict=False)
+        changes = [*(jnp.maximum(a, b) for a, b in pairs), *changes[len(changes) // 2 * 2 :]]
+    return changes[0]
 
 
 def tangential(

@@ -109,11 +109,13 @@ def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial
     return judged(task, here, Point(t1, q1, v1, a[last]), h, a[:last], jnp.where(begin, 1, last), known)
 
 
-def stage_state(method: Method, here: Point, h: Array, a: Array, i: Any, into: Sequence[Array] = ()) -> tuple[Array, Array, Array]:
+def stage_state(
+    method: Method, here: Point, h: Array, a: Array, i: Any, into: Sequence[Array] = ()
+) -> tuple[Array, Array, Array]:
     """t, q and v of stage i > 0, from the accelerations (stages, n, *lanes) of those before; the last is the end of the step.
 
     Two of three coefficients are zero. A single run takes all as they come; in lanes, where the accelerations do not fit into the
-    fastest memory, each stage has sums of its own. They replace what is in `into`.
+    fastest memory, each stage has sums of its own, of what is not zero. They replace what is in `into`.
     """
 
     def state(node: Any, row_q: Any, row_v: Any) -> tuple[Array, Array]:
