@@ -13,7 +13,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from udkjax.environment import disable_async_dispatch
 from udkjax.study.machine import processor
+
+disable_async_dispatch()  # as the first name that is taken from udkjax does, but before anything here computes by JAX
 
 
 class Compiled:
