@@ -3,12 +3,10 @@
 import diffrax
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-# By NumPy: what computes by JAX while it is imported starts the CPU before udkjax has set it up.
-PIVOTS, PINS = np.array([0.0, 1.0, 2.0]), np.array([-1.0, 0.0, 1.0])
-MASS = np.array([1.0, 1.0, 0.1] * 3 + [2.0, 2.0, 0.2])
-WEIGHT = np.array([0.0, -9.81, 0.0] * 4)
+PIVOTS, PINS = jnp.array([0.0, 1.0, 2.0]), jnp.array([-1.0, 0.0, 1.0])
+MASS = jnp.array([1.0, 1.0, 0.1] * 3 + [2.0, 2.0, 0.2])
+WEIGHT = jnp.array([0.0, -9.81, 0.0] * 4)
 MAX_STEPS = 100_000
 
 
