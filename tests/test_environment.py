@@ -53,38 +53,30 @@ def test_the_environment_decides(tmp_path, choice, expected):
     assert python(PRINT.replace("jax, udkjax", "udkjax, jax"), HOME=tmp_path, **choice) == expected.format(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("installed", "given", "expected"),
-    [
-        ("0.10.2", None, "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"),
-        ("0.11.2", "--xla_a=1", "--xla_a=1 --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"),
-        ("0.11.2", "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=7", None),
-        ("0.12.0", None, None),
-        ("0.12.0", "--xla_a=1", None),
-        ("our own", None, None),
-    ],
-)
-def test_loops_are_compiled_whole(monkeypatch, installed, given, expected):
-    monkeypatch.setenv("XLA_FLAGS", given or "")
-    monkeypatch.setattr(environment, "version", {"jax": installed}.get)
-    environment.enable_whole_loops()
-    assert os.environ["XLA_FLAGS"] == (expected or given or "")
+LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold"
+VECTORS = "--xla_cpu_prefer_vector_width"
 
 
 @pytest.mark.parametrize(
-    ("installed", "given", "expected"),
+    ("enable", "installed", "given", "expected"),
     [
-        ("0.10.2", None, "--xla_cpu_prefer_vector_width=512"),
-        ("0.12.0.1", "--xla_a=1", "--xla_a=1 --xla_cpu_prefer_vector_width=512"),
-        ("0.12.0", "--xla_cpu_prefer_vector_width=128", None),
-        ("0.13.0", None, None),  # XLA ends the process on a flag that it no longer knows
-        ("our own", None, None),
+        (environment.enable_whole_loops, "0.10.2", None, f"{LOOPS}=1000000000"),
+        (environment.enable_whole_loops, "0.11.2", "--xla_a=1", f"--xla_a=1 {LOOPS}=1000000000"),
+        (environment.enable_whole_loops, "0.11.2", f"{LOOPS}=7", None),
+        (environment.enable_whole_loops, "0.12.0", None, None),
+        (environment.enable_whole_loops, "0.12.0", "--xla_a=1", None),
+        (environment.enable_whole_loops, "our own", None, None),
+        (environment.enable_wide_vectors, "0.10.2", None, f"{VECTORS}=512"),
+        (environment.enable_wide_vectors, "0.12.0.1", "--xla_a=1", f"--xla_a=1 {VECTORS}=512"),
+        (environment.enable_wide_vectors, "0.12.0", f"{VECTORS}=128", None),
+        (environment.enable_wide_vectors, "0.13.0", None, None),  # XLA ends the process on a flag that it no longer knows
+        (environment.enable_wide_vectors, "our own", None, None),
     ],
 )
-def test_vectors_are_as_wide_as_there_are(monkeypatch, installed, given, expected):
+def test_flags_are_added_where_they_are_known_and_not_given(monkeypatch, enable, installed, given, expected):
     monkeypatch.setenv("XLA_FLAGS", given or "")
     monkeypatch.setattr(environment, "version", {"jax": installed}.get)
-    environment.enable_wide_vectors()
+    enable()
     assert os.environ["XLA_FLAGS"] == (expected or given or "")
 
 
