@@ -13,10 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from udkjax.environment import disable_async_dispatch
 from udkjax.study.machine import processor
-
-disable_async_dispatch()  # as the first name that is taken from udkjax does, but before anything here computes by JAX
 
 
 class Compiled:

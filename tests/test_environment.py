@@ -80,12 +80,31 @@ def test_flags_are_added_where_they_are_known_and_not_given(monkeypatch, enable,
     assert os.environ["XLA_FLAGS"] == (expected or given or "")
 
 
-@pytest.mark.parametrize("order", ["import jax, udkjax as udk", "import udkjax as udk, jax"], ids=["jax first", "udkjax first"])
+@pytest.mark.parametrize(
+    "order",
+    [
+        "import jax, udkjax as udk",
+        "import udkjax as udk, jax",
+        "import udkjax as udk, jax.numpy, jax",
+        "import udkjax as udk; udk.library; import jax",
+        "import udkjax as udk; from importlib.util import find_spec; assert find_spec('jax'); import jax",
+        "import udkjax as udk, sys; del sys.modules['udkjax.environment'], sys.modules['udkjax']; import udkjax as udk, jax",
+    ],
+    ids=["jax first", "udkjax first", "a part of jax", "a name first", "looked for before", "imported twice"],
+)
 @pytest.mark.parametrize("then", [False, True], ids=["as it is", "changed"])
 def test_programs_run_in_the_thread_that_calls_them(tmp_path, order, then):
-    code = order + "; udk.library"
-    code += "; jax.config.update('jax_cpu_enable_async_dispatch', True)" if then else ""
-    assert python(code + "; udk.simulate; print(jax.config.read('jax_cpu_enable_async_dispatch'))", HOME=tmp_path) == str(then)
+    code = f"{order}; jax.config.update('jax_cpu_enable_async_dispatch', True)" if then else order
+    # what JAX's own first use of the CPU goes by, before any name is taken from udkjax, and what is found after one was
+    code += "; print(r := jax.config.read('jax_cpu_enable_async_dispatch'))"
+    code += "; udk.simulate; assert r == jax.config.read('jax_cpu_enable_async_dispatch')"
+    code += "; import sys; assert not any(type(f).__module__.startswith('udkjax') for f in sys.meta_path)"
+    assert python(code, HOME=tmp_path) == str(then)
+
+
+def test_jax_is_missed_as_ever_where_it_is_not_installed(tmp_path):
+    code = "import sys, udkjax; sys.path[:] = []\ntry: import jax\nexcept ImportError as e: print(e)"
+    assert python(code, HOME=tmp_path) == "No module named 'jax'"
 
 
 def test_a_cache_configured_before_stays(tmp_path):

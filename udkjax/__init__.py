@@ -135,7 +135,6 @@ __all__ = [*_MODULES, *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 def __getattr__(name: str):
     if name in _MODULES or name in _HOME:
         import_module("udkjax.equations")  # with it, mechanisms find their redundant rows when they are built
-        disable_async_dispatch()
     if name in _MODULES:
         value = import_module(_MODULES[name])
     elif name in _HOME:

@@ -8,8 +8,11 @@ import atexit
 import os
 import sys
 import time
+from importlib.machinery import ModuleSpec
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 
 FLOAT64 = "JAX_ENABLE_X64"
 DISPATCH = "jax_cpu_enable_async_dispatch"  # JAX looks at it when it first uses the CPU
@@ -27,8 +30,6 @@ KNOWN = (0, 12)  # the newest JAX whose XLA is known to know the flag: one that 
 LARGEST = 512 * 2**20  # bytes; a simulation's program is about one megabyte
 RARELY = 24 * 3600  # s between two looks at how large it is
 
-_told: set[str] = set()  # settings that were made: what the user changes afterwards stays
-
 
 def enable_float64() -> None:
     """Turn float64 on, unless the environment says `JAX_ENABLE_X64=0`."""
@@ -41,11 +42,39 @@ def disable_async_dispatch() -> None:
     """Let programs on the CPU run in the thread that calls them.
 
     To hand one over to another thread, and to wait for it, takes up to 0.08 ms: half as long as a short run itself. JAX knows no
-    environment variable for this; once it is imported it is told, the first time that it is found to be.
+    environment variable for this: it is told as soon as it is imported, before anybody can use it.
     """
-    if "jax" in sys.modules and DISPATCH not in _told:
-        _told.add(DISPATCH)
-        sys.modules["jax"].config.update(DISPATCH, False)
+    if "jax" in sys.modules:
+        _told_to_wait(sys.modules["jax"])
+    else:
+        sys.meta_path.insert(0, _JaxFinder())
+
+
+def _told_to_wait(jax: ModuleType) -> None:
+    jax.config.update(DISPATCH, False)
+
+
+class _JaxFinder:
+    """Finds JAX as the other finders do, and tells it once it has been imported."""
+
+    def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        if fullname != "jax":
+            return None
+        sys.meta_path.remove(self)
+        try:
+            spec = find_spec(fullname)
+        finally:
+            sys.meta_path.insert(0, self)  # found is not imported
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def then_tell(module: ModuleType) -> None:
+                execute(module)
+                sys.meta_path.remove(self)
+                _told_to_wait(module)
+
+            spec.loader.exec_module = then_tell
+        return spec
 
 
 def enable_whole_loops() -> None:
