@@ -43,9 +43,12 @@ def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vecto
 
 
 def kept(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, list[Array]]:
-    """`project` by elimination without a branch, and the factors of the first position."""
+    """`project` by elimination without a branch, and the factors of the first position: in a loop side by side.
+
+    What a loop hands on costs as many addresses as there are arrays.
+    """
     found, (_, factors), safe = _projected(None, equations, t, q, v)
-    return *_trusted(found, safe), factors
+    return *_trusted(found, safe), [stacked(factors)] if equations.loop else factors
 
 
 def closed(equations: "Equations", t: Any, q: Vector, v: Vector, steps: Any) -> tuple[Vector, Vector, Array]:
@@ -74,8 +77,9 @@ def _projected(steps: Any, equations: "Equations", t: Any, q: Vector, v: Vector)
     # On scalars until all is done: vectors that a loop carries have the batch first under vmap, where the programs have it last.
 
     def without(xs: Sequence[Array], name: str, qs: Sequence[Array]) -> list[Array]:
-        residual = equations.code.program(name)([*equations.constants, t, *qs, *xs])
-        return [x - y for x, y in zip(xs, step([*equations.constants, *factors, *residual]), strict=True)]
+        residual = equations.code.program(name)([*equations.constants, t, *qs, *xs], equations.loop)
+        change = step([*equations.constants, *factors, *residual], equations.loop)
+        return [x - y for x, y in zip(xs, change, strict=True)]
 
     def nearer(state: Any) -> Any:
         k, q, v, _ = state
@@ -114,7 +118,9 @@ def tangential(
         return plain_tangential(equations, t, q, v, dq, dv)
     if factors is None:
         *factors, _ = equations.run("factor", t, q, v)
-    *changes, far = equations.code.program("tangential")([*equations.constants, *factors, *scalars([dq, dv])])
+    factors = scalars(factors) if equations.loop else factors
+    given = [*equations.constants, *factors, *scalars([dq, dv])]
+    *changes, far = equations.code.program("tangential")(given, equations.loop)
     return Tangential(stacked(changes[: len(q)]), stacked(changes[len(q) :]), far)
 
 
@@ -330,7 +336,7 @@ def _those(values: Any, moving: tuple[bool, ...]) -> list[Any]:
 
 
 def _run(program: Program, equations: "Equations", t: Any, q: Any, v: Any, more: Sequence[Any] = ()) -> list[Any]:
-    return program([*equations.constants, t, *scalars([q, v]), *more])
+    return program([*equations.constants, t, *scalars([q, v]), *more], equations.loop)
 
 
 def _flat(values: Sequence[Any]) -> Array:

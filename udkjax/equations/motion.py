@@ -7,6 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from udkjax.straightline import Loop
+
 Vector = Float[Array, "n"]
 
 
@@ -50,6 +52,11 @@ class Motion(eqx.Module):
     def forgiving(self) -> "Motion":
         """The same without a branch, for states near the manifold: rows that depend on others are not asked to close further."""
         return self.quick
+
+    def within(self, loop: Loop) -> "Motion":
+        """The same, to be evaluated in that loop, which XLA compiles into one function."""
+        del loop
+        return self
 
     @abstractmethod
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:

@@ -27,6 +27,7 @@ from udkjax.equations.plain import plain_accelerations
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, Varga
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
+from udkjax.straightline import Loop
 
 # Far above rounding and drift, far below the singular values of a mechanism in ordinary positions: with the states returned to
 # the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
@@ -68,6 +69,7 @@ class Equations(MechanismMotion):
         static=True, default=True
     )  # whether `Auto` turns to singular values itself, or says NaN where it should
     doubt: bool = eqx.field(static=True, default=True)  # whether it says anything of rows that elimination drops
+    loop: Loop | None = eqx.field(static=True, default=None)  # in which its programs run
 
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
         """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
@@ -162,7 +164,7 @@ class Equations(MechanismMotion):
 
     def run(self, name: str, t: Any, q: Any, v: Any) -> list[Any]:
         """Evaluate one of the programs."""
-        return self.code.program(name)([*self.constants, t, *scalars([q, v])])
+        return self.code.program(name)([*self.constants, t, *scalars([q, v])], self.loop)
 
     def arrays(self, name: str, t: Any, q: Any, v: Any) -> list[Array]:
         """What a program returns, as arrays: the values of D, the right-hand side, and vectors over the coordinates."""
@@ -197,6 +199,9 @@ class Equations(MechanismMotion):
         drop = places.index(self.code.drop.index)
         constants = [jnp.asarray(NOTHING_LEFT) if k == drop else c for k, c in enumerate(self.constants)]
         return dataclasses.replace(self, constants=constants, branch=False, doubt=False)
+
+    def within(self, loop: Loop) -> "Equations":
+        return dataclasses.replace(self, loop=loop)
 
     def exact(self) -> "Equations":
         """The same by singular values of all rows: what `Auto` turns to."""

@@ -23,7 +23,7 @@ from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import lasting, violation
 from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.integrate.undifferentiated import undifferentiated
-from udkjax.straightline import apart, when, whole
+from udkjax.straightline import Loop, apart, when, whole
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
@@ -32,6 +32,7 @@ PASSES = 6  # projections of an output: where two branches of the manifold meet,
 LANES = 64  # with 16 or 32 a lane of the paper's linkage takes longer, with 128 no less
 # A single run has its outputs projected side by side, too, where that fills vectors and does not take long to compile.
 FEW_OUTPUTS, FEW_BODIES = 16, 12
+FEW_NUMBERS = 10**6  # of outputs: a loop that handles gigabytes is not compiled into one function
 
 
 def serves(problem: Problem) -> bool:
@@ -195,10 +196,15 @@ def _marched(problem: Problem, lanes: Lanes) -> Raw:
 
 def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     """What to march along."""
+    loop = Loop() if lanes.size is None and not recorded and len(problem.ts) * len(problem.q) <= FEW_NUMBERS else None
+
+    def over(function: Callable) -> Callable:
+        return partial(lanes.over, lambda e, *x: function(e if loop is None else e.within(loop), *x))
+
     task = Task(
-        partial(lanes.over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
-        partial(lanes.over, lambda e, t, q, v: e.quick.kept(t, q, v)) if problem.projected else lambda t, q, v: (q, v, None),
-        partial(lanes.over, lasting) if problem.projected else _all_of_it,
+        over(lambda e, t, q, v: e.quick.accelerations(t, q, v)),
+        over(lambda e, t, q, v: e.quick.kept(t, q, v)) if problem.projected else lambda t, q, v: (q, v, None),
+        over(lasting) if problem.projected else _all_of_it,
         None,
         problem.equations.branches,
         *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),

@@ -10,6 +10,7 @@ from udkjax.straightline.derivative import tangents as tangents
 from udkjax.straightline.emit import Program as Program
 from udkjax.straightline.emit import frontier as frontier
 from udkjax.straightline.emit import operations as operations
+from udkjax.straightline.fusion import Loop as Loop
 from udkjax.straightline.graph import Graph as Graph
 from udkjax.straightline.graph import Scalar as Scalar
 from udkjax.straightline.read import read as read

@@ -10,6 +10,7 @@ operations in a batch, after twice as many outside of one; a barrier stops the d
 import math
 import operator
 from collections.abc import Callable, Collection, Sequence
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.straightline.barrier import cut
+from udkjax.straightline.fusion import Loop, together
 from udkjax.straightline.graph import Details, Graph, Node, Scalar
 from udkjax.straightline.trigonometry import sincos_of_each
 
@@ -37,7 +39,10 @@ _ARITHMETIC: dict[str, tuple[Callable, Callable]] = {
 
 
 class Program:
-    """`program(values)` takes one value for each of `inputs` and returns one for each of `outputs`."""
+    """`program(values)` takes one value for each of `inputs` and returns one for each of `outputs`.
+
+    In a loop that XLA compiles into one function, `program(values, loop)` is one fusion of it.
+    """
 
     def __init__(self, graph: Graph, inputs: Sequence[Scalar], outputs: Sequence[Scalar], cut_every: int | None = CUT_EVERY):
         self.graph, self.inputs, self.outputs, self.cut_every = graph, list(inputs), list(outputs), cut_every
@@ -54,7 +59,7 @@ class Program:
         """Whether the program needs this input at all."""
         return scalar.index in self.last_use
 
-    def __call__(self, values: Sequence[Any]) -> list[Any]:
+    def __call__(self, values: Sequence[Any], loop: Loop | None = None) -> list[Any]:
         if all(isinstance(v, float | int) for v in values):
             try:
                 return self._run(values)
@@ -63,7 +68,13 @@ class Program:
                     return self._run([np.float64(v) for v in values])
         dtypes = [s.node.dtype for s in self.inputs]
         given = zip(values, dtypes, strict=True)
-        return self._traced([v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in given])
+        values = [v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in given]
+        return self._traced(values) if loop is None else self._together(loop, *values)
+
+    @cached_property
+    def _together(self) -> Callable[..., list[Any]]:
+        examples = [jax.ShapeDtypeStruct((), s.node.dtype) for s in self.inputs]
+        return together(lambda *values: [jnp.asarray(x) for x in self._run(values)], examples)
 
     def _run(self, values: Sequence[Any]) -> list[Any]:
         known: dict[int, Any] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}

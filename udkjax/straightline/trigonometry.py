@@ -55,6 +55,14 @@ def sincos_of_each(xs: Sequence[Any]) -> list[tuple[Any, Any]]:
     return list(zip(found[::2], found[1::2], strict=True))
 
 
+def sincos_of_one(x: Any) -> tuple[Any, Any]:
+    """As `sincos` on the CPU, of a number, where XLA repeats nothing."""
+    if x.dtype != jnp.float64:
+        return jax.lax.sin(x), jax.lax.cos(x)
+    n, r = _reduced(x)
+    return _turned(n, *_near_zero(r))
+
+
 def _by_polynomials(x: Any) -> tuple[Any, Any]:
     # Without the barriers XLA would compute what both results share once for each of them, and both for each of their uses.
     n, r = cut(_reduced(x))

@@ -1,0 +1,153 @@
+"""A program as one fusion: the same numbers as with barriers, wherever it is, and never where XLA cannot take it."""
+
+import os
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax.equations.udwadia_kalaba import prepare
+from udkjax.straightline import Loop, fusion
+
+TRIED = jax.__version_info__[:2] in fusion.KNOWN
+OFF = pytest.mark.skipif(not TRIED, reason="fusions were not tried with this version of JAX")
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    return udk.library.parallelogram()
+
+
+def looped(mechanism, loop):
+    """States after three evaluations that each wait for the one before, in a loop of which XLA does not know how long it is."""
+    equations = prepare(mechanism).quick.within(loop)
+
+    def run(q, v):
+        def again(_, state):
+            q, v = state
+            a = equations.accelerations(0.0, q, v)
+            q, v, known = equations.kept(0.0, q + 1e-3 * v, v + 1e-3 * a)
+            left = equations.tangential(0.0, q, v, a, v, known)
+            return q, v + 1e-9 * left.dq
+
+        return jax.lax.fori_loop(0, jnp.where(jnp.sum(q * q) > 0.0, 3, 2), again, (q, v))
+
+    return run, mechanism.q0.ravel(), mechanism.v0.ravel() + jnp.linspace(0.1, 0.3, mechanism.q0.size)
+
+
+def fusions(text):
+    """How many fusions a lowered program holds that XLA did not make."""
+    return text.count("mhlo.fusion")
+
+
+def simulated(mechanism, ts, **choices):
+    run = jax.jit(lambda mass: udk.simulate(mechanism.with_parameters({"body.link1.mass": mass}), ts, throw=False, **choices).q)
+    return run.lower(1.0).as_text(), lambda: run(1.0)
+
+
+@OFF
+@pytest.mark.parametrize("scene", ["parallelogram", "double_pendulum", "slider_crank", "chain"])
+def test_the_numbers_are_those_of_the_programs_with_barriers(scene):
+    mechanism = udk.library.chain(4) if scene == "chain" else getattr(udk.library, scene)()
+    run, *state = looped(mechanism, Loop())
+    barred, *_ = looped(mechanism, None)
+    assert fusions(jax.jit(run).lower(*state).as_text()) >= 5
+    assert fusions(jax.jit(barred).lower(*state).as_text()) == 0
+    for found, expected in zip(jax.jit(run)(*state), jax.jit(barred)(*state), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+@OFF
+def test_a_fusion_is_one_pass_over_its_operations(linkage):
+    """None is repeated, and what it hands over are its results alone."""
+
+    def cost(loop):
+        run, *state = looped(linkage, loop)
+        found = jax.jit(run).lower(*state).compile().cost_analysis()
+        assert found
+        return found
+
+    fused, barred = cost(Loop()), cost(None)
+    assert fused["flops"] <= barred["flops"]
+    assert fused["bytes accessed"] < 0.7 * barred["bytes accessed"]
+
+
+def test_derivatives_and_batches_take_the_program_as_it_is(linkage):
+    run, q, v = looped(linkage, Loop())
+    barred, *_ = looped(linkage, None)
+    assert fusions(jax.jit(jax.vmap(run, (None, 0))).lower(q, jnp.stack([v, 2 * v])).as_text()) == 0
+    expected = jax.vmap(barred, (None, 0))(q, jnp.stack([v, 2 * v]))
+    for found, e in zip(jax.jit(jax.vmap(run, (None, 0)))(q, jnp.stack([v, 2 * v])), expected, strict=True):
+        np.testing.assert_allclose(found, e, rtol=1e-12, atol=1e-12)
+    for found, e in zip(jax.jvp(run, (q, v), (v, v))[1], jax.jvp(barred, (q, v), (v, v))[1], strict=True):
+        np.testing.assert_allclose(found, e, rtol=1e-11, atol=1e-11)
+
+
+@OFF
+def test_single_runs_are_made_of_fusions(linkage):
+    text, run = simulated(linkage, jnp.linspace(0.0, 0.5, 4))
+    assert fusions(text) >= 5
+    assert np.isfinite(run()).all()
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [{"method": udk.SVD()}, {"method": udk.Varga()}, {"formulation": udk.Augmented()}, {"solver": diffrax.Kvaerno5()}],
+    ids=["SVD", "Varga", "augmented", "implicit"],
+)
+def test_what_is_no_straight_line_code_is_left_alone(linkage, choices):
+    assert fusions(simulated(linkage, jnp.linspace(0.0, 0.05, 3), **choices)[0]) == 0
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_runs_that_are_differentiated_twice_hold_none(linkage, order):
+    """The second derivative takes the plain form, which asks LAPACK: no loop that it is in is one function."""
+
+    def end(mass):
+        changed = linkage.with_parameters({"body.link1.mass": mass})
+        return udk.simulate(changed, jnp.array([0.0, 0.05]), throw=False, adjoint=diffrax.ForwardMode()).q[-1, 0, 2]
+
+    derivative = end
+    for _ in range(order):
+        derivative = jax.jacfwd(derivative)
+    assert (fusions(jax.jit(derivative).lower(1.0).as_text()) > 0) == (TRIED and order == 1)
+
+
+def test_a_loop_of_gigabytes_holds_none(linkage):
+    """XLA would not make one function of it."""
+    ts = jax.ShapeDtypeStruct((10**6,), float)
+    text = jax.jit(lambda ts: udk.simulate(linkage, ts, throw=False).q[-1]).lower(ts).as_text()
+    assert fusions(text) == 0
+
+
+@pytest.mark.parametrize("flag", [f"--xla_{flag}=1" for flag in fusion.FLAGS])
+def test_flags_that_take_loops_apart_forbid_it(monkeypatch, linkage, flag):
+    run, *state = looped(linkage, Loop())
+    monkeypatch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} {flag}")
+    assert fusions(jax.jit(run).lower(*state).as_text()) == 0
+
+
+def test_a_user_who_turns_optimization_off_gets_none(linkage):
+    run, *state = looped(linkage, Loop())
+    jax.config.update("jax_disable_most_optimizations", True)
+    try:
+        assert fusions(jax.jit(run).lower(*state).as_text()) == 0
+    finally:
+        jax.config.update("jax_disable_most_optimizations", False)
+
+
+def test_operations_of_a_library_and_arrays_are_no_fusion():
+    """Only what XLA makes arithmetic of, number by number, and not all of too much."""
+
+    def parts(function, n=2):
+        return fusion.Parts(jax.make_jaxpr(function)(*[jax.ShapeDtypeStruct((), float)] * n))
+
+    assert parts(lambda x, y: [x * y + 1.0, x]).is_one_fusion
+    assert not parts(lambda x, y: [x, y]).is_one_fusion
+    assert not parts(lambda x, y: [jax.scipy.special.gammaln(x) * y]).is_one_fusion
+    assert not parts(lambda x, y: [jnp.stack([x, y])[0] * 2.0]).is_one_fusion
+    assert not parts(lambda x, y: [jax.lax.cond(x > y, lambda: x, lambda: y)]).is_one_fusion
+    assert not parts(lambda x, y: [sum([x * k for k in range(fusion.LARGEST)], y)]).is_one_fusion
