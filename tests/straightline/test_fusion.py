@@ -151,3 +151,29 @@ def test_operations_of_a_library_and_arrays_are_no_fusion():
     assert not parts(lambda x, y: [jnp.stack([x, y])[0] * 2.0]).is_one_fusion
     assert not parts(lambda x, y: [jax.lax.cond(x > y, lambda: x, lambda: y)]).is_one_fusion
     assert not parts(lambda x, y: [sum([x * k for k in range(fusion.LARGEST)], y)]).is_one_fusion
+
+
+@pytest.mark.parametrize(
+    ("function", "whole"),
+    [
+        (lambda x, y: [x * y], True),
+        (lambda x, y: [x, y], True),
+        (lambda x, y: [jax.scipy.special.gammaln(x) * y], False),
+        (lambda x, y: [jnp.linalg.solve(jnp.array([[x, y], [y, 3.0]]), jnp.ones(2))[0]], False),
+    ],
+    ids=["arithmetic", "nothing", "a function of a library", "LAPACK"],
+)
+def test_what_else_is_in_a_loop_forbids_all_fusions_in_it(function, whole):
+    loop, number = Loop(), jax.ShapeDtypeStruct((), float)
+    simple, other = (fusion.together(f, [number] * 2) for f in (lambda x, y: [x + y * y], function))
+
+    def run(x):
+        def again(x):
+            return simple(loop, x, 1.0)[0] + sum(other(loop, x, 2.0))
+
+        return jax.lax.while_loop(lambda x: x < 100.0, again, x)
+
+    lowered = jax.jit(run).lower(1.0)
+    assert loop.whole == whole
+    assert (fusions(lowered.as_text()) > 0) == (TRIED and whole)
+    lowered.compile()  # which would end the process

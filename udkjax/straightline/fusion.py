@@ -46,7 +46,12 @@ def together(function: Callable[..., list[Any]], examples: Sequence[Any]) -> Cal
     """`function(*numbers)`, traced for numbers like `examples`, to be called with the loop that it is in first."""
     jaxpr = jax.make_jaxpr(function)(*examples)
     parts = Parts(jaxpr)
-    return lambda loop, *xs: together_p.bind(*xs, parts=parts, loop=loop)
+
+    def call(loop: Loop, *xs: Any) -> list[Any]:
+        loop.whole &= parts.simple  # what else there is may keep XLA from making one function of the loop
+        return together_p.bind(*xs, parts=parts, loop=loop)
+
+    return call
 
 
 class Parts:
@@ -61,8 +66,8 @@ class Parts:
         self.gives = [x for x in dict.fromkeys(x for x in inner.outvars if not isinstance(x, Literal)) if x in made]
         names = {eqn.primitive.name for eqn in inner.eqns}
         scalar = not any(x.aval.shape for eqn in inner.eqns for x in [*eqn.invars, *eqn.outvars])
-        simple = names <= SIMPLE | {cut_p.name, sincos_p.name} and not inner.constvars
-        self.is_one_fusion = bool(self.gives) and scalar and simple and len(inner.eqns) <= LARGEST
+        self.simple = names <= SIMPLE | {cut_p.name, sincos_p.name} and scalar and not inner.constvars
+        self.is_one_fusion = bool(self.gives) and self.simple and len(inner.eqns) <= LARGEST
 
     def inside(self, *xs: Any) -> list[Any]:
         """What it computes, without barriers, and sine and cosine of one angle at a time."""
