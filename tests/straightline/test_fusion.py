@@ -13,7 +13,7 @@ from udkjax.equations.udwadia_kalaba import prepare
 from udkjax.straightline import Loop, fusion
 
 TRIED = jax.__version_info__[:2] in fusion.KNOWN
-OFF = pytest.mark.skipif(not TRIED, reason="fusions were not tried with this version of JAX")
+ONLY_WHERE_TRIED = pytest.mark.skipif(not TRIED, reason="fusions were not tried with this version of JAX")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def simulated(mechanism, ts, **choices):
     return run.lower(1.0).as_text(), lambda: run(1.0)
 
 
-@OFF
+@ONLY_WHERE_TRIED
 @pytest.mark.parametrize("scene", ["parallelogram", "double_pendulum", "slider_crank", "chain"])
 def test_the_numbers_are_those_of_the_programs_with_barriers(scene):
     mechanism = udk.library.chain(4) if scene == "chain" else getattr(udk.library, scene)()
@@ -60,7 +60,7 @@ def test_the_numbers_are_those_of_the_programs_with_barriers(scene):
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
-@OFF
+@ONLY_WHERE_TRIED
 def test_a_fusion_is_one_pass_over_its_operations(linkage):
     """None is repeated, and what it hands over are its results alone."""
 
@@ -86,7 +86,7 @@ def test_derivatives_and_batches_take_the_program_as_it_is(linkage):
         np.testing.assert_allclose(found, e, rtol=1e-11, atol=1e-11)
 
 
-@OFF
+@ONLY_WHERE_TRIED
 def test_single_runs_are_made_of_fusions(linkage):
     text, run = simulated(linkage, jnp.linspace(0.0, 0.5, 4))
     assert fusions(text) >= 5

@@ -167,6 +167,8 @@ def scalars(leaves: Sequence[Any]) -> list[Any]:
 
 
 def _numbers(leaf: Any) -> list[Any]:
+    if not np.shape(leaf):
+        return [leaf[()] if isinstance(leaf, np.ndarray) else leaf]
     if not isinstance(leaf, Tracer):
         return [leaf[place] for place in np.ndindex(*np.shape(leaf))]
     flat = leaf.reshape(-1)

@@ -4,24 +4,20 @@ A first derivative goes by the factors that the value was found with, forward or
 derivative beyond the first, it is that of the plain form.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
-import equinox.internal as eqxi
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool
 
 from udkjax.equations.code import scalars, stacked
+from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, those
 from udkjax.equations.motion import Tangential, Vector
-from udkjax.equations.plain import plain_accelerations, plain_correction, plain_project, plain_tangential
-from udkjax.straightline import Program, when
+from udkjax.equations.plain import plain_accelerations, plain_project, plain_tangential
+from udkjax.straightline import when
 
 if TYPE_CHECKING:
     from udkjax.equations.udwadia_kalaba import Equations
@@ -77,9 +73,8 @@ def _projected(steps: Any, equations: "Equations", t: Any, q: Vector, v: Vector)
     # On scalars until all is done: vectors that a loop carries have the batch first under vmap, where the programs have it last.
 
     def without(xs: Sequence[Array], name: str, qs: Sequence[Array]) -> list[Array]:
-        residual = equations.code.program(name)([*equations.constants, t, *qs, *xs], equations.loop)
-        change = step([*equations.constants, *factors, *residual], equations.loop)
-        return [x - y for x, y in zip(xs, change, strict=True)]
+        residual = equations.call(equations.code.program(name), t, *qs, *xs)
+        return [x - y for x, y in zip(xs, equations.call(step, *factors, *residual), strict=True)]
 
     def nearer(state: Any) -> Any:
         k, q, v, _ = state
@@ -118,9 +113,7 @@ def tangential(
         return plain_tangential(equations, t, q, v, dq, dv)
     if factors is None:
         *factors, _ = equations.run("factor", t, q, v)
-    factors = scalars(factors) if equations.loop else factors
-    given = [*equations.constants, *factors, *scalars([dq, dv])]
-    *changes, far = equations.code.program("tangential")(given, equations.loop)
+    *changes, far = equations.call(equations.code.program("tangential"), *factors, dq, dv)
     return Tangential(stacked(changes[: len(q)]), stacked(changes[len(q) :]), far)
 
 
@@ -145,13 +138,13 @@ def _branched(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: A
 
 @partial(accelerations.defjvp, symbolic_zeros=True)
 def _(program, primals, tangents):
-    moving = _moving(tangents)
+    moving = moving_of(tangents)
     if not any(moving):
         return accelerations(program, *primals), jnp.zeros_like(primals[2])
     if primals[0].branches:
-        return accelerations(program, *primals), _by_plain_form("accelerations", primals, tangents)[0]
+        return accelerations(program, *primals), by_plain_form("accelerations", primals, tangents)[0]
     a, kept = _evaluated(program, moving, *primals)
-    return a, _apply(Linear.at("accelerations", primals, moving, kept), _those(tangents, moving))[0]
+    return a, applied(Linear.at("accelerations", primals, moving, kept), those(tangents, moving))[0]
 
 
 @partial(_projected.defjvp, symbolic_zeros=True)
@@ -178,20 +171,21 @@ def _(primals, tangents):
 
 def _correction(equations: "Equations", t: Any, q: Vector, v: Vector, tangents: Any) -> Sequence[Array]:
     """Where the residuals vanish the tangents of one Newton step are those of the projection."""
-    primals, moving = (equations, t, q, v), _moving(tangents)
+    primals, moving = (equations, t, q, v), moving_of(tangents)
     if not any(moving):
         return jnp.zeros_like(q), jnp.zeros_like(v)
     if equations.branches or not equations.eliminates:
-        return _by_plain_form("projection", primals, tangents)
+        return by_plain_form("projection", primals, tangents)
     program = equations.code.derivative("projection", moving).evaluation("projection")
-    kept = _run(program, *jax.lax.stop_gradient(primals))
-    return _apply(Linear.at("projection", primals, moving, kept), _those(tangents, moving))
+    equations, *state = jax.lax.stop_gradient(primals)
+    kept = equations.call(program, *state)
+    return applied(Linear.at("projection", primals, moving, kept), those(tangents, moving))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _evaluated(program: str, moving: tuple[bool, ...], equations: "Equations", t: Any, q: Vector, v: Vector) -> Any:
     """a, and what its derivative needs to know of the state."""
-    outputs = _run(equations.code.derivative("accelerations", moving).evaluation(program), equations, t, q, v)
+    outputs = equations.call(equations.code.derivative("accelerations", moving).evaluation(program), t, q, v)
     n = len(q)
     return _checked(equations, outputs[n], stacked(outputs[:n]), plain_accelerations, t, q, v), outputs[n + 1 :]
 
@@ -204,141 +198,5 @@ def _(program, moving, primals, tangents):
     return (a, kept), (tangent, [jnp.zeros_like(k) for k in kept])
 
 
-class Linear(eqx.Module):
-    """The derivative of the accelerations or of the projection at one state, or its transpose: a linear map.
-
-    Of tangents of those inputs that are `moving` to the tangents of what is found, each a list of arrays.
-    """
-
-    equations: "Equations"
-    t: Array
-    q: Vector
-    v: Vector
-    kept: list[Array]
-    name: str = eqx.field(static=True)
-    moving: tuple[bool, ...] = eqx.field(static=True)
-    transposed: bool = eqx.field(static=True, default=False)
-
-    @classmethod
-    def at(cls, name: str, primals: Any, moving: tuple[bool, ...], kept: list[Array]) -> "Linear":
-        equations, t, q, v = primals
-        t = jnp.asarray(t, jnp.result_type(float))
-        return cls(equations, t, q, v, [jax.lax.stop_gradient(jnp.asarray(k)) for k in kept], name, moving)
-
-    @property
-    def T(self) -> "Linear":
-        return dataclasses.replace(self, transposed=not self.transposed)
-
-    @property
-    def primals(self) -> tuple["Equations", Array, Vector, Vector]:
-        return self.equations, self.t, self.q, self.v
-
-
-# A primitive of its own, so that reverse mode runs the transposed program instead of transposing one operation after another, and
-# so that no derivative is ever taken of what is kept.
-
-
-def _linear(linear: Linear, vector: Array) -> Array:
-    derivative = linear.equations.code.derivative(linear.name, linear.moving)
-    program = derivative.reverse if linear.transposed else derivative.forward
-    return stacked(_run(program, *linear.primals, [*linear.kept, *scalars([vector])]))
-
-
-@eqxi.filter_primitive_def
-def _shape(linear, vector):
-    found = jax.eval_shape(
-        _linear, *jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), (linear, vector))
-    )
-    return jax.core.ShapedArray(found.shape, found.dtype)
-
-
-@eqxi.filter_primitive_jvp
-def _derivative(primals, tangents):
-    linear, vector = primals
-    at, dot = tangents
-    result = _bind(linear, vector)
-    if not jax.tree.leaves(at):
-        return result, _bind(linear, dot)
-    return result, eqx.filter_jvp(_by_plain_form_of, primals, tangents)[1]
-
-
-@eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
-def _transpose(inputs, cotangent):
-    linear, _ = inputs
-    return jax.tree.map(lambda _: None, linear), _bind(linear.T, cotangent)
-
-
-_linear_p = eqxi.create_vprim("derivative_of_elimination", eqxi.filter_primitive_def(_linear), _shape, _derivative, _transpose)
-
-
-def _bind(linear: Linear, vector: Array) -> Array:
-    return eqxi.filter_primitive_bind(_linear_p, linear, vector)
-
-
-def _apply(linear: Linear, vectors: list[Array]) -> list[Array]:
-    """Tangents of what is found. In one vector: where vmap batches only some inputs, their cotangents know what to sum over."""
-    found = _bind(linear, _flat(vectors))
-    return [found[k : k + len(linear.q)] for k in range(0, len(found), len(linear.q))]
-
-
-# --- the same by the plain form
-
-
-def _by_plain_form(name: str, primals: Any, tangents: Any) -> list[Array]:
-    moving = _moving(tangents)
-    function, at = _plain(name, primals, moving)
-    return jax.jvp(function, at, _those(tangents, moving))[1]
-
-
-def _by_plain_form_of(linear: Linear, vector: Array) -> Array:
-    function, at = _plain(linear.name, linear.primals, linear.moving)
-    if linear.transposed:
-        ends = np.cumsum([np.size(x) for x in jax.eval_shape(function, *at)])[:-1]
-        return _flat(jax.vjp(function, *at)[1](jnp.split(vector, ends)))
-    ends = np.cumsum([np.size(x) for x in at])[:-1]
-    parts = [part.reshape(np.shape(x)) for part, x in zip(jnp.split(vector, ends), at, strict=True)]
-    return _flat(jax.jvp(function, at, parts)[1])
-
-
-def _plain(name: str, primals: Any, moving: tuple[bool, ...]) -> tuple[Any, list[Array]]:
-    """The plain form as a function of those inputs that are moving, and their values."""
-
-    def function(*some: Array) -> list[Array]:
-        rest = iter(some)
-        *constants, t, q, v = (next(rest) if moves else x for x, moves in zip(_leaves(primals), moving, strict=True))
-        equations = dataclasses.replace(primals[0], constants=constants)
-        if name == "accelerations":
-            return [plain_accelerations(equations, t, q, v)]
-        return list(plain_correction(equations, t, q, v))
-
-    return function, _those(primals, moving)
-
-
 def _no_tangent(x: Any) -> Any:
     return jnp.zeros_like(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else np.zeros(jnp.shape(x), jax.dtypes.float0)
-
-
-# --- lists of inputs: the constants, t, q, v
-
-
-def _leaves(primals: Any) -> list[Any]:
-    equations, t, q, v = primals
-    return [*equations.constants, t, q, v]
-
-
-def _moving(tangents: Any) -> tuple[bool, ...]:
-    """Which inputs have a tangent at all."""
-    return tuple(not isinstance(x, SymbolicZero) and x.dtype != jax.dtypes.float0 for x in _leaves(tangents))
-
-
-def _those(values: Any, moving: tuple[bool, ...]) -> list[Any]:
-    return [x for x, moves in zip(_leaves(values), moving, strict=True) if moves]
-
-
-def _run(program: Program, equations: "Equations", t: Any, q: Any, v: Any, more: Sequence[Any] = ()) -> list[Any]:
-    return program([*equations.constants, t, *scalars([q, v]), *more], equations.loop)
-
-
-def _flat(values: Sequence[Any]) -> Array:
-    """Numbers and vectors in one vector."""
-    return jnp.concatenate([jnp.ravel(jnp.asarray(x, jnp.result_type(float))) for x in values])

@@ -27,7 +27,7 @@ from udkjax.equations.plain import plain_accelerations
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, Varga
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Loop
+from udkjax.straightline import Loop, Program
 
 # Far above rounding and drift, far below the singular values of a mechanism in ordinary positions: with the states returned to
 # the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
@@ -164,7 +164,11 @@ class Equations(MechanismMotion):
 
     def run(self, name: str, t: Any, q: Any, v: Any) -> list[Any]:
         """Evaluate one of the programs."""
-        return self.code.program(name)([*self.constants, t, *scalars([q, v])], self.loop)
+        return self.call(self.code.program(name), t, q, v)
+
+    def call(self, program: Program, *arrays: Any) -> list[Any]:
+        """Evaluate a program of the constants and of all numbers of some arrays."""
+        return program([*self.constants, *scalars(arrays)], self.loop)
 
     def arrays(self, name: str, t: Any, q: Any, v: Any) -> list[Array]:
         """What a program returns, as arrays: the values of D, the right-hand side, and vectors over the coordinates."""
