@@ -9,6 +9,7 @@ import udkjax as udk
 from udkjax import GROUND
 from udkjax.equations import prepare
 from udkjax.equations.plain import plain_accelerations, plain_correction
+from udkjax.straightline import Loop
 
 ELIMINATION = udk.Elimination()
 BAUMGARTE = udk.Baumgarte(2.0, 3.0)
@@ -138,3 +139,44 @@ def test_a_gradient_in_a_loop_keeps_few_numbers(linkage):
     kept = [x.aval.shape for x in scans[0].outvars if x.aval.shape[:1] == (7,)]  # pyright: ignore[reportAttributeAccessIssue]
     assert 0 < len(kept) <= 100
     assert sum(int(np.prod(shape[1:])) for shape in kept) <= 150
+
+
+def test_in_a_loop_value_and_directions_are_found_by_one_program():
+    """With the numbers of the parts, along few directions and many, for accelerations and projection."""
+    mechanism = udk.library.slider_crank()
+    q, v = (0.01 * jnp.sin(jnp.arange(x.size)) + x.ravel() for x in (mechanism.q0, mechanism.v0))
+    directions = jnp.asarray(np.random.default_rng(2).standard_normal((6, 1 + 2 * q.size)))
+
+    def changes(loop):
+        def state(gravity, q, v):
+            equations = prepare(mechanism.with_parameters({"gravity": jnp.array([0.0, -gravity])}), ELIMINATION).quick
+            equations = equations if loop is None else equations.within(loop)
+
+            def once(c):
+                q, v = equations.project(0.3, *c[1:3])
+                return c[0] + 1, q, v, equations.accelerations(0.3, q, v)
+
+            return jax.lax.while_loop(lambda c: c[0] < 2, once, (0, q, v, q))[1:]
+
+        def along(d):
+            return jax.jvp(state, (jnp.array(9.81), q, v), (d[0], d[1 : 1 + q.size], d[1 + q.size :]))
+
+        return [jax.vmap(along)(directions[:size]) for size in (1, 3, 6)]
+
+    parts, at_once = (jax.tree.leaves(jax.jit(lambda loop=loop: changes(loop))()) for loop in (None, Loop()))
+    size = max(float(jnp.abs(x).max()) for x in parts)
+    for one, other in zip(at_once, parts, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-11 * size)
+
+
+def test_value_and_directions_at_once_hand_nothing_on(linkage):
+    """A program for both has the operations of its parts, none twice."""
+    code = prepare(linkage).code
+    moving = tuple(k in (0, len(code.constants) + 1, len(code.constants) + 2) for k in range(len(code.constants) + 3))
+    derivative = code.derivative("accelerations", moving)
+    assert derivative.few("accelerations") == 4
+    value, forward = derivative.evaluation("accelerations"), derivative.forward
+    for directions in (1, 4):
+        both = derivative.along("accelerations", directions)
+        assert sum(both.count().values()) <= sum(value.count().values()) + directions * sum(forward.count().values())
+        assert len(both.outputs) == len(code.outputs["accelerations"]) + directions * len(forward.outputs)

@@ -17,7 +17,7 @@ from udkjax.equations.code import scalars, stacked
 from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, those
 from udkjax.equations.motion import Tangential, Vector
 from udkjax.equations.plain import plain_accelerations, plain_project, plain_tangential
-from udkjax.straightline import when
+from udkjax.straightline import along, when
 
 if TYPE_CHECKING:
     from udkjax.equations.udwadia_kalaba import Equations
@@ -143,8 +143,8 @@ def _(program, primals, tangents):
         return accelerations(program, *primals), jnp.zeros_like(primals[2])
     if primals[0].branches:
         return accelerations(program, *primals), by_plain_form("accelerations", primals, tangents)[0]
-    a, kept = _evaluated(program, moving, *primals)
-    return a, applied(Linear.at("accelerations", primals, moving, kept), those(tangents, moving))[0]
+    (a,), (da,) = _along("accelerations", program, moving, primals, those(tangents, moving))
+    return a, da
 
 
 @partial(_projected.defjvp, symbolic_zeros=True)
@@ -176,10 +176,38 @@ def _correction(equations: "Equations", t: Any, q: Vector, v: Vector, tangents: 
         return jnp.zeros_like(q), jnp.zeros_like(v)
     if equations.branches or not equations.eliminates:
         return by_plain_form("projection", primals, tangents)
-    program = equations.code.derivative("projection", moving).evaluation("projection")
-    equations, *state = jax.lax.stop_gradient(primals)
-    kept = equations.call(program, *state)
-    return applied(Linear.at("projection", primals, moving, kept), those(tangents, moving))
+    _, changes = _along("projection", "projection", moving, primals, those(tangents, moving))
+    return changes
+
+
+def _along(name: str, program: str, moving: tuple[bool, ...], primals: Any, direction: list[Array]) -> tuple[list[Array], ...]:
+    """The accelerations by a program, or nothing where `name` is "projection", and the tangents of what has that name."""
+
+    def in_parts(primals: Any, *directions: list[Array]) -> tuple[list[Array], ...]:
+        if name == "accelerations":
+            a, kept = _evaluated(program, moving, *primals)
+            value = [a]
+        else:
+            equations, *state = jax.lax.stop_gradient(primals)
+            value, kept = [], equations.call(equations.code.derivative(name, moving).evaluation(program), *state)
+        linear = Linear.at(name, primals, moving, kept)
+        return value, *(applied(linear, direction) for direction in directions)
+
+    def at_once(primals: Any, *directions: list[Array]) -> tuple[list[Array], ...]:
+        equations, *state = primals
+        program_along = equations.code.derivative(name, moving).along(program, len(directions))
+        outputs = equations.call(program_along, *state, *(x for direction in directions for x in direction))
+        n, value = len(state[1]), []
+        if name == "accelerations":
+            *a, safe = outputs[: n + 1]
+            value, outputs = [_checked(equations, safe, stacked(a), plain_accelerations, *state)], outputs[n + 1 :]
+        changes = [stacked(outputs[k : k + n]) for k in range(0, len(outputs), n)]
+        each = len(changes) // len(directions)
+        return value, *(changes[k : k + each] for k in range(0, len(changes), each))
+
+    if primals[0].loop is None:
+        return in_parts(primals, direction)
+    return along(in_parts, at_once, primals, direction, primals[0].code.derivative(name, moving).few(program))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))

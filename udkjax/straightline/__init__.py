@@ -1,5 +1,6 @@
 """Straight-line programs: scalar expressions recorded once, with everything that is structurally zero or repeated left out."""
 
+from udkjax.straightline.along import along as along
 from udkjax.straightline.barrier import cut as cut
 from udkjax.straightline.branching import apart as apart
 from udkjax.straightline.branching import when as when

@@ -96,11 +96,16 @@ def _batched(xs: Sequence[Any], axes: Sequence[int | None], parts: Parts, loop: 
 
 
 def _derivative(primals: Sequence[Any], tangents: Sequence[Any], parts: Parts, loop: Loop) -> tuple[list[Any], list[Any]]:
+    return differentiated(parts.whole, primals, tangents)
+
+
+def differentiated(whole: Callable[..., Any], primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    """What a primitive and its derivative return, where it computes what `whole` does."""
     moving = [not isinstance(dx, ad.Zero) for dx in tangents]
 
     def function(*some: Any) -> list[Any]:
         rest = iter(some)
-        return parts.whole(*[next(rest) if m else x for x, m in zip(primals, moving, strict=True)])
+        return whole(*[next(rest) if m else x for x, m in zip(primals, moving, strict=True)])
 
     some, changes = ([x for x, m in zip(xs, moving, strict=True) if m] for xs in (primals, tangents))
     found, slopes = jax.jvp(function, some, changes)

@@ -1,0 +1,109 @@
+"""A value and how it changes along directions, by one program where no transformation is left.
+
+What JAX differentiates comes in parts: a value, with what its derivative needs to know, then linear maps of tangents, which a
+linearization keeps for later and a batch of directions applies to all. Where both run side by side in any case, a program that
+finds both at once need not hand on what it knows.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+from jax.extend.core import Primitive, set_current_trace
+from jax.interpreters import ad, batching, mlir, partial_eval
+
+from udkjax.straightline.fusion import differentiated
+
+Parts = Callable[..., tuple[list[Any], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
+
+
+def along(seen: Parts, run: Parts, at: Any, direction: Any, few: int = 1) -> tuple[list[Any], ...]:
+    """The value at `at` and its change along `direction`, trees of arrays: by `run`; transformations see what `seen` does.
+
+    A batch of up to `few` directions at one place is so many directions for `run`.
+    """
+    (place, way), static = eqx.partition((at, direction), eqx.is_array)
+    (start, places), (ways, form) = jax.tree.flatten(place), jax.tree.flatten(way)
+
+    def function(parts: Parts) -> Callable[..., tuple[list[Any], ...]]:
+        return lambda at, *directions: parts(
+            eqx.combine(places.unflatten(at), static[0]), *(eqx.combine(form.unflatten(d), static[1]) for d in directions)
+        )
+
+    both = Both(function(seen), function(run), start, ways, few)
+    return both.split(along_p.bind(*start, *ways, both=both))
+
+
+class Both:
+    """The two forms as functions of lists of arrays: those of the place, then those of one direction after another."""
+
+    def __init__(self, seen: Parts, run: Parts, start: Sequence[Any], way: Sequence[Any], few: int):
+        self.seen, self.run = partial(self._flat, seen), partial(self._flat, run)
+        self.start, self.way, self.few = len(start), len(way), few
+        self._parts, self._examples = seen, [[jax.ShapeDtypeStruct(x.shape, x.dtype) for x in xs] for xs in (start, way)]
+
+    def _flat(self, parts: Parts, *xs: Any) -> list[Any]:
+        ways = [xs[k : k + self.way] for k in range(self.start, len(xs), self.way)]
+        return [x for found in parts(xs[: self.start], *ways) for x in found]
+
+    def split(self, found: Sequence[Any]) -> tuple[list[Any], ...]:
+        """What was found along one direction, as the two forms return it."""
+        return list(found[: self.values]), list(found[self.values :])
+
+    @cached_property
+    def shapes(self) -> tuple[list[Any], list[Any]]:
+        """Of the value, and of the change along a direction."""
+        value, change = jax.eval_shape(self._parts, *self._examples)
+        return value, change
+
+    @property
+    def values(self) -> int:
+        return len(self.shapes[0])
+
+
+def _avals(*xs: Any, both: Both) -> list[Any]:
+    value, change = both.shapes
+    directions = (len(xs) - both.start) // both.way
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in [*value, *change * directions]]
+
+
+def _batched(xs: Sequence[Any], axes: Sequence[int | None], both: Both) -> tuple[list[Any], list[int | None]]:
+    size = next(x.shape[axis] for x, axis in zip(xs, axes, strict=True) if axis is not None)
+    directions, moved = (len(xs) - both.start) // both.way, any(axis is not None for axis in axes[: both.start])
+    if moved or size * directions > both.few:
+        changes = [0] * (len(both.shapes[1]) * directions)
+        out = [*[0 if moved else None] * both.values, *changes]
+        return jax.vmap(both.seen, in_axes=tuple(axes), out_axes=out)(*xs), out
+
+    def way(k: int) -> list[Any]:
+        pairs = zip(xs[both.start :], axes[both.start :], strict=True)
+        return [x if axis is None else jax.lax.index_in_dim(x, k, axis, keepdims=False) for x, axis in pairs]
+
+    found = along_p.bind(*xs[: both.start], *(x for k in range(size) for x in way(k)), both=both)
+    value, changes = found[: both.values], found[both.values :]
+    each = len(changes) // size
+    stacked = [jnp.stack(changes[k::each]) for k in range(each)]
+    return [*value, *stacked], [*[None] * len(value), *[0] * each]
+
+
+def _derivative(primals: Sequence[Any], tangents: Sequence[Any], both: Both) -> tuple[list[Any], list[Any]]:
+    return differentiated(both.seen, primals, tangents)
+
+
+def _part(trace: Any, *xs: Any, both: Both) -> list[Any]:
+    with set_current_trace(trace):
+        return both.seen(*xs)
+
+
+along_p = Primitive("along")
+along_p.multiple_results = True
+along_p.def_impl(lambda *xs, both: both.seen(*xs))
+along_p.def_abstract_eval(_avals)
+batching.primitive_batchers[along_p] = _batched
+ad.primitive_jvps[along_p] = _derivative
+partial_eval.custom_partial_eval_rules[along_p] = _part
+mlir.register_lowering(along_p, lambda ctx, *values, both: mlir.lower_fun(both.run)(ctx, *values))
