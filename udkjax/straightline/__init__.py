@@ -1,6 +1,5 @@
 """Straight-line programs: scalar expressions recorded once, with everything that is structurally zero or repeated left out."""
 
-from udkjax.straightline.along import along as along
 from udkjax.straightline.barrier import cut as cut
 from udkjax.straightline.branching import apart as apart
 from udkjax.straightline.branching import when as when
@@ -8,6 +7,7 @@ from udkjax.straightline.branching import whole as whole
 from udkjax.straightline.derivative import Differential as Differential
 from udkjax.straightline.derivative import cotangents as cotangents
 from udkjax.straightline.derivative import tangents as tangents
+from udkjax.straightline.directions import along as along
 from udkjax.straightline.emit import Program as Program
 from udkjax.straightline.emit import frontier as frontier
 from udkjax.straightline.emit import operations as operations
