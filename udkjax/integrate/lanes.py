@@ -32,7 +32,7 @@ PASSES = 6  # projections of an output: where two branches of the manifold meet,
 LANES = 64  # with 16 or 32 a lane of the paper's linkage takes longer, with 128 no less
 # A single run has its outputs projected side by side, too, where that fills vectors and does not take long to compile.
 FEW_OUTPUTS, FEW_BODIES = 16, 12
-FEW_NUMBERS = 10**6  # of outputs: a loop that handles gigabytes is not compiled into one function
+FEW_NUMBERS = 10**6  # of outputs: far below the gigabyte from which on XLA makes no function of a loop
 
 
 def serves(problem: Problem) -> bool:
