@@ -3,6 +3,7 @@
 import re
 from functools import partial
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +27,33 @@ def started(text: str) -> dict[str, list[str]]:
         if name:
             found["ENTRY" if name[1] else name[2]] = [line for line in lines if not NOTHING.search(line)]
     return found
+
+
+def ready(entry: str) -> int:
+    """How many operations of the program wait for no other."""
+    given, count = set(), 0
+    for line in entry.splitlines():
+        match = re.match(r"\s*(?:ROOT )?(%[\w.\-]+) = .*? ([a-z\-]+)\((.*?)\)[,\s]", line + " ")
+        if match and all(name in given for name in re.findall(r"%[\w.\-]+", match[3])):
+            waits = match[2] not in ("parameter", "constant", "tuple", "get-tuple-element", "bitcast")
+            count += waits
+            given |= set() if waits else {match[1]}
+    return count
+
+
+@pytest.mark.skipif(jax.__version_info__ < (0, 12), reason="older versions of XLA fuse otherwise")
+def test_what_waits_for_nothing_is_handed_to_no_other_thread():
+    """Of a run with numbers that are traced, and of its derivative by two of them."""
+    mechanism = udk.library.parallelogram()
+
+    def angle(masses):
+        changed = mechanism.with_parameters({"body.link1.mass": masses[0], "body.link2.mass": masses[1]})
+        start, forward = udk.State(mechanism.q0, mechanism.v0), diffrax.ForwardMode()
+        return udk.simulate(changed, TS[:2], start, adjoint=forward, careful=False, throw=False).q[-1, 0, 2]
+
+    for function in (angle, jax.jacfwd(angle)):
+        text = jax.jit(function).lower((1.0, 1.0)).compile().as_text() or ""
+        assert 0 < ready(text.split("\nENTRY")[1]) <= SEQUENTIAL
 
 
 def compiled(mechanism, careful):

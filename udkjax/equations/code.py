@@ -42,7 +42,7 @@ class Code:
         self.gains = [graph.input(name, "parameter") for name in ("alpha", "beta")] if baumgarte else []
         self.drop = graph.input("drop", "parameter")
         self.n = len(equations.q)
-        self.root = [graph.sqrt(graph.constant(1.0) / m) for m in equations.mass]
+        self.root = [graph.constant(1.0) / graph.sqrt(m) for m in equations.mass]
         everything = list(range(len(equations.psi)))
         self.kept = [i for i in everything if i not in left_out]
         self.left_out = left_out
@@ -72,7 +72,7 @@ class Code:
     def _eliminate(self):
         """The equation for rows that are independent: a = a_F + M^(-1) Psi_q^T y with D D^T y = b."""
         graph, e = self.graph, self.equations
-        self.compliance = [graph.constant(1.0) / m for m in e.mass]
+        self.compliance = [r * r for r in self.root]
         rows = [self.D[i] for i in self.kept]
         self._dropping = factorize(rows, graph, self.drop)
         self._gram = factorize(rows, graph) if self.elimination == "check" else self._dropping

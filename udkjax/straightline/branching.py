@@ -19,10 +19,14 @@ def apart(x: Array) -> Array:
     return jax.lax.sort(jnp.stack([x, jnp.full_like(x, jnp.iinfo(x.dtype).max)]), dimension=0)[0]
 
 
-def whole(function: Callable[[], Tree], holds: Array) -> Tree:
-    """`function()`, compiled into one function. The condition `holds`, always, but XLA must not know."""
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function))
-    return when(holds, lambda _: function(), nothing)
+def whole(function: Callable[[Tree], tuple[Tree, Array]], holds: Array, x: Tree) -> tuple[Tree, Array]:
+    """`function(x)`, another such tree and an array, compiled into one function. The condition `holds`; XLA must not know.
+
+    Of more than eight operations that wait for nothing, as zeros would to begin with, XLA hands some to other threads.
+    """
+    other = jax.eval_shape(function, x)[1]
+    begin = x, jnp.broadcast_to(holds.astype(other.dtype), other.shape)
+    return when(holds, lambda begin: function(begin[0]), begin)
 
 
 def when(condition: Array, function: Callable[[Tree], Tree], x: Tree) -> Tree:
