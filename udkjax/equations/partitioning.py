@@ -146,12 +146,12 @@ def _(primals, tangents):
 
 def _newton(held: Partitioned, t: Any, q: Vector) -> Vector:
     D, psi, root = held.equations.weighted(t, q)
-    return q - root * (held._plus(D) @ psi)
+    return jnp.where(held.dependent, q - root * (held._plus(D) @ psi), q)  # the rest stays to the bit
 
 
 def _velocity(held: Partitioned, t: Any, q: Vector, v: Vector) -> Vector:
     D, _, root = held.equations.weighted(t, q)
-    return v - root * (held._plus(D) @ held.violation(t, q, v)[1])
+    return jnp.where(held.dependent, v - root * (held._plus(D) @ held.violation(t, q, v)[1]), v)
 
 
 @jax.custom_jvp
