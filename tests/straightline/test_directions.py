@@ -76,10 +76,10 @@ def test_a_batch_of_places_is_one_of_the_parts():
 def test_a_linearization_sees_the_parts_also_within_loops():
     @partial(jax.jit, static_argnums=1)
     def linear(x, within):
-        function = (
-            sine if not within else lambda x: jax.lax.while_loop(lambda c: c[0] < 1, lambda c: (c[0] + 1, sine(c[1])), (0, x))[1]
-        )
-        value, push = jax.linearize(function, x)
+        def looped(x):
+            return jax.lax.while_loop(lambda c: c[0] < 1, lambda c: (c[0] + 1, sine(c[1])), (0, x))[1]
+
+        value, push = jax.linearize(looped if within else sine, x)
         return value, push(jnp.ones(2)), jax.jit(push)(jnp.ones(2))
 
     value, change, again = linear(X, False)

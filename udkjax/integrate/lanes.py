@@ -23,7 +23,7 @@ from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import lasting, violation
 from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.integrate.undifferentiated import undifferentiated
-from udkjax.straightline import Loop, apart, when, whole
+from udkjax.straightline import Loop, apart, when
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 ROUND = 8  # lanes: what the widest vector units hold
@@ -224,18 +224,18 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
     """What a march leaves behind, with the outputs on the manifold."""
     inner, end = len(problem.ts) - 2, jnp.concatenate([m.here.q, m.here.v])
 
-    def outputs(ys: Array) -> tuple[Array, Array]:
+    def outputs(given: tuple[Array, Array]) -> tuple[Array, Array]:
         first = lanes.over(violation, jnp.broadcast_to(problem.ts[0], lanes.shape), start)
-        ys, violated = _each_output(
-            lanes, partial(_output, problem.projected), problem.ts[1:], ys[..., 1:, :], wide=problem.careful
-        )
+        each, ys = partial(_output, problem.projected), given[0][..., 1:, :]
+        ys, violated = _each_output(lanes, each, problem.ts[1:], ys, wide=problem.careful)
         ys = jnp.concatenate([start.T[..., None, :], ys], axis=-2)
         violated = jnp.concatenate([first[..., None], violated], axis=-1)
         return (ys, violated) if lanes.size is None else (jnp.moveaxis(ys, 0, -1), violated.T)
 
     start = jnp.concatenate([problem.q, problem.v])
     ys = jnp.concatenate([start.T[..., None, :], m.outputs[..., :inner, :], end.T[..., None, :]], axis=-2)
-    ys, violated = whole(outputs, m.tried >= 0, ys) if lanes.size is None else outputs(ys)
+    given = ys, ys[..., 0]  # in place of violations, which are as many
+    ys, violated = when(m.tried >= 0, outputs, given) if lanes.size is None else outputs(given)
     number = jnp.arange(inner + 2).reshape(-1, *[1] * len(lanes.shape))
     reached = (number <= m.written) & (number <= inner) | (m.code == DONE)
     return Raw(ys, violated, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)

@@ -3,7 +3,6 @@
 from udkjax.straightline.barrier import cut as cut
 from udkjax.straightline.branching import apart as apart
 from udkjax.straightline.branching import when as when
-from udkjax.straightline.branching import whole as whole
 from udkjax.straightline.derivative import Differential as Differential
 from udkjax.straightline.derivative import cotangents as cotangents
 from udkjax.straightline.derivative import tangents as tangents

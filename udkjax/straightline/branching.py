@@ -19,16 +19,10 @@ def apart(x: Array) -> Array:
     return jax.lax.sort(jnp.stack([x, jnp.full_like(x, jnp.iinfo(x.dtype).max)]), dimension=0)[0]
 
 
-def whole(function: Callable[[Tree], tuple[Tree, Array]], holds: Array, x: Tree) -> tuple[Tree, Array]:
-    """`function(x)`, another such tree and an array, compiled into one function. The condition `holds`; XLA must not know.
-
-    Of more than eight operations that wait for nothing, as zeros would to begin with, XLA hands some to other threads.
-    """
-    other = jax.eval_shape(function, x)[1]
-    begin = x, jnp.broadcast_to(holds.astype(other.dtype), other.shape)
-    return when(holds, lambda begin: function(begin[0]), begin)
-
-
 def when(condition: Array, function: Callable[[Tree], Tree], x: Tree) -> Tree:
-    """`function(x)` or x: a branch that does not keep XLA from compiling the loop that it is in into one function."""
+    """`function(x)` or x: a branch that does not keep XLA from compiling the loop that it is in into one function.
+
+    Where XLA cannot know that the condition holds, it makes one function of `function`. An x that has been computed is better
+    than zeros: of more than eight operations that wait for nothing XLA hands some to other threads.
+    """
     return jax.lax.while_loop(lambda c: c[0], lambda c: (jnp.zeros_like(condition), function(c[1])), (condition, x))[1]
