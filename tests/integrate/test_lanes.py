@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
 from udkjax.equations.code import Code
-from udkjax.integrate import lanes
+from udkjax.integrate import batched, lanes
 from udkjax.integrate.explicit import stage_state
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.tableau import method_of
@@ -90,7 +90,8 @@ def test_a_batch_of_batches(pendulum, batch):
 
 def test_the_form_for_other_devices(pendulum, batch, monkeypatch):
     """A batch taken whole by vmap, as a GPU takes it."""
-    monkeypatch.setattr(lanes, "CHUNKED", ())
+    for module in (batched, lanes):
+        monkeypatch.setattr(module, "CHUNKED", ())
     found = jax.jit(jax.vmap(last(pendulum)))(*members(MEMBERS))
     assert_allclose(found.q, batch.q, rtol=0, atol=1e-12)
     assert_allclose(found.stats["steps"], batch.stats["steps"])

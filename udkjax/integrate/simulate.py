@@ -20,7 +20,8 @@ from udkjax.equations.partitioning import Partitioned
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.lanes import one_by_one, serves, solve
+from udkjax.integrate.batched import one_by_one
+from udkjax.integrate.lanes import serves, solve
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.problem import DOUBTED, Problem, Raw
 from udkjax.integrate.projection import Projection

@@ -19,7 +19,8 @@ import numpy as np
 
 from udkjax.equations.assembly import State, close
 from udkjax.equations.settled import close_all
-from udkjax.integrate.lanes import CHUNKED, LANES
+from udkjax.integrate.batched import CHUNKED
+from udkjax.integrate.lanes import LANES
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result, Solution
 from udkjax.integrate.solvers import forward_mode

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Int
 
 from udkjax.equations.redundancy import redundant_rows
-from udkjax.integrate.lanes import CHUNKED, LANES, ROUND
+from udkjax.integrate.batched import CHUNKED
+from udkjax.integrate.lanes import LANES, ROUND
 from udkjax.integrate.solution import Result
 from udkjax.study.sweep.measures import Named, guessed
 from udkjax.study.sweep.member import END, RESULT, STEPS, Kept, Recipe
