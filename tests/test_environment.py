@@ -55,6 +55,7 @@ def test_the_environment_decides(tmp_path, choice, expected):
 
 LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold"
 VECTORS = "--xla_cpu_prefer_vector_width"
+CHECKS = "--xla_backend_extra_options=-vectorize-memory-check-threshold"
 
 
 @pytest.mark.parametrize(
@@ -71,13 +72,27 @@ VECTORS = "--xla_cpu_prefer_vector_width"
         (environment.enable_wide_vectors, "0.12.0", f"{VECTORS}=128", None),
         (environment.enable_wide_vectors, "0.13.0", None, None),  # XLA ends the process on a flag that it no longer knows
         (environment.enable_wide_vectors, "our own", None, None),
+        (environment.enable_vectors_of_many_arrays, "0.11.2", None, None),
+        (environment.enable_vectors_of_many_arrays, "0.12.0", None, f"{CHECKS}=1000000"),
+        (environment.enable_vectors_of_many_arrays, "0.12.0", "--xla_backend_extra_options=a=1", None),
     ],
 )
 def test_flags_are_added_where_they_are_known_and_not_given(monkeypatch, enable, installed, given, expected):
     monkeypatch.setenv("XLA_FLAGS", given or "")
     monkeypatch.setattr(environment, "version", {"jax": installed}.get)
+    monkeypatch.delitem(sys.modules, "jax._src.xla_bridge", raising=False)  # XLA has not read its flags yet
     enable()
     assert os.environ["XLA_FLAGS"] == (expected or given or "")
+
+
+def test_no_flag_is_added_that_xla_would_not_read_any_more(monkeypatch):
+    import jax
+
+    jax.devices()
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(environment, "version", {"jax": "0.12.0"}.get)
+    environment.enable_vectors_of_many_arrays()
+    assert not os.environ["XLA_FLAGS"]
 
 
 @pytest.mark.parametrize(

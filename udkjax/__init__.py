@@ -14,6 +14,7 @@ from udkjax.environment import (
     disable_async_dispatch,
     enable_compilation_cache,
     enable_float64,
+    enable_vectors_of_many_arrays,
     enable_whole_loops,
     enable_wide_vectors,
 )
@@ -153,4 +154,5 @@ enable_float64()
 disable_async_dispatch()
 enable_whole_loops()
 enable_wide_vectors()
+enable_vectors_of_many_arrays()
 enable_compilation_cache()

@@ -24,6 +24,9 @@ WHOLE_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 WHOLE_BELOW = 10**9  # bytes that a round of the loop touches; JAX's own choice from 0.12 on, before that it is 1024
 VECTORS = "xla_cpu_prefer_vector_width"
 WIDEST = 512  # bits
+OPTIONS = "xla_backend_extra_options"
+MEMORY_CHECKS = "vectorize-memory-check-threshold"
+MANY = 10**6  # by itself LLVM gives up after 128
 KNOWN = (0, 12)  # the newest JAX whose XLA is known to know the flag: one that it does not know ends the process
 
 # JAX can bound the cache itself only where the package filelock is installed, and then it looks at every file for each program.
@@ -94,6 +97,17 @@ def enable_wide_vectors() -> None:
     """
     if _jax_version() <= KNOWN:
         _add_flag(VECTORS, f"--{VECTORS}={WIDEST}")
+
+
+def enable_vectors_of_many_arrays() -> None:
+    """Let LLVM use vectors in loops along many arrays, though it has to look first whether any of them overlap.
+
+    A batch's fusions are such loops; they are used only where XLA was told so before it read its flags (straightline/fusion.py).
+    """
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    running = bridge is not None and bridge.backends_are_initialized()
+    if _jax_version() == KNOWN and not running:
+        _add_flag(OPTIONS, f"--{OPTIONS}=-{MEMORY_CHECKS}={MANY}")
 
 
 def _jax_version() -> tuple[int, ...]:

@@ -75,15 +75,53 @@ def test_a_fusion_is_one_pass_over_its_operations(linkage):
     assert fused["bytes accessed"] < 0.7 * barred["bytes accessed"]
 
 
-def test_derivatives_and_batches_take_the_program_as_it_is(linkage):
-    run, q, v = looped(linkage, Loop())
+@pytest.mark.parametrize("scene", ["parallelogram", "driven_pendulum", "slider_crank", "chain"])
+@pytest.mark.parametrize("axes", [(None, 0), (0, 0), (1, -1)], ids=["velocities", "states", "along the last axis"])
+def test_batches_take_fusions_of_vectors(scene, axes):
+    mechanism = udk.library.chain(4) if scene == "chain" else getattr(udk.library, scene)()
+    run, *state = looped(mechanism, Loop(batch=True))
+    barred, *_ = looped(mechanism, None)
+    scales = 1.0 + 1e-3 * np.arange(5)
+    state = [x if axis is None else np.stack([k * x for k in scales], axis) for x, axis in zip(state, axes, strict=True)]
+    both = [jax.jit(jax.vmap(f, axes)) for f in (run, barred)]
+    assert [fusions(f.lower(*state).as_text()) > 0 for f in both] == [TRIED, False]
+    for found, expected in zip(*(f(*state) for f in both), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_batches_of_batches_and_of_single_runs_and_a_compiler_that_was_not_told_take_the_program_as_it_is(linkage, monkeypatch):
+    run, q, v = looped(linkage, Loop(batch=True))
     barred, *_ = looped(linkage, None)
-    assert fusions(jax.jit(jax.vmap(run, (None, 0))).lower(q, jnp.stack([v, 2 * v])).as_text()) == 0
-    expected = jax.vmap(barred, (None, 0))(q, jnp.stack([v, 2 * v]))
-    for found, e in zip(jax.jit(jax.vmap(run, (None, 0)))(q, jnp.stack([v, 2 * v])), expected, strict=True):
-        np.testing.assert_allclose(found, e, rtol=1e-12, atol=1e-12)
+    several = jnp.stack([jnp.stack([v, 2 * v, 3 * v])] * 2)
+    twice = jax.jit(jax.vmap(jax.vmap(run, (None, 0)), (None, 0)))
+    assert fusions(twice.lower(q, several).as_text()) == 0
+    for found, expected in zip(twice(q, several), jax.vmap(jax.vmap(barred, (None, 0)), (None, 0))(q, several), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    single, *_ = looped(linkage, Loop())
+    assert fusions(jax.jit(jax.vmap(single, (None, 0))).lower(q, several[0]).as_text()) == 0
+    monkeypatch.setenv("XLA_FLAGS", "")
+    assert fusions(jax.jit(jax.vmap(run, (None, 0))).lower(q, several[0]).as_text()) == 0
+
+
+def test_a_batch_of_few_operations_and_many_results_is_no_fusion():
+    """The loop would look longer at where its arrays are than it takes."""
+
+    def fused(results, steps, size):
+        jaxpr = jax.make_jaxpr(lambda x: [x * k + sum([x] * steps) for k in range(results)])(1.0)
+        return fusion.Parts(jaxpr, ((),), (size is not None,), size).is_one_fusion
+
+    assert fused(60, 1, None) and fused(2, 50, 64)
+    assert not fused(60, 1, 64)
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_derivatives_take_the_program_as_it_is(linkage, batch):
+    loop = Loop(batch)
+    run, q, v = looped(linkage, loop)
+    barred, *_ = looped(linkage, None)
     for found, e in zip(jax.jvp(run, (q, v), (v, v))[1], jax.jvp(barred, (q, v), (v, v))[1], strict=True):
         np.testing.assert_allclose(found, e, rtol=1e-11, atol=1e-11)
+    assert loop.whole != batch
 
 
 @ONLY_WHERE_TRIED
@@ -143,7 +181,7 @@ def test_operations_of_a_library_and_arrays_are_no_fusion():
     """Only what XLA makes arithmetic of, number by number, and not all of too much."""
 
     def parts(function, n=2):
-        return fusion.Parts(jax.make_jaxpr(function)(*[jax.ShapeDtypeStruct((), float)] * n))
+        return fusion.Parts(jax.make_jaxpr(function)(*[jax.ShapeDtypeStruct((), float)] * n), ((),) * n)
 
     assert parts(lambda x, y: [x * y + 1.0, x]).is_one_fusion
     assert not parts(lambda x, y: [x, y]).is_one_fusion
@@ -164,8 +202,8 @@ def test_operations_of_a_library_and_arrays_are_no_fusion():
     ids=["arithmetic", "nothing", "a function of a library", "LAPACK"],
 )
 def test_what_else_is_in_a_loop_forbids_all_fusions_in_it(function, whole):
-    loop, number = Loop(), jax.ShapeDtypeStruct((), float)
-    simple, other = (fusion.together(f, [number] * 2) for f in (lambda x, y: [x + y * y], function))
+    loop, numbers = Loop(), [jax.ShapeDtypeStruct((), float)] * 2
+    simple, other = (fusion.together(jax.make_jaxpr(f)(*numbers), [(), ()]) for f in (lambda x, y: [x + y * y], function))
 
     def run(x):
         def again(x):

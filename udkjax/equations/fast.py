@@ -207,6 +207,7 @@ def _along(name: str, program: str, moving: tuple[bool, ...], primals: Any, dire
 
     if primals[0].loop is None:
         return in_parts(primals, direction)
+    primals[0].loop.differentiated()
     return along(in_parts, at_once, primals, direction, primals[0].code.derivative(name, moving).few(program))
 
 

@@ -168,7 +168,9 @@ class Equations(MechanismMotion):
 
     def call(self, program: Program, *arrays: Any) -> list[Any]:
         """Evaluate a program of the constants and of all numbers of some arrays."""
-        return program([*self.constants, *scalars(arrays)], self.loop)
+        if self.loop is None:
+            return program([*self.constants, *scalars(arrays)])
+        return program.within(self.loop, [*self.constants, *(x for x in arrays if np.size(x))])
 
     def arrays(self, name: str, t: Any, q: Any, v: Any) -> list[Array]:
         """What a program returns, as arrays: the values of D, the right-hand side, and vectors over the coordinates."""

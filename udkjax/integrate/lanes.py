@@ -80,19 +80,24 @@ def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
 class Lanes:
     """Equations evaluated for one state, or for lanes of states (n, L), with equations of their own where `axes` says so."""
 
-    def __init__(self, equations: Motion, axes: Any = None, size: int | None = None):
+    def __init__(self, equations: Motion, axes: Any = None, size: int | None = None, loop: Loop | None = None):
         self.equations, self.size, self.shape = equations, size, () if size is None else (size,)
         self._arrays, self._static = eqx.partition(equations, eqx.is_array)
-        self._axes = axes
+        self._axes, self._loop = axes, loop
+
+    def within(self, loop: Loop | None) -> "Lanes":
+        """The same, whose programs run in this loop where they are evaluated for all lanes."""
+        return Lanes(self.equations, self._axes, self.size, loop)
 
     def over(self, function: Callable, *states: Array) -> Any:
         """`function(equations, t, q, v)` of each lane."""
-        if self.size is None:
-            return function(self.equations, *states)
 
         def lane(arrays, *state):
-            return function(eqx.combine(arrays, self._static), *state)
+            equations = eqx.combine(arrays, self._static)
+            return function(equations if self._loop is None else equations.within(self._loop), *state)
 
+        if self.size is None:
+            return lane(self._arrays, *states)
         return jax.vmap(lane, in_axes=(self._axes, *[-1] * len(states)), out_axes=-1)(self._arrays, *states)
 
     def each(self, which: Array, function: Callable, otherwise: Any, *states: Any) -> Any:
@@ -116,15 +121,11 @@ def _marched(problem: Problem, lanes: Lanes) -> Raw:
 
 def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     """What to march along."""
-    loop = Loop() if lanes.size is None and not recorded and len(problem.ts) * len(problem.q) <= FEW_NUMBERS else None
-
-    def over(function: Callable) -> Callable:
-        return partial(lanes.over, lambda e, *x: function(e if loop is None else e.within(loop), *x))
-
+    over = lanes.within(None if recorded else _loop_of(problem, lanes)).over
     task = Task(
-        over(lambda e, t, q, v: e.quick.accelerations(t, q, v)),
-        over(lambda e, t, q, v: e.quick.kept(t, q, v)) if problem.projected else lambda t, q, v: (q, v, None),
-        over(lasting) if problem.projected else _all_of_it,
+        partial(over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
+        partial(over, lambda e, t, q, v: e.quick.kept(t, q, v)) if problem.projected else lambda t, q, v: (q, v, None),
+        partial(over, lasting) if problem.projected else _all_of_it,
         None,
         problem.equations.branches,
         *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
@@ -133,6 +134,11 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     if problem.equations.branches and problem.careful:
         task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
     return task
+
+
+def _loop_of(problem: Problem, lanes: Lanes) -> Loop | None:
+    few = len(problem.ts) * len(problem.q) * (lanes.size or 1) <= FEW_NUMBERS
+    return Loop(lanes.size is not None) if few else None
 
 
 def _all_of_it(t: Array, q: Array, v: Array, dq: Array, dv: Array, known: Any) -> Tangential:
@@ -232,10 +238,12 @@ def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], t
 def _output(projected: bool, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array]:
     """Interpolated states (2n, *lanes), returned to the manifold, and how they violate the constraints."""
 
+    inside = lanes.within(Loop(lanes.size is not None))
+
     def again(carry: Any) -> Any:
         k, y, far = carry
         steps = jnp.where(k == 0, 2, 1)  # where two are not enough, those that follow want factors of their own
-        *nearer, moved = lanes.over(lambda e, t, y: e.forgiving.closed(t, *jnp.split(y, 2), steps), t, y)
+        *nearer, moved = inside.over(lambda e, t, y: e.forgiving.closed(t, *jnp.split(y, 2), steps), t, y)
         return k + 1, jnp.where(far, jnp.concatenate(nearer), y), far & ~(moved <= FAR)
 
     if projected:

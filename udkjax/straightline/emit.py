@@ -10,7 +10,6 @@ operations in a batch, after twice as many outside of one; a barrier stops the d
 import math
 import operator
 from collections.abc import Callable, Collection, Sequence
-from functools import cached_property
 from typing import Any
 
 import jax
@@ -39,10 +38,7 @@ _ARITHMETIC: dict[str, tuple[Callable, Callable]] = {
 
 
 class Program:
-    """`program(values)` takes one value for each of `inputs` and returns one for each of `outputs`.
-
-    In a loop that XLA compiles into one function, `program(values, loop)` is one fusion of it.
-    """
+    """`program(values)` takes one value for each of `inputs` and returns one for each of `outputs`."""
 
     def __init__(self, graph: Graph, inputs: Sequence[Scalar], outputs: Sequence[Scalar], cut_every: int | None = CUT_EVERY):
         self.graph, self.inputs, self.outputs, self.cut_every = graph, list(inputs), list(outputs), cut_every
@@ -54,27 +50,34 @@ class Program:
             dict.fromkeys(n.arguments[0].index for n in nodes if n.kind == "apply" and n.detail.primitive.name in _PAIR)
         )
         self._traced = jax.jit(self._run)  # traced once, wherever and however often it is called and differentiated
+        self._fusions: dict[Any, Callable[..., list[Any]]] = {}
 
     def uses(self, scalar: Scalar) -> bool:
         """Whether the program needs this input at all."""
         return scalar.index in self.last_use
 
-    def __call__(self, values: Sequence[Any], loop: Loop | None = None) -> list[Any]:
+    def __call__(self, values: Sequence[Any]) -> list[Any]:
         if all(isinstance(v, float | int) for v in values):
             try:
                 return self._run(values)
             except (ArithmeticError, ValueError):  # 1/0, an overflow, sin(inf): in JAX no errors, but values that are not finite
                 with np.errstate(all="ignore"):
                     return self._run([np.float64(v) for v in values])
-        dtypes = [s.node.dtype for s in self.inputs]
-        given = zip(values, dtypes, strict=True)
-        values = [v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in given]
-        return self._traced(values) if loop is None else self._together(loop, *values)
+        return self._traced(self._typed(values))
 
-    @cached_property
-    def _together(self) -> Callable[..., list[Any]]:
-        examples = [jax.ShapeDtypeStruct((), s.node.dtype) for s in self.inputs]
-        return together(lambda *values: [jnp.asarray(x) for x in self._run(values)], examples)
+    def within(self, loop: Loop, arrays: Sequence[Any]) -> list[Any]:
+        """The same of all numbers of some arrays, as one fusion of a loop that XLA compiles into one function."""
+        arrays = [jnp.asarray(x) for x in arrays]
+        known = tuple((x.shape, x.dtype) for x in arrays)
+        if known not in self._fusions:
+            examples = [jax.ShapeDtypeStruct((), x.dtype) for x in arrays for _ in range(x.size)]
+            jaxpr = jax.make_jaxpr(lambda *values: [jnp.asarray(x) for x in self._run(self._typed(values))])(*examples)
+            self._fusions[known] = together(jaxpr, [x.shape for x in arrays])
+        return self._fusions[known](loop, *arrays)
+
+    def _typed(self, values: Sequence[Any]) -> list[Any]:
+        given = zip(values, (s.node.dtype for s in self.inputs), strict=True)
+        return [v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in given]
 
     def _run(self, values: Sequence[Any]) -> list[Any]:
         known: dict[int, Any] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
