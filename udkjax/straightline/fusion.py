@@ -43,8 +43,8 @@ SIMPLE = frozenset(
 class Loop:
     """A loop that XLA compiles into one function, unless something in it turns out to forbid that before it is compiled.
 
-    XLA must not know how often it goes round, or may write the rounds one after the other instead. Where one is batched that is
-    not made for a `batch` it may hold products of matrices, which forbid it; so may one that is made so, where it is differentiated.
+    XLA must not know how often it goes round, or may write the rounds one after the other instead. A loop that is batched, but
+    not made for a `batch`, may hold products of matrices, which forbid it; and so may one that is, where it is differentiated.
     """
 
     def __init__(self, batch: bool = False) -> None:
