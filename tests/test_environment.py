@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from udkjax import environment
+from udkjax.straightline import fusion
 
 PRINT = "import jax, udkjax; print(jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs)"
 RUN = """
@@ -83,6 +84,10 @@ def test_flags_are_added_where_they_are_known_and_not_given(monkeypatch, enable,
     monkeypatch.delitem(sys.modules, "jax._src.xla_bridge", raising=False)  # XLA has not read its flags yet
     enable()
     assert os.environ["XLA_FLAGS"] == (expected or given or "")
+
+
+def test_fusions_of_batches_look_for_the_flag_that_is_added():
+    assert fusion.MEMORY_CHECKS == environment.MEMORY_CHECKS
 
 
 def test_no_flag_is_added_that_xla_would_not_read_any_more(monkeypatch):
