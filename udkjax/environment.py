@@ -104,9 +104,10 @@ def enable_vectors_of_many_arrays() -> None:
 
     A batch's fusions are such loops; they are used only where XLA was told so before it read its flags (straightline/fusion.py).
     """
+    if _jax_version() != KNOWN:
+        return
     bridge = sys.modules.get("jax._src.xla_bridge")
-    running = bridge is not None and bridge.backends_are_initialized()
-    if _jax_version() == KNOWN and not running:
+    if bridge is None or not bridge.backends_are_initialized():
         _add_flag(OPTIONS, f"--{OPTIONS}=-{MEMORY_CHECKS}={MANY}")
 
 

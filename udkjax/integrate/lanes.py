@@ -237,7 +237,6 @@ def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], t
 
 def _output(projected: bool, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array]:
     """Interpolated states (2n, *lanes), returned to the manifold, and how they violate the constraints."""
-
     inside = lanes.within(Loop(lanes.size is not None))
 
     def again(carry: Any) -> Any:
