@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from udkjax.equations.expressions import Alike, alike, applied, differentiated
 from udkjax.pinv.blocks import take
 from udkjax.scene.mechanism import Mechanism, attached
-from udkjax.straightline import Graph, Program, Scalar, frontier
+from udkjax.straightline import Graph, Loop, Program, Scalar, along_elements, frontier
 
 POSITIONS, VELOCITIES = ("x", "y", "angle"), ("vx", "vy", "omega")
 FREE = ("fx", "fy", "fangle")  # of a_F
@@ -146,15 +146,14 @@ class Group(NamedTuple):
         found = jax.vmap(lambda values: [jnp.asarray(c) for c in self.kind.prologue(values)], axis_size=size)(values)
         return jnp.stack(found) if found else jnp.zeros((0, size))
 
-    def run(self, names: tuple[str, ...], numbers: Array, t: Any, fields: Fields) -> list[list[Any]]:
+    def run(self, names: tuple[str, ...], numbers: Array, t: Any, fields: Fields, loop: Loop | None = None) -> list[list[Any]]:
         """Evaluate outputs: for each name a list of arrays (elements,), or of numbers where they are known."""
         program, used, varying = self.kind.program(names)
         size = len(self.members)
         state = [take(fields[name], self.bodies[body]) for name, body, _ in used]
         found = {}
         if varying:
-            call = jax.vmap(lambda c, s: [jnp.asarray(x) for x in program([*c, t, *s])], axis_size=size)
-            found = dict(zip((s.index for s in varying), call(list(numbers), state), strict=True))
+            found = dict(zip((s.index for s in varying), along_elements(program, loop, size, numbers, t, *state), strict=True))
 
         def value(s: Scalar) -> Any:
             return s.constant if s.constant is not None else found[s.index] if s.sign > 0 else -found[s.index]

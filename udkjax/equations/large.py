@@ -23,9 +23,10 @@ from udkjax.equations.large_plain import branch, by_method, plain_accelerations,
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
 from udkjax.equations.motion import MechanismMotion, Tangential, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
-from udkjax.pinv.block_methods import BlockElimination, DenseParts, factorized
+from udkjax.pinv.block_methods import BlockElimination, DenseParts, factorized, solved
 from udkjax.pinv.blocks import by_block, flat
 from udkjax.scene.mechanism import Mechanism
+from udkjax.straightline import Loop
 
 # The least share of a row's length that closing takes for granted: enough to tell redundant rows from rounding, too little to
 # slow down Newton's method where rows are independent.
@@ -49,6 +50,7 @@ class LargeEquations(MechanismMotion):
     branch: bool = eqx.field(static=True, default=True)  # whether to turn to dense matrices, or to say NaN where that is needed
     doubt: bool = eqx.field(static=True, default=True)  # whether to say anything of pivots that are small
     dense: bool = eqx.field(static=True, default=False)  # whether the method is applied to D of all rows as a matrix
+    loop: Loop | None = eqx.field(static=True, default=None)  # in which its programs run
 
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
         """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
@@ -169,6 +171,9 @@ class LargeEquations(MechanismMotion):
         """The same without a branch: small pivots are taken for what they are."""
         return dataclasses.replace(self, branch=False, doubt=False)
 
+    def within(self, loop: Loop) -> "LargeEquations":
+        return dataclasses.replace(self, loop=loop)
+
     def exact(self) -> "LargeEquations":
         """The same on all rows as a matrix: what to turn to where rows are not independent."""
         method = self.method.exact if isinstance(self.method, Auto) else self.method
@@ -184,7 +189,7 @@ class LargeEquations(MechanismMotion):
     @property
     def elimination(self) -> BlockElimination:
         """D^+ of the rows kept, by levels."""
-        return BlockElimination(self.layout.kept.pattern, jnp.sqrt(jnp.asarray(self.drop)))
+        return BlockElimination(self.layout.kept.pattern, jnp.sqrt(jnp.asarray(self.drop)), loop=self.loop)
 
     def _rank(self, D: Float[Array, "r 3 s"], t: Any, q: Vector) -> Array:
         """The rank of all rows: those kept, and those left out that some motion which these allow does not satisfy."""
@@ -206,7 +211,7 @@ class LargeEquations(MechanismMotion):
 
     def arrays(self, rows: Selection, names: Sequence[str], t: Any, q: Vector, v: Vector, free: Any = None) -> list[Array]:
         """`names`, of D, b, psi and psi_dot, of some rows in blocks; b takes a_F."""
-        return rows.evaluate(names, self.numbers["constraints"], t, self._fields(q, v, free))
+        return rows.evaluate(names, self.numbers["constraints"], t, self._fields(q, v, free), self.loop)
 
     def free(self, t: Any, q: Vector, v: Vector) -> Float[Array, "3 bodies"]:
         """a_F = M^-1 F."""
@@ -215,7 +220,7 @@ class LargeEquations(MechanismMotion):
             return fall
         fields, parts = self._fields(q, v), []
         for group, numbers in zip(self.layout.forces, self.numbers["forces"], strict=True):
-            (loads,) = group.run(("loads",), numbers, t, fields)
+            (loads,) = group.run(("loads",), numbers, t, fields, self.loop)
             size = len(group.members)
             loads = jnp.stack([jnp.broadcast_to(jnp.asarray(x), (size,)) for x in loads]) if loads else jnp.zeros((0, size))
             parts.append(loads.reshape(-1, 3, size).swapaxes(0, 1).reshape(3, -1))
@@ -265,8 +270,8 @@ def _accelerations(equations: LargeEquations, t: Any, q: Vector, v: Vector, watc
         return flat(free)
     D, b = equations.arrays(layout.kept, ["D", "b"], t, q, v, free)
     pattern = layout.kept.pattern
-    factors, safe = factorized(pattern, D, equations.drop)
-    x = pattern.rmatvec(D, pattern.levels.solve(factors, b.T).T)
+    factors, safe = factorized(pattern, D, equations.drop, loop=equations.loop)
+    x = pattern.rmatvec(D, solved(pattern, factors, b, equations.loop))
     a = flat(free + root * x)
     if watch and layout.left_out:
         safe = safe & _satisfied(equations, t, q, v, free, x)
@@ -311,10 +316,10 @@ def _fast_project(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tu
     if not len(rows.rows):
         return q, v
     D, psi = equations.arrays(rows, ["D", "psi"], t, q, v)
-    factors, safe = factorized(rows.pattern, D, equations.drop)
+    factors, safe = factorized(rows.pattern, D, equations.drop, loop=equations.loop)
 
     def without(x: Vector, residual: Array) -> Vector:
-        return x - flat(root * rows.pattern.rmatvec(D, rows.pattern.levels.solve(factors, residual.T).T))
+        return x - flat(root * rows.pattern.rmatvec(D, solved(rows.pattern, factors, residual, equations.loop)))
 
     q1 = without(q, psi)
     q2 = without(q1, equations.arrays(rows, ["psi"], t, q1, v)[0])

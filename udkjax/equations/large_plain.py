@@ -76,6 +76,8 @@ def by_method(equations: "LargeEquations", use: Any, t: Any, q: Vector, v: Vecto
     if not len(layout.kept.rows):
         return use(_Unconstrained(), layout.kept)
     if not equations.by_levels:
+        if equations.loop is not None:
+            equations.loop.holds(False)  # it may ask LAPACK
         D = equations.arrays(layout.all, ["D"], t, q, v)[0]
         return use(DenseParts(layout.all.pattern, equations.method).plus(D), layout.all)
     plus = equations.elimination.plus(equations.arrays(layout.kept, ["D"], t, q, v)[0])

@@ -16,6 +16,7 @@ from udkjax.equations.alike import Fields, Group, constraint_kind, force_kind, g
 from udkjax.equations.motion import Vector
 from udkjax.pinv.blocks import BlockPattern, Sums, by_block, take
 from udkjax.scene.mechanism import Mechanism
+from udkjax.straightline import Loop
 from udkjax.straightline.trigonometry import sincos
 
 
@@ -47,12 +48,14 @@ class Selection:
                     present[r, k % 3] |= not entries[row * width + k].is_zero
         return BlockPattern(self._sizes, self._meets, 3, self._bodies, present=present)
 
-    def evaluate(self, names: Sequence[str], numbers: Sequence[Array], t: Any, fields: Fields) -> list[Array]:
+    def evaluate(
+        self, names: Sequence[str], numbers: Sequence[Array], t: Any, fields: Fields, loop: Loop | None = None
+    ) -> list[Array]:
         """`D` as `BlockPattern` wants it, the others as (rows of a block, blocks)."""
         found = [self._padded(name, []) for name in names] if not self.parts else None
         if found is not None:
             return found
-        by_group = [group.run(tuple(names), numbers[k], t, fields) for k, group, _ in self.parts]
+        by_group = [group.run(tuple(names), numbers[k], t, fields, loop) for k, group, _ in self.parts]
         return [self._padded(name, [outputs[i] for outputs in by_group]) for i, name in enumerate(names)]
 
     def _padded(self, name: str, by_group: list[list[Any]]) -> Array:

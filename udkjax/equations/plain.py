@@ -69,7 +69,7 @@ def _by_method(equations: "Equations", use: Any, name: str, t: Any, q: Vector, v
     """Call `use` with D^+ by the equations' method, and the name of the program whose rows it is for."""
     programs, method = equations.code, equations.method
     if equations.loop is not None:
-        equations.loop.whole = False  # it may ask LAPACK
+        equations.loop.holds(False)  # it may ask LAPACK
     if not programs.kept:
         return use(_Unconstrained(), name)
 

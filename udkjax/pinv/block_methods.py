@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.pinv.blocks import BlockPattern, by_block, flat, take
 from udkjax.pinv.rule import Pseudoinverse, number
+from udkjax.straightline import Loop
 
 
 class Blockwise(Pseudoinverse):
@@ -41,6 +42,12 @@ class BlockFactors(NamedTuple):
     rank: Int[Array, ""]
 
 
+class Leveled(NamedTuple):
+    """Factors by levels, and not by code written out."""
+
+    factors: Any
+
+
 class BlockElimination(Blockwise):
     """Elimination of independent rows that come in blocks: operator, b and x as in `Blockwise`.
 
@@ -50,12 +57,20 @@ class BlockElimination(Blockwise):
     """
 
     damping: Float[Array, ""] | None = None
+    loop: Loop | None = eqx.field(static=True, default=None)  # in which it is used
 
-    def __init__(self, pattern: BlockPattern, rank_tol: ArrayLike = 1e-8, damping: ArrayLike | None = None):
-        self.rank_tol, self.relative, self.damping, self.pattern = number(rank_tol), True, number(damping), pattern
+    def __init__(
+        self,
+        pattern: BlockPattern,
+        rank_tol: ArrayLike = 1e-8,
+        damping: ArrayLike | None = None,
+        loop: Loop | None = None,
+    ):
+        self.rank_tol, self.relative, self.damping = number(rank_tol), True, number(damping)
+        self.pattern, self.loop = pattern, loop
 
     def factor(self, D: Float[Array, "r c s"]) -> BlockFactors:
-        factors, safe = factorized(self.pattern, D, jnp.asarray(self.rank_tol) ** 2, self.damping)
+        factors, safe = factorized(self.pattern, D, jnp.asarray(self.rank_tol) ** 2, self.damping, self.loop)
         return BlockFactors(D, factors, jnp.where(safe, self.pattern.sizes.sum(), 0))
 
     def apply(self, factors: BlockFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
@@ -65,17 +80,35 @@ class BlockElimination(Blockwise):
         return self._square(factors, self.matvec(factors.D, c))
 
     def _square(self, factors: BlockFactors, b: Float[Array, "m"]) -> Float[Array, "m"]:
-        return self.pattern.levels.solve(factors.factors, b.reshape(-1, self.pattern.rows)).ravel()
+        return flat(solved(self.pattern, factors.factors, by_block(b, self.pattern.rows), self.loop))
 
 
-def factorized(pattern: BlockPattern, D: Float[Array, "r c s"], drop: Any, damping: Any = None) -> tuple[Any, Bool[Array, ""]]:
-    """Factorize D D^T; return what `Levels.solve` takes, and whether every pivot exceeds `drop` times its row's diagonal."""
+def factorized(
+    pattern: BlockPattern, D: Float[Array, "r c s"], drop: Any, damping: Any = None, loop: Loop | None = None
+) -> tuple[Any, Bool[Array, ""]]:
+    """Factorize D D^T; return what `solved` takes, and whether every pivot exceeds `drop` times its row's diagonal.
+
+    In a loop that XLA compiles into one function by code written out, where there is any.
+    """
+    if damping is None and loop is not None and loop.fuses and pattern.written_out is not None:
+        return pattern.written_out.factor(D, drop, loop)
     diagonal, coupling = (pattern.copies or pattern).gram(D)
     if damping is not None:  # of the rows themselves, not of welds
         squares = jnp.sum(D**2, 1).reshape(pattern.rows, pattern.deep, pattern.blocks).sum(1).T
         row = np.arange(pattern.rows)
         diagonal = diagonal.at[: pattern.blocks, row, row].add(damping * squares)
-    return pattern.levels.factor(diagonal, coupling, drop)
+    factors, safe = pattern.levels.factor(diagonal, coupling, drop)
+    return Leveled(factors), safe
+
+
+def solved(
+    pattern: BlockPattern, factors: Any, r: Float[Array, "r blocks"], loop: Loop | None = None
+) -> Float[Array, "r blocks"]:
+    """Return y with D D^T y = r, by factors from `factorized`."""
+    if isinstance(factors, Leveled):
+        return pattern.levels.solve(factors.factors, r.T).T
+    assert pattern.written_out is not None
+    return pattern.written_out.solve(factors, r, loop)
 
 
 class PartFactors(NamedTuple):

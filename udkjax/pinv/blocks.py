@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from udkjax.pinv.levels import Levels
 from udkjax.pinv.stretching import MANY, Stretched, stretch
+from udkjax.pinv.written_out import WrittenOut
 
 GATHERED = 4  # terms of a sum that are fetched; what is beyond, in a few sums of many terms, is sent
 
@@ -82,6 +83,12 @@ class BlockPattern:
     def levels(self) -> "Levels | Copies":
         """The elimination of D D^T."""
         return Levels.of(self.sizes.tolist(), self.coupled[0].tolist()) if self.copies is None else self.copies
+
+    @cached_property
+    def written_out(self) -> WrittenOut | None:
+        """The same by code written out, if that is not too much."""
+        found = WrittenOut(self) if self.copies is None and self.blocks else None
+        return found if found is not None and found.worthwhile else None
 
     @cached_property
     def parts(self) -> list["Parts"]:

@@ -127,7 +127,7 @@ def factorize(rows: Sequence[Row], graph: Graph, drop: Scalar | None = None) -> 
     for i, row in enumerate(rows):
         for k in row:
             meets.setdefault(k, []).append(i)
-    zero, one = graph.constant(0.0), graph.constant(1.0)
+    zero = graph.constant(0.0)
     column: list[dict[int, Scalar]] = [{} for _ in rows]  # the lower triangle of D D^T, by columns
     for k in sorted(meets):
         for i in meets[k]:
@@ -135,9 +135,21 @@ def factorize(rows: Sequence[Row], graph: Graph, drop: Scalar | None = None) -> 
                 if place[j] <= place[i]:
                     target = column[place[j]]
                     target[place[i]] = target.get(place[i], zero) + rows[i][k] * rows[j][k]
-    diagonal = [column[j].get(j, zero) for j in range(len(rows))]
+    return Factors(order, column, *eliminate(column, len(rows), graph, drop))
+
+
+def eliminate(
+    column: list[dict[int, Scalar]], count: int, graph: Graph, drop: Scalar | None = None
+) -> tuple[list[Scalar], list[tuple[Scalar, Scalar]]]:
+    """Eliminate the first rows of a symmetric matrix, given by the columns of its lower triangle.
+
+    Their columns become those of L, without the unit diagonal; what is left of the others is in their place. Returns the
+    reciprocals of the pivots, and the pivots, each with its row's diagonal entry.
+    """
+    zero, one = graph.constant(0.0), graph.constant(1.0)
+    diagonal = [column[j].get(j, zero) for j in range(count)]
     inverse, pivots = [], []
-    for j in range(len(rows)):
+    for j in range(count):
         d = column[j].get(j, zero)
         inverse.append(one / d if drop is None else where(greater(d, diagonal[j] * drop), one / d, zero))
         pivots.append((d, diagonal[j]))
@@ -148,24 +160,35 @@ def factorize(rows: Sequence[Row], graph: Graph, drop: Scalar | None = None) -> 
                 if k <= i:
                     column[k][i] = column[k].get(i, zero) - lower[i] * column[j][k]
         column[j] = lower
-    return Factors(order, column, inverse, pivots)
+    return inverse, pivots
 
 
 def multipliers(factors: Factors, b: Sequence[Scalar]) -> list[Scalar]:
     """y with D D^T y = b, zero where a row was dropped."""
-    m = len(b)
-    y = [b[i] for i in factors.order]
-    for j in range(m):
-        for i, entry in factors.lower[j].items():
-            y[i] = y[i] - entry * y[j]
-    for j in reversed(range(m)):
-        y[j] = y[j] * factors.inverse_pivots[j]
-        for i, entry in reversed(factors.lower[j].items()):  # what was found last comes last: nothing else waits for it
-            y[j] = y[j] - entry * y[i]
-    result: list[Scalar] = [b[0]] * m
+    y = backward(factors.lower, factors.inverse_pivots, forward(factors.lower, [b[i] for i in factors.order]))
+    result: list[Scalar] = [b[0]] * len(b)
     for j, i in enumerate(factors.order):
         result[i] = y[j]
     return result
+
+
+def forward(lower: Sequence[dict[int, Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
+    """L^-1 b; of rows beyond the columns of L, what these leave."""
+    y = list(b)
+    for j, entries in enumerate(lower):
+        for i, entry in entries.items():
+            y[i] = y[i] - entry * y[j]
+    return y
+
+
+def backward(lower: Sequence[dict[int, Scalar]], inverse_pivots: Sequence[Scalar], y: Sequence[Scalar]) -> list[Scalar]:
+    """x with diag(p) L^T x = y; beyond the columns of L, y is x."""
+    x = list(y)
+    for j in reversed(range(len(inverse_pivots))):
+        x[j] = x[j] * inverse_pivots[j]
+        for i, entry in reversed(lower[j].items()):  # what was found last comes last: nothing else waits for it
+            x[j] = x[j] - entry * x[i]
+    return x
 
 
 def transpose_times(rows: Sequence[Row], y: Sequence[Scalar], columns: int, zero: Scalar) -> list[Scalar]:

@@ -8,6 +8,7 @@ from udkjax.straightline.derivative import cotangents as cotangents
 from udkjax.straightline.derivative import tangents as tangents
 from udkjax.straightline.directions import along as along
 from udkjax.straightline.emit import Program as Program
+from udkjax.straightline.emit import along_elements as along_elements
 from udkjax.straightline.emit import frontier as frontier
 from udkjax.straightline.emit import operations as operations
 from udkjax.straightline.fusion import Loop as Loop

@@ -110,6 +110,22 @@ class Program:
         return counts | ({"sincos": len(self.angles)} if self.angles else {})
 
 
+def along_elements(program: Program, loop: Loop | None, size: int, *arrays: Any) -> list[Any]:
+    """A program of all numbers of some arrays for each of `size` elements, which come last; of numbers, which are those of all.
+
+    In a loop, as one fusion.
+    """
+    given = [x for x in map(jnp.asarray, arrays) if x.size]
+    axes = [-1 if x.ndim else None for x in given]
+
+    def element(*arrays: Any) -> list[Any]:
+        if loop is not None:
+            return program.within(loop.along_elements, arrays)
+        return [jnp.asarray(x) for x in program([x for array in arrays for x in (array if array.ndim else [array])])]
+
+    return jax.vmap(element, in_axes=axes, axis_size=size)(*given) if program.outputs else []
+
+
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:
     """Return what an early program must hand to a later one: the early nodes that the outputs or later nodes use.
 

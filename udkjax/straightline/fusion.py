@@ -29,7 +29,7 @@ from udkjax.straightline.trigonometry import sincos_of_one, sincos_p
 KNOWN = ((0, 12),)  # versions of JAX that were tried
 FLAGS = ("while_loop_byte_threshold", "disable_hlo_passes", "optimization_level")  # with one of them loops may be taken apart
 MEMORY_CHECKS = "vectorize-memory-check-threshold"  # without it loops along many arrays are worked off number by number
-LARGEST = 4000  # operations: none with more was tried; with 3,600 (ten four-bars) compiling takes a thirtieth longer, a run 0.7
+LARGEST = 10000  # operations: none with more was tried; with 3,600 (ten four-bars) compiling takes a thirtieth longer, a run 0.7
 # A fusion of a batch first looks, for each two arrays of which one is a result, whether they overlap: in 1.4 ns. An operation on
 # 64 members takes 4 ns by itself, and 1.3 in a fusion. So many such looks for an operation are worth it.
 CHECKS = 2.0
@@ -48,11 +48,32 @@ class Loop:
     """
 
     def __init__(self, batch: bool = False) -> None:
-        self.whole, self.batch = True, batch
+        self.batch, self._found = batch, {"whole": True}
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing has been found yet that forbids it."""
+        return self._found["whole"]
+
+    @property
+    def fuses(self) -> bool:
+        """Whether programs along the elements of one state can be fusions in it, as far as is known."""
+        return self.whole and not self.batch and _known() and MEMORY_CHECKS in os.environ.get("XLA_FLAGS", "") and not _flagged()
+
+    def holds(self, simple: bool) -> None:
+        """Say whether what is in it is arithmetic alone."""
+        self._found["whole"] &= simple
 
     def differentiated(self) -> None:
         """Say that a derivative is taken in it."""
-        self.whole &= not self.batch
+        self.holds(not self.batch)
+
+    @property
+    def along_elements(self) -> "Loop":
+        """The same loop, for programs that are mapped over elements of one state."""
+        other = Loop(True)
+        other._found = self._found
+        return other
 
 
 def together(jaxpr: Any, shapes: Sequence[tuple[int, ...]]) -> Callable[..., list[Any]]:
@@ -60,7 +81,7 @@ def together(jaxpr: Any, shapes: Sequence[tuple[int, ...]]) -> Callable[..., lis
     parts = Parts(jaxpr, tuple(shapes))
 
     def call(loop: Loop, *arrays: Any) -> list[Any]:
-        loop.whole &= parts.simple  # what else there is may keep XLA from making one function of the loop
+        loop.holds(parts.simple)  # what else there is may keep XLA from making one function of the loop
         return together_p.bind(*arrays, parts=parts, loop=loop)
 
     return call
@@ -194,12 +215,20 @@ def _lowered(ctx: mlir.LoweringRuleContext, *values: Any, parts: Parts, loop: Lo
 
 
 def _lowered_on_cpu(ctx: mlir.LoweringRuleContext, *values: Any, parts: Parts, loop: Loop) -> Any:
-    flagged = any(flag in os.environ.get("XLA_FLAGS", "") for flag in FLAGS) or jax.config.read("jax_disable_most_optimizations")
     exported = ctx.module_context.lowering_parameters.for_export
-    known = jax.__version_info__[:2] in KNOWN
     in_vectors = parts.size is None or MEMORY_CHECKS in os.environ.get("XLA_FLAGS", "")
-    fused = known and loop.whole and parts.is_one_fusion and in_vectors and not flagged and not exported
+    fused = _known() and loop.whole and parts.is_one_fusion and in_vectors and not _flagged() and not exported
     return mlir.lower_fun(parts.around if fused else parts.whole)(ctx, *values)
+
+
+def _known() -> bool:
+    return jax.__version_info__[:2] in KNOWN
+
+
+def _flagged() -> bool:
+    """Whether loops may be taken apart."""
+    given = os.environ.get("XLA_FLAGS", "")
+    return any(flag in given for flag in FLAGS) or jax.config.read("jax_disable_most_optimizations")
 
 
 mlir.register_lowering(together_p, _lowered)
