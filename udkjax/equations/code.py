@@ -31,9 +31,9 @@ class Code:
 
     rows       D, b, a_F, M^(-1/2)        closure    D, Psi, M^(-1/2)        rate    D, Psi_dot, M^(-1/2)
 
-    and for elimination: `accelerations` (a, whether all pivots are safe), `factor` (the factors at (t, q), whether safe), `step`
-    (the change of q or v that removes a residual, given the factors), `psi` and `psi_dot` (of the rows kept), `tangential` (of
-    changes of q and v, given the factors, what projection leaves; whether all pivots are far from none).
+    and for elimination: `accelerations` (a, whether all pivots are safe), `nearer` (q and v after a Newton step to Psi = 0 and to
+    Psi_dot = 0, whether safe), `tangential` (of changes of q and v what projection leaves; whether all pivots are far from none).
+    Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
 
     def __init__(self, equations: Expressions, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None):
@@ -82,15 +82,11 @@ class Code:
         self.outputs["accelerations"] = [*self.a, safe]
         watched = all_of([safe, *(self._satisfied(i, self.a) for i in self.left_out)], graph)
         self.outputs["accelerations_watched"] = [*self.a, watched]
-        self.residual = [graph.input(f"r{k}", "residual") for k in range(len(self.kept))]
-        self.outputs["step"] = self.spread(self.solved(self.residual, dropping=True))
+        psi, psi_dot = ([residual[i] for i in self.kept] for residual in (e.psi, e.psi_dot))
+        self.outputs["nearer"] = [*self._without(e.q, psi), *self._without(e.v, psi_dot), self._safe(self._dropping)]
         self.changes = [graph.input(f"d{k}", "change") for k in range(2 * self.n)]
         far = all_of(self._dropping.above(NEAR), graph)
         self.outputs["tangential"] = [*self._tangential(self.changes[: self.n]), *self._tangential(self.changes[self.n :]), far]
-        late = self.outputs["step"] + self.outputs["tangential"]
-        early = frontier(graph, late, lambda node: not node.depends & {"residual", "change"})
-        self.factors = [s for s in early if not s.node.depends <= {"parameter"}]
-        self.outputs["factor"] = [*self.factors, self._safe(self._dropping)]
 
     def _safe(self, factors: Factors) -> Scalar:
         """Whether no pivot is too small to be trusted; a method that drops such rows does not ask."""
@@ -110,8 +106,11 @@ class Code:
 
     def _tangential(self, change: Sequence[Scalar]) -> list[Scalar]:
         rows, zero = (self.equations.psi_q[i] for i in self.kept), self.graph.constant(0.0)
-        residual = [sum((entry * change[k] for k, entry in row.items()), zero) for row in rows]
-        return [c - s for c, s in zip(change, self.spread(self.solved(residual, dropping=True)), strict=True)]
+        return self._without(change, [sum((entry * change[k] for k, entry in row.items()), zero) for row in rows])
+
+    def _without(self, x: Sequence[Scalar], residual: Sequence[Scalar]) -> list[Scalar]:
+        """x without what makes a residual of the rows kept: x - M^(-1) Psi_q^T (D D^T)^(-1) residual."""
+        return [c - s for c, s in zip(x, self.spread(self.solved(residual, dropping=True)), strict=True)]
 
     def b(self, i: int) -> Scalar:
         """gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F of one row."""
@@ -133,8 +132,7 @@ class Code:
     def program(self, name: str) -> Program:
         if name not in self._programs:
             e = self.equations
-            given = {"step": "residual", "tangential": "changes"}
-            state = [*self.factors, *getattr(self, given[name])] if name in given else [e.t, *e.q, *e.v]
+            state = [e.t, *e.q, *e.v, *(self.changes if name == "tangential" else [])]
             self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name])
         return self._programs[name]
 

@@ -17,12 +17,12 @@ from udkjax.equations.code import scalars, stacked
 from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, those
 from udkjax.equations.motion import Tangential, Vector
 from udkjax.equations.plain import plain_accelerations, plain_project, plain_tangential
-from udkjax.straightline import along, when
+from udkjax.straightline import along
 
 if TYPE_CHECKING:
     from udkjax.equations.udwadia_kalaba import Equations
 
-FAR = 1e-8  # m, rad: Newton's method converges quadratically, and leaves rounding errors of a residual that moves less
+FAR = 1e-13  # m, rad: what a Newton step that moves q by less leaves of Psi_dot are rounding errors
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -33,67 +33,45 @@ def accelerations(program: str, equations: "Equations", t: Any, q: Vector, v: Ve
 
 
 def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """As the plain form, but with the factors of the first position kept: they differ by the residual, and so does the result."""
-    found, _, safe = _projected(None, equations, t, q, v)
-    return _trusted(found, safe)
+    """As the plain form, by Newton steps in position and velocity at once."""
+    return closed(equations, t, q, v, 2)
 
 
-def kept(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, list[Array]]:
-    """`project` by elimination without a branch, and the factors of the first position: in a loop side by side.
-
-    What a loop hands on costs as many addresses as there are arrays.
-    """
-    found, (_, factors), safe = _projected(None, equations, t, q, v)
-    return *_trusted(found, safe), [stacked(factors)] if equations.loop else factors
-
-
-def closed(equations: "Equations", t: Any, q: Vector, v: Vector, steps: Any) -> tuple[Vector, Vector, Array]:
-    """By elimination without a branch: Newton steps in position and velocity, and how far the last one went."""
-    found, (moved, _), safe = _projected(steps, equations, t, q, v)
-    return *_trusted(found, safe), moved
-
-
-def _trusted(found: Sequence[Array], safe: Any) -> tuple[Array, Array]:
+def closed(equations: "Equations", t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
+    """By at most so many steps."""
+    found, safe = _projected(steps, equations, t, q, v)
     q, v = (jnp.where(safe, x, jnp.nan) for x in found)
     return q, v
 
 
-@jax.custom_jvp
-def _projected(steps: Any, equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any, Any, Any]:
-    """q and v, numbers in any case; how far the last step went, and the factors; and whether all that can be trusted.
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any, Any]:
+    """q and v, numbers in any case, and whether they can be trusted.
 
-    At most so many `steps` go in position and velocity, until one moves neither; if None, one in velocity, and in position a
-    second if the first moved it. Derivatives are taken where q and v are then.
+    A Newton step takes v to where Psi_dot = 0 at the q that it starts from, so the last must not move q. There are at most so
+    many `steps`. Derivatives are taken where q and v are then.
     """
     if not equations.eliminates:
-        return plain_project(equations, t, q, v), (jnp.nan, []), jnp.array(True)
-    *factors, safe = equations.run("factor", t, q, v)
-    step = equations.code.program("step")
+        return plain_project(equations, t, q, v), jnp.array(True)
+    program = equations.code.program("nearer")
 
     # On scalars until all is done: vectors that a loop carries have the batch first under vmap, where the programs have it last.
 
-    def without(xs: Sequence[Array], name: str, qs: Sequence[Array]) -> list[Array]:
-        residual = equations.call(equations.code.program(name), t, *qs, *xs)
-        return [x - y for x, y in zip(xs, equations.call(step, *factors, *residual), strict=True)]
-
     def nearer(state: Any) -> Any:
-        k, q, v, _ = state
-        q1 = without(q, "psi_kept", q)
-        v1 = without(v, "psi_dot_kept", q1)
-        return k + 1, q1, v1, _largest_change([*q1, *v1], [*q, *v])
+        k, q, v, _, safe = state
+        *found, still = equations.call(program, t, *q, *v)
+        q1, v1 = found[: len(q)], found[len(q) :]
+        return k + 1, q1, v1, _largest_change(q1, q), safe & still
 
-    qs, vs = scalars([q]), scalars([v])
-    if steps is not None:
-        _, *found, moved = jax.lax.while_loop(lambda s: (s[0] < steps) & ~(s[-1] <= FAR), nearer, (0, qs, vs, jnp.inf))
-    else:
-        q1 = without(qs, "psi_kept", qs)
-        moved = _largest_change(q1, qs)
-        q2 = when(moved > FAR, lambda q1: without(q1, "psi_kept", q1), q1)
-        found = [q2, without(vs, "psi_dot_kept", q2)]
+    def more(state: Any) -> Any:
+        return (state[0] < steps) & ~(state[3] <= FAR)
+
+    start = 0, scalars([q]), scalars([v]), jnp.inf, jnp.array(True)
+    _, *found, _, safe = jax.lax.while_loop(more, nearer, start)
     found = [stacked(x) for x in found]
     if equations.branches:
-        return _branched(equations, safe, tuple(found), plain_project, t, q, v), (moved, []), jnp.array(True)
-    return tuple(found), (moved, factors), safe if _checks(equations) else jnp.array(True)
+        return _branched(equations, safe, tuple(found), plain_project, t, q, v), jnp.array(True)
+    return tuple(found), safe if _checks(equations) else jnp.array(True)
 
 
 def _largest_change(new: Sequence[Array], old: Sequence[Array]) -> Array:
@@ -105,15 +83,11 @@ def _largest_change(new: Sequence[Array], old: Sequence[Array]) -> Array:
     return changes[0]
 
 
-def tangential(
-    equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, factors: list[Array] | None
-) -> Tangential:
+def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
     """What projection at q leaves of small changes: for estimates of errors, which nobody differentiates, nor do they branch."""
     if not equations.eliminates:
         return plain_tangential(equations, t, q, v, dq, dv)
-    if factors is None:
-        *factors, _ = equations.run("factor", t, q, v)
-    *changes, far = equations.call(equations.code.program("tangential"), *factors, dq, dv)
+    *changes, far = equations.call(equations.code.program("tangential"), t, q, v, dq, dv)
     return Tangential(stacked(changes[: len(q)]), stacked(changes[len(q) :]), far)
 
 
@@ -148,11 +122,11 @@ def _(program, primals, tangents):
 
 
 @partial(_projected.defjvp, symbolic_zeros=True)
-def _(primals, tangents):
-    equations, t, _, _ = primals[1:]
-    (q, v), about, safe = _projected(*primals)
-    dq, dv = _correction(equations, t, q, v, tangents[1:])
-    return ((q, v), about, safe), ((dq, dv), *jax.tree.map(_no_tangent, (about, safe)))
+def _(steps, primals, tangents):
+    equations, t, _, _ = primals
+    (q, v), safe = _projected(steps, *primals)
+    dq, dv = _correction(equations, t, q, v, tangents)
+    return ((q, v), safe), ((dq, dv), np.zeros(jnp.shape(safe), jax.dtypes.float0))
 
 
 @jax.custom_jvp
@@ -225,7 +199,3 @@ def _(program, moving, primals, tangents):
     a, tangent = jax.jvp(partial(accelerations, program), primals, tangents)
     kept = _evaluated(program, moving, *primals)[1]
     return (a, kept), (tangent, [jnp.zeros_like(k) for k in kept])
-
-
-def _no_tangent(x: Any) -> Any:
-    return jnp.zeros_like(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else np.zeros(jnp.shape(x), jax.dtypes.float0)

@@ -178,17 +178,14 @@ class Formulated(Rewritten):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.project(t, q, v)
 
-    def kept(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
-        return self.equations.kept(t, q, v)
-
-    def closed(self, t: Any, q: Vector, v: Vector, steps: Any = 2) -> tuple[Vector, Vector, Array]:
+    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
         return self.equations.closed(t, q, v, steps)
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.as_projected(t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, known: Any = None) -> Tangential:
-        return self.equations.tangential(t, q, v, dq, dv, known)
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+        return self.equations.tangential(t, q, v, dq, dv)
 
     @property
     def left_out(self) -> tuple[int, ...]:

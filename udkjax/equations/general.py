@@ -70,7 +70,7 @@ class GeneralEquations(Motion):
             v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
         return q, v
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, known: Any = None) -> Tangential:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq."""
         if self.system.constraint is not None:
             slopes = jax.jacfwd(self._psi, 1)(t, q)

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.alike import Fields
-from udkjax.equations.code import CONSISTENT, TINY, structure
+from udkjax.equations.code import CONSISTENT, NEAR, TINY, structure
 from udkjax.equations.large_plain import branch, by_method, plain_accelerations, plain_correction, plain_project, plain_tangential
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
-from udkjax.equations.motion import MechanismMotion, Tangential, Vector
+from udkjax.equations.motion import FAR, MechanismMotion, Tangential, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.block_methods import BlockElimination, DenseParts, factorized, solved
 from udkjax.pinv.blocks import by_block, flat
@@ -72,15 +72,19 @@ class LargeEquations(MechanismMotion):
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
-        return _compiled(_project, self, t, q, v)
+        return self.closed(t, q, v, 2)
+
+    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
+        """By at most so many Newton steps in position, and one in velocity."""
+        return _compiled(_project, self, t, q, v, steps)
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives that `project` has where it returns it."""
         return _compiled(_as_projected, self, t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, known: Any = None) -> Tangential:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
-        return _compiled(plain_tangential, self, t, q, v, dq, dv)
+        return _compiled(_tangential, self, t, q, v, dq, dv)
 
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""
@@ -286,15 +290,15 @@ def _satisfied(equations: LargeEquations, t: Any, q: Vector, v: Vector, free: Ar
     return jnp.all(jnp.abs(sum_of(D, x) - b) <= CONSISTENT * (sum_of(jnp.abs(D), jnp.abs(x)) + jnp.abs(b)) + TINY)
 
 
-@jax.custom_jvp
-def _project(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    return _fast_project(equations, t, q, v) if equations.by_levels else plain_project(equations, t, q, v)
+@partial(jax.custom_jvp, nondiff_argnums=(4,))
+def _project(equations: LargeEquations, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
+    return _fast_project(equations, t, q, v, steps) if equations.by_levels else plain_project(equations, t, q, v)
 
 
 @_project.defjvp
-def _(primals, tangents):
+def _(steps, primals, tangents):
     equations, t, q, v = primals
-    return jax.jvp(_as_projected, (equations, t, *_project(equations, t, q, v)), tangents)
+    return jax.jvp(_as_projected, (equations, t, *_project(equations, t, q, v, steps)), tangents)
 
 
 @jax.custom_jvp
@@ -310,21 +314,40 @@ def _(primals, tangents):
     return (q, v), jax.jvp(plain_correction, primals, tangents)[1]
 
 
-def _fast_project(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """As the plain form, but with the factors of the first position kept: they differ by the residual, and so does the result."""
+def _fast_project(equations: LargeEquations, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
+    """Newton steps in position until one moves nothing, and one in velocity: rounds of one loop, so as to compile one of them."""
     rows, root = equations.layout.kept, equations.numbers["root"]
     if not len(rows.rows):
         return q, v
-    D, psi = equations.arrays(rows, ["D", "psi"], t, q, v)
-    factors, safe = factorized(rows.pattern, D, equations.drop, loop=equations.loop)
 
-    def without(x: Vector, residual: Array) -> Vector:
-        return x - flat(root * rows.pattern.rmatvec(D, solved(rows.pattern, factors, residual, equations.loop)))
+    def step(state: Any) -> Any:
+        k, q, v, closed, _, safe = state
+        D, psi, psi_dot = equations.arrays(rows, ["D", "psi", "psi_dot"], t, q, v)
+        factors, still = factorized(rows.pattern, D, equations.drop, loop=equations.loop)
+        y = solved(rows.pattern, factors, jnp.where(closed, psi_dot, psi), equations.loop)
+        x = flat(root * rows.pattern.rmatvec(D, y))
+        near = (jnp.max(jnp.abs(x)) <= FAR) | (k + 1 >= steps)
+        return k + 1, jnp.where(closed, q, q - x), jnp.where(closed, v - x, v), near, closed, safe & still
 
-    q1 = without(q, psi)
-    q2 = without(q1, equations.arrays(rows, ["psi"], t, q1, v)[0])
-    result = q2, without(v, equations.arrays(rows, ["psi_dot"], t, q2, v)[0])
-    return _checked(equations, safe, result, plain_project, t, q, v)
+    start = 0, q, v, *(jnp.array(x) for x in (False, False, True))
+    _, *found, _, _, safe = jax.lax.while_loop(lambda s: ~s[-2], step, start)
+    return _checked(equations, safe, tuple(found), plain_project, t, q, v)
+
+
+def _tangential(equations: LargeEquations, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+    """As the plain form, with one elimination for all of it, and the rest of it in rounds of one loop."""
+    rows, root = equations.layout.kept, flat(equations.numbers["root"])
+    if not len(rows.rows) or not equations.by_levels or equations.branches:
+        return plain_tangential(equations, t, q, v, dq, dv)
+    (D,) = equations.arrays(rows, ["D"], t, q, v)
+    factors, far = factorized(rows.pattern, D, NEAR, loop=equations.loop)
+
+    def left(x: Vector) -> Vector:
+        residual = rows.pattern.matvec(D, by_block(x / root, 3))
+        return x - root * flat(rows.pattern.rmatvec(D, solved(rows.pattern, factors, residual, equations.loop)))
+
+    first, second = jax.lax.map(left, jnp.stack([dq, dv]))
+    return Tangential(first, second, far)
 
 
 _accelerations.defjvp(lambda watch, primals, tangents: jax.jvp(plain_accelerations, primals, tangents))

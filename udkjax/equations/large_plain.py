@@ -63,9 +63,9 @@ def plain_tangential(equations: "LargeEquations", t: Any, q: Vector, v: Vector, 
     root = flat(equations.numbers["root"])
 
     def left(plus: Any, rows: Selection) -> Tangential:
-        known = isinstance(plus.method, BlockElimination)
+        by_levels = isinstance(plus.method, BlockElimination)
         first, second = (x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv))
-        return Tangential(first, second, factorized(rows.pattern, plus.matrix, NEAR)[1] if known else jnp.array(True))
+        return Tangential(first, second, factorized(rows.pattern, plus.matrix, NEAR)[1] if by_levels else jnp.array(True))
 
     return by_method(equations, left, t, q, v)
 

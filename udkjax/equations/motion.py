@@ -4,12 +4,15 @@ from abc import abstractmethod
 from typing import Any, NamedTuple, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.straightline import Loop
 
 Vector = Float[Array, "n"]
+
+FAR = 1e-8  # m, rad: Newton's method converges quadratically, and leaves rounding errors of a residual that moves less
 
 
 class Tangential(NamedTuple):
@@ -74,27 +77,26 @@ class Motion(eqx.Module):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """q and v returned to the constraint manifold."""
 
-    def kept(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
-        """`project`, and what it knows of the state that `tangential` need not find again. By default: nothing."""
-        return *self.project(t, q, v), None
+    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
+        """`project`, from farther away: by at most so many steps of Newton's method.
 
-    def closed(self, t: Any, q: Vector, v: Vector, steps: Any = 2) -> tuple[Vector, Vector, Array]:
-        """`project`, by at most so many steps where it counts them, and how far the last moved any coordinate or velocity.
-
-        By default: `project`, and how far that went.
+        By default it is projected until that moves nothing, at most so many times.
         """
-        q1, v1 = self.project(t, q, v)
-        return q1, v1, jnp.maximum(jnp.max(jnp.abs(q1 - q), initial=0.0), jnp.max(jnp.abs(v1 - v), initial=0.0))
+
+        def again(state: Any) -> Any:
+            k, q, v, _ = state
+            q1, v1 = self.project(t, q, v)
+            moved = jnp.max(jnp.abs(jnp.concatenate([q1 - q, v1 - v])), initial=0.0)
+            return k + 1, q1, v1, moved > FAR
+
+        return jax.lax.while_loop(lambda s: (s[0] < steps) & s[-1], again, (0, q, v, jnp.array(True)))[1:3]
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives of a projection that returns it. By default it is projected again."""
         return self.project(t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, known: Any = None) -> Tangential:
-        """What projection at q leaves of small changes of positions and velocities. By default: all of them.
-
-        `known`, if any, is what `kept` returned where it returned q.
-        """
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+        """What projection at q leaves of small changes of positions and velocities. By default: all of them."""
         return Tangential(dq, dv)
 
     @abstractmethod

@@ -91,12 +91,7 @@ class Equations(MechanismMotion):
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
         return fast.project(self, t, q, v)
 
-    def kept(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Any]:
-        """`project`, and the factors that it found."""
-        return super().kept(t, q, v) if self.branches or not self.eliminates else fast.kept(self, t, q, v)
-
-    def closed(self, t: Any, q: Vector, v: Vector, steps: Any = 2) -> tuple[Vector, Vector, Array]:
-        """`project`, with further steps in velocity, too, and how far the last step moved any coordinate or velocity."""
+    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
         by_elimination = self.eliminates and not self.branches
         return fast.closed(self, t, q, v, steps) if by_elimination else super().closed(t, q, v, steps)
 
@@ -104,9 +99,9 @@ class Equations(MechanismMotion):
         """A state on the manifold, with the derivatives that `project` has where it returns it."""
         return fast.as_projected(self, t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector, known: Any = None) -> Tangential:
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
-        return fast.tangential(self, t, q, v, dq, dv, known)
+        return fast.tangential(self, t, q, v, dq, dv)
 
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""

@@ -74,8 +74,8 @@ class Task(NamedTuple):
     """What to march along. Numbers are one for each lane, or one for all."""
 
     accelerations: Callable[..., Array]  # of lanes: (t, q, v) -> a
-    project: Callable[..., tuple[Array, Array, Any]]  # (t, q, v) -> q, v, what `lasting` is to know of them
-    lasting: Callable[..., Tangential]  # (t, q, v, error of q, error of v, what is known) -> the errors as they count
+    project: Callable[..., tuple[Array, Array]]  # (t, q, v) -> q, v
+    lasting: Callable[..., Tangential]  # (t, q, v, error of q, error of v) -> the errors as they count
     careful: Callable[..., Trial] | None  # takes a step again, by equations that may branch; None: the lane ends as `DOUBTED`
     doubts: bool  # whether accelerations that are not a number mean that a step wants care
     ts: Array  # (T, *lanes)
@@ -93,20 +93,19 @@ def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial
     last = task.method.stages
 
     def end(state):
-        q, v, known = task.project(t1, *state[1:3])
-        return t1, q, v, undifferentiated(known)
+        q, v = task.project(t1, *state[1:])
+        return t1, q, v
 
     def stage(i, carry):
-        a, *into, known = carry
+        a, *into = carry
         t, q, v = stage_state(task.method, here, h, a, i, into)
-        t, q, v, known = when(i == last, end, (t, q, v, known))
-        return jax.lax.dynamic_update_index_in_dim(a, task.accelerations(t, q, v), i, 0), q, v, known
+        t, q, v = when(i == last, end, (t, q, v))
+        return jax.lax.dynamic_update_index_in_dim(a, task.accelerations(t, q, v), i, 0), q, v
 
     a = jnp.zeros((last + 1, *here.a.shape), here.a.dtype).at[0].set(here.a)
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(end, here)[-1])
     start = jnp.where(jnp.all(begin), last, 1)
-    a, q1, v1, known = jax.lax.fori_loop(start, last + 1, stage, (a, here.q, here.v, nothing))
-    return judged(task, here, Point(t1, q1, v1, a[last]), h, a[:last], jnp.where(begin, 1, last), known)
+    a, q1, v1 = jax.lax.fori_loop(start, last + 1, stage, (a, here.q, here.v))
+    return judged(task, here, Point(t1, q1, v1, a[last]), h, a[:last], jnp.where(begin, 1, last))
 
 
 def stage_state(
@@ -132,13 +131,13 @@ def stage_state(
     return here.t + node * h, q, v
 
 
-def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: Any, known: Any) -> Trial:
+def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: Any) -> Trial:
     """A step with its error; of a method whose last stage is the next step's first, that is the one after projection."""
     method = task.method
     a = a.at[-1].set(to.a) if method.ends else a
     error_v = h * _combine(method.error_v, a)
     error_q = h * (h * _combine(method.error_q, a))
-    error_q, error_v, far = task.lasting(to.t, to.q, to.v, error_q, error_v, known)
+    error_q, error_v, far = task.lasting(to.t, to.q, to.v, error_q, error_v)
     size = jnp.maximum(_relative(task, error_q, here.q, to.q), _relative(task, error_v, here.v, to.v))
     size = jnp.where(_over_all(jnp.logical_and, jnp.all, jnp.isfinite(to.a)), size, jnp.nan)
     evaluations = jnp.broadcast_to(jnp.asarray(evaluations), size.shape)

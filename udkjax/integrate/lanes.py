@@ -24,8 +24,7 @@ from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.straightline import Loop, apart, when
 
 ROUND = 8  # lanes: what the widest vector units hold
-FAR = 1e-8  # m, rad, m/s, rad/s: a step of a projection leaves rounding errors of what is nearer to the manifold
-PASSES = 6  # projections of an output: where two branches of the manifold meet, Newton's method halves the distance in a step
+STEPS = 7  # to an output: where two branches of the manifold meet, Newton's method halves the distance in each
 LANES = 64  # with 16 or 32 a lane of the paper's linkage takes longer, with 128 no less
 # A single run has its outputs projected side by side, too, where that fills vectors and does not take long to compile.
 FEW_OUTPUTS, FEW_BODIES = 16, 12
@@ -124,7 +123,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     over = lanes.within(None if recorded else _loop_of(problem, lanes)).over
     task = Task(
         partial(over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
-        partial(over, lambda e, t, q, v: e.quick.kept(t, q, v)) if problem.projected else lambda t, q, v: (q, v, None),
+        partial(over, lambda e, t, q, v: e.quick.project(t, q, v)) if problem.projected else lambda t, q, v: (q, v),
         partial(over, lasting) if problem.projected else _all_of_it,
         None,
         problem.equations.branches,
@@ -141,7 +140,7 @@ def _loop_of(problem: Problem, lanes: Lanes) -> Loop | None:
     return Loop(lanes.size is not None) if few else None
 
 
-def _all_of_it(t: Array, q: Array, v: Array, dq: Array, dv: Array, known: Any) -> Tangential:
+def _all_of_it(t: Array, q: Array, v: Array, dq: Array, dv: Array) -> Tangential:
     """Errors where nothing takes any of them back."""
     return Tangential(dq, dv, jnp.ones(t.shape, bool))
 
@@ -185,7 +184,8 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
             return i + 1, jax.lax.dynamic_update_index_in_dim(a, found, i, 0), q, v, ~jnp.all(jnp.isfinite(found))
 
         def more(carry: Any) -> Any:  # a loop that XLA compiles into one function, and what it cannot
-            carry = jax.lax.while_loop(lambda c: (c[0] <= stages) & ~c[-1], partial(stage, equations.quick), carry)
+            quick = equations.quick.within(Loop())
+            carry = jax.lax.while_loop(lambda c: (c[0] <= stages) & ~c[-1], partial(stage, quick), carry)
             return jax.lax.cond(carry[-1], again, lambda c: c, carry)
 
         def again(carry: Any) -> Any:
@@ -198,7 +198,7 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
         _, a, q1, v1, _ = jax.lax.while_loop(lambda c: c[0] <= stages, more, first)
         mine, evaluations = task._replace(rtol=rtol, atol=atol), jnp.where(begin, 2, 2 * stages + 1)
         mine = mine._replace(lasting=partial(lasting, equations)) if projected else mine
-        return judged(mine, here._replace(a=a[0]), Point(t1, q1, v1, a[stages]), h, a[:stages], evaluations, None)
+        return judged(mine, here._replace(a=a[0]), Point(t1, q1, v1, a[stages]), h, a[:stages], evaluations)
 
     tolerances = (jnp.broadcast_to(x, h.shape) for x in (task.rtol, task.atol))
     unknown = jnp.zeros((stages, *here.a.shape)) if task.recorded else None
@@ -237,15 +237,7 @@ def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], t
 
 def _output(projected: bool, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array]:
     """Interpolated states (2n, *lanes), returned to the manifold, and how they violate the constraints."""
-    inside = lanes.within(Loop(lanes.size is not None))
-
-    def again(carry: Any) -> Any:
-        k, y, far = carry
-        steps = jnp.where(k == 0, 2, 1)  # where two are not enough, those that follow want factors of their own
-        *nearer, moved = inside.over(lambda e, t, y: e.forgiving.closed(t, *jnp.split(y, 2), steps), t, y)
-        return k + 1, jnp.where(far, jnp.concatenate(nearer), y), far & ~(moved <= FAR)
-
     if projected:
-        start = 0, y, jnp.ones(lanes.shape, bool)  # no lane's result depends on those beside it
-        y = jax.lax.while_loop(lambda c: jnp.any(c[2]) & (c[0] < PASSES), again, start)[1]
+        inside = lanes.within(Loop(lanes.size is not None))  # what closes it is a loop
+        y = inside.over(lambda e, t, y: jnp.concatenate(e.forgiving.closed(t, *jnp.split(y, 2), STEPS)), t, y)
     return y, lanes.over(violation, t, y)

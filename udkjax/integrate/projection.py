@@ -28,13 +28,13 @@ def project(equations: Motion, t: Any, y: Float[Array, "2n"]) -> Float[Array, "2
     return jnp.concatenate(equations.project(t, q, v))
 
 
-def lasting(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array, known: Any = None) -> Tangential:
+def lasting(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array) -> Tangential:
     """The errors dq and dv of a step that ends in q and v, with what projection takes back of them counted by `TAKEN_BACK`.
 
-    Close to dependent rows it need not be exact, and does not branch. `known` is what `Motion.kept` returned with q and v.
+    Close to dependent rows it need not be exact, and does not branch.
     """
-    q, v, dq, dv, known = undifferentiated((q, v, dq, dv, known))
-    left_q, left_v, far = undifferentiated(equations.forgiving).tangential(t, q, v, dq, dv, known)
+    q, v, dq, dv = undifferentiated((q, v, dq, dv))
+    left_q, left_v, far = undifferentiated(equations.forgiving).tangential(t, q, v, dq, dv)
     return Tangential(left_q + TAKEN_BACK * (dq - left_q), left_v + TAKEN_BACK * (dv - left_v), jnp.asarray(far))
 
 

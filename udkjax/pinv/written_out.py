@@ -41,6 +41,13 @@ class Known(NamedTuple):
     sent: Array  # (summands, fronts)
 
 
+class Right(NamedTuple):
+    """Their part of a right-hand side."""
+
+    own: Array  # (e, fronts)
+    carried: Array  # (summands, fronts)
+
+
 class WrittenOut:
     """The elimination of all D of one pattern: `levels` of fronts that are alike, the deepest first."""
 
@@ -100,7 +107,7 @@ class WrittenOut:
         factors, safe, sent = [], [], jnp.zeros(0, D.dtype)
         for level in self.levels:
             known = [Known(*cut([_take(D.ravel(), group.D), _take(sent, group.sent)])) for group in level]
-            done = [group.code.up(*each, drop, loop) for group, each in zip(level, known, strict=True)]
+            done = [group.code.up(each.D, each.sent, drop, loop) for group, each in zip(level, known, strict=True)]
             sent = _joined([x for update, _ in done for x in update], jnp)
             safe += [s for _, s in done]
             factors.append(known)
@@ -108,18 +115,21 @@ class WrittenOut:
 
     def solve(self, factors: Any, r: Array, loop: Loop | None) -> Array:
         """Return y (rows of a block, blocks) with D D^T y = r; zero beyond a block's size."""
-        reduced, sent = [], jnp.zeros(0, r.dtype)
+        rights, sent = [], jnp.zeros(0, r.dtype)
         for level, known in zip(self.levels, factors, strict=True):
-            right = [cut([_take(r.ravel(), group.rows), _take(sent, group.carried)]) for group in level]
-            each = zip(level, known, right, strict=True)
-            sent = _joined([x for group, front, some in each for x in group.code.forward(*front, *some, loop)], jnp)
-            reduced.append(right)
+            right = [Right(*cut([_take(r.ravel(), group.rows), _take(sent, group.carried)])) for group in level]
+            parts: list[Array] = []
+            for group, k, b in zip(level, known, right, strict=True):
+                parts += group.code.forward(k.D, k.sent, b.own, b.carried, loop)
+            sent = _joined(parts, jnp)
+            rights.append(right)
         found = jnp.zeros(0, r.dtype)
-        for level, known, right in zip(reversed(self.levels), reversed(factors), reversed(reduced), strict=True):
-            above = [cut([_take(found, group.above)])[0] for group in level]
-            each = zip(level, known, right, above, strict=True)
-            parts = [x for group, front, some, x in each for x in group.code.backward(*front, *some, x, loop)]
-            found = _joined([found, *parts], jnp)
+        for level, known, right in zip(reversed(self.levels), reversed(factors), reversed(rights), strict=True):
+            parts = [found]
+            for group, k, b in zip(level, known, right, strict=True):
+                (above,) = cut([_take(found, group.above)])
+                parts += group.code.backward(k.D, k.sent, b.own, b.carried, above, loop)
+            found = _joined(parts, jnp)
         y = _take(found, self.solution).reshape(r.shape)
         return jnp.where(self.padding, 0, y) if self.padding.any() else y
 
