@@ -13,6 +13,7 @@ import udkjax as udk
 from udkjax.equations import large, redundancy
 from udkjax.equations.udwadia_kalaba import prepare
 from udkjax.pinv.blocks import Sums
+from udkjax.straightline import Loop
 
 
 def everything() -> udk.Mechanism:
@@ -326,7 +327,7 @@ def side_by_side(one, copies, off=0.0):
     return udk.Mechanism(bodies, joints)
 
 
-@pytest.mark.parametrize("name", ["accelerations", "factor", "step", "psi_dot_kept"])
+@pytest.mark.parametrize("name", ["accelerations", "nearer", "tangential", "psi_dot_kept"])
 def test_two_of_them_take_twice_the_operations_of_one(name):
     one = udk.library.four_bar()
     counts = [prepare(m, udk.Elimination(), large=False).code.program(name).count() for m in (one, side_by_side(one, 2))]
@@ -420,3 +421,44 @@ def test_the_cost_of_a_right_hand_side_grows_with_the_scene(n):
         return cost["flops"]
 
     assert np.log(flops(n) / flops(n // 10)) / np.log(10) < 1.1
+
+
+def marched(equations, loop, q, v):
+    """A state after three rounds of what a step asks for, in a loop of which XLA does not know how long it is."""
+    equations = equations.quick if loop is None else equations.quick.within(loop)
+
+    def again(_, state):
+        q, v = state
+        a = equations.accelerations(0.0, q, v)
+        q, v = equations.project(0.0, q + 1e-3 * v, v + 1e-3 * a)
+        return q, v + 1e-9 * equations.tangential(0.0, q, v, a, v).dq
+
+    return jax.lax.fori_loop(0, jnp.where(jnp.sum(q * q) > 0.0, 3, 2), again, (q, v))
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: udk.library.n_four_bar(7, 1.0), lambda: udk.library.chain(12, 0.4)], ids=["loops", "chain"]
+)
+def test_in_a_loop_that_is_one_function_it_is_written_out(make):
+    mech = make()
+    equations, loop = prepare(mech, large=True), Loop()
+    q, v = mech.q0.ravel(), mech.v0.ravel() + jnp.linspace(0.1, 0.3, mech.q0.size)
+    runs = [jax.jit(partial(marched, equations, x)).lower(q, v) for x in (loop, None)]
+    assert [run.as_text().count("mhlo.fusion") > 0 for run in runs] == [loop.fuses, False]
+    for found, expected in zip(*(run.compile()(q, v) for run in runs), strict=True):
+        assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
+
+
+def test_batches_and_derivatives_of_such_loops_are_those_by_levels():
+    """Batches of fronts would be too much to compile where they are no fusions."""
+    mech = udk.library.n_four_bar(5, 1.0)
+    equations = prepare(mech, large=True)
+    q, v = mech.q0.ravel(), mech.v0.ravel() + jnp.linspace(0.1, 0.3, mech.q0.size)
+    several = jnp.stack([v, 2 * v])
+    lanes, plain = (jax.jit(jax.vmap(partial(marched, equations, x), (None, 0))) for x in (Loop(batch=True), None))
+    assert lanes.lower(q, several).as_text().count("mhlo.fusion") == 0
+    for found, expected in zip(lanes(q, several), plain(q, several), strict=True):
+        assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
+    along = [jax.jit(lambda v, x=x: jax.jvp(partial(marched, equations, x, q), (v,), (v,))[1])(v) for x in (Loop(), None)]
+    for found, expected in zip(*along, strict=True):
+        assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

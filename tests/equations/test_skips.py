@@ -352,7 +352,7 @@ def test_a_duplicated_joint_adds_no_operation(linkage, plain, copies, baumgarte)
 
 def test_a_duplicated_joint_adds_no_operation_to_the_projection(linkage):
     more = {f"{name} again": joint for name, joint in linkage.joints.items()}
-    for name in ("factor", "step", "psi_kept", "psi_dot_kept"):
+    for name in ("nearer", "tangential"):
         counts = [prepare(m, ELIMINATION).code.program(name).count() for m in (linkage, joined(linkage, joints=more))]
         assert counts[0] == counts[1], name
 
@@ -407,12 +407,13 @@ def test_a_chain_of_loops_grows_linearly():
     assert counts[2] - counts[1] < 1.2 * (counts[1] - counts[0])
 
 
-def test_a_projection_factorizes_once(linkage):
-    """Two steps in position and two in velocity by the factors of one position: 11 reciprocals, of the pivots."""
+def test_a_step_of_a_projection_factorizes_once(linkage):
+    """In position and velocity at once, and all steps are rounds of one loop: 11 reciprocals, of the pivots."""
     equations = prepare(linkage, ELIMINATION)
     text = lowered(lambda t, q, v: equations.project(t, q, v), 0.0, linkage.q0.ravel(), linkage.v0.ravel())
-    assert operations(text)["divide"] == 11
-    assert arithmetic(text) <= 3 * arithmetic(right_hand_side(linkage))
+    assert text.count("stablehlo.divide") == 11
+    step, a = (sum(equations.code.program(name).count().values()) for name in ("nearer", "accelerations"))
+    assert step <= 1.5 * a  # with a choice at each pivot, and for two residuals
 
 
 def test_numbers_that_change_do_not_compile_anew(linkage):
@@ -514,5 +515,5 @@ def test_a_projection_is_differentiated_by_one_further_factorization(linkage):
     q, v = linkage.q0.ravel(), linkage.v0.ravel()
     project = lambda q, v: equations.project(0.0, q, v)  # noqa: E731
     value, both = lowered(project, q, v), lowered(lambda q, v: jax.jvp(project, (q, v), (v, q)), q, v)
-    assert operations(both)["divide"] == 22
-    assert arithmetic(both) <= 2 * arithmetic(value)
+    assert [text.count("stablehlo.divide") for text in (value, both)] == [11, 22]
+    assert both.count("stablehlo.multiply") <= 2.1 * value.count("stablehlo.multiply")

@@ -284,27 +284,20 @@ def test_the_tangential_part_is_what_projection_leaves(mechanisms, nearby, metho
 
 @pytest.mark.parametrize("method", [udk.Auto(), udk.SVD()], ids=["Auto", "SVD"])
 @pytest.mark.parametrize("name", ["parallelogram", "slider_crank"])
-def test_what_a_projection_knows_besides(nearby, method, name):
-    """How far its last step went, beyond which nothing is left; and the factors, with which the tangential part is the same."""
+def test_closing_goes_on_until_nothing_moves(nearby, method, name):
     mech, (q, *_), (v, *_) = nearby(name)
-    dq, dv = 1e-7 * np.random.default_rng(4).standard_normal((2, len(q)))
 
     @eqx.filter_jit
     def found(mech, q, v):
         equations, t = prepare(mech, method).quick, 0.0
-        *first, moved = equations.closed(t, q, v)
-        *second, still = equations.closed(t, *first)
-        *end, known = equations.kept(t, q, v)
-        parts = [equations.tangential(t, *end, dq, dv, k)[:2] for k in (known, None)]
-        return first, second, (moved, still), equations.violation(t, *first), parts, (end, equations.project(t, q, v))
+        first = equations.closed(t, q, v, 7)
+        return first, equations.closed(t, *first, 7), equations.violation(t, *first)
 
-    for off in (1.0, 1e3):  # times 1e-7
-        first, second, (moved, still), violated, parts, ends = found(mech, q, v + (off - 1) * (v - mech.v0.ravel()))
-        assert still < 1e-14 and (moved < 1e-8 or method == udk.SVD())
+    for off in (1.0, 1e3, 1e5):  # times 1e-7
+        start = mech.q0.ravel() + off * (q - mech.q0.ravel()), mech.v0.ravel() + off * (v - mech.v0.ravel())
+        first, second, violated = found(mech, *start)
         assert_allclose(first, second, atol=1e-14)
         assert_allclose(jnp.concatenate(violated), 0.0, atol=1e-13)
-        assert_allclose(parts[0], parts[1], atol=1e-12)
-        assert_allclose(*ends, atol=0)
 
 
 def test_bodies_without_constraints_fall_freely(twin):

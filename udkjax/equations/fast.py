@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 
 from udkjax.equations.code import scalars, stacked
 from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, those
-from udkjax.equations.motion import Tangential, Vector
+from udkjax.equations.motion import STEPS, Tangential, Vector
 from udkjax.equations.plain import plain_accelerations, plain_project, plain_tangential
 from udkjax.straightline import along
 
@@ -34,7 +34,7 @@ def accelerations(program: str, equations: "Equations", t: Any, q: Vector, v: Ve
 
 def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     """As the plain form, by Newton steps in position and velocity at once."""
-    return closed(equations, t, q, v, 2)
+    return closed(equations, t, q, v, STEPS)
 
 
 def closed(equations: "Equations", t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
@@ -48,8 +48,8 @@ def closed(equations: "Equations", t: Any, q: Vector, v: Vector, steps: int) -> 
 def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any, Any]:
     """q and v, numbers in any case, and whether they can be trusted.
 
-    A Newton step takes v to where Psi_dot = 0 at the q that it starts from, so the last must not move q. There are at most so
-    many `steps`. Derivatives are taken where q and v are then.
+    A Newton step takes the given v to where Psi_dot = 0 at the q that it starts from, so the last must not move q. There are at
+    most so many `steps`. Derivatives are taken where q and v are then.
     """
     if not equations.eliminates:
         return plain_project(equations, t, q, v), jnp.array(True)
@@ -58,15 +58,16 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
     # On scalars until all is done: vectors that a loop carries have the batch first under vmap, where the programs have it last.
 
     def nearer(state: Any) -> Any:
-        k, q, v, _, safe = state
-        *found, still = equations.call(program, t, *q, *v)
+        k, q, _, _, safe = state
+        *found, still = equations.call(program, t, *q, *vs)
         q1, v1 = found[: len(q)], found[len(q) :]
         return k + 1, q1, v1, _largest_change(q1, q), safe & still
 
     def more(state: Any) -> Any:
         return (state[0] < steps) & ~(state[3] <= FAR)
 
-    start = 0, scalars([q]), scalars([v]), jnp.inf, jnp.array(True)
+    vs = scalars([v])
+    start = 0, scalars([q]), vs, jnp.inf, jnp.array(True)
     _, *found, _, safe = jax.lax.while_loop(more, nearer, start)
     found = [stacked(x) for x in found]
     if equations.branches:

@@ -21,7 +21,7 @@ from udkjax.equations.alike import Fields
 from udkjax.equations.code import CONSISTENT, NEAR, TINY, structure
 from udkjax.equations.large_plain import branch, by_method, plain_accelerations, plain_correction, plain_project, plain_tangential
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
-from udkjax.equations.motion import FAR, MechanismMotion, Tangential, Vector
+from udkjax.equations.motion import FAR, STEPS, MechanismMotion, Tangential, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.block_methods import BlockElimination, DenseParts, factorized, solved
 from udkjax.pinv.blocks import by_block, flat
@@ -72,7 +72,7 @@ class LargeEquations(MechanismMotion):
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
-        return self.closed(t, q, v, 2)
+        return self.closed(t, q, v, STEPS)
 
     def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
         """By at most so many Newton steps in position, and one in velocity."""

@@ -12,6 +12,7 @@ from udkjax.straightline import Loop
 
 Vector = Float[Array, "n"]
 
+STEPS = 3  # of Newton's method in a projection, at most: the last of which usually finds nothing to do
 FAR = 1e-8  # m, rad: Newton's method converges quadratically, and leaves rounding errors of a residual that moves less
 
 

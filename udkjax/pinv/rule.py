@@ -204,7 +204,7 @@ def _apply(plus: Plus, b):
 
 @eqxi.filter_primitive_def
 def _shape_of_apply(plus, b):
-    structs = jtu.tree_map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), (plus, b))
+    structs = jtu.tree_map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), (plus, b))
     out = jax.eval_shape(_apply, *structs)
     return jax.core.ShapedArray(out.shape, out.dtype)
 

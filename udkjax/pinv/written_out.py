@@ -231,7 +231,7 @@ def _met(fronts: Sequence[Front], rows: _Rows) -> dict[int, np.ndarray]:
 def _take(values: Array, places: np.ndarray) -> Array:
     if not places.size:
         return jnp.zeros(places.shape, values.dtype)
-    return values.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return jnp.asarray(values).at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _joined(parts: Sequence[Any], numpy: Any = np) -> Any:

@@ -122,10 +122,10 @@ class Parts:
         """What it computes, by itself."""
         function = jaxpr_as_fun(self.jaxpr)
         if self.size is None:
-            return function(*(x for array in arrays for x in _rows(array.reshape(-1))))
+            return function(*(x for array in arrays for x in _rows(jnp.reshape(array, -1))))
         axes = tuple(0 if b else None for b, numbers in zip(self.batched, self.given, strict=True) for _ in numbers)
         each = zip(arrays, self.batched, strict=True)
-        rows = [x for array, b in each for x in _rows(array.reshape(-1, self.size) if b else array.reshape(-1))]
+        rows = [x for array, b in each for x in _rows(jnp.reshape(array, (-1, self.size) if b else -1))]
         return jax.vmap(function, in_axes=axes, axis_size=self.size)(*rows)
 
     def around(self, *arrays: Any) -> list[Any]:
