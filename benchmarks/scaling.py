@@ -1,4 +1,7 @@
-"""How one right-hand side grows with the scene: operations, time, memory, and what it takes until the first one is evaluated."""
+"""How one right-hand side grows with the scene: operations, time, memory, and what it takes until the first one is evaluated.
+
+Each is evaluated as a run evaluates it: in a loop that XLA compiles into one function.
+"""
 
 import statistics
 import time
@@ -11,6 +14,7 @@ import numpy as np
 import udkjax as udk
 from benchmarks.common import Compiled, in_turn, machine, report
 from udkjax.equations import prepare
+from udkjax.straightline import Loop
 
 SIZES = {"N-four-bar": (1, 2, 5, 10, 20, 40, 100, 200, 1000), "chain": (1, 10, 100, 1000)}
 STRAIGHT = (1, 2, 5, 10, 20)  # N-four-bars as straight-line code, whatever the size: compiling more takes minutes
@@ -30,7 +34,7 @@ def chain(n: int) -> udk.Mechanism:
 
 
 def measured(name: str, make: Any, n: int, large: bool | None, evaluations: int) -> tuple[dict[str, Any], Any]:
-    """Build, compile and count; and a program of many evaluations, each of which needs the one before, to be timed."""
+    """Build, compile and count a loop of evaluations, as in a run: each needs the one before; and what times it."""
     seconds = {}
 
     def timed(part: str, function: Any) -> Any:
@@ -42,20 +46,21 @@ def measured(name: str, make: Any, n: int, large: bool | None, evaluations: int)
     mechanism = timed("build", lambda: make(n))
     equations = timed("prepare", lambda: prepare(mechanism, large=large))
     y = np.asarray(mechanism.q0).ravel(), np.asarray(mechanism.v0).ravel()
-    rhs = jax.jit(lambda e, q, v: e.quick.accelerations(0.0, q, v))
-    lowered = timed("trace", lambda: rhs.lower(equations, *y))
+
+    def repeat(e: Any, q: Any, v: Any, rounds: Any) -> Any:
+        inside = e.quick.within(Loop())
+        step = lambda _, y: (y[0] + 1e-12 * y[1], y[1] + 1e-12 * inside.accelerations(0.0, *y))  # noqa: E731
+        return jax.lax.fori_loop(0, rounds, step, (q, v))
+
+    lowered = timed("trace", lambda: jax.jit(repeat).lower(equations, *y, evaluations))
     compiled = timed("compile", lowered.compile)
     cost, memory = compiled.cost_analysis(), compiled.memory_analysis()
     bodies = len(mechanism.body_names)
     figures = {"name": name, "n": n, "bodies": bodies, "form": type(equations).__name__, "flops": cost["flops"], **seconds}
     figures["temporary_bytes"], figures["argument_bytes"] = memory.temp_size_in_bytes, memory.argument_size_in_bytes
 
-    def repeat(e: Any, q: Any, v: Any) -> Any:
-        step = lambda _, y: (y[0] + 1e-12 * y[1], y[1] + 1e-12 * e.quick.accelerations(0.0, *y))  # noqa: E731
-        return jax.lax.fori_loop(0, evaluations, step, (q, v))
-
-    program = Compiled(repeat, equations, *y)
-    return figures, lambda at_least: program.cpu_seconds(equations, *y, at_least=at_least) / evaluations
+    program = Compiled(repeat, equations, *y, evaluations)
+    return figures, lambda at_least: program.cpu_seconds(equations, *y, evaluations, at_least=at_least) / evaluations
 
 
 def exponent(rows: list[dict[str, Any]], key: str, form: str | None = None) -> float:

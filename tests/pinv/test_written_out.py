@@ -90,7 +90,7 @@ def test_as_fusions_of_a_loop_it_is_the_same(name):
     def solved(loop):
         def again(state):
             k, r, safe = state
-            factors, still = code.factor(D, DROP, loop)
+            factors, still = code.factor(jnp.asarray(D), DROP, loop)
             return k - 1, code.solve(factors, r, loop), safe & still
 
         return jax.jit(lambda k: jax.lax.while_loop(lambda s: s[0] > 0, again, (k, jnp.asarray(r), jnp.array(True))))
