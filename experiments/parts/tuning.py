@@ -142,9 +142,9 @@ def drift_of_steps(mechanism: udk.Mechanism, method: Pseudoinverse, most: int) -
     def run(gains: Any, state: udk.State, span: Any, steps: Any) -> Any:
         equations: Any = prepare(mechanism, method, udk.Baumgarte(gains[0], gains[1]))
         # None of the estimates of errors is looked at: tolerances of one, and all errors last.
-        lasting = lambda t, q, v, dq, dv, known: Tangential(dq, dv, jnp.array(True))  # noqa: E731
+        lasting = lambda t, q, v, dq, dv: Tangential(dq, dv, jnp.array(True))  # noqa: E731
         numbers = (jnp.stack([0.0, span]), jnp.ones(()), jnp.ones(()), jnp.zeros(()))
-        task = Task(equations.accelerations, lambda t, q, v: (q, v, None), lasting, None, False, *numbers, None, 1, DOPRI8)
+        task = Task(equations.accelerations, lambda t, q, v: (q, v), lasting, None, False, *numbers, None, 1, DOPRI8)
         h, no, q, v = span / steps, jnp.array(False), state.q.ravel(), state.v.ravel()
         t = jnp.zeros(())
         first = Point(t, q, v, equations.accelerations(t, q, v))
