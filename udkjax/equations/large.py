@@ -8,22 +8,21 @@ other is a matrix (rows, coordinates), for what that costs.
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from udkjax.equations import large_fast
 from udkjax.equations.alike import Fields
-from udkjax.equations.code import CONSISTENT, NEAR, TINY, structure
-from udkjax.equations.large_plain import branch, by_method, plain_accelerations, plain_correction, plain_project, plain_tangential
+from udkjax.equations.code import structure
+from udkjax.equations.large_plain import by_method, plain_accelerations
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
-from udkjax.equations.motion import FAR, STEPS, MechanismMotion, Tangential, Vector
+from udkjax.equations.motion import STEPS, MechanismMotion, Tangential, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
-from udkjax.pinv.block_methods import BlockElimination, DenseParts, factorized, solved
+from udkjax.pinv.block_methods import BlockElimination, DenseParts
 from udkjax.pinv.blocks import by_block, flat
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Loop
@@ -54,7 +53,7 @@ class LargeEquations(MechanismMotion):
 
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
         """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
-        return _compiled(_accelerations if self.by_levels else _plainly, self, t, q, v, watch)
+        return _compiled(large_fast.accelerations if self.by_levels else _plainly, self, t, q, v, watch)
 
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         """lambda = -(D^+)^T D^+ b of all rows: by elimination where none is left out, else by singular values."""
@@ -76,15 +75,15 @@ class LargeEquations(MechanismMotion):
 
     def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
         """By at most so many Newton steps in position, and one in velocity."""
-        return _compiled(_project, self, t, q, v, steps)
+        return _compiled(large_fast.project, self, t, q, v, steps)
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives that `project` has where it returns it."""
-        return _compiled(_as_projected, self, t, q, v)
+        return _compiled(large_fast.as_projected, self, t, q, v)
 
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
-        return _compiled(_tangential, self, t, q, v, dq, dv)
+        return _compiled(large_fast.tangential, self, t, q, v, dq, dv)
 
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows: also of those that the method leaves out."""
@@ -261,102 +260,3 @@ def _called(function: Any, *arguments: Any) -> Any:
 
 def _plainly(equations: LargeEquations, t: Any, q: Vector, v: Vector, _: bool) -> Vector:
     return plain_accelerations(equations, t, q, v)
-
-
-# --- fast
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(4,))
-def _accelerations(equations: LargeEquations, t: Any, q: Vector, v: Vector, watch: bool) -> Vector:
-    layout, root = equations.layout, equations.numbers["root"]
-    free = equations.free(t, q, v)
-    if not len(layout.kept.rows):
-        return flat(free)
-    D, b = equations.arrays(layout.kept, ["D", "b"], t, q, v, free)
-    pattern = layout.kept.pattern
-    factors, safe = factorized(pattern, D, equations.drop, loop=equations.loop)
-    x = pattern.rmatvec(D, solved(pattern, factors, b, equations.loop))
-    a = flat(free + root * x)
-    if watch and layout.left_out:
-        safe = safe & _satisfied(equations, t, q, v, free, x)
-    return _checked(equations, safe, a, plain_accelerations, t, q, v)
-
-
-def _satisfied(equations: LargeEquations, t: Any, q: Vector, v: Vector, free: Array, x: Array) -> Bool[Array, ""]:
-    """Whether the accelerations satisfy the rows left out, too: D x = b, relative to the size of its terms."""
-    rows = equations.layout.all
-    D, b = equations.arrays(rows, ["D", "b"], t, q, v, free)
-    sum_of = rows.pattern.matvec
-    return jnp.all(jnp.abs(sum_of(D, x) - b) <= CONSISTENT * (sum_of(jnp.abs(D), jnp.abs(x)) + jnp.abs(b)) + TINY)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(4,))
-def _project(equations: LargeEquations, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
-    return _fast_project(equations, t, q, v, steps) if equations.by_levels else plain_project(equations, t, q, v)
-
-
-@_project.defjvp
-def _(steps, primals, tangents):
-    equations, t, q, v = primals
-    return jax.jvp(_as_projected, (equations, t, *_project(equations, t, q, v, steps)), tangents)
-
-
-@jax.custom_jvp
-def _as_projected(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    del equations, t
-    return q, v
-
-
-@_as_projected.defjvp
-def _(primals, tangents):
-    """Where the residuals vanish the tangents of one Newton step are those of the projection."""
-    _, _, q, v = primals
-    return (q, v), jax.jvp(plain_correction, primals, tangents)[1]
-
-
-def _fast_project(equations: LargeEquations, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
-    """Newton steps in position until one moves nothing, and one in velocity: rounds of one loop, so as to compile one of them."""
-    rows, root = equations.layout.kept, equations.numbers["root"]
-    if not len(rows.rows):
-        return q, v
-
-    def step(state: Any) -> Any:
-        k, q, v, closed, _, safe = state
-        D, psi, psi_dot = equations.arrays(rows, ["D", "psi", "psi_dot"], t, q, v)
-        factors, still = factorized(rows.pattern, D, equations.drop, loop=equations.loop)
-        y = solved(rows.pattern, factors, jnp.where(closed, psi_dot, psi), equations.loop)
-        x = flat(root * rows.pattern.rmatvec(D, y))
-        near = (jnp.max(jnp.abs(x)) <= FAR) | (k + 1 >= steps)
-        return k + 1, jnp.where(closed, q, q - x), jnp.where(closed, v - x, v), near, closed, safe & still
-
-    start = 0, q, v, *(jnp.array(x) for x in (False, False, True))
-    _, *found, _, _, safe = jax.lax.while_loop(lambda s: ~s[-2], step, start)
-    return _checked(equations, safe, tuple(found), plain_project, t, q, v)
-
-
-def _tangential(equations: LargeEquations, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
-    """As the plain form, with one elimination for all of it, and the rest of it in rounds of one loop."""
-    rows, root = equations.layout.kept, flat(equations.numbers["root"])
-    if not len(rows.rows) or not equations.by_levels or equations.branches:
-        return plain_tangential(equations, t, q, v, dq, dv)
-    (D,) = equations.arrays(rows, ["D"], t, q, v)
-    factors, far = factorized(rows.pattern, D, NEAR, loop=equations.loop)
-
-    def left(x: Vector) -> Vector:
-        residual = rows.pattern.matvec(D, by_block(x / root, 3))
-        return x - root * flat(rows.pattern.rmatvec(D, solved(rows.pattern, factors, residual, equations.loop)))
-
-    first, second = jax.lax.map(left, jnp.stack([dq, dv]))
-    return Tangential(first, second, far)
-
-
-_accelerations.defjvp(lambda watch, primals, tangents: jax.jvp(plain_accelerations, primals, tangents))
-
-
-def _checked(equations: LargeEquations, safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
-    """Take what elimination gave where its pivots are safe; else turn to the dense method, or say that it is not a number."""
-    if not equations.doubt:
-        return fast
-    if not equations.branches:
-        return jax.tree.map(lambda x: jnp.where(safe, x, jnp.nan), fast)
-    return branch(safe, lambda: fast, lambda: plain(equations.exact(), *state))
