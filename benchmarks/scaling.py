@@ -17,7 +17,7 @@ from udkjax.equations import prepare
 from udkjax.straightline import Loop
 
 SIZES = {"N-four-bar": (1, 2, 5, 10, 20, 40, 100, 200, 1000), "chain": (1, 10, 100, 1000)}
-STRAIGHT = (1, 2, 5, 10, 20)  # N-four-bars as straight-line code, whatever the size: compiling more takes minutes
+STRAIGHT = (1, 2, 5, 10, 20)  # N-four-bars as straight-line code, whatever the size: more is no fusion
 UP_TO = 200  # the exponents are those of N-four-bars of 1 to so many
 ROUNDS, AT_LEAST = 9, 0.05  # s
 EVALUATIONS = 40_000  # of one four-bar in a call: to hand over the numbers of 20 takes as long as 50 of their right-hand sides

@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.equations.expressions import Alike, alike, applied, differentiated
-from udkjax.pinv.blocks import take
+from udkjax.pinv.places import take
 from udkjax.scene.mechanism import Mechanism, attached
 from udkjax.straightline import Graph, Loop, Program, Scalar, along_elements, frontier
 

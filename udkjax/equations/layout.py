@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.alike import Fields, Group, constraint_kind, force_kind, groups, stack
 from udkjax.equations.motion import Vector
-from udkjax.pinv.blocks import BlockPattern, Sums, by_block, take
+from udkjax.pinv.blocks import BlockPattern, Sums, by_block
+from udkjax.pinv.places import take
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Loop
 from udkjax.straightline.trigonometry import sincos

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from udkjax.pinv.blocks import BlockPattern, by_block, flat, take
+from udkjax.pinv.blocks import BlockPattern, by_block, flat
+from udkjax.pinv.places import take
 from udkjax.pinv.rule import Pseudoinverse, number
 from udkjax.straightline import Loop
 

@@ -18,6 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from udkjax.pinv.levels import Levels
+from udkjax.pinv.places import take
 from udkjax.pinv.stretching import MANY, Stretched, stretch
 from udkjax.pinv.written_out import WrittenOut
 
@@ -45,11 +46,6 @@ class Sums:
         for fetched in self.near:
             total = total + take(padded, fetched)
         return total.at[..., self.there].add(take(values, self.far)) if len(self.far) else total
-
-
-def take(values: Float[Array, "*shape n"], places: np.ndarray) -> Array:
-    """values[..., places], for places that are known to exist."""
-    return jnp.asarray(values).at[..., places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 class BlockPattern:

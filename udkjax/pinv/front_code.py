@@ -45,7 +45,7 @@ class FrontCode:
     """The programs of a structure, for arrays (number, fronts)."""
 
     def __init__(self, structure: Structure):
-        graph, self.structure = Graph(), structure
+        graph = Graph()
         e, n = structure.eliminated, structure.eliminated + structure.boundary
 
         def inputs(name: str, count: int) -> list[Scalar]:

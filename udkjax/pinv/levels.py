@@ -20,6 +20,7 @@ from jax import Array, lax
 
 from udkjax.pinv.dissection import dissect
 from udkjax.pinv.fronts import Group, Plan, plan
+from udkjax.pinv.places import take
 from udkjax.straightline import barrier
 
 # Up to so many rows are eliminated by code written out, more by a loop: code grows with the square of their number.
@@ -99,14 +100,14 @@ class Levels:
         found = jnp.zeros(0, r.dtype)
         for (groups, group_factors), zs in reversed(list(zip(levels, reduced, strict=True))):
             found = cut(_flat([found, *(_backward(*each, found) for each in zip(groups, group_factors, zs, strict=True))]))
-        y = _take(found, self.plan.solution)
+        y = take(found, self.plan.solution)
         return y if min(self.sizes) == self.width else y * (np.arange(self.width) < np.array(self.sizes)[:, None])
 
 
 def _eliminate(group: Group, entries: Array, sent: Array | None, drop: Array | float) -> tuple[Factor, Array, Array]:
     """Return the factor of a group, its updates (b, b, fronts), and whether its pivots are safe."""
     e, b = group.eliminated, group.boundary
-    own = _take(entries, group.entries)
+    own = take(entries, group.entries)
     rows = cut(jnp.concatenate([_sum(sent, group.pivot, own[:, :e]), _sum(sent, group.side, own[:, e:])], axis=1))
     if e <= UNROLLED:
         for j in range(e - 1):
@@ -134,7 +135,7 @@ def _pivot(j: int | Array, rows: Array) -> Array:
 def _forward(group: Group, factor: Factor, right: Array, sent: Array | None) -> tuple[Array, Array]:
     """Return diag(p)^-1 L^-1 r of a group's rows, and what it sends up: W^T diag(p)^-1 L^-1 r, taken out."""
     e, b = group.eliminated, group.boundary
-    r = cut(_sum(sent, group.carried, _take(right, group.rows)))
+    r = cut(_sum(sent, group.carried, take(right, group.rows)))
     z = cut(_products(_lower(factor).swapaxes(0, 1), r[:, None]) * factor.inverse_pivots)
     passed = _sum(sent, group.passed, jnp.zeros((b, group.fronts), r.dtype))
     return z, cut(passed - _products(factor.rows[:, e:], z[:, None]))
@@ -142,7 +143,7 @@ def _forward(group: Group, factor: Factor, right: Array, sent: Array | None) -> 
 
 def _backward(group: Group, factor: Factor, z: Array, found: Array) -> Array:
     """Return the solution at a group's rows, when it has been found at their boundaries."""
-    x = cut(_take(found, group.above))
+    x = cut(take(found, group.above))
     t = z - _products(factor.rows[:, group.eliminated :].swapaxes(0, 1), x[:, None]) * factor.inverse_pivots
     return cut(_products(_lower(factor), cut(t)[:, None]))
 
@@ -164,12 +165,8 @@ def _products(a: Array, b: Array) -> Array:
     return sum((a[k] * b[k] for k in range(1, len(a))), a[0] * b[0])
 
 
-def _take(values: Array, places: np.ndarray) -> Array:
-    return values.at[places].get(mode="promise_in_bounds")
-
-
 def _sum(values: Array | None, places: np.ndarray, start: Array) -> Array:
-    return start if values is None else sum((_take(values, p) for p in places), start)
+    return start if values is None else sum((take(values, p) for p in places), start)
 
 
 def _flat(arrays: Sequence[Array]) -> Array:

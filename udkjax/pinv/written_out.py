@@ -14,11 +14,14 @@ from jax import Array
 
 from udkjax.pinv.dissection import Front, dissect
 from udkjax.pinv.front_code import FrontCode, Structure, front_code
+from udkjax.pinv.places import take
 from udkjax.pinv.subtrees import merged
 from udkjax.straightline import Loop, cut
 
-# Multiplications of all kinds of fronts together, at most: compiling takes a second for 2,000 of them.
-WRITTEN = 10_000
+# Multiplications of all kinds of fronts together, at most. Rows of loops and chains of any length have 1,100 to 2,100, of 10 to
+# 14 kinds; random trees of 40, 80 and 160 joints 1,900, 3,100 and 5,700, of 23, 34 and 56 kinds, and take 5, 12 and 22 s to
+# compile, where levels take 2.
+WRITTEN = 2_500
 VECTOR = 8  # numbers: what the widest vector units hold
 
 
@@ -106,7 +109,7 @@ class WrittenOut:
         """As `Levels.factor`, of D itself: return what `solve` takes, and whether every pivot is safe."""
         factors, safe, sent = [], [], jnp.zeros(0, D.dtype)
         for level in self.levels:
-            known = [Known(*cut([_take(D.ravel(), group.D), _take(sent, group.sent)])) for group in level]
+            known = [Known(*cut([take(D.ravel(), group.D), take(sent, group.sent)])) for group in level]
             done = [group.code.up(each.D, each.sent, drop, loop) for group, each in zip(level, known, strict=True)]
             sent = _joined([x for update, _ in done for x in update], jnp)
             safe += [s for _, s in done]
@@ -117,7 +120,7 @@ class WrittenOut:
         """Return y (rows of a block, blocks) with D D^T y = r; zero beyond a block's size."""
         rights, sent = [], jnp.zeros(0, r.dtype)
         for level, known in zip(self.levels, factors, strict=True):
-            right = [Right(*cut([_take(r.ravel(), group.rows), _take(sent, group.carried)])) for group in level]
+            right = [Right(*cut([take(r.ravel(), group.rows), take(sent, group.carried)])) for group in level]
             parts: list[Array] = []
             for group, k, b in zip(level, known, right, strict=True):
                 parts += group.code.forward(k.D, k.sent, b.own, b.carried, loop)
@@ -127,10 +130,10 @@ class WrittenOut:
         for level, known, right in zip(reversed(self.levels), reversed(factors), reversed(rights), strict=True):
             parts = [found]
             for group, k, b in zip(level, known, right, strict=True):
-                (above,) = cut([_take(found, group.above)])
+                (above,) = cut([take(found, group.above)])
                 parts += group.code.backward(k.D, k.sent, b.own, b.carried, above, loop)
             found = _joined(parts, jnp)
-        y = _take(found, self.solution).reshape(r.shape)
+        y = take(found, self.solution).reshape(r.shape)
         return jnp.where(self.padding, 0, y) if self.padding.any() else y
 
 
@@ -226,12 +229,6 @@ def _met(fronts: Sequence[Front], rows: _Rows) -> dict[int, np.ndarray]:
             local[mine] = np.arange(len(mine))
             met.update({child: local[rows.of(fronts[child].boundary)] for child in front.children})
     return met
-
-
-def _take(values: Array, places: np.ndarray) -> Array:
-    if not places.size:
-        return jnp.zeros(places.shape, values.dtype)
-    return jnp.asarray(values).at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _joined(parts: Sequence[Any], numpy: Any = np) -> Any:
