@@ -124,7 +124,7 @@ def stage_state(
     tableau = (method.nodes, method.q, method.v)
     node, *rows = (jax.lax.dynamic_index_in_dim(jnp.asarray(c), i, keepdims=False) for c in tableau)
     if not here.t.shape:
-        return here.t + node * h, *state(node, *rows)
+        return here.t + node * h, *cut(state(node, *rows))
     q, v = into
     for k, row in enumerate(zip(*tableau, strict=True)):
         q, v = when(i == k, lambda _, row=row: state(*row), (q, v)) if k else (q, v)
@@ -137,6 +137,7 @@ def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: 
     a = a.at[-1].set(to.a) if method.ends else a
     error_v = h * _combine(method.error_v, a)
     error_q = h * (h * _combine(method.error_q, a))
+    error_q, error_v = cut([error_q, error_v])
     error_q, error_v, far = task.lasting(to.t, to.q, to.v, error_q, error_v)
     size = jnp.maximum(_relative(task, error_q, here.q, to.q), _relative(task, error_v, here.v, to.v))
     size = jnp.where(_over_all(jnp.logical_and, jnp.all, jnp.isfinite(to.a)), size, jnp.nan)
@@ -148,7 +149,8 @@ def _combine(weights: Any, a: Array) -> Array:
     """sum_j weights_j a_j. Not a product of matrices, for which XLA writes a loop that does not vectorize."""
     known = isinstance(weights, np.ndarray)
     terms = [w * x for w, x in zip(weights, a, strict=True) if not known or w != 0] or [jnp.zeros_like(a[0])]
-    return cut([sum(sum(terms[k::CHAINS]) for k in range(min(CHAINS, len(terms))))])[0]
+    total = sum(sum(terms[k::CHAINS]) for k in range(min(CHAINS, len(terms))))
+    return cut([total])[0] if a.ndim > 2 else total
 
 
 def _relative(task: Task, error: Array, y0: Array, y1: Array) -> Array:
