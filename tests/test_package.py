@@ -16,10 +16,11 @@ ROOT = Path(udkjax.__file__).parent
 BELOW = {
     "environment": set(),
     "straightline": set(),
+    "kept": {"environment", "straightline"},
     "pinv": {"straightline"},
     "scene": set(),
     "equations": {"scene", "pinv", "straightline"},
-    "integrate": {"equations", "scene", "pinv", "straightline"},
+    "integrate": {"equations", "scene", "pinv", "straightline", "kept"},
     "study": {"integrate", "equations", "scene", "pinv", "straightline"},
     "show": {"environment", "study", "integrate", "equations", "scene", "pinv", "straightline"},
 }

@@ -149,7 +149,7 @@ def _combine(weights: Any, a: Array) -> Array:
     """sum_j weights_j a_j. Not a product of matrices, for which XLA writes a loop that does not vectorize."""
     known = isinstance(weights, np.ndarray)
     terms = [w * x for w, x in zip(weights, a, strict=True) if not known or w != 0] or [jnp.zeros_like(a[0])]
-    total = sum(sum(terms[k::CHAINS]) for k in range(min(CHAINS, len(terms))))
+    total: Any = sum(sum(terms[k::CHAINS]) for k in range(min(CHAINS, len(terms))))
     return cut([total])[0] if a.ndim > 2 else total
 
 

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +27,7 @@ from udkjax.integrate.projection import Projection
 from udkjax.integrate.reverse import reversible
 from udkjax.integrate.solution import Result, SimulationError, Solution
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.kept import Kept
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -114,7 +114,7 @@ def simulate(
     return solution
 
 
-@eqx.filter_jit
+@Kept
 def _simulate(
     mechanism,
     ts,
