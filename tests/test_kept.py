@@ -128,6 +128,10 @@ def test_what_a_user_has_changed_or_written_is_not_kept(folder, monkeypatch):
             patch.setattr(changed, name, None)
             kept(MECHANISM, x, 2.0)
         assert not [*folder.iterdir()]
+    with monkeypatch.context() as patch:
+        patch.setattr("os.path.exists", lambda path: False)  # who cannot see the package does not know which one it is
+        once_more()(MECHANISM, x, 2.0)
+    assert not [*folder.iterdir()]
     once_more()(MECHANISM, x, 2.0)
     assert [*folder.iterdir()]
 

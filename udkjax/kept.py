@@ -73,7 +73,7 @@ class Kept:
             if len(self._programs) == MOST:
                 del self._programs[next(iter(self._programs))]
             file = self._file(arguments)
-            program = None if file is None else _read(file, arrays) or self._made(file, arguments, arrays)
+            program = None if file is None else _read(file) or self._made(file, arguments, arrays)
             self._programs[key] = program
         program = self._programs[key]
         return self._jitted(*arguments) if program is None else program(arrays)
@@ -179,6 +179,8 @@ def _surroundings() -> Iterator[str]:
     yield f"{sys.version} {platform.system()} {platform.machine()}"
     yield os.environ.get(XLA_FLAGS, "")
     package = os.path.dirname(__file__)
+    if not os.path.exists(__file__):  # in an archive, say
+        raise _UnknownError
     for folder, _, names in sorted(os.walk(package)):
         for file in sorted(os.path.join(folder, name) for name in names if name.endswith(".py")):
             status = os.stat(file)
@@ -213,8 +215,7 @@ def _folder() -> Path | None:
     return folder if folder is not None and str(folder) == used else None
 
 
-def _read(file: Path, arrays: list[Any]) -> Program | None:
-    """A program that runs."""
+def _read(file: Path) -> Program | None:
     try:
         data = file.read_bytes()
     except OSError:
