@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from udkjax.equations.expressions import Alike, alike, applied, differentiated
+from udkjax.equations.elements import Alike, alike, applied, differentiated
 from udkjax.pinv.places import take
 from udkjax.scene.mechanism import Mechanism, attached
 from udkjax.straightline import Graph, Loop, Program, Scalar, along_elements, frontier

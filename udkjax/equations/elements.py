@@ -1,0 +1,179 @@
+"""What one element says, a constraint or a force, as scalars of a graph: traced once for all elements that are alike.
+
+For a constraint with residual Psi(t, q) the graph gets, all by forward differentiation of the residual alone, along (1, v):
+
+    Psi_dot = Psi_q v + Psi_t        gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt
+
+(or, where that is shorter, gamma from derivatives of the entries of Psi_q, which often are other entries of it)
+and Psi_q one column at a time, each along a unit vector whose zeros the graph folds away: a row is {column: scalar}.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from udkjax.scene.bodies import GROUND, Frame
+from udkjax.straightline import Differential, Graph, Scalar, operations, trace
+
+Row = dict[int, Scalar]
+
+
+def scalar(array: Any) -> Scalar:
+    """The scalar that an array of shape () holds."""
+    return np.asarray(array, object).item()
+
+
+def _scalars(outputs: list[np.ndarray]) -> list[list[Scalar]]:
+    """Split the outputs of a traced function, given as one array each of the same length."""
+    return [list(o) for o in outputs]
+
+
+def _frames(ground: tuple[bool, ...], q: Any, v: Any = None) -> list[Frame]:
+    """Make the frames that an element sees; the sine and cosine of a body are the same expressions for every element."""
+    frames, k = [], 0
+    for fixed in ground:
+        if fixed:
+            frames.append(Frame(0.0, 0.0, 0.0, 1.0, 0.0, *(() if v is None else (0.0, 0.0, 0.0))))
+        else:
+            x, y, angle = q[k : k + 3]
+            frames.append(Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), *(() if v is None else v[k : k + 3])))
+            k += 3
+    return frames
+
+
+class Alike(NamedTuple):
+    """What elements have in common that are traced once: all but the names of their bodies and the values of their numbers."""
+
+    tree: Any
+    shapes: tuple
+    ground: tuple[bool, ...]  # which of its frames are the ground's
+
+    @property
+    def moving(self) -> int:
+        """How many bodies move in it."""
+        return len(self.ground) - sum(self.ground)
+
+
+def alike(element: Any, frames: Sequence[str]) -> Alike:
+    """Return an element's structure; `frames` are the names of the bodies that it sees."""
+    numbers = {name: GROUND if name == GROUND else str(k) for k, name in enumerate(frames)}
+    nameless = object.__new__(type(element))
+    for name, value in vars(element).items():
+        object.__setattr__(nameless, name, value)
+    for field in dataclasses.fields(element):
+        if field.name == "bodies" or "names" in field.metadata:
+            value = getattr(element, field.name)
+            renamed = numbers.get(value, "") if isinstance(value, str) else tuple(numbers.get(name, "") for name in value)
+            object.__setattr__(nameless, field.name, renamed)
+    leaves, tree = jax.tree.flatten(nameless)
+    return Alike(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(name == GROUND for name in frames))
+
+
+def differentiated(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
+    """Psi, the rows of Psi_q over the columns of q, Psi_dot and gamma of a constraint on scalars."""
+    along, bend = _traced(*kind)
+    one, zero = graph.constant(1.0), graph.constant(0.0)
+
+    def derivative(program, dt, dq) -> list[list[Scalar]]:
+        return _scalars(program(graph, leaves, [np.asarray(s, object) for s in (t, *q, dt, *dq)]))
+
+    value, rate = derivative(along, one, v)
+    (acceleration,) = derivative(bend, one, v)
+    rows: list[Row] = [{} for _ in value]
+    for k in range(len(q)):
+        unit = [one if i == k else zero for i in range(len(q))]
+        for row, entry in zip(rows, derivative(along, zero, unit)[1], strict=True):
+            if not entry.is_zero:
+                row[k] = entry
+    if not any("time" in s.node.depends for s in value):
+        acceleration = _shorter(graph, rows, acceleration, _quadratic(graph, rows, q, v))
+    return value, rows, rate, [-s for s in acceleration]
+
+
+def _quadratic(graph: Graph, rows: list[Row], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
+    """(Psi_q v)_q v as the sum of (dPsi_q[k]/dq[j]) v[j] v[k]; None where an opaque expression is in the way."""
+    entries = Differential(graph, [entry for row in rows for entry in row.values()], q)
+    column = {s.index: j for j, s in enumerate(q)}
+    total = []
+    for row in rows:
+        terms: dict[tuple[int, int], Scalar] = {}
+        for k, entry in row.items():
+            for place, slope in entries.row(entry).items():
+                if place not in column:
+                    return None
+                pair = min(k, column[place]), max(k, column[place])
+                terms[pair] = terms[pair] + slope if pair in terms else slope
+        total.append(sum((slope * (v[j] * v[k]) for (j, k), slope in terms.items()), graph.constant(0.0)))
+    return total
+
+
+def _shorter(graph: Graph, known: list[Row], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
+    """The one of two ways to write the same that takes fewer operations, with the entries of the rows known."""
+    if other is None:
+        return one
+    given = [entry for row in known for entry in row.values()]
+    return other if operations(graph, given, other) < operations(graph, given, one) else one
+
+
+def applied(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
+    """The generalized loads of a force element over the columns of q, and its potential, on scalars."""
+    loads, energy = _traced_force(*kind)
+    numbers = [np.asarray(s, object) for s in (t, *q, *v)]
+    (stored,) = energy(graph, leaves, numbers)
+    return [scalar(s) for s in loads(graph, leaves, numbers)], scalar(stored)
+
+
+def _residual(element: Any, ground: tuple[bool, ...], t: Any, q: Any) -> jax.Array:
+    rows = element.residual(t, *_frames(ground, q))
+    rows = rows if isinstance(rows, list | tuple) else list(jnp.atleast_1d(rows))
+    return jnp.stack([jnp.asarray(r, jnp.result_type(float)) for r in rows])
+
+
+@lru_cache(maxsize=256)
+def _traced(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
+    """Trace a residual's first and second derivative along (dt, dq)."""
+    n = 3 * (len(ground) - sum(ground))
+    leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
+    number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+
+    def along(leaves, numbers):
+        element = jax.tree.unflatten(tree, leaves)
+        t, q, dt, dq = numbers[0], numbers[1 : 1 + n], numbers[1 + n], numbers[2 + n :]
+        return jax.jvp(lambda t, q: _residual(element, ground, t, q), (t, q), (dt, dq))
+
+    def bend(leaves, numbers):
+        t, q, dt, dq = numbers[0], numbers[1 : 1 + n], numbers[1 + n], numbers[2 + n :]
+        rate = lambda t, q: along(leaves, [t, *q, dt, *dq])[1]  # noqa: E731
+        return jax.jvp(rate, (t, q), (dt, dq))[1]
+
+    numbers = [number] * (2 + 2 * n)
+    return trace(along, leaves, numbers), trace(bend, leaves, numbers)
+
+
+@lru_cache(maxsize=256)
+def _traced_force(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
+    """Trace a force element's generalized loads, -dV/dq of its potential plus what it states itself, and its potential."""
+    n = 3 * (len(ground) - sum(ground))
+    leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
+    number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+
+    def potential(leaves, numbers):
+        element = jax.tree.unflatten(tree, leaves)
+        value = element.potential(numbers[0], *_frames(ground, numbers[1 : 1 + n], numbers[1 + n :]))
+        return jnp.zeros(()) if value is None else jnp.asarray(value, number.dtype)
+
+    def loads(leaves, numbers):
+        element = jax.tree.unflatten(tree, leaves)
+        own = element.loads(numbers[0], *_frames(ground, numbers[1 : 1 + n], numbers[1 + n :]))
+        own = [(0.0, 0.0, 0.0)] * len(ground) if own is None else own
+        moving = [c for load, fixed in zip(own, ground, strict=True) if not fixed for c in load]
+        slope = jax.grad(lambda q: potential(leaves, [numbers[0], *q, *numbers[1 + n :]]))(numbers[1 : 1 + n])
+        return [jnp.asarray(c, number.dtype) - s for c, s in zip(moving, slope, strict=True)]
+
+    numbers = [number] * (1 + 2 * n)
+    return trace(loads, leaves, numbers), trace(potential, leaves, numbers)
