@@ -1,9 +1,10 @@
 """Compiled programs that the next process finds again without tracing them.
 
-JAX keeps compiled programs by their text, which it has to trace and to write down first: half of what a second process waits for,
-and more with larger scenes. Where a program follows from the structure of a function's arguments alone, as those of this package
-do, that structure finds it: described in words, by the names and values of what is known, and the types and shapes of arrays.
-What cannot be described, as functions of users, is traced; and so is everything where this package is not as it was imported.
+JAX keeps compiled programs by their text, which it has to trace and to write down first: a third of what a second process waits
+for, and more than half with larger scenes. Where a program follows from the structure of a function's arguments alone, as those
+of this package do, that structure finds it: described in words, by the names and values of what is known, and the types and
+shapes of arrays. What cannot be described, as functions of users, is traced; and so is everything where this package is not as it
+was imported.
 """
 
 import functools
@@ -170,7 +171,7 @@ def _words(x: Any, known: bool = False) -> Iterator[str]:
 
 def _is_ours(x: Any) -> bool:
     """Whether a class or function is one of this package, which its name finds."""
-    return x.__module__.partition(".")[0] == PACKAGE and "<" not in x.__qualname__
+    return str(x.__module__).partition(".")[0] == PACKAGE and "<" not in x.__qualname__
 
 
 def _surroundings() -> Iterator[str]:
@@ -222,15 +223,19 @@ def _read(file: Path) -> Program | None:
         return None
     if hashlib.sha256(data[DIGEST:]).digest() != data[:DIGEST]:  # a file that was cut short, say
         return None
-    executable, results = pickle.loads(zlib.decompress(data[DIGEST:]))
-    return Program(deserialize_and_load(*executable), results)
+    try:
+        executable, results = pickle.loads(zlib.decompress(data[DIGEST:]))
+        return Program(deserialize_and_load(*executable), results)
+    except Exception:  # of pickle or of XLA, whatever it is: then it is made again
+        return None
 
 
 def _write(file: Path, kept: bytes) -> None:
     """Whole, or not at all."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as new:
+        # What is left of it where there is no room has the name of a program, so that it is removed like one.
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix="-cache", delete=False) as new:
             new.write(hashlib.sha256(kept).digest() + kept)
         os.replace(new.name, file)
     except OSError:  # no room, or not allowed
