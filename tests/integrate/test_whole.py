@@ -11,6 +11,7 @@ import pytest
 from jax.custom_derivatives import SymbolicZero
 
 import udkjax as udk
+from udkjax.integrate.lanes import LANES
 from udkjax.integrate.packing import Packing
 
 SEQUENTIAL = 8  # operations that XLA does one after the other in the same thread, however large their arrays
@@ -73,6 +74,21 @@ def test_a_run_starts_few_operations(careful):
     for body in loops:
         assert len(computations[body]) <= SEQUENTIAL
         assert sum("xla_cpu_small_call" in line for line in computations[body]) == 1
+
+
+@pytest.mark.skipif(jax.__version_info__ < (0, 12), reason="older versions of XLA know no such loops")
+def test_lanes_of_many_coordinates_are_one_function_too():
+    """Of reductions over 4,096 numbers and more XLA would make calls of a library, which no such function can hold."""
+    count = 1 + 4096 // (2 * 3 * LANES)
+    rods = {f"rod{k}": udk.Body(2.0, 0.4, position=[k, -0.75]) for k in range(count)}
+    pins = {f"pin{k}": udk.Revolute(["ground", f"rod{k}"], [[k, 0.0], [0.0, 0.75]]) for k in range(count)}
+    mechanism = udk.Mechanism(rods, pins)
+    start = udk.State(mechanism.q0, mechanism.v0)
+    run = jax.vmap(lambda tol: udk.simulate(mechanism, TS[:2], start, tol, tol, careful=False, throw=False).q)
+    entry = started(jax.jit(run).lower(np.full(LANES, 1e-8)).compile().as_text() or "")["ENTRY"]
+    in_lanes = [line for line in entry if f"[{3 * count},{LANES}]" in line]
+    assert any("xla_cpu_small_call" in line for line in in_lanes)
+    assert not any(" while(" in line for line in in_lanes)
 
 
 def test_what_is_packed_is_unpacked():

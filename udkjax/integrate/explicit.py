@@ -14,7 +14,6 @@ number, because elimination met a pivot that it must not trust, a lane takes a s
 waits, and the loop around takes the step again, by equations that may branch.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -26,6 +25,7 @@ from jaxtyping import Array
 from udkjax.equations.motion import Tangential
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
+from udkjax.integrate.norms import all_finite, largest
 from udkjax.integrate.packing import Packing
 from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
 from udkjax.integrate.record import Record, blank, noted
@@ -140,7 +140,7 @@ def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: 
     error_q, error_v = cut([error_q, error_v])
     error_q, error_v, far = task.lasting(to.t, to.q, to.v, error_q, error_v)
     size = jnp.maximum(_relative(task, error_q, here.q, to.q), _relative(task, error_v, here.v, to.v))
-    size = jnp.where(_over_all(jnp.logical_and, jnp.all, jnp.isfinite(to.a)), size, jnp.nan)
+    size = jnp.where(all_finite(to.a), size, jnp.nan)
     evaluations = jnp.broadcast_to(jnp.asarray(evaluations), size.shape)
     return Trial(to, undifferentiated(size), far, evaluations, a if task.recorded else None)
 
@@ -155,12 +155,7 @@ def _combine(weights: Any, a: Array) -> Array:
 
 def _relative(task: Task, error: Array, y0: Array, y1: Array) -> Array:
     scale = task.atol + task.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
-    return _over_all(jnp.maximum, jnp.max, jnp.abs(error) / scale)
-
-
-def _over_all(pair: Callable, every: Callable, x: Array) -> Array:
-    """`every` of the coordinates. In lanes one after another: XLA writes a loop over lanes for it that does not vectorize."""
-    return cut([functools.reduce(pair, cut(list(x)))])[0] if x.ndim > 1 else every(x)
+    return largest(jnp.abs(error) / scale)
 
 
 def march(task: Task, q: Array, v: Array) -> March:
@@ -237,7 +232,8 @@ def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array, care
     factor = jnp.clip(factor, jnp.where(accept, 1.0, SHRINK), jnp.where(accept, GROW, SAFETY))
     tried = m.tried + judged
     h = jnp.where(judged, undifferentiated(trial.to.t - m.here.t) * factor, m.h)
-    h = jnp.where(judged & (tried == 0), _first_step(task, trial.to), h)
+    begun = judged & (tried == 0)
+    h = when(jnp.any(begun), lambda h: jnp.where(begun, _first_step(task, trial.to), h), h)
     code = jnp.where(judged & (h < task.smallest), STEP_TOO_SMALL, m.code)
     code = jnp.where((code == RUNNING) & (tried >= task.max_steps), STEP_LIMIT, code)
     code = jnp.where(accept & last, DONE, code)

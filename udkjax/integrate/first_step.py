@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from udkjax.integrate.norms import largest
 from udkjax.integrate.undifferentiated import undifferentiated
 
 
@@ -13,6 +14,6 @@ def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array) ->
     """
     y, slope, span, rtol, atol = undifferentiated((y, slope, span, rtol, atol))
     scale = atol + rtol * jnp.abs(y)
-    size, rate = jnp.max(jnp.abs(y) / scale, axis=0), jnp.max(jnp.abs(slope) / scale, axis=0)
+    size, rate = largest(jnp.abs(y) / scale), largest(jnp.abs(slope) / scale)
     ordinary = jnp.isfinite(rate) & (rate > 0) & (size > 0)
     return jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, rate, 1.0), span), 1e-4 * span)
