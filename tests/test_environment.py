@@ -74,7 +74,7 @@ CHECKS = "--xla_backend_extra_options=-vectorize-memory-check-threshold"
         (environment.enable_wide_vectors, "0.13.0", None, None),  # XLA ends the process on a flag that it no longer knows
         (environment.enable_wide_vectors, "our own", None, None),
         (environment.enable_vectors_of_many_arrays, "0.11.2", None, None),
-        (environment.enable_vectors_of_many_arrays, "0.12.0", None, f"{CHECKS}=1000000"),
+        (environment.enable_vectors_of_many_arrays, "0.12.0", None, f"{CHECKS}=1000000,{environment.NO_LONG_UNROLLING}"),
         (environment.enable_vectors_of_many_arrays, "0.12.0", "--xla_backend_extra_options=a=1", None),
     ],
 )
