@@ -56,7 +56,8 @@ def test_the_environment_decides(tmp_path, choice, expected):
 
 LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold"
 VECTORS = "--xla_cpu_prefer_vector_width"
-CHECKS = "--xla_backend_extra_options=-vectorize-memory-check-threshold"
+EXTRA, LIBRARY = "--xla_backend_extra_options", "--xla_cpu_experimental_ynn_fusion_type"
+OPTIONS = f"{EXTRA}=-vectorize-memory-check-threshold=1000000,{environment.NO_LONG_UNROLLING}"
 
 
 @pytest.mark.parametrize(
@@ -74,8 +75,9 @@ CHECKS = "--xla_backend_extra_options=-vectorize-memory-check-threshold"
         (environment.enable_wide_vectors, "0.13.0", None, None),  # XLA ends the process on a flag that it no longer knows
         (environment.enable_wide_vectors, "our own", None, None),
         (environment.enable_vectors_of_many_arrays, "0.11.2", None, None),
-        (environment.enable_vectors_of_many_arrays, "0.12.0", None, f"{CHECKS}=1000000,{environment.NO_LONG_UNROLLING}"),
-        (environment.enable_vectors_of_many_arrays, "0.12.0", "--xla_backend_extra_options=a=1", None),
+        (environment.enable_vectors_of_many_arrays, "0.12.0", None, f"{LIBRARY}=-reduce {OPTIONS}"),
+        (environment.enable_vectors_of_many_arrays, "0.12.0", f"{LIBRARY}=+dot", f"{LIBRARY}=+dot {OPTIONS}"),
+        (environment.enable_vectors_of_many_arrays, "0.12.0", f"{EXTRA}=a=1", f"{EXTRA}=a=1 {LIBRARY}=-reduce"),
     ],
 )
 def test_flags_are_added_where_they_are_known_and_not_given(monkeypatch, enable, installed, given, expected):
@@ -86,8 +88,8 @@ def test_flags_are_added_where_they_are_known_and_not_given(monkeypatch, enable,
     assert os.environ["XLA_FLAGS"] == (expected or given or "")
 
 
-def test_fusions_of_batches_look_for_the_flag_that_is_added():
-    assert fusion.MEMORY_CHECKS == environment.MEMORY_CHECKS
+def test_fusions_of_batches_look_for_the_flags_that_are_added():
+    assert all(flag in f"{LIBRARY}=-reduce {OPTIONS}" for flag in fusion.NEEDED)
 
 
 def test_no_flag_is_added_that_xla_would_not_read_any_more(monkeypatch):

@@ -4,7 +4,8 @@ Nothing is imported before it is used, so that the command line answers at once.
 JAX, unless the environment says `JAX_ENABLE_X64=0`, and lets JAX keep compiled programs in the user's cache folder, unless it
 says `UDKJAX_COMPILATION_CACHE=0`, or names another folder there. On the CPU programs run in the thread that calls them, until
 `jax.config.update("jax_cpu_enable_async_dispatch", True)`. `XLA_FLAGS` is told to use vectors of 512 bits where the CPU has them,
-unless it says something of `xla_cpu_prefer_vector_width`, and before JAX 0.12 to compile loops whole.
+unless it says something of `xla_cpu_prefer_vector_width`, before JAX 0.12 to compile loops whole, and on JAX 0.12 what fusions of
+batches need (environment.py).
 """
 
 from importlib import import_module

@@ -26,6 +26,7 @@ VECTORS = "xla_cpu_prefer_vector_width"
 WIDEST = 512  # bits
 OPTIONS = "xla_backend_extra_options"
 MEMORY_CHECKS = "vectorize-memory-check-threshold"
+LIBRARY = "xla_cpu_experimental_ynn_fusion_type"
 MANY = 10**6  # by itself LLVM gives up after 128
 # Loops of eight rounds and more, as lanes are made of by the hundred, are not written out: that takes a quarter off what lanes of
 # the paper's linkage compile, of larger scenes a third, and changes nothing else that could be measured but a hundredth of a run.
@@ -105,13 +106,15 @@ def enable_wide_vectors() -> None:
 def enable_vectors_of_many_arrays() -> None:
     """Let LLVM use vectors in loops along many arrays, though it has to look first whether any of them overlap.
 
-    A batch's fusions are such loops; they are used only where XLA was told so before it read its flags (straightline/fusion.py).
-    It is told with it how LLVM is to compile them in less time.
+    A batch's fusions are such loops; they are used only where XLA was told so before it read its flags (straightline/fusion.py),
+    and that it is not to call a library for reductions of 4,096 numbers and more, which keeps it from making one function of the
+    loop that they are in. It is told with it how LLVM is to compile them in less time.
     """
     if _jax_version() != KNOWN:
         return
     bridge = sys.modules.get("jax._src.xla_bridge")
     if bridge is None or not bridge.backends_are_initialized():
+        _add_flag(LIBRARY, f"--{LIBRARY}=-reduce")
         _add_flag(OPTIONS, f"--{OPTIONS}=-{MEMORY_CHECKS}={MANY},{NO_LONG_UNROLLING}")
 
 

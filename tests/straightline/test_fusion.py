@@ -222,3 +222,23 @@ def test_what_else_is_in_a_loop_forbids_all_fusions_in_it(function, whole):
     assert loop.whole == whole
     assert (fusions(lowered.as_text()) > 0) == (TRIED and whole)
     lowered.compile()  # which would end the process
+
+
+@ONLY_WHERE_TRIED
+def test_large_reductions_do_not_take_a_loop_apart():
+    """XLA would make calls of a library of them, which no function of a loop can hold."""
+    simple = fusion.together(jax.make_jaxpr(lambda x, y: [x + y * y])(1.0, 1.0), [(), ()])
+
+    def run(x, many):
+        loop = Loop(batch=True)
+
+        def again(state):
+            x, many = state
+            largest = jnp.max(jnp.abs(many), axis=0)
+            return jax.vmap(lambda x, y: simple(loop, x, y)[0])(x, largest), many + x
+
+        return jax.lax.while_loop(lambda state: jnp.any(state[0] < 100.0), again, (x, many))
+
+    lowered = jax.jit(run).lower(np.linspace(1.0, 2.0, 64), np.ones((100, 64)))
+    assert fusions(lowered.as_text()) > 0
+    assert "xla_cpu_small_call" in (lowered.compile().as_text() or "")

@@ -28,7 +28,9 @@ from udkjax.straightline.trigonometry import sincos_of_one, sincos_p
 
 KNOWN = ((0, 12),)  # versions of JAX that were tried
 FLAGS = ("while_loop_byte_threshold", "disable_hlo_passes", "optimization_level")  # with one of them loops may be taken apart
-MEMORY_CHECKS = "vectorize-memory-check-threshold"  # without it loops along many arrays are worked off number by number
+# Without the first, loops along many arrays are worked off number by number; without the second, large reductions in a loop keep
+# XLA from making one function of it.
+NEEDED = ("vectorize-memory-check-threshold", "xla_cpu_experimental_ynn_fusion_type=-reduce")
 LARGEST = 10_000  # operations: twenty four-bars have 7,000, and take half of the time as one; what is larger goes by levels
 # A fusion of a batch first looks, for each two arrays of which one is a result, whether they overlap: in 1.4 ns. An operation on
 # 64 members takes 4 ns by itself, and 1.3 in a fusion. So many such looks for an operation are worth it.
@@ -58,7 +60,7 @@ class Loop:
     @property
     def fuses(self) -> bool:
         """Whether programs along the elements of one state can be fusions in it, as far as is known."""
-        return self.whole and not self.batch and _known() and MEMORY_CHECKS in os.environ.get("XLA_FLAGS", "") and not _flagged()
+        return self.whole and not self.batch and _known() and _told() and not _flagged()
 
     def holds(self, simple: bool) -> None:
         """Say whether what is in it is arithmetic alone."""
@@ -216,13 +218,19 @@ def _lowered(ctx: mlir.LoweringRuleContext, *values: Any, parts: Parts, loop: Lo
 
 def _lowered_on_cpu(ctx: mlir.LoweringRuleContext, *values: Any, parts: Parts, loop: Loop) -> Any:
     exported = ctx.module_context.lowering_parameters.for_export
-    in_vectors = parts.size is None or MEMORY_CHECKS in os.environ.get("XLA_FLAGS", "")
+    in_vectors = parts.size is None or _told()
     fused = _known() and loop.whole and parts.is_one_fusion and in_vectors and not _flagged() and not exported
     return mlir.lower_fun(parts.around if fused else parts.whole)(ctx, *values)
 
 
 def _known() -> bool:
     return jax.__version_info__[:2] in KNOWN
+
+
+def _told() -> bool:
+    """Whether XLA compiles loops along many arrays as they have to be."""
+    given = os.environ.get("XLA_FLAGS", "")
+    return all(flag in given for flag in NEEDED)
 
 
 def _flagged() -> bool:
