@@ -74,10 +74,10 @@ OPTIONS = f"{EXTRA}=-vectorize-memory-check-threshold=1000000,{environment.NO_LO
         (environment.enable_wide_vectors, "0.12.0", f"{VECTORS}=128", None),
         (environment.enable_wide_vectors, "0.13.0", None, None),  # XLA ends the process on a flag that it no longer knows
         (environment.enable_wide_vectors, "our own", None, None),
-        (environment.enable_vectors_of_many_arrays, "0.11.2", None, None),
-        (environment.enable_vectors_of_many_arrays, "0.12.0", None, f"{LIBRARY}=-reduce {OPTIONS}"),
-        (environment.enable_vectors_of_many_arrays, "0.12.0", f"{LIBRARY}=+dot", f"{LIBRARY}=+dot {OPTIONS}"),
-        (environment.enable_vectors_of_many_arrays, "0.12.0", f"{EXTRA}=a=1", f"{EXTRA}=a=1 {LIBRARY}=-reduce"),
+        (environment.enable_fusions_of_batches, "0.11.2", None, None),
+        (environment.enable_fusions_of_batches, "0.12.0", None, f"{LIBRARY}=-reduce {OPTIONS}"),
+        (environment.enable_fusions_of_batches, "0.12.0", f"{LIBRARY}=+dot", f"{LIBRARY}=+dot {OPTIONS}"),
+        (environment.enable_fusions_of_batches, "0.12.0", f"{EXTRA}=a=1", f"{EXTRA}=a=1 {LIBRARY}=-reduce"),
     ],
 )
 def test_flags_are_added_where_they_are_known_and_not_given(monkeypatch, enable, installed, given, expected):
@@ -98,7 +98,7 @@ def test_no_flag_is_added_that_xla_would_not_read_any_more(monkeypatch):
     jax.devices()
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(environment, "version", {"jax": "0.12.0"}.get)
-    environment.enable_vectors_of_many_arrays()
+    environment.enable_fusions_of_batches()
     assert not os.environ["XLA_FLAGS"]
 
 

@@ -15,7 +15,7 @@ from udkjax.environment import (
     disable_async_dispatch,
     enable_compilation_cache,
     enable_float64,
-    enable_vectors_of_many_arrays,
+    enable_fusions_of_batches,
     enable_whole_loops,
     enable_wide_vectors,
 )
@@ -155,5 +155,5 @@ enable_float64()
 disable_async_dispatch()
 enable_whole_loops()
 enable_wide_vectors()
-enable_vectors_of_many_arrays()
+enable_fusions_of_batches()
 enable_compilation_cache()

@@ -26,11 +26,11 @@ VECTORS = "xla_cpu_prefer_vector_width"
 WIDEST = 512  # bits
 OPTIONS = "xla_backend_extra_options"
 MEMORY_CHECKS = "vectorize-memory-check-threshold"
-LIBRARY = "xla_cpu_experimental_ynn_fusion_type"
 MANY = 10**6  # by itself LLVM gives up after 128
 # Loops of eight rounds and more, as lanes are made of by the hundred, are not written out: that takes a quarter off what lanes of
-# the paper's linkage compile, of larger scenes a third, and changes nothing else that could be measured but a hundredth of a run.
+# the paper's linkage compile, of larger scenes a third, and costs single runs one to three hundredths of their time.
 NO_LONG_UNROLLING = "-unroll-full-max-count=7,-forget-scev-loop-unroll"
+LIBRARY = "xla_cpu_experimental_ynn_fusion_type"
 KNOWN = (0, 12)  # the newest JAX whose XLA is known to know the flag: one that it does not know ends the process
 
 # JAX can bound the cache itself only where the package filelock is installed, and then it looks at every file for each program.
@@ -103,12 +103,12 @@ def enable_wide_vectors() -> None:
         _add_flag(VECTORS, f"--{VECTORS}={WIDEST}")
 
 
-def enable_vectors_of_many_arrays() -> None:
-    """Let LLVM use vectors in loops along many arrays, though it has to look first whether any of them overlap.
+def enable_fusions_of_batches() -> None:
+    """Let XLA and LLVM make vector code of the loops along many arrays that a batch's fusions are (straightline/fusion.py).
 
-    A batch's fusions are such loops; they are used only where XLA was told so before it read its flags (straightline/fusion.py),
-    and that it is not to call a library for reductions of 4,096 numbers and more, which keeps it from making one function of the
-    loop that they are in. It is told with it how LLVM is to compile them in less time.
+    LLVM looks first whether any two of the arrays overlap, however many looks that takes, and leaves long loops as they are, which
+    compiles in less time. XLA calls no library for reductions of 4,096 numbers and more: it could not make one function of the
+    loop that they are in, and fusions work in no other. There are none where XLA had read its flags before.
     """
     if _jax_version() != KNOWN:
         return

@@ -15,6 +15,7 @@ waits, and the loop around takes the step again, by equations that may branch.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -268,25 +269,31 @@ def _write(task: Task, m: March, points: tuple[Point, ...], until: Array) -> Mar
     inner, lanes = len(task.ts) - 2, m.code.shape
     times = jnp.concatenate([task.ts[1:-1], jnp.broadcast_to(task.ts[-1], (BLOCK, *task.ts.shape[1:]))])
 
-    def block(m: March) -> Array:
+    def block(written: Array) -> Array:
         if times.ndim == 1:
-            return times[m.written + jnp.arange(BLOCK).reshape(BLOCK, *[1] * len(lanes))]
-        return jnp.take_along_axis(times, m.written + jnp.arange(BLOCK)[:, None], axis=0)
+            return times[written + jnp.arange(BLOCK).reshape(BLOCK, *[1] * len(lanes))]
+        return jnp.take_along_axis(times, written + jnp.arange(BLOCK)[:, None], axis=0)
 
-    def behind(m: March) -> Array:
-        number = m.written + jnp.arange(BLOCK).reshape(BLOCK, *[1] * len(lanes))
-        return jnp.sum((block(m) <= until) & (number < inner), axis=0)
+    def behind(written: Array) -> Array:
+        number = written + jnp.arange(BLOCK).reshape(BLOCK, *[1] * len(lanes))
+        return jnp.sum((block(written) <= until) & (number < inner), axis=0)
 
-    def more(m: March) -> March:
-        states = interpolated(points, block(m))
-        written = m.written + behind(m)
+    def due(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        known = jax.tree.map(lambda x: jnp.where(state[0] >= 0, x, 0.0), points)
+        return jax.lax.while_loop(lambda state: jnp.any(behind(state[0]) > 0), partial(more, known), state)
+
+    def more(points: tuple[Point, ...], state: tuple[Array, Array]) -> tuple[Array, Array]:
+        written, outputs = state
+        states = interpolated(points, block(written))
         if not lanes:
-            return m._replace(written=written, outputs=jax.lax.dynamic_update_slice(m.outputs, states, (m.written, 0)))
+            return written + behind(written), jax.lax.dynamic_update_slice(outputs, states, (written, 0))
 
         def lane(k, outputs):
             block = jax.lax.dynamic_index_in_dim(states, k, axis=-1, keepdims=False)
-            return jax.lax.dynamic_update_slice(outputs, block[None], (k, m.written[k], 0))
+            return jax.lax.dynamic_update_slice(outputs, block[None], (k, written[k], 0))
 
-        return m._replace(written=written, outputs=jax.lax.fori_loop(0, lanes[0], lane, m.outputs))
+        return written + behind(written), jax.lax.fori_loop(0, lanes[0], lane, outputs)
 
-    return jax.lax.while_loop(lambda m: jnp.any(behind(m) > 0), more, m)
+    state = m.written, m.outputs
+    written, outputs = when(jnp.any(behind(m.written) > 0), due, state)
+    return m._replace(written=written, outputs=outputs)

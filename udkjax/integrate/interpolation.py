@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from udkjax.straightline import cut
+
 POINTS = 4  # states that an interpolating polynomial goes through: with three, velocities between steps are worse than at steps
 STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 
@@ -43,7 +45,7 @@ def interpolated(points: tuple[Point, ...], times: Array) -> Array:
                 following.append(known[order][first])
             else:
                 following.append((column[i + 1] - column[i]) * inverse[first, last])
-        column = following
+        column = cut(following) if order % 3 == 2 else following
         coefficients.append(column[0] if order < 3 else jnp.where(used[order // 3 - 1], column[0], 0.0))
     q, v = jnp.zeros((), column[0].dtype), jnp.zeros((), column[0].dtype)
     for k, coefficient in reversed(list(enumerate(coefficients))):
