@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 
 from udkjax.equations.code import scalars, stacked
 from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, those
-from udkjax.equations.motion import STEPS, Tangential, Vector
+from udkjax.equations.motion import STEPS, Closed, Tangential, Vector
 from udkjax.equations.plain import plain_accelerations, plain_project, plain_tangential
 from udkjax.straightline import along
 
@@ -34,25 +34,26 @@ def accelerations(program: str, equations: "Equations", t: Any, q: Vector, v: Ve
 
 def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     """As the plain form, by Newton steps in position and velocity at once."""
-    return closed(equations, t, q, v, STEPS)
-
-
-def closed(equations: "Equations", t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
-    """By at most so many steps."""
-    found, safe = _projected(steps, equations, t, q, v)
-    q, v = (jnp.where(safe, x, jnp.nan) for x in found)
+    q, v, _ = closed(equations, t, q, v, STEPS)
     return q, v
+
+
+def closed(equations: "Equations", t: Any, q: Vector, v: Vector, steps: int) -> Closed:
+    """By at most so many steps."""
+    found, (safe, moving) = _projected(steps, equations, t, q, v)
+    q, v = (jnp.where(safe, x, jnp.nan) for x in found)
+    return Closed(q, v, moving)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any, Any]:
-    """q and v, numbers in any case, and whether they can be trusted.
+    """q and v, numbers in any case; whether they can be trusted, and whether they still moved.
 
     A Newton step takes the given v to where Psi_dot = 0 at the q that it starts from, so the last must not move q. There are at
     most so many `steps`. Derivatives are taken where q and v are then.
     """
     if not equations.eliminates:
-        return plain_project(equations, t, q, v), jnp.array(True)
+        return plain_project(equations, t, q, v), (jnp.array(True), jnp.array(False))
     program = equations.code.program("nearer")
 
     # On scalars until all is done: vectors that a loop carries have the batch first under vmap, where the programs have it last.
@@ -68,11 +69,11 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
 
     vs = scalars([v])
     start = 0, scalars([q]), vs, jnp.inf, jnp.array(True)
-    _, *found, _, safe = jax.lax.while_loop(more, nearer, start)
-    found = [stacked(x) for x in found]
+    _, *found, change, safe = jax.lax.while_loop(more, nearer, start)
+    found, moving = [stacked(x) for x in found], ~(change <= FAR)
     if equations.branches:
-        return _branched(equations, safe, tuple(found), plain_project, t, q, v), jnp.array(True)
-    return tuple(found), safe if _checks(equations) else jnp.array(True)
+        return _branched(equations, safe, tuple(found), plain_project, t, q, v), (jnp.array(True), moving & safe)
+    return tuple(found), (safe if _checks(equations) else jnp.array(True), moving)
 
 
 def _largest_change(new: Sequence[Array], old: Sequence[Array]) -> Array:
@@ -125,9 +126,9 @@ def _(program, primals, tangents):
 @partial(_projected.defjvp, symbolic_zeros=True)
 def _(steps, primals, tangents):
     equations, t, _, _ = primals
-    (q, v), safe = _projected(steps, *primals)
+    (q, v), judged = _projected(steps, *primals)
     dq, dv = _correction(equations, t, q, v, tangents)
-    return ((q, v), safe), ((dq, dv), np.zeros(jnp.shape(safe), jax.dtypes.float0))
+    return ((q, v), judged), ((dq, dv), tuple(np.zeros(jnp.shape(x), jax.dtypes.float0) for x in judged))
 
 
 @jax.custom_jvp

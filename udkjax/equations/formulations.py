@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.motion import Motion, Tangential, Vector
+from udkjax.equations.motion import Closed, Motion, Tangential, Vector
 from udkjax.equations.udwadia_kalaba import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
@@ -178,7 +178,7 @@ class Formulated(Rewritten):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.project(t, q, v)
 
-    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
+    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
         return self.equations.closed(t, q, v, steps)
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:

@@ -20,7 +20,7 @@ from udkjax.equations.alike import Fields
 from udkjax.equations.code import structure
 from udkjax.equations.large_plain import by_method, plain_accelerations
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
-from udkjax.equations.motion import STEPS, MechanismMotion, Tangential, Vector
+from udkjax.equations.motion import STEPS, Closed, MechanismMotion, Tangential, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.block_methods import BlockElimination, DenseParts
 from udkjax.pinv.blocks import by_block, flat
@@ -71,11 +71,12 @@ class LargeEquations(MechanismMotion):
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
-        return self.closed(t, q, v, STEPS)
+        q, v, _ = self.closed(t, q, v, STEPS)
+        return q, v
 
-    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
+    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
         """By at most so many Newton steps in position, and one in velocity."""
-        return _compiled(large_fast.project, self, t, q, v, steps)
+        return Closed(*_compiled(large_fast.project, self, t, q, v, steps))
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives that `project` has where it returns it."""

@@ -24,6 +24,14 @@ class Tangential(NamedTuple):
     far: Any = True  # from singular configurations, as far as the method knows
 
 
+class Closed(NamedTuple):
+    """A state that Newton's method has brought to the constraint manifold, or as close as its steps went."""
+
+    q: Vector
+    v: Vector
+    moving: Any = False  # whether the last step still moved it by more than rounding, as far as the method knows
+
+
 class Motion(eqx.Module):
     """The equations of motion of one system, ready to be evaluated. Coordinates and velocities are flat vectors (n,)."""
 
@@ -78,7 +86,7 @@ class Motion(eqx.Module):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """q and v returned to the constraint manifold."""
 
-    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
+    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
         """`project`, from farther away: by at most so many steps of Newton's method.
 
         By default it is projected until that moves nothing, at most so many times.
@@ -90,7 +98,7 @@ class Motion(eqx.Module):
             moved = jnp.max(jnp.abs(jnp.concatenate([q1 - q, v1 - v])), initial=0.0)
             return k + 1, q1, v1, moved > FAR
 
-        return jax.lax.while_loop(lambda s: (s[0] < steps) & s[-1], again, (0, q, v, jnp.array(True)))[1:3]
+        return Closed(*jax.lax.while_loop(lambda s: (s[0] < steps) & s[-1], again, (0, q, v, jnp.array(True)))[1:])
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives of a projection that returns it. By default it is projected again."""

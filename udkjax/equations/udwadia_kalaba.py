@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations import fast
 from udkjax.equations.code import Code, code, scalars, stacked
-from udkjax.equations.motion import MechanismMotion, Tangential, Vector
+from udkjax.equations.motion import Closed, MechanismMotion, Tangential, Vector
 from udkjax.equations.plain import plain_accelerations
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, Varga
 from udkjax.scene.fields import number
@@ -91,7 +91,7 @@ class Equations(MechanismMotion):
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
         return fast.project(self, t, q, v)
 
-    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> tuple[Vector, Vector]:
+    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
         by_elimination = self.eliminates and not self.branches
         return fast.closed(self, t, q, v, steps) if by_elimination else super().closed(t, q, v, steps)
 

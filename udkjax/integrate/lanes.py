@@ -25,6 +25,7 @@ from udkjax.straightline import Loop, apart, when
 
 ROUND = 8  # lanes: what the widest vector units hold
 STEPS = 7  # to an output: where two branches of the manifold meet, Newton's method halves the distance in each
+FEW_STEPS = 3  # the last of which usually moves nothing
 LANES = 64  # with 16 or 32 a lane of the paper's linkage takes longer, with 128 no less
 # A single run has its outputs projected side by side, too, where that fills vectors and does not take long to compile.
 FEW_OUTPUTS, FEW_BODIES = 16, 12
@@ -209,8 +210,8 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
 # --- outputs
 
 
-def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], ts: Array, ys: Array, wide: bool) -> Any:
-    """`function(lanes, t, y)` of states ys (*lanes, T, 2n), one time after another: that is faster than all at once.
+def _each_output(lanes: Lanes, function: Callable, ts: Array, ys: Array, wide: bool) -> Any:
+    """`function(steps, lanes, t, y)` of states ys (*lanes, T, 2n), one time after another: that is faster than all at once.
 
     `wide` takes the times of a single run as so many lanes, which takes longer to compile.
     """
@@ -220,24 +221,53 @@ def _each_output(lanes: Lanes, function: Callable[[Lanes, Array, Array], Any], t
 
         def one(k: Array, found: Any) -> Any:
             y = jax.lax.dynamic_index_in_dim(found[0], k, axis=-2, keepdims=False)
-            y, violated = function(lanes, jnp.broadcast_to(ts[k], lanes.shape), y.T)
+            y, violated, _ = function(STEPS, lanes, jnp.broadcast_to(ts[k], lanes.shape), y.T)
             return (
                 jax.lax.dynamic_update_index_in_dim(found[0], y.T, k, axis=-2),
                 jax.lax.dynamic_update_index_in_dim(found[1], violated, k, axis=-1),
             )
 
         return jax.lax.fori_loop(0, count, one, (ys, jnp.zeros((*lanes.shape, count), ys.dtype)))
+    return _side_by_side(lanes.equations, function, ts, ys)
+
+
+def _side_by_side(equations: Motion, function: Callable, ts: Array, ys: Array) -> tuple[Array, Array]:
+    """The same of a single run's states, as many at once as there are lanes.
+
+    All have a few steps of Newton's method, and then those that still move some more: they would hold up the others.
+    """
+    count = len(ys)
     chunks = -(-count // LANES)
     width = -(-count // (chunks * ROUND)) * ROUND
-    places = jnp.minimum(jnp.arange(chunks * width), count - 1).reshape(chunks, width)
-    times = Lanes(lanes.equations, None, width)
-    found = jax.lax.map(lambda places: function(times, ts[places], ys[places].T), places)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 1).reshape(-1, *x.shape[1:-1])[:count], found)
+    times = Lanes(equations, None, width)
+
+    def more(state: Any) -> Any:
+        tries, waiting, queue, ys, violated = state
+
+        def chunk(k: Array, state: Any) -> Any:
+            number = k * width + jnp.arange(width)
+            places = jnp.where(number < waiting, jax.lax.dynamic_slice(queue, (k * width,), (width,)), queue[k * width])
+            found, worst, moving = function(FEW_STEPS, times, ts[places], state[2][places].T)
+
+            def lane(i: Array, state: Any) -> Any:
+                left, again, ys, violated = state
+                ys = jax.lax.dynamic_update_slice(ys, found[:, i][None], (places[i], 0))
+                again, violated = again.at[left].set(places[i]), violated.at[places[i]].set(worst[i])
+                return left + (moving[i] & (number[i] < waiting)), again, ys, violated
+
+            return jax.lax.fori_loop(0, width, lane, state)
+
+        return tries + 1, *jax.lax.fori_loop(0, -(-waiting // width), chunk, (jnp.zeros_like(waiting), queue, ys, violated))
+
+    start = jnp.array(0), jnp.array(count), jnp.arange(chunks * width), ys, jnp.zeros(count, ys.dtype)
+    return jax.lax.while_loop(lambda state: (state[0] * FEW_STEPS < STEPS) & (state[1] > 0), more, start)[3:]
 
 
-def _output(projected: bool, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array]:
-    """Interpolated states (2n, *lanes), returned to the manifold, and how they violate the constraints."""
+def _output(projected: bool, steps: int, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Interpolated states (2n, *lanes), returned to the manifold; how they violate the constraints; whether they still moved."""
+    moving = jnp.zeros(lanes.shape, bool)
     if projected:
         inside = lanes.within(Loop(lanes.size is not None))  # what closes it is a loop
-        y = inside.over(lambda e, t, y: jnp.concatenate(e.forgiving.closed(t, *jnp.split(y, 2), STEPS)), t, y)
-    return y, lanes.over(violation, t, y)
+        q, v, moving = inside.over(lambda e, t, y: e.forgiving.closed(t, *jnp.split(y, 2), steps), t, y)
+        y = jnp.concatenate([q, v])
+    return y, lanes.over(violation, t, y), moving
