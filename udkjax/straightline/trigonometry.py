@@ -24,6 +24,7 @@ from udkjax.straightline.barrier import cut
 
 # pi/2 in three parts of 33 bits, whose products with integers below 2^20 are exact, and a rest: fdlibm, e_rem_pio2.c.
 _PARTS = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624871116645580e-21, 8.47842766036889956997e-32)
+_SHIFT = 1.5 * 2.0**52  # what it is added to is rounded to an integer, whose last bits are those of the sum
 # (sin r - r) / r^3 and (cos r - 1 + r^2 / 2) / r^4 in powers of r^2, highest first, for |r| <= pi/4.
 _SINE = (
     1.58969099521155010221e-10,
@@ -59,27 +60,29 @@ def sincos_of_one(x: Any) -> tuple[Any, Any]:
     """As `sincos` on the CPU, of a number, where XLA repeats nothing."""
     if x.dtype != jnp.float64:
         return jax.lax.sin(x), jax.lax.cos(x)
-    n, r = _reduced(x)
-    return _turned(n, *_near_zero(r))
+    k, r = _reduced(x)
+    return _turned(k, *_near_zero(r))
 
 
 def _by_polynomials(x: Any) -> tuple[Any, Any]:
     # Without the barriers XLA would compute what both results share once for each of them, and both for each of their uses.
-    n, r = cut(_reduced(x))
+    k, r = cut(_reduced(x))
     s, c = cut(_near_zero(r))
-    s, c = cut(_turned(n, s, c))
+    s, c = cut(_turned(k, s, c))
     return s, c
 
 
 def _reduced(x: Any) -> tuple[Any, Any]:
-    """n and x - n pi/2."""
+    """An integer with the last bits of n, and x - n pi/2."""
     a, b, c, d = _PARTS
-    n = jax.lax.round(x * (2 / math.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
+    shifted = x * (2 / math.pi) + _SHIFT
+    n = shifted - _SHIFT
     rest = x - n * a
     high = rest - n * b
     low = (rest - high) - n * b  # what rounding took from it
     r = (high + (low - n * c)) - n * d
-    return n, jnp.minimum(jnp.maximum(r, -1.0), 1.0)  # from 1e16 on n is not exact: where r means nothing, keep a cosine a cosine
+    r = jnp.minimum(jnp.maximum(r, -1.0), 1.0)  # from 1e16 on n is not exact: where r means nothing, keep a cosine a cosine
+    return jax.lax.bitcast_convert_type(shifted, jnp.int64), r
 
 
 def _near_zero(r: Any) -> tuple[Any, Any]:
@@ -88,12 +91,16 @@ def _near_zero(r: Any) -> tuple[Any, Any]:
     return r + r * (z * s), (1.0 - 0.5 * z) + z * z * c
 
 
-def _turned(n: Any, s: Any, c: Any) -> tuple[Any, Any]:
-    """Turn by n right angles."""
-    quadrant = n - 4.0 * jnp.floor(n * 0.25)
-    first, second, third = quadrant == 1.0, quadrant == 2.0, quadrant == 3.0
-    s, c = jax.lax.select(first | third, c, s), jax.lax.select(first | third, s, c)
-    return jax.lax.select(second | third, -s, s), jax.lax.select(first | second, -c, c)
+def _turned(k: Any, s: Any, c: Any) -> tuple[Any, Any]:
+    """Turn by k right angles."""
+    odd = (k & 1) != 0
+    s, c = jax.lax.select(odd, c, s), jax.lax.select(odd, s, c)
+    return _negative_where(k, s), _negative_where(k + 1, c)
+
+
+def _negative_where(k: Any, x: Any) -> Any:
+    """-x where the last bit but one of k is set."""
+    return jax.lax.bitcast_convert_type(jax.lax.bitcast_convert_type(x, jnp.int64) ^ ((k & 2) << 62), x.dtype)
 
 
 # A primitive, of angles to their sines and cosines in turn, so that each platform gets its own form of it.
