@@ -32,7 +32,8 @@ class Code:
     rows       D, b, a_F, M^(-1/2)        closure    D, Psi, M^(-1/2)        rate    D, Psi_dot, M^(-1/2)
 
     and for elimination: `accelerations` (a, whether all pivots are safe), `nearer` (q and v after a Newton step to Psi = 0 and to
-    Psi_dot = 0, whether safe), `tangential` (of changes of q and v what projection leaves; whether all pivots are far from none).
+    Psi_dot = 0, whether safe), `closer` (the same of q alone), `arrival` (v after that step, and the accelerations with it, where q
+    is already on the manifold; whether safe), `tangential` (of changes of q and v what projection leaves; whether all pivots are far from none).
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
 
@@ -83,7 +84,14 @@ class Code:
         watched = all_of([safe, *(self._satisfied(i, self.a) for i in self.left_out)], graph)
         self.outputs["accelerations_watched"] = [*self.a, watched]
         psi, psi_dot = ([residual[i] for i in self.kept] for residual in (e.psi, e.psi_dot))
-        self.outputs["nearer"] = [*self._without(e.q, psi), *self._without(e.v, psi_dot), self._safe(self._dropping)]
+        closer, with_doubt = self._without(e.q, psi), self._safe(self._dropping)
+        self.outputs["nearer"] = [*closer, *self._without(e.v, psi_dot), with_doubt]
+        self.outputs["closer"] = [*closer, with_doubt]
+        v = self._without(e.v, psi_dot, dropping=False)
+        moved = dict(zip((x.index for x in e.v), v, strict=True))
+        n, loads = self.n, graph.replaced([*e.free, *(self.b(i) for i in self.kept)], moved)
+        a = [f + s for f, s in zip(loads[:n], self.spread(self.solved(loads[n:])), strict=True)]
+        self.outputs["arrival"] = [*v, *a, safe]
         self.changes = [graph.input(f"d{k}", "change") for k in range(2 * self.n)]
         far = all_of(self._dropping.above(NEAR), graph)
         self.outputs["tangential"] = [*self._tangential(self.changes[: self.n]), *self._tangential(self.changes[self.n :]), far]
@@ -108,9 +116,9 @@ class Code:
         rows, zero = (self.equations.psi_q[i] for i in self.kept), self.graph.constant(0.0)
         return self._without(change, [sum((entry * change[k] for k, entry in row.items()), zero) for row in rows])
 
-    def _without(self, x: Sequence[Scalar], residual: Sequence[Scalar]) -> list[Scalar]:
+    def _without(self, x: Sequence[Scalar], residual: Sequence[Scalar], dropping: bool = True) -> list[Scalar]:
         """x without what makes a residual of the rows kept: x - M^(-1) Psi_q^T (D D^T)^(-1) residual."""
-        return [c - s for c, s in zip(x, self.spread(self.solved(residual, dropping=True)), strict=True)]
+        return [c - s for c, s in zip(x, self.spread(self.solved(residual, dropping)), strict=True)]
 
     def b(self, i: int) -> Scalar:
         """gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F of one row."""

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from udkjax.equations.udwadia_kalaba import Equations
 
 FAR = 1e-13  # m, rad: what a Newton step that moves q by less leaves of Psi_dot are rounding errors
+CLOSE = 1e-8  # m, rad: and of Psi, since Newton's method converges quadratically
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -74,6 +75,31 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
     if equations.branches:
         return _branched(equations, safe, tuple(found), plain_project, t, q, v), (jnp.array(True), moving & safe)
     return tuple(found), (safe if _checks(equations) else jnp.array(True), moving)
+
+
+def arrived(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector]:
+    """q and v on the manifold, and the accelerations there: by Newton steps in position, and one program of all the rest."""
+    found, safe = _arrived(equations, t, q, v)
+    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if _checks(equations) else found
+    return q, v, a
+
+
+@jax.custom_jvp
+def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any, Any]:
+    """q, v and a, numbers in any case; whether they can be trusted."""
+    program = equations.code.program("closer")
+
+    def closer(state: Any) -> Any:
+        k, q, _, safe = state
+        *found, still = equations.call(program, t, *q, *vs)
+        return k + 1, found, _largest_change(found, q), safe & still
+
+    vs = scalars([v])
+    start = 0, scalars([q]), jnp.inf, jnp.array(True)
+    _, found, _, safe = jax.lax.while_loop(lambda s: (s[0] < STEPS) & ~(s[2] <= CLOSE), closer, start)
+    q = stacked(found)
+    *found, still = equations.call(equations.code.program("arrival"), t, q, v)
+    return (q, stacked(found[: len(q)]), stacked(found[len(q) :])), safe & still
 
 
 def _largest_change(new: Sequence[Array], old: Sequence[Array]) -> Array:
@@ -129,6 +155,19 @@ def _(steps, primals, tangents):
     (q, v), judged = _projected(steps, *primals)
     dq, dv = _correction(equations, t, q, v, tangents)
     return ((q, v), judged), ((dq, dv), tuple(np.zeros(jnp.shape(x), jax.dtypes.float0) for x in judged))
+
+
+@partial(_arrived.defjvp, symbolic_zeros=True)
+def _(primals, tangents):
+    equations, t, _, _ = primals
+    (q, v, a), safe = _arrived(*primals)
+    dq, dv = _correction(equations, t, q, v, tangents)
+    da = jnp.zeros_like(a)
+    if any(moving_of(tangents)):
+        changes = (*tangents[:2], dq, dv)
+        moving = moving_of(changes)
+        _, (da,) = _along("accelerations", "accelerations", moving, (equations, t, q, v), those(changes, moving))
+    return ((q, v, a), safe), ((dq, dv, da), np.zeros(jnp.shape(safe), jax.dtypes.float0))
 
 
 @jax.custom_jvp

@@ -86,6 +86,11 @@ class Motion(eqx.Module):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """q and v returned to the constraint manifold."""
 
+    def arrived(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector]:
+        """`project` at the end of a step: q and v, and the accelerations there."""
+        q, v = self.project(t, q, v)
+        return q, v, self.accelerations(t, q, v)
+
     def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
         """`project`, from farther away: by at most so many steps of Newton's method.
 

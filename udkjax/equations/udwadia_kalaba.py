@@ -91,9 +91,16 @@ class Equations(MechanismMotion):
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
         return fast.project(self, t, q, v)
 
+    def arrived(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector]:
+        """q and v projected, and the accelerations there: by one elimination less."""
+        return fast.arrived(self, t, q, v) if self._by_elimination else super().arrived(t, q, v)
+
     def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
-        by_elimination = self.eliminates and not self.branches
-        return fast.closed(self, t, q, v, steps) if by_elimination else super().closed(t, q, v, steps)
+        return fast.closed(self, t, q, v, steps) if self._by_elimination else super().closed(t, q, v, steps)
+
+    @property
+    def _by_elimination(self) -> bool:
+        return self.eliminates and not self.branches
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives that `project` has where it returns it."""

@@ -75,7 +75,7 @@ class Task(NamedTuple):
     """What to march along. Numbers are one for each lane, or one for all."""
 
     accelerations: Callable[..., Array]  # of lanes: (t, q, v) -> a
-    project: Callable[..., tuple[Array, Array]]  # (t, q, v) -> q, v
+    arrived: Callable[..., tuple[Array, Array, Array]]  # at the end of a step: (t, q, v) -> q, v returned to the manifold, and a
     lasting: Callable[..., Tangential]  # (t, q, v, error of q, error of v) -> the errors as they count
     careful: Callable[..., Trial] | None  # takes a step again, by equations that may branch; None: the lane ends as `DOUBTED`
     doubts: bool  # whether accelerations that are not a number mean that a step wants care
@@ -93,20 +93,16 @@ def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial
     """One step of all lanes; where they `begin`, only the accelerations at its end."""
     last = task.method.stages
 
-    def end(state):
-        q, v = task.project(t1, *state[1:])
-        return t1, q, v
-
     def stage(i, carry):
         a, *into = carry
         t, q, v = stage_state(task.method, here, h, a, i, into)
-        t, q, v = when(i == last, end, (t, q, v))
         return jax.lax.dynamic_update_index_in_dim(a, task.accelerations(t, q, v), i, 0), q, v
 
-    a = jnp.zeros((last + 1, *here.a.shape), here.a.dtype).at[0].set(here.a)
+    a = jnp.zeros((last, *here.a.shape), here.a.dtype).at[0].set(here.a)
     start = jnp.where(jnp.all(begin), last, 1)
-    a, q1, v1 = jax.lax.fori_loop(start, last + 1, stage, (a, here.q, here.v))
-    return judged(task, here, Point(t1, q1, v1, a[last]), h, a[:last], jnp.where(begin, 1, last))
+    a, *_ = jax.lax.fori_loop(start, last, stage, (a, here.q, here.v))
+    _, *end = stage_state(task.method, here, h, a, last)
+    return judged(task, here, Point(t1, *task.arrived(t1, *end)), h, a, jnp.where(begin, 1, last))
 
 
 def stage_state(
@@ -123,6 +119,9 @@ def stage_state(
         return here.q + h * (node * here.v + h * _combine(row_q, stages)), here.v + h * _combine(row_v, stages)
 
     tableau = (method.nodes, method.q, method.v)
+    if isinstance(i, int):
+        node, *rows = (c[i] for c in tableau)
+        return here.t + node * h, *cut(state(node, *rows))
     node, *rows = (jax.lax.dynamic_index_in_dim(jnp.asarray(c), i, keepdims=False) for c in tableau)
     if not here.t.shape:
         return here.t + node * h, *cut(state(node, *rows))

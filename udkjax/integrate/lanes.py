@@ -124,7 +124,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     over = lanes.within(None if recorded else _loop_of(problem, lanes)).over
     task = Task(
         partial(over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
-        partial(over, lambda e, t, q, v: e.quick.project(t, q, v)) if problem.projected else lambda t, q, v: (q, v),
+        partial(over, _projected if problem.projected else _as_it_is),
         partial(over, lasting) if problem.projected else _all_of_it,
         None,
         problem.equations.branches,
@@ -134,6 +134,14 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     if problem.equations.branches and problem.careful:
         task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
     return task
+
+
+def _projected(equations: Motion, t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
+    return equations.quick.arrived(t, q, v)
+
+
+def _as_it_is(equations: Motion, t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
+    return q, v, equations.quick.accelerations(t, q, v)
 
 
 def _loop_of(problem: Problem, lanes: Lanes) -> Loop | None:

@@ -6,7 +6,7 @@ never emitted (emit.py), so a caller builds freely and chooses later.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -196,6 +196,28 @@ class Graph:
                 found.add(index)
                 stack.extend(a.index for a in self.nodes[index].arguments)
         return sorted(found)
+
+    def replaced(self, wanted: Sequence[Scalar], others: Mapping[int, Scalar]) -> list[Scalar]:
+        """The same expressions, of others in place of some nodes."""
+        found = dict(others)
+
+        def other(a: Scalar) -> Scalar:
+            new = found.get(a.index, Scalar(self, a.index))
+            return new if a.sign > 0 else -new
+
+        arithmetic = {"add": self.add, "mul": self.multiply, "div": self.divide, "sqrt": self.sqrt}
+        for index in self.needed([s.index for s in wanted], found):
+            node = self.nodes[index]
+            values = tuple(map(other, node.arguments))
+            if values == node.arguments:
+                continue
+            if node.kind == "sub":
+                found[index] = values[0] - values[1]
+            elif node.kind in arithmetic:
+                found[index] = arithmetic[node.kind](*values)
+            else:
+                found[index] = Scalar(self, self._operation(node.kind, values, node.detail, node.dtype))
+        return [other(s) for s in wanted]
 
     def _operation(self, kind, arguments, detail=None, dtype=None) -> int:
         depends = frozenset().union(*(a.node.depends for a in arguments)) if arguments else frozenset()
