@@ -104,11 +104,11 @@ def enable_wide_vectors() -> None:
 
 
 def enable_fusions_of_batches() -> None:
-    """Let XLA and LLVM make vector code of the loops along many arrays that a batch's fusions are (straightline/fusion.py).
+    """Let XLA and LLVM make vector code of loops along many arrays, as a batch's fusions are (straightline/fusion.py).
 
-    LLVM looks first whether any two of the arrays overlap, however many looks that takes, and leaves long loops as they are, which
-    compiles in less time. XLA calls no library for reductions of 4,096 numbers and more: it could not make one function of the
-    loop that they are in, and fusions work in no other. There are none where XLA had read its flags before.
+    LLVM looks first whether any two of the arrays overlap, however many looks that takes, and leaves long loops as they are,
+    which compiles in less time. XLA calls no library for reductions of 4,096 numbers and more: it could not make one function of
+    the loop that they are in, and fusions work in no other. There are none where XLA had read its flags before.
     """
     if _jax_version() != KNOWN:
         return

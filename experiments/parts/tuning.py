@@ -144,7 +144,8 @@ def drift_of_steps(mechanism: udk.Mechanism, method: Pseudoinverse, most: int) -
         # None of the estimates of errors is looked at: tolerances of one, and all errors last.
         lasting = lambda t, q, v, dq, dv: Tangential(dq, dv, jnp.array(True))  # noqa: E731
         numbers = (jnp.stack([0.0, span]), jnp.ones(()), jnp.ones(()), jnp.zeros(()))
-        task = Task(equations.accelerations, lambda t, q, v: (q, v), lasting, None, False, *numbers, None, 1, DOPRI8)
+        arrived = lambda t, q, v: (q, v, equations.accelerations(t, q, v))  # noqa: E731
+        task = Task(equations.accelerations, arrived, lasting, None, False, *numbers, None, 1, DOPRI8)
         h, no, q, v = span / steps, jnp.array(False), state.q.ravel(), state.v.ravel()
         t = jnp.zeros(())
         first = Point(t, q, v, equations.accelerations(t, q, v))

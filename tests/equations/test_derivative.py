@@ -81,6 +81,53 @@ def test_first_derivatives_are_those_of_the_plain_form(scene, method, baumgarte)
         np.testing.assert_allclose(inner(back, dots), inner(weights, fast[1]), rtol=0, atol=1e-11 * terms)
 
 
+@pytest.mark.parametrize(("scene", "order"), [("driven", 1), pytest.param("parallelogram", 2, marks=pytest.mark.slow)])
+def test_an_arrival_is_a_projection_and_the_accelerations_there(scene, order):
+    """In value, and in derivatives along all numbers of the scene, t, q and v."""
+    mechanism = driven() if scene == "driven" else udk.library.parallelogram()
+    random = np.random.default_rng(1)
+    q, v = (x.ravel() + 1e-7 * random.standard_normal(x.size) for x in (mechanism.q0, mechanism.v0))
+    inputs = (mechanism, jnp.array(0.3), q, v)
+    dots = jax.tree.map(lambda x: jnp.asarray(random.standard_normal(np.shape(x))), inputs)
+
+    def arrived(equations, t, q, v):
+        return equations.arrived(t, q, v)
+
+    def one_after_another(equations, t, q, v):
+        q, v = equations.project(t, q, v)
+        return q, v, equations.accelerations(t, q, v)
+
+    def derivatives(form, mechanism, t, q, v):
+        def function(mechanism, t, q, v):
+            return form(prepare(mechanism, udk.Auto(), large=False).quick, t, q, v)
+
+        def along(*at):
+            return jax.jvp(function, at, dots)
+
+        weights = (jnp.cos(jnp.arange(q.size)), jnp.sin(jnp.arange(q.size)), jnp.ones(q.size))
+        at = mechanism, t, q, v
+        return along(*at) if order == 1 else jax.jvp(along, at, dots), inner(jax.vjp(function, *at)[1](weights), dots)
+
+    def closed(mechanism, t, q, v):
+        close = lambda _, state: prepare(mechanism, udk.Auto(), large=False).project(t, *state)  # noqa: E731
+        q, v = jax.lax.fori_loop(0, 6, close, (q, v))
+        return mechanism, t, q + 1e-9 * jnp.cos(jnp.arange(q.size)), v + 1e-9
+
+    at = jax.jit(closed)(*inputs)
+    found, expected = (jax.tree.leaves(jax.jit(derivatives, static_argnums=0)(f, *at)) for f in (arrived, one_after_another))
+    size = max(float(jnp.abs(x).max()) for x in expected)
+    assert len(found) == len(expected) == 6 * order + 1 and size > 1.0
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10 * size)
+
+
+def test_an_arrival_takes_one_elimination_less(linkage):
+    """Than projection, whose last Newton step finds nothing to do, and accelerations."""
+    code = prepare(linkage).code
+    operations = {name: sum(code.program(name).count().values()) for name in ("nearer", "accelerations", "closer", "arrival")}
+    assert operations["closer"] + operations["arrival"] <= 0.63 * (2 * operations["nearer"] + operations["accelerations"])
+
+
 @pytest.fixture(scope="module")
 def linkage():
     return udk.library.parallelogram()
@@ -93,20 +140,20 @@ def test_a_state_that_elimination_cannot_solve_spoils_no_derivative(linkage, pla
 
     def chosen(q, v):
         a = equations.accelerations(0.0, q, v)
-        projected = jnp.concatenate(equations.project(0.0, q, v))
+        projected = jnp.concatenate([*equations.project(0.0, q, v), *equations.arrived(0.0, q, v)])
         found = jnp.concatenate([a, projected])
-        return jnp.where(jnp.all(jnp.isfinite(found)), found, 2.0 * jnp.tile(q, 3)), (a, projected)
+        return jnp.where(jnp.all(jnp.isfinite(found)), found, 2.0 * jnp.tile(q, 6)), (a, projected)
 
     @jax.jit
     def both(q, v):
         _, back, spoilt = jax.vjp(chosen, q, v, has_aux=True)
-        return spoilt, back(jnp.ones(36)), jax.jvp(chosen, (q, v), (v, q), has_aux=True)[1]
+        return spoilt, back(jnp.ones(72)), jax.jvp(chosen, (q, v), (v, q), has_aux=True)[1]
 
     (a, projected), (of_q, of_v), tangent = both(q, v)
     assert jnp.all(jnp.isnan(a)) and jnp.all(jnp.isnan(projected))
-    np.testing.assert_allclose(of_q, 6.0, rtol=1e-15)
+    np.testing.assert_allclose(of_q, 12.0, rtol=1e-15)
     np.testing.assert_allclose(of_v, 0.0, atol=1e-15)
-    np.testing.assert_allclose(tangent, 2.0 * jnp.tile(v, 3), rtol=1e-15)
+    np.testing.assert_allclose(tangent, 2.0 * jnp.tile(v, 6), rtol=1e-15)
 
 
 def test_batches_of_states_and_of_directions(linkage, placed):

@@ -27,9 +27,11 @@ ARITHMETIC = (
     *("floor", "round_nearest_even"),
 )
 TRIGONOMETRY = ("sincos", "sine", "cosine", "tan", "tanh", "atan2", "exponential", "log")
-PAIR = 51  # floating-point operations in `sincos`
-CHOICES = ("compare", "select", "clamp", "and", "or", "not", "reduce")
-MOVES = "constant reshape slice concatenate broadcast_in_dim convert optimization_barrier transpose branch".split()
+PAIR = 47  # floating-point operations in `sincos`
+CHOICES = ("compare", "select", "clamp", "and", "or", "not", "xor", "shift_left", "reduce")
+MOVES = (
+    "constant reshape slice concatenate broadcast_in_dim convert bitcast_convert optimization_barrier transpose branch".split()
+)
 NAME = r'@"?([^"(\s]+)"?'  # of a function
 ELIMINATION = udk.Elimination()
 

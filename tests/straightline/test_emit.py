@@ -114,6 +114,18 @@ def test_an_output_that_is_early_itself_goes_through_the_frontier():
     assert Program(graph, [*early, q], outputs)([3.0, 9.0, 2.0]) == [9.0, 6.0, 2.0]
 
 
+def test_what_opaque_nodes_take_can_be_replaced():
+    graph = Graph()
+    m = np.array([graph.input(k, "parameter") for k in range(3)], object)
+    q = graph.input("q", "state")
+    (ordered,), bent = trace(jnp.sort, jnp.asarray(X))(graph, m), trace(jnp.tanh, 0.5)(graph, q * m[1])
+    outputs = [ordered[2] * q, ordered[0] + bent[0].item()]
+    found = graph.replaced(outputs, {m[1].index: -q, q.index: q + 1.0})
+    values = [*map(float, X), 0.4]
+    expected = Program(graph, [*m, q], outputs)([values[0], -0.4, values[2], 1.4])
+    assert Program(graph, [*m, q], found)(values) == pytest.approx(expected)
+
+
 def test_an_early_opaque_node_hands_over_its_results():
     graph = Graph()
     m = np.array([graph.input(k, "parameter") for k in range(3)], object)

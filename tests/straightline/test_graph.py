@@ -190,6 +190,26 @@ def test_simplified_expressions_have_the_same_value(tree, values):
     assert found == pytest.approx(float(expected), rel=1e-9, abs=1e-9)
 
 
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(_trees, _trees, st.lists(st.floats(-3, 3), min_size=3, max_size=3))
+def test_an_input_can_be_replaced_by_an_expression(tree, another, values):
+    """As if the expression had been built of it."""
+    graph = Graph()
+    inputs = [graph.input(k, "state") for k in range(3)]
+    built = lambda tree, inputs: evaluated(tree, lambda k: inputs[k] if isinstance(k, int) else graph.constant(k), graph.sqrt)  # noqa: E731
+    whole, other = built(tree, inputs), built(another, inputs)
+    assert graph.replaced([whole, -whole], {}) == [whole, -whole]
+    replaced = graph.replaced([whole], {inputs[0].index: other})
+    with np.errstate(all="ignore"):
+        known = lambda k: np.float64(values[k] if isinstance(k, int) else k)  # noqa: E731
+        first = evaluated(another, known, np.sqrt)
+        expected = evaluated(tree, lambda k: first if k == 0 and isinstance(k, int) else known(k), np.sqrt)
+        if not np.isfinite(expected) or abs(expected) > 1e9:
+            return
+        (found,) = Program(graph, inputs, replaced)([np.float64(v) for v in values])
+    assert found == pytest.approx(float(expected), rel=1e-9, abs=1e-9)
+
+
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(_trees, _trees)
 def test_no_operation_is_emitted_twice(first, second):

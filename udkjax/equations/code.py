@@ -32,8 +32,8 @@ class Code:
     rows       D, b, a_F, M^(-1/2)        closure    D, Psi, M^(-1/2)        rate    D, Psi_dot, M^(-1/2)
 
     and for elimination: `accelerations` (a, whether all pivots are safe), `nearer` (q and v after a Newton step to Psi = 0 and to
-    Psi_dot = 0, whether safe), `closer` (the same of q alone), `arrival` (v after that step, and the accelerations with it, where q
-    is already on the manifold; whether safe), `tangential` (of changes of q and v what projection leaves; whether all pivots are far from none).
+    Psi_dot = 0, whether safe), `closer` (the same of q alone), `arrival` (the same of v alone, and the accelerations with it),
+    `tangential` (of changes of q and v what projection leaves; whether all pivots are far from none).
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
 

@@ -278,6 +278,7 @@ def _write(task: Task, m: March, points: tuple[Point, ...], until: Array) -> Mar
         return jnp.sum((block(written) <= until) & (number < inner), axis=0)
 
     def due(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        # What XLA does not know to be the points themselves: else it would make polynomials of them where no output is due, too.
         known = jax.tree.map(lambda x: jnp.where(state[0] >= 0, x, 0.0), points)
         return jax.lax.while_loop(lambda state: jnp.any(behind(state[0]) > 0), partial(more, known), state)
 

@@ -9,6 +9,9 @@ from jaxtyping import Array
 from udkjax.straightline import cut
 
 POINTS = 4  # states that an interpolating polynomial goes through: with three, velocities between steps are worse than at steps
+# Columns of differences between two barriers: with none XLA computes each coefficient with all that it is made of, which takes
+# single runs a tenth longer; with one after each of them lanes take a tenth longer.
+CUT_EVERY = 3
 STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 
 
@@ -45,7 +48,7 @@ def interpolated(points: tuple[Point, ...], times: Array) -> Array:
                 following.append(known[order][first])
             else:
                 following.append((column[i + 1] - column[i]) * inverse[first, last])
-        column = cut(following) if order % 3 == 2 else following
+        column = cut(following) if order % CUT_EVERY == CUT_EVERY - 1 else following
         coefficients.append(column[0] if order < 3 else jnp.where(used[order // 3 - 1], column[0], 0.0))
     q, v = jnp.zeros((), column[0].dtype), jnp.zeros((), column[0].dtype)
     for k, coefficient in reversed(list(enumerate(coefficients))):
