@@ -145,7 +145,8 @@ def drift_of_steps(mechanism: udk.Mechanism, method: Pseudoinverse, most: int) -
         lasting = lambda t, q, v, dq, dv: Tangential(dq, dv, jnp.array(True))  # noqa: E731
         numbers = (jnp.stack([0.0, span]), jnp.ones(()), jnp.ones(()), jnp.zeros(()))
         arrived = lambda t, q, v: (q, v, equations.accelerations(t, q, v))  # noqa: E731
-        task = Task(equations.accelerations, arrived, lasting, None, False, *numbers, None, 1, DOPRI8)
+        ended = lambda *at: (*arrived(*at[:3]), lasting(*at))  # noqa: E731
+        task = Task(equations.accelerations, arrived, lasting, ended, None, False, *numbers, None, 1, DOPRI8)
         h, no, q, v = span / steps, jnp.array(False), state.q.ravel(), state.v.ravel()
         t = jnp.zeros(())
         first = Point(t, q, v, equations.accelerations(t, q, v))

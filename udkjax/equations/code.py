@@ -33,7 +33,8 @@ class Code:
 
     and for elimination: `accelerations` (a, whether all pivots are safe), `nearer` (q and v after a Newton step to Psi = 0 and to
     Psi_dot = 0, whether safe), `closer` (the same of q alone), `arrival` (the same of v alone, and the accelerations with it),
-    `tangential` (of changes of q and v what projection leaves; whether all pivots are far from none).
+    `tangential` (of changes of q and v what projection leaves; whether all pivots are far from none), `finish` (`arrival` and
+    `tangential`, with its pivots; whether safe).
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
 
@@ -91,10 +92,12 @@ class Code:
         moved = dict(zip((x.index for x in e.v), v, strict=True))
         n, loads = self.n, graph.replaced([*e.free, *(self.b(i) for i in self.kept)], moved)
         a = [f + s for f, s in zip(loads[:n], self.spread(self.solved(loads[n:])), strict=True)]
-        self.outputs["arrival"] = [*v, *a, safe]
+        self.outputs["arrival"] = [*v, *a, safe, safe]
         self.changes = [graph.input(f"d{k}", "change") for k in range(2 * self.n)]
         far = all_of(self._dropping.above(NEAR), graph)
-        self.outputs["tangential"] = [*self._tangential(self.changes[: self.n]), *self._tangential(self.changes[self.n :]), far]
+        self.outputs["tangential"] = [*self._tangential(True), far]
+        far = all_of(self._gram.above(NEAR), graph)
+        self.outputs["finish"] = [*v, *a, *self._tangential(False), far, safe]
 
     def _safe(self, factors: Factors) -> Scalar:
         """Whether no pivot is too small to be trusted; a method that drops such rows does not ask."""
@@ -112,9 +115,13 @@ class Code:
         """M^(-1) Psi_q^T y, of the rows kept."""
         return [c * s for c, s in zip(self.compliance, self.pulled(y), strict=True)]
 
-    def _tangential(self, change: Sequence[Scalar]) -> list[Scalar]:
-        rows, zero = (self.equations.psi_q[i] for i in self.kept), self.graph.constant(0.0)
-        return self._without(change, [sum((entry * change[k] for k, entry in row.items()), zero) for row in rows])
+    def _tangential(self, dropping: bool) -> list[Scalar]:
+        rows, zero = [self.equations.psi_q[i] for i in self.kept], self.graph.constant(0.0)
+        found = []
+        for change in (self.changes[: self.n], self.changes[self.n :]):
+            residual = [sum((entry * change[k] for k, entry in row.items()), zero) for row in rows]
+            found += self._without(change, residual, dropping)
+        return found
 
     def _without(self, x: Sequence[Scalar], residual: Sequence[Scalar], dropping: bool = True) -> list[Scalar]:
         """x without what makes a residual of the rows kept: x - M^(-1) Psi_q^T (D D^T)^(-1) residual."""
@@ -140,7 +147,7 @@ class Code:
     def program(self, name: str) -> Program:
         if name not in self._programs:
             e = self.equations
-            state = [e.t, *e.q, *e.v, *(self.changes if name == "tangential" else [])]
+            state = [e.t, *e.q, *e.v, *(self.changes if name in ("tangential", "finish") else [])]
             self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name])
         return self._programs[name]
 

@@ -79,14 +79,23 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
 
 def arrived(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector]:
     """q and v on the manifold, and the accelerations there: by Newton steps in position, and one program of all the rest."""
-    found, safe = _arrived(equations, t, q, v)
+    found, _, (_, safe) = _arrived(equations, t, q, v, ())
     q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if _checks(equations) else found
     return q, v, a
 
 
+def finished(
+    equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector
+) -> tuple[Vector, Vector, Vector, Tangential]:
+    """`arrived`, and what projection leaves of small changes there, by the same program."""
+    found, (dq, dv), (far, safe) = _arrived(equations, t, q, v, (dq, dv))
+    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if _checks(equations) else found
+    return q, v, a, Tangential(dq, dv, far)
+
+
 @jax.custom_jvp
-def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any, Any]:
-    """q, v and a, numbers in any case; whether they can be trusted."""
+def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector, changes: tuple[Vector, ...]) -> tuple[Any, Any, Any]:
+    """q, v and a, numbers in any case; what is left of changes; whether the end is far from singular, whether to be trusted."""
     program = equations.code.program("closer")
 
     def closer(state: Any) -> Any:
@@ -98,8 +107,9 @@ def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Any,
     start = 0, scalars([q]), jnp.inf, jnp.array(True)
     _, found, _, safe = jax.lax.while_loop(lambda s: (s[0] < STEPS) & ~(s[2] <= CLOSE), closer, start)
     q = stacked(found)
-    *found, still = equations.call(equations.code.program("arrival"), t, q, v)
-    return (q, stacked(found[: len(q)]), stacked(found[len(q) :])), safe & still
+    *found, far, still = equations.call(equations.code.program("finish" if changes else "arrival"), t, q, v, *changes)
+    v, a, *left = (stacked(found[k : k + len(q)]) for k in range(0, len(found), len(q)))
+    return (q, v, a), tuple(left), (far, safe & still)
 
 
 def _largest_change(new: Sequence[Array], old: Sequence[Array]) -> Array:
@@ -159,15 +169,18 @@ def _(steps, primals, tangents):
 
 @partial(_arrived.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
-    equations, t, _, _ = primals
-    (q, v, a), safe = _arrived(*primals)
+    equations, t, *_ = primals
+    tangents = tangents[:4]
+    found = _arrived(*primals)
+    (q, v, a), *rest = found
     dq, dv = _correction(equations, t, q, v, tangents)
     da = jnp.zeros_like(a)
     if any(moving_of(tangents)):
         changes = (*tangents[:2], dq, dv)
         moving = moving_of(changes)
         _, (da,) = _along("accelerations", "accelerations", moving, (equations, t, q, v), those(changes, moving))
-    return ((q, v, a), safe), ((dq, dv, da), np.zeros(jnp.shape(safe), jax.dtypes.float0))
+    none = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0) if x.dtype == bool else jnp.zeros_like(x), rest)
+    return found, ((dq, dv, da), *none)
 
 
 @jax.custom_jvp

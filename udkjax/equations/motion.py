@@ -91,6 +91,15 @@ class Motion(eqx.Module):
         q, v = self.project(t, q, v)
         return q, v, self.accelerations(t, q, v)
 
+    @property
+    def finishes(self) -> bool:
+        """Whether there is a `finished` that takes less than `arrived` and `tangential`."""
+        return False
+
+    def finished(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector, Vector, Tangential]:
+        """`arrived`, and `tangential` there, which has no derivative."""
+        raise NotImplementedError
+
     def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
         """`project`, from farther away: by at most so many steps of Newton's method.
 

@@ -35,6 +35,7 @@ RANK_TOL = 1e-4
 # Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
 # longer to trace and compile, the larger the scene (see the scaling benchmark).
 LARGE = 150
+FEW = 20  # coordinates: up to so many, `finish` has not too many results for a fusion of lanes (straightline/fusion.py)
 NOTHING_LEFT = 1e-14  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
 # Varga's method compares diagonal entries of R, which are larger than singular values, with the largest norm of a column, which
 # is less than the largest of them. With this many times the threshold runs that cross singular configurations take as many steps
@@ -97,6 +98,15 @@ class Equations(MechanismMotion):
 
     def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
         return fast.closed(self, t, q, v, steps) if self._by_elimination else super().closed(t, q, v, steps)
+
+    @property
+    def finishes(self) -> bool:
+        few = self.loop is None or not self.loop.batch or self.code.n <= FEW
+        return self._by_elimination and few
+
+    def finished(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector, Vector, Tangential]:
+        """q and v projected, the accelerations there, and what projection leaves of changes: by one elimination."""
+        return fast.finished(self, t, q, v, dq, dv)
 
     @property
     def _by_elimination(self) -> bool:

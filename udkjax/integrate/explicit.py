@@ -75,8 +75,9 @@ class Task(NamedTuple):
     """What to march along. Numbers are one for each lane, or one for all."""
 
     accelerations: Callable[..., Array]  # of lanes: (t, q, v) -> a
-    arrived: Callable[..., tuple[Array, Array, Array]]  # at the end of a step: (t, q, v) -> q, v returned to the manifold, and a
+    arrived: Callable[..., tuple[Array, Array, Array]]  # where a step ends: (t, q, v) -> q, v on the manifold, and a
     lasting: Callable[..., Tangential]  # (t, q, v, error of q, error of v) -> the errors as they count
+    ended: Callable[..., tuple[Array, Array, Array, Tangential]]  # both: (t, q, v, error of q, error of v) -> q, v, a, errors
     careful: Callable[..., Trial] | None  # takes a step again, by equations that may branch; None: the lane ends as `DOUBTED`
     doubts: bool  # whether accelerations that are not a number mean that a step wants care
     ts: Array  # (T, *lanes)
@@ -102,7 +103,12 @@ def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial
     start = jnp.where(jnp.all(begin), last, 1)
     a, *_ = jax.lax.fori_loop(start, last, stage, (a, here.q, here.v))
     _, *end = stage_state(task.method, here, h, a, last)
-    return judged(task, here, Point(t1, *task.arrived(t1, *end)), h, a, jnp.where(begin, 1, last))
+    if task.method.ends:
+        q, v, new = task.arrived(t1, *end)
+        left = task.lasting(t1, q, v, *errors(task.method, h, a, new))
+    else:
+        q, v, new, left = task.ended(t1, *end, *errors(task.method, h, a))
+    return judged(task, here, Point(t1, q, v, new), left, a, jnp.where(begin, 1, last))
 
 
 def stage_state(
@@ -131,18 +137,21 @@ def stage_state(
     return here.t + node * h, q, v
 
 
-def judged(task: Task, here: Point, to: Point, h: Array, a: Array, evaluations: Any) -> Trial:
-    """A step with its error; of a method whose last stage is the next step's first, that is the one after projection."""
-    method = task.method
-    a = a.at[-1].set(to.a) if method.ends else a
+def errors(method: Method, h: Array, a: Array, end: Array | None = None) -> list[Array]:
+    """Of q and v, from the accelerations of all stages; `end`: those after projection, where they are the last stage's."""
+    a = a if end is None else a.at[-1].set(end)
     error_v = h * _combine(method.error_v, a)
     error_q = h * (h * _combine(method.error_q, a))
-    error_q, error_v = cut([error_q, error_v])
-    error_q, error_v, far = task.lasting(to.t, to.q, to.v, error_q, error_v)
-    size = jnp.maximum(_relative(task, error_q, here.q, to.q), _relative(task, error_v, here.v, to.v))
+    return cut([error_q, error_v])
+
+
+def judged(task: Task, here: Point, to: Point, left: Tangential, a: Array, evaluations: Any) -> Trial:
+    """A step with what lasts of its errors."""
+    size = jnp.maximum(_relative(task, left.dq, here.q, to.q), _relative(task, left.dv, here.v, to.v))
     size = jnp.where(all_finite(to.a), size, jnp.nan)
     evaluations = jnp.broadcast_to(jnp.asarray(evaluations), size.shape)
-    return Trial(to, undifferentiated(size), far, evaluations, a if task.recorded else None)
+    a = a.at[-1].set(to.a) if task.method.ends else a
+    return Trial(to, undifferentiated(size), left.far, evaluations, a if task.recorded else None)
 
 
 def _combine(weights: Any, a: Array) -> Array:

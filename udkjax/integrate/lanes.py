@@ -16,10 +16,10 @@ from jaxtyping import Array
 
 from udkjax.equations.motion import Motion, Tangential
 from udkjax.integrate.batched import CHUNKED, batched
-from udkjax.integrate.explicit import March, Task, Trial, judged, march, stage_state
+from udkjax.integrate.explicit import March, Task, Trial, errors, judged, march, stage_state
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
-from udkjax.integrate.projection import lasting, violation
+from udkjax.integrate.projection import ended, lasting, violation
 from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.straightline import Loop, apart, when
 
@@ -124,24 +124,24 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     over = lanes.within(None if recorded else _loop_of(problem, lanes)).over
     task = Task(
         partial(over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
-        partial(over, _projected if problem.projected else _as_it_is),
-        partial(over, lasting) if problem.projected else _all_of_it,
+        partial(over, lambda e, t, q, v: e.quick.arrived(t, q, v)),
+        partial(over, lasting),
+        partial(over, ended),
         None,
         problem.equations.branches,
         *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
         recorded,
     )
+    if not problem.projected:
+
+        def as_it_is(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
+            return q, v, task.accelerations(t, q, v)
+
+        task = task._replace(arrived=as_it_is, lasting=_all_of_it)
+        task = task._replace(ended=lambda t, q, v, dq, dv: (*as_it_is(t, q, v), _all_of_it(t, q, v, dq, dv)))
     if problem.equations.branches and problem.careful:
         task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
     return task
-
-
-def _projected(equations: Motion, t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
-    return equations.quick.arrived(t, q, v)
-
-
-def _as_it_is(equations: Motion, t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
-    return q, v, equations.quick.accelerations(t, q, v)
 
 
 def _loop_of(problem: Problem, lanes: Lanes) -> Loop | None:
@@ -206,8 +206,10 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
         first = start, none, here.q, here.v, jnp.array(False)
         _, a, q1, v1, _ = jax.lax.while_loop(lambda c: c[0] <= stages, more, first)
         mine, evaluations = task._replace(rtol=rtol, atol=atol), jnp.where(begin, 2, 2 * stages + 1)
-        mine = mine._replace(lasting=partial(lasting, equations)) if projected else mine
-        return judged(mine, here._replace(a=a[0]), Point(t1, q1, v1, a[stages]), h, a[:stages], evaluations)
+        to, found = Point(t1, q1, v1, a[stages]), a[:stages]
+        final = partial(lasting, equations) if projected else _all_of_it
+        left = final(t1, q1, v1, *errors(task.method, h, found, to.a if task.method.ends else None))
+        return judged(mine, here._replace(a=a[0]), to, left, found, evaluations)
 
     tolerances = (jnp.broadcast_to(x, h.shape) for x in (task.rtol, task.atol))
     unknown = jnp.zeros((stages, *here.a.shape)) if task.recorded else None

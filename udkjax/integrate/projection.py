@@ -34,8 +34,22 @@ def lasting(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array)
     Close to dependent rows it need not be exact, and does not branch.
     """
     q, v, dq, dv = undifferentiated((q, v, dq, dv))
-    left_q, left_v, far = undifferentiated(equations.forgiving).tangential(t, q, v, dq, dv)
-    return Tangential(left_q + TAKEN_BACK * (dq - left_q), left_v + TAKEN_BACK * (dv - left_v), jnp.asarray(far))
+    return _counted(undifferentiated(equations.forgiving).tangential(t, q, v, dq, dv), dq, dv)
+
+
+def ended(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array) -> tuple[Array, Array, Array, Tangential]:
+    """The end of a step with errors dq and dv: q and v on the manifold, the accelerations there, and the errors `lasting`."""
+    quick = equations.quick
+    if not quick.finishes:
+        q, v, a = quick.arrived(t, q, v)
+        return q, v, a, lasting(equations, t, q, v, dq, dv)
+    dq, dv = undifferentiated((dq, dv))
+    q, v, a, left = quick.finished(t, q, v, dq, dv)
+    return q, v, a, _counted(left, dq, dv)
+
+
+def _counted(left: Tangential, dq: Array, dv: Array) -> Tangential:
+    return Tangential(left.dq + TAKEN_BACK * (dq - left.dq), left.dv + TAKEN_BACK * (dv - left.dv), jnp.asarray(left.far))
 
 
 def violation(equations: Motion, t: Any, y: Float[Array, "2n"]) -> Float[Array, ""]:
