@@ -182,9 +182,7 @@ class Equations(MechanismMotion):
         """Evaluate a program of the constants and of all numbers of some arrays."""
         if self.loop is None:
             return program([*self.constants, *scalars(arrays)])
-        # One array of constants is one buffer, and XLA makes all of them anew for each run; in lanes most are the same for all.
-        constants = self.constants if self.loop.batch else [stacked(self.constants)]
-        return program.within(self.loop, [x for x in (*constants, *arrays) if np.size(x)])
+        return program.within(self.loop, [*self.constants, *(x for x in arrays if np.size(x))])
 
     def arrays(self, name: str, t: Any, q: Any, v: Any) -> list[Array]:
         """What a program returns, as arrays: the values of D, the right-hand side, and vectors over the coordinates."""
