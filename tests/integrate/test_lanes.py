@@ -1,5 +1,7 @@
 """Batches of explicit Runge-Kutta runs: in lanes, each the same as alone, and as by diffrax."""
 
+from functools import partial
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from udkjax.equations import prepare
 from udkjax.equations.code import Code
 from udkjax.integrate import batched, lanes
 from udkjax.integrate.explicit import stage_state
@@ -211,6 +214,24 @@ def test_one_direction_for_all_members(pendulum):
     _, slopes = jax.vmap(lambda x: jax.jvp(angle, (x,), (1.0,)))(inertias)
     ahead, behind = (jax.vmap(angle)(inertias + h) for h in (1e-4, -1e-4))
     assert_allclose(slopes, (ahead - behind) / 2e-4, rtol=1e-4)
+
+
+def test_outputs_side_by_side_are_those_one_after_another(placed):
+    """Also where some beside singular configurations take more of Newton's steps than the others of their chunk."""
+    angles = jnp.concatenate([jnp.linspace(-1.0, 1.0, 2 * lanes.LANES + 10), jnp.array([1e-3, 1e-5, 0.0])])
+    states = jnp.stack(jax.vmap(placed)(angles, jnp.ones_like(angles)), 1).reshape(len(angles), 24)
+    states += 1e-6 * np.random.default_rng(0).standard_normal(states.shape)
+    one, times = lanes.Lanes(prepare(udk.library.parallelogram())), jnp.zeros(len(angles))
+
+    @partial(jax.jit, static_argnums=1)
+    def closed(states, wide):
+        return lanes._each_output(one, partial(lanes._output, True), times, states, wide)
+
+    (found, violated), (expected, violated_then) = closed(states, True), closed(states, False)
+    ordinary = np.abs(angles) > 1e-4
+    assert_allclose(found[ordinary], expected[ordinary], rtol=0, atol=1e-14)
+    assert_allclose(violated[ordinary], 0.0, atol=1e-12)
+    assert np.all(violated <= 1.01 * violated_then + 1e-15) and violated.max() < 1e-6 < jnp.abs(found - states).max()
 
 
 def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
