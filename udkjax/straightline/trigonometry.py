@@ -24,7 +24,7 @@ from udkjax.straightline.barrier import cut
 
 # pi/2 in three parts of 33 bits, whose products with integers below 2^20 are exact, and a rest: fdlibm, e_rem_pio2.c.
 _PARTS = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624871116645580e-21, 8.47842766036889956997e-32)
-_SHIFT = 1.5 * 2.0**52  # what it is added to is rounded to an integer, whose last bits are those of the sum
+_SHIFT = 1.5 * 2.0**52  # the last bits of its sum with an integer are those of the integer
 # (sin r - r) / r^3 and (cos r - 1 + r^2 / 2) / r^4 in powers of r^2, highest first, for |r| <= pi/4.
 _SINE = (
     1.58969099521155010221e-10,
@@ -75,14 +75,13 @@ def _by_polynomials(x: Any) -> tuple[Any, Any]:
 def _reduced(x: Any) -> tuple[Any, Any]:
     """An integer with the last bits of n, and x - n pi/2."""
     a, b, c, d = _PARTS
-    shifted = x * (2 / math.pi) + _SHIFT
-    n = shifted - _SHIFT
+    n = jax.lax.round(x * (2 / math.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
     rest = x - n * a
     high = rest - n * b
     low = (rest - high) - n * b  # what rounding took from it
     r = (high + (low - n * c)) - n * d
     r = jnp.minimum(jnp.maximum(r, -1.0), 1.0)  # from 1e16 on n is not exact: where r means nothing, keep a cosine a cosine
-    return jax.lax.bitcast_convert_type(shifted, jnp.int64), r
+    return jax.lax.bitcast_convert_type(n + _SHIFT, jnp.int64), r
 
 
 def _near_zero(r: Any) -> tuple[Any, Any]:
