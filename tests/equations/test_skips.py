@@ -24,11 +24,11 @@ from udkjax.straightline.trigonometry import sincos
 
 ARITHMETIC = (
     *("add", "subtract", "multiply", "divide", "negate", "abs", "sqrt", "rsqrt", "cbrt", "power", "maximum", "minimum"),
-    *("floor", "round_nearest_even"),
+    *("floor", "round_nearest_even", "xor", "shift_left"),
 )
 TRIGONOMETRY = ("sincos", "sine", "cosine", "tan", "tanh", "atan2", "exponential", "log")
-PAIR = 47  # floating-point operations in `sincos`
-CHOICES = ("compare", "select", "clamp", "and", "or", "not", "xor", "shift_left", "reduce")
+PAIR = 51  # operations in `sincos`, on numbers and, for signs, on their bits
+CHOICES = ("compare", "select", "clamp", "and", "or", "not", "reduce")
 MOVES = (
     "constant reshape slice concatenate broadcast_in_dim convert bitcast_convert optimization_barrier transpose branch".split()
 )
@@ -471,7 +471,7 @@ def flops(text: str) -> int:
 
 
 def test_a_tangent_takes_half_of_what_the_accelerations_take(linkage, plain):
-    assert flops(pushed(linkage)) <= 1.51 * flops(plain)  # it needs no other sines and cosines, which are the cheaper by now
+    assert flops(pushed(linkage)) <= 1.5 * flops(plain)
 
 
 def test_a_gradient_takes_half_of_what_the_accelerations_take(linkage, plain):

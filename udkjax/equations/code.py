@@ -92,7 +92,7 @@ class Code:
         moved = dict(zip((x.index for x in e.v), v, strict=True))
         n, loads = self.n, graph.replaced([*e.free, *(self.b(i) for i in self.kept)], moved)
         a = [f + s for f, s in zip(loads[:n], self.spread(self.solved(loads[n:])), strict=True)]
-        self.outputs["arrival"] = [*v, *a, safe, safe]
+        self.outputs["arrival"] = [*v, *a, safe]
         self.changes = [graph.input(f"d{k}", "change") for k in range(2 * self.n)]
         far = all_of(self._dropping.above(NEAR), graph)
         self.outputs["tangential"] = [*self._tangential(True), far]

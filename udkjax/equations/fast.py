@@ -107,7 +107,8 @@ def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector, changes: tupl
     start = 0, scalars([q]), jnp.inf, jnp.array(True)
     _, found, _, safe = jax.lax.while_loop(lambda s: (s[0] < STEPS) & ~(s[2] <= CLOSE), closer, start)
     q = stacked(found)
-    *found, far, still = equations.call(equations.code.program("finish" if changes else "arrival"), t, q, v, *changes)
+    *found, still = equations.call(equations.code.program("finish" if changes else "arrival"), t, q, v, *changes)
+    far = found.pop() if changes else still  # who asks for no changes does not ask how far, either
     v, a, *left = (stacked(found[k : k + len(q)]) for k in range(0, len(found), len(q)))
     return (q, v, a), tuple(left), (far, safe & still)
 

@@ -125,11 +125,9 @@ def stage_state(
         return here.q + h * (node * here.v + h * _combine(row_q, stages)), here.v + h * _combine(row_v, stages)
 
     tableau = (method.nodes, method.q, method.v)
-    if isinstance(i, int):
-        node, *rows = (c[i] for c in tableau)
-        return here.t + node * h, *cut(state(node, *rows))
-    node, *rows = (jax.lax.dynamic_index_in_dim(jnp.asarray(c), i, keepdims=False) for c in tableau)
-    if not here.t.shape:
+    known = isinstance(i, int)
+    node, *rows = (c[i] if known else jax.lax.dynamic_index_in_dim(jnp.asarray(c), i, keepdims=False) for c in tableau)
+    if known or not here.t.shape:
         return here.t + node * h, *cut(state(node, *rows))
     q, v = into
     for k, row in enumerate(zip(*tableau, strict=True)):
