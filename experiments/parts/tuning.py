@@ -13,9 +13,9 @@ import udkjax as udk
 from experiments.parts.linkage import parallelogram, start
 from udkjax.equations import prepare
 from udkjax.equations.motion import Tangential
-from udkjax.integrate.explicit import Task, attempt
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.solution import Result
+from udkjax.integrate.step import Task, attempt
 from udkjax.integrate.tableau import DOPRI8
 from udkjax.pinv import Pseudoinverse
 from udkjax.study.identify.fitting import Fit, descend

@@ -13,8 +13,8 @@ import udkjax as udk
 from udkjax.equations import prepare
 from udkjax.equations.code import Code
 from udkjax.integrate import batched, lanes
-from udkjax.integrate.explicit import stage_state
 from udkjax.integrate.interpolation import Point
+from udkjax.integrate.step import stage_state
 from udkjax.integrate.tableau import method_of
 from udkjax.study.exact import exact_coordinates
 

@@ -16,10 +16,11 @@ from jaxtyping import Array
 
 from udkjax.equations.motion import Motion, Tangential
 from udkjax.integrate.batched import CHUNKED, batched
-from udkjax.integrate.explicit import March, Task, Trial, errors, judged, march, stage_state
+from udkjax.integrate.explicit import March, march
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import ended, lasting, violation
+from udkjax.integrate.step import Task, Trial, errors, judged, stage_state
 from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.straightline import Loop, apart, when
 

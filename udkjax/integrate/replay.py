@@ -22,12 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.integrate.explicit import BLOCK, Task, attempt, stage_state, when
+from udkjax.integrate.explicit import BLOCK
 from udkjax.integrate.interpolation import POINTS
 from udkjax.integrate.lanes import Lanes, task_of
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.record import BEHIND, Record, as_point, noted
 from udkjax.integrate.replay_outputs import Equations, Sums, Walk, of_outputs, of_points
+from udkjax.integrate.step import Task, attempt, stage_state
+from udkjax.straightline import when
 
 
 def walked_back(problem: Problem, moving: Problem, raw: Raw, record: Record, ys: Array, y: Array) -> Problem:
