@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 SOURCE = Path(__file__).with_name("linkage.cpp")
-FLAGS = ("-std=c++17", "-O3", "-march=native")
+FLAGS = ("-std=c++17", "-O3", "-march=native", "-Wno-psabi")
 STATE = 24  # 12 coordinates, 12 velocities
 PARAMETERS = (  # in the order of the gradient
     *("link1.mass", "link2.mass", "link3.mass", "coupler.mass"),

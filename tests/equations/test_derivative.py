@@ -224,7 +224,7 @@ def test_in_a_loop_value_and_directions_are_found_by_one_program():
         def along(d):
             return jax.jvp(state, (jnp.array(9.81), q, v), (d[0], d[1 : 1 + q.size], d[1 + q.size :]))
 
-        return [jax.vmap(along)(directions[:size]) for size in (1, 3, 6)]
+        return [jax.vmap(along)(directions[:size]) for size in (1, 3, 4, 6)]
 
     parts, at_once = (jax.tree.leaves(jax.jit(lambda loop=loop: changes(loop))()) for loop in (None, Loop()))
     size = max(float(jnp.abs(x).max()) for x in parts)
@@ -238,9 +238,9 @@ def test_value_and_directions_at_once_hand_nothing_on(linkage):
     code = prepare(linkage).code
     moving = tuple(k in (0, len(code.constants) + 1, len(code.constants) + 2) for k in range(len(code.constants) + 3))
     derivative = code.derivative("accelerations", moving)
-    assert derivative.few("accelerations") == 4
+    assert derivative.few("accelerations") == 3
     value, forward = derivative.evaluation("accelerations"), derivative.forward
-    for directions in (1, 4):
+    for directions in (1, 3):
         both = derivative.along("accelerations", directions)
         assert sum(both.count().values()) <= sum(value.count().values()) + directions * sum(forward.count().values())
         assert len(both.outputs) == len(code.outputs["accelerations"]) + directions * len(forward.outputs)

@@ -44,17 +44,29 @@ def ready(entry: str) -> int:
 
 @pytest.mark.skipif(jax.__version_info__ < (0, 12), reason="older versions of XLA fuse otherwise")
 def test_what_waits_for_nothing_is_handed_to_no_other_thread():
-    """Of a run with numbers that are traced, and of its derivative by two of them."""
+    """Of a run with numbers that are traced, also with all masses and inertias, and of its derivative by two of them."""
     mechanism = udk.library.parallelogram()
+    names = [f"body.{body}.{name}" for body in mechanism.body_names for name in ("mass", "inertia")]
 
-    def angle(masses):
-        changed = mechanism.with_parameters({"body.link1.mass": masses[0], "body.link2.mass": masses[1]})
+    def angle(values):
+        changed = mechanism.with_parameters(dict(zip(names, values, strict=False)))
         start, forward = udk.State(mechanism.q0, mechanism.v0), diffrax.ForwardMode()
         return udk.simulate(changed, TS[:2], start, adjoint=forward, careful=False, throw=False).q[-1, 0, 2]
 
-    for function in (angle, jax.jacfwd(angle)):
-        text = jax.jit(function).lower((1.0, 1.0)).compile().as_text() or ""
+    for function, count in ((angle, 2), (angle, len(names)), (jax.jacfwd(angle), 2)):
+        text = jax.jit(function).lower((1.0,) * count).compile().as_text() or ""
         assert 0 < ready(text.split("\nENTRY")[1]) <= SEQUENTIAL
+
+
+def test_a_run_walked_back_starts_few_operations():
+    """Also where there is one output alone: no loop over those, but one function."""
+    mechanism = udk.library.parallelogram()
+
+    def angle(mass):
+        changed = mechanism.with_parameters({"body.link1.mass": mass})
+        return udk.simulate(changed, TS[:2], udk.State(mechanism.q0, mechanism.v0), throw=False).q[-1, 0, 2]
+
+    assert len(started(jax.jit(jax.grad(angle)).lower(1.0).compile().as_text() or "")["ENTRY"]) <= 40
 
 
 def compiled(mechanism, careful):

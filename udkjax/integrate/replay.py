@@ -41,7 +41,8 @@ def walked_back(problem: Problem, moving: Problem, raw: Raw, record: Record, ys:
     outputs = jnp.where(raw.reached[:, None], ys, 0.0)
     first, outputs = outputs[0], outputs[1:]
     if problem.projected:
-        sums, outputs = of_outputs(problem, raw, equations, sums, outputs)
+        # Of one output alone XLA would make no function, but start each operation by itself.
+        sums, outputs = when(raw.accepted >= 0, lambda x: of_outputs(problem, raw, equations, *x), (sums, outputs))
     done, inner = raw.status == DONE, len(problem.ts) - 2
     end = outputs[-1] + y
     outputs = jnp.concatenate([outputs[:inner], jnp.zeros((BLOCK, 2 * n))])
