@@ -27,8 +27,8 @@ WIDEST = 512  # bits
 OPTIONS = "xla_backend_extra_options"
 MEMORY_CHECKS = "vectorize-memory-check-threshold"
 MANY = 10**6  # by itself LLVM gives up after 128
-# Loops of four rounds and more are not written out. Lanes are made of hundreds of eight: that takes a quarter off what those of the
-# paper's linkage compile, of larger scenes a third. Those along four directions of a derivative would be no vectors any more.
+# Loops of four rounds and more are not written out. Lanes are made of hundreds of eight: that takes a quarter off what those of
+# the paper's linkage compile, of larger scenes a third. Those along four directions of a derivative would be no vectors any more.
 NO_LONG_UNROLLING = "-unroll-full-max-count=3,-forget-scev-loop-unroll"
 LIBRARY = "xla_cpu_experimental_ynn_fusion_type"
 KNOWN = (0, 12)  # the newest JAX whose XLA is known to know the flag: one that it does not know ends the process
