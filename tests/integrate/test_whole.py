@@ -44,17 +44,16 @@ def ready(entry: str) -> int:
 
 @pytest.mark.skipif(jax.__version_info__ < (0, 12), reason="older versions of XLA fuse otherwise")
 def test_what_waits_for_nothing_is_handed_to_no_other_thread():
-    """Of a run with numbers that are traced, also with all masses and inertias, and of its derivative by two of them."""
+    """Of a run with numbers that are traced, and of its derivative by two of them."""
     mechanism = udk.library.parallelogram()
-    names = [f"body.{body}.{name}" for body in mechanism.body_names for name in ("mass", "inertia")]
 
-    def angle(values):
-        changed = mechanism.with_parameters(dict(zip(names, values, strict=False)))
+    def angle(masses):
+        changed = mechanism.with_parameters({"body.link1.mass": masses[0], "body.link2.mass": masses[1]})
         start, forward = udk.State(mechanism.q0, mechanism.v0), diffrax.ForwardMode()
         return udk.simulate(changed, TS[:2], start, adjoint=forward, careful=False, throw=False).q[-1, 0, 2]
 
-    for function, count in ((angle, 2), (angle, len(names)), (jax.jacfwd(angle), 2)):
-        text = jax.jit(function).lower((1.0,) * count).compile().as_text() or ""
+    for function in (angle, jax.jacfwd(angle)):
+        text = jax.jit(function).lower((1.0, 1.0)).compile().as_text() or ""
         assert 0 < ready(text.split("\nENTRY")[1]) <= SEQUENTIAL
 
 

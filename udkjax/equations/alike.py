@@ -143,7 +143,7 @@ class Group(NamedTuple):
             values += list(shared)
         size = len(self.members)
         values = [jnp.broadcast_to(jnp.asarray(v), (size,)) for v in values]
-        found = jax.vmap(lambda values: [jnp.asarray(c) for c in self.kind.prologue.early(values)], axis_size=size)(values)
+        found = jax.vmap(lambda values: [jnp.asarray(c) for c in self.kind.prologue(values)], axis_size=size)(values)
         return jnp.stack(found) if found else jnp.zeros((0, size))
 
     def run(self, names: tuple[str, ...], numbers: Array, t: Any, fields: Fields, loop: Loop | None = None) -> list[list[Any]]:

@@ -1,11 +1,10 @@
 """What of a program XLA compiles into one function: loops, unless there is something in them that it cannot compile so."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array
 
 Tree = TypeVar("Tree")
@@ -18,18 +17,6 @@ def apart(x: Array) -> Array:
     less time than all as one.
     """
     return jax.lax.sort(jnp.stack([x, jnp.full_like(x, jnp.iinfo(x.dtype).max)]), dimension=0)[0]
-
-
-def as_one(function: Callable[..., Tree], *xs: Any) -> Tree:
-    """What a function that is jitted returns, which XLA compiles into one function on the CPU, and all derivatives of it, too.
-
-    It must be arithmetic: XLA asks only of loops whether that can be. Operations by themselves are started one by one, for a
-    microsecond each, and some on other threads where more than eight are ready.
-    """
-    if jax.default_backend() != "cpu":
-        return function(*xs)
-    with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
-        return function(*xs)
 
 
 def when(condition: Array, function: Callable[[Tree], Tree], x: Tree) -> Tree:

@@ -15,11 +15,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from udkjax.straightline.barrier import cut
-from udkjax.straightline.branching import as_one
-from udkjax.straightline.fusion import SIMPLE, Loop, together
+from udkjax.straightline.fusion import Loop, together
 from udkjax.straightline.graph import Details, Graph, Node, Scalar
 from udkjax.straightline.trigonometry import sincos_of_each
 
@@ -53,7 +51,6 @@ class Program:
         )
         self._traced = jax.jit(self._run)  # traced once, wherever and however often it is called and differentiated
         self._fusions: dict[Any, Callable[..., list[Any]]] = {}
-        self._divided: dict[tuple[bool, ...], tuple[Program, Program]] = {}
 
     def uses(self, scalar: Scalar) -> bool:
         """Whether the program needs this input at all."""
@@ -77,39 +74,6 @@ class Program:
             jaxpr = jax.make_jaxpr(lambda *values: [jnp.asarray(x) for x in self._run(self._typed(values))])(*examples)
             self._fusions[known] = together(jaxpr, [x.shape for x in arrays])
         return self._fusions[known](loop, *arrays)
-
-    def early(self, values: Sequence[Any]) -> list[Any]:
-        """The same, once for many calls of others: what depends on values that are traced as one function."""
-        traced = tuple(isinstance(v, Tracer) for v in values)
-        if not any(traced) or not self._is_simple:
-            return self(values)
-        if traced not in self._divided:
-            self._divided[traced] = self._by_what_moves(traced)
-        still, moving = self._divided[traced]
-        given = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
-        found = dict(zip(still.outputs, still([given[s.index] for s in still.inputs]), strict=True))
-        late = moving._typed([given[s.index] for s in moving.inputs])
-        found |= zip(moving.outputs, as_one(moving._traced, late), strict=True)
-        return [found[s] for s in self.outputs]
-
-    @property
-    def _is_simple(self) -> bool:
-        """Whether it is arithmetic on numbers."""
-        nodes = [self.graph.nodes[i] for i in self.order]
-        return all(n.detail.primitive.name in SIMPLE if n.kind == "apply" else n.kind not in ("call", "pick") for n in nodes)
-
-    def _by_what_moves(self, moves: Sequence[bool]) -> tuple["Program", "Program"]:
-        """The program of what depends on none of some inputs, and that of all else."""
-        moving = {s.index for s, m in zip(self.inputs, moves, strict=True) if m}
-        for index in self.order:
-            if any(a.index in moving for a in self.graph.nodes[index].arguments):
-                moving.add(index)
-
-        def part(outputs: list[Scalar]) -> Program:
-            whole = Program(self.graph, self.inputs, outputs)
-            return Program(self.graph, [s for s in self.inputs if whole.uses(s)], outputs)
-
-        return part([s for s in self.outputs if s.index not in moving]), part([s for s in self.outputs if s.index in moving])
 
     def _typed(self, values: Sequence[Any]) -> list[Any]:
         given = zip(values, (s.node.dtype for s in self.inputs), strict=True)
