@@ -30,7 +30,7 @@ from udkjax.straightline.fusion import LARGEST
 if TYPE_CHECKING:
     from udkjax.equations.code import Code
 
-DIRECTIONS = 3  # of the linkage three in registers take a tenth less than as a vector, four a third more
+DIRECTIONS = 3  # of the linkage three in one program take a tenth less than side by side, four a sixth more
 
 
 class Derivative:
