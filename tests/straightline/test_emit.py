@@ -114,6 +114,93 @@ def test_an_output_that_is_early_itself_goes_through_the_frontier():
     assert Program(graph, [*early, q], outputs)([3.0, 9.0, 2.0]) == [9.0, 6.0, 2.0]
 
 
+def entry(function, *xs) -> list[str]:
+    """The calls that a compiled program makes."""
+    text = jax.jit(function).lower(*xs).compile().as_text() or ""
+    return [line for line in text.split("\nENTRY")[1].splitlines() if " call(" in line]
+
+
+def test_what_is_computed_early_is_one_function_with_its_derivatives():
+    """Of what is traced: results that depend on nothing of it are not among its."""
+    graph = Graph()
+    m, g = (graph.input(name, "parameter") for name in "mg")
+    program = Program(graph, [m, g], [graph.constant(1.0) / graph.sqrt(m), g * g, m * g * 2.0])
+    early = lambda m, g=1.5: program.early([m, g])  # noqa: E731
+    plain = lambda m, g=1.5: [1.0 / jnp.sqrt(m), g * g, m * g * 2.0]  # noqa: E731
+    (call,) = [e for e in jax.make_jaxpr(early)(0.7).eqns if e.primitive.name in ("jit", "pjit")]
+    assert len(call.outvars) == 2
+    total = lambda f: lambda *xs: sum(k * x for k, x in enumerate(f(*xs), 1))  # noqa: E731
+    for xs in ((0.7,), (0.7, -1.2)):
+        places = tuple(range(len(xs)))
+        both = total(early), total(plain)
+        for derived in (
+            lambda f: f,
+            lambda f, places=places: jax.jacfwd(f, places),
+            lambda f, places=places: jax.grad(f, places),
+            lambda f: lambda *some: jax.vmap(f)(*(x * jnp.arange(1.0, 4.0) for x in some)),
+            lambda f, places=places: jax.hessian(f, places),
+        ):
+            found, expected = (jax.jit(derived(f))(*xs) for f in both)
+            np.testing.assert_allclose(np.ravel(found), np.ravel(expected), rtol=1e-13)
+    for function in (early, jax.jacfwd(early), lambda x: jax.vmap(early)(x * jnp.ones(3))):
+        assert len(entry(function, 0.7)) == 1
+    assert len(entry(jax.grad(total(early)), 0.7)) <= 2
+
+
+@pytest.mark.parametrize("size", (1, 2))
+def test_what_xla_knows_of_a_batch_can_be_given_to_one_function(size):
+    """XLA finds out that some of what is given is known, and all alike, and then that a derivative needs none of it."""
+    graph = Graph()
+    m, n, g = (graph.input(name, "parameter") for name in "mng")
+    program = Program(graph, [m, n, g], [m, -m, m * n, n / g, g * g])
+    known = jnp.array([[0.25, 0.25], [4.0, 1.0], [3.0, 3.0]])
+
+    @jax.jit
+    def given(known, g):  # traced, so that it is XLA which evaluates it
+        return jnp.sqrt(known)[:, :size], g * jnp.ones(size)
+
+    def early(g):
+        known_to_xla, moving = given(known, g)
+        return jax.vmap(lambda m, n, g: program.early([m, n, g]))(known_to_xla[0], known_to_xla[1], moving)
+
+    def plain(g):
+        m, n = jnp.sqrt(known)[:2, :size]
+        return [m, -m, m * n, n / g, g * g * jnp.ones(size)]
+
+    for derived in (
+        lambda f: f,
+        jax.jacfwd,
+        jax.jacrev,
+        jax.hessian,
+        lambda f: jax.grad(lambda g: f(g)[3] @ given(known, g)[0][2]),
+        lambda f: lambda g: jax.vmap(f)(g * jnp.arange(1.0, 4.0)),
+    ):
+        np.testing.assert_allclose(*(np.asarray(jax.jit(derived(f))(0.7)) for f in (early, plain)), rtol=1e-14)
+    assert len(entry(early, 0.7)) == 1
+
+
+def test_functions_called_by_what_is_one_function_are_part_of_it():
+    graph = Graph()
+    m, n = (graph.input(name, "parameter") for name in "mn")
+    result = [trace(f, 0.5)(graph, x)[0].item() for f in (jnp.sin, jnp.cos) for x in (m, n)]
+    program = Program(graph, [m, n], result)
+    early = lambda m: jnp.stack(program.early([m, m * m]))  # noqa: E731
+    expected = np.array([np.sin(0.7), np.sin(0.49), np.cos(0.7), np.cos(0.49)])
+    np.testing.assert_allclose(jax.jit(early)(0.7), expected, rtol=1e-15)
+    assert len(entry(early, 0.7)) == 1
+
+
+def test_what_is_no_arithmetic_is_computed_early_as_it_is():
+    graph = Graph()
+    xs = [graph.input(k, "parameter") for k in range(3)]
+    f = lambda x: jnp.sort(x) * 2.0  # noqa: E731
+    (result,) = trace(f, X)(graph, np.array(xs, object))
+    program = Program(graph, xs, list(result))
+    early = lambda x: jnp.stack(program.early(list(x)))  # noqa: E731
+    np.testing.assert_array_equal(jax.jit(early)(X), f(X))
+    assert not entry(early, X)
+
+
 def test_what_opaque_nodes_take_can_be_replaced():
     graph = Graph()
     m = np.array([graph.input(k, "parameter") for k in range(3)], object)

@@ -256,7 +256,7 @@ def prepare(
         elimination, drop = "check", chosen.branch_tol
     programs = code(mechanism, left_out if elimination else (), baumgarte is not None, elimination)
     numbers = [*scalars(jax.tree.leaves(mechanism)), *gains, drop]
-    constants = [jnp.asarray(c) for c in programs.prologue(numbers)]
+    constants = [jnp.asarray(c) for c in programs.prologue.early(numbers)]
     return Equations(constants, chosen, programs)
 
 

@@ -5,9 +5,15 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array
 
 Tree = TypeVar("Tree")
+
+ONE = {
+    "inlineable": "false",
+    "xla_cpu_small_call": "true",
+}  # what XLA notes itself at the loops that it compiles into one function
 
 
 def apart(x: Array) -> Array:
@@ -17,6 +23,27 @@ def apart(x: Array) -> Array:
     less time than all as one.
     """
     return jax.lax.sort(jnp.stack([x, jnp.full_like(x, jnp.iinfo(x.dtype).max)]), dimension=0)[0]
+
+
+def as_one(function: Callable[[Tree], Tree]) -> Callable[[Tree], Tree]:
+    """The same, which XLA compiles into one function on the CPU wherever it is called, and all derivatives of it, too.
+
+    It must be arithmetic that uses all it is given: XLA asks only of loops whether they can be compiled so. Operations by
+    themselves are started one by one, for a microsecond each, and some on other threads where more than eight are ready.
+    """
+
+    inner = jax.jit(function)
+
+    def outer(x: Tree) -> Tree:
+        if jax.default_backend() != "cpu":
+            return inner(x)
+        # XLA may put a constant in the place of an argument, which is then left unused, and XLA, having no address of it, ends
+        # the process. What has passed a barrier is no constant. Of results, that is for what is handed back to them.
+        with set_xla_metadata(**ONE):
+            results = inner(jax.lax.optimization_barrier(x))
+        return jax.lax.optimization_barrier(results)
+
+    return outer
 
 
 def when(condition: Array, function: Callable[[Tree], Tree], x: Tree) -> Tree:

@@ -15,9 +15,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from udkjax.straightline.barrier import cut
-from udkjax.straightline.fusion import Loop, together
+from udkjax.straightline.branching import as_one
+from udkjax.straightline.fusion import SIMPLE, Loop, together
 from udkjax.straightline.graph import Details, Graph, Node, Scalar
 from udkjax.straightline.trigonometry import sincos_of_each
 
@@ -51,6 +53,7 @@ class Program:
         )
         self._traced = jax.jit(self._run)  # traced once, wherever and however often it is called and differentiated
         self._fusions: dict[Any, Callable[..., list[Any]]] = {}
+        self._divided: dict[tuple[bool, ...], list[tuple[Program, Callable[..., list[Any]]]]] = {}
 
     def uses(self, scalar: Scalar) -> bool:
         """Whether the program needs this input at all."""
@@ -74,6 +77,43 @@ class Program:
             jaxpr = jax.make_jaxpr(lambda *values: [jnp.asarray(x) for x in self._run(self._typed(values))])(*examples)
             self._fusions[known] = together(jaxpr, [x.shape for x in arrays])
         return self._fusions[known](loop, *arrays)
+
+    def early(self, values: Sequence[Any]) -> list[Any]:
+        """The same, once for many calls of others: what is computed of values that are traced by one function."""
+        traced = tuple(isinstance(v, Tracer) for v in values)
+        if not any(traced) or not self._is_simple:
+            return self(values)
+        if traced not in self._divided:
+            self._divided[traced] = self._by_what_moves(traced)
+        given = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
+        found: dict[Scalar, Any] = {}
+        for part, run in self._divided[traced]:
+            found |= zip(part.outputs, run([given[s.index] for s in part.inputs]), strict=True)
+        return [found[s] for s in self.outputs]
+
+    @property
+    def _is_simple(self) -> bool:
+        """Whether it is arithmetic on numbers."""
+        nodes = [self.graph.nodes[i] for i in self.order]
+        return all(n.detail.primitive.name in SIMPLE if n.kind == "apply" else n.kind not in ("call", "pick") for n in nodes)
+
+    def _by_what_moves(self, moves: Sequence[bool]) -> "list[tuple[Program, Callable[..., list[Any]]]]":
+        """The program of what depends on none of some inputs or is one of them, and that of all else, with how to run each."""
+        inputs = {s.index for s, m in zip(self.inputs, moves, strict=True) if m}
+        moving = {*inputs}
+        for index in self.order:
+            if any(a.index in moving for a in self.graph.nodes[index].arguments):
+                moving.add(index)
+
+        def part(wanted: Callable[[Scalar], bool]) -> Program:
+            outputs = [s for s in self.outputs if wanted(s)]
+            whole = Program(self.graph, self.inputs, outputs)
+            return Program(self.graph, [s for s in self.inputs if whole.uses(s)], outputs)
+
+        still, handed_on = part(lambda s: s.index not in moving), part(lambda s: s.index in inputs)
+        late = part(lambda s: s.index in moving - inputs)
+        run = as_one(late._run)
+        return [(still, still), (handed_on, handed_on), (late, lambda values: run(late._typed(values)) if late.outputs else [])]
 
     def _typed(self, values: Sequence[Any]) -> list[Any]:
         given = zip(values, (s.node.dtype for s in self.inputs), strict=True)
