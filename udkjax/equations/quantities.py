@@ -1,6 +1,6 @@
 """What one asks of a motion: accelerations, multipliers, reactions, energies, violations."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,10 +33,16 @@ def equations_of(
     method: Pseudoinverse | None = None,
     baumgarte: Baumgarte | None = None,
     formulation: Formulation | None = None,
+    moving: Sequence[bool] = (),
 ) -> Motion:
-    """Prepare the equations of motion of whatever has some, by the Udwadia-Kalaba equation or another formulation."""
-    general = isinstance(system, ConstrainedSystem)
-    equations = prepare_general(system, method, baumgarte) if general else prepare(system, method, baumgarte)
+    """Prepare the equations of motion of whatever has some, by the Udwadia-Kalaba equation or another formulation.
+
+    `moving` is that of `prepare`.
+    """
+    if isinstance(system, ConstrainedSystem):
+        equations = prepare_general(system, method, baumgarte)
+    else:
+        equations = prepare(system, method, baumgarte, moving=moving)
     return equations if formulation is None else formulation.of(equations)
 
 

@@ -9,6 +9,7 @@ It is written twice. The plain form (plain.py) is the equation as it stands, on 
 """
 
 import dataclasses
+from collections.abc import Sequence
 from functools import reduce
 from itertools import pairwise
 from typing import Any
@@ -227,12 +228,17 @@ class Equations(MechanismMotion):
 
 
 def prepare(
-    mechanism: Mechanism, method: Pseudoinverse | None = None, baumgarte: Baumgarte | None = None, large: bool | None = None
+    mechanism: Mechanism,
+    method: Pseudoinverse | None = None,
+    baumgarte: Baumgarte | None = None,
+    large: bool | None = None,
+    moving: Sequence[bool] = (),
 ) -> Any:
     """Prepare a mechanism for a method (default `Auto`). Its numbers may be traced; its structure decides what is compiled.
 
     Returns `Equations`, straight-line code, or of a scene of more than `LARGE` elements `LargeEquations`, whose program does not
-    grow with the scene. `large` says which, whatever the size.
+    grow with the scene. `large` says which, whatever the size. `moving` says of each leaf of the mechanism whether it is traced
+    where all begins: of the others XLA may know the numbers, though they are traced here. Without it none is taken to be.
 
     A method without a `rank_tol` gets `rank_tolerance`. Without knowledge of which rows are redundant (a mechanism that was built
     from traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
@@ -255,8 +261,10 @@ def prepare(
     elif isinstance(chosen, Auto):
         elimination, drop = "check", chosen.branch_tol
     programs = code(mechanism, left_out if elimination else (), baumgarte is not None, elimination)
-    numbers = [*scalars(jax.tree.leaves(mechanism)), *gains, drop]
-    constants = [jnp.asarray(c) for c in programs.prologue.early(numbers)]
+    leaves = jax.tree.leaves(mechanism)
+    numbers = [*scalars(leaves), *gains, drop]
+    moves = [move for leaf, move in zip(leaves, moving or [False] * len(leaves), strict=True) for _ in range(np.size(leaf))]
+    constants = [jnp.asarray(c) for c in programs.prologue.early(numbers, [*moves, *[False] * (len(numbers) - len(moves))])]
     return Equations(constants, chosen, programs)
 
 

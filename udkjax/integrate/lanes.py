@@ -131,6 +131,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
         None,
         problem.equations.branches,
         *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
+        _number_of(problem.equations),
         recorded,
     )
     if not problem.projected:
@@ -143,6 +144,12 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     if problem.equations.branches and problem.careful:
         task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
     return task
+
+
+def _number_of(equations: Motion) -> Array:
+    """One that is there once all of some equations are."""
+    some = [x.ravel()[0] for x in jax.tree.leaves(equations) if eqx.is_inexact_array(x) and x.size]
+    return sum(some, jnp.zeros(()))
 
 
 def _loop_of(problem: Problem, lanes: Lanes) -> Loop | None:

@@ -91,8 +91,9 @@ def simulate(
     choices = (solver, adjoint, max_steps, _meter(progress))
 
     def run(mechanism: Any, careful: bool) -> tuple[Solution, Any, Any]:
+        moving = tuple(isinstance(x, Tracer) for x in jax.tree.leaves(mechanism))
         with _uncollected():
-            return _simulate(mechanism, ts, state, closure, *settings, *choices, careful)
+            return _simulate(mechanism, ts, state, closure, *settings, *choices, careful, moving if any(moving) else ())
 
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
@@ -132,9 +133,11 @@ def _simulate(
     max_steps,
     meter,
     careful,
+    moving,
 ):
     """Return the solution; whether it takes rows that the method leaves out; whether it takes care that was not to be taken."""
-    equations = equations_of(mechanism, method, stabilization if isinstance(stabilization, Baumgarte) else None, formulation)
+    baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
+    equations = equations_of(mechanism, method, baumgarte, formulation, moving)
     projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, Partitioned))
     start, closed, missed = _start(equations, state, closure)
     # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.

@@ -1,6 +1,7 @@
 """Straight-line programs: scalar expressions recorded once, with everything that is structurally zero or repeated left out."""
 
 from udkjax.straightline.barrier import cut as cut
+from udkjax.straightline.branching import after as after
 from udkjax.straightline.branching import apart as apart
 from udkjax.straightline.branching import when as when
 from udkjax.straightline.derivative import Differential as Differential

@@ -25,11 +25,23 @@ def apart(x: Array) -> Array:
     return jax.lax.sort(jnp.stack([x, jnp.full_like(x, jnp.iinfo(x.dtype).max)]), dimension=0)[0]
 
 
+def after(x: Array, tree: Tree) -> Tree:
+    """The same numbers, which XLA has at hand no sooner than the number x, of any value.
+
+    What waits for nothing is ready at once, and of more than nine operations that are, XLA starts some on other threads, which
+    takes longer than to do them.
+    """
+    width = 8 * x.dtype.itemsize
+    bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(x), jnp.dtype(f"uint{width}"))
+    never = jax.lax.shift_right_logical(bits, bits.dtype.type(width - 1)) > 1  # one bit: XLA does not look so far
+    return jax.tree.map(lambda y: jnp.where(never, jnp.ones_like(y), y), tree)
+
+
 def as_one(function: Callable[[Tree], Tree]) -> Callable[[Tree], Tree]:
     """The same, which XLA compiles into one function on the CPU wherever it is called, and all derivatives of it, too.
 
     It must be arithmetic that uses all it is given: XLA asks only of loops whether they can be compiled so. Operations by
-    themselves are started one by one, for a microsecond each, and some on other threads where more than eight are ready.
+    themselves are started one by one, for a microsecond each, and some on other threads where more than nine are ready.
     """
 
     inner = jax.jit(function)

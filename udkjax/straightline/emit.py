@@ -15,7 +15,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from udkjax.straightline.barrier import cut
 from udkjax.straightline.branching import as_one
@@ -78,16 +77,19 @@ class Program:
             self._fusions[known] = together(jaxpr, [x.shape for x in arrays])
         return self._fusions[known](loop, *arrays)
 
-    def early(self, values: Sequence[Any]) -> list[Any]:
-        """The same, once for many calls of others: what is computed of values that are traced by one function."""
-        traced = tuple(isinstance(v, Tracer) for v in values)
-        if not any(traced) or not self._is_simple:
+    def early(self, values: Sequence[Any], moving: Sequence[bool]) -> list[Any]:
+        """The same, once for many calls of others: what is computed of `moving` values by one function.
+
+        All else is left to XLA, which may know it.
+        """
+        moves = tuple(moving)
+        if not any(moves) or not self._is_simple:
             return self(values)
-        if traced not in self._divided:
-            self._divided[traced] = self._by_what_moves(traced)
+        if moves not in self._divided:
+            self._divided[moves] = self._by_what_moves(moves)
         given = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
         found: dict[Scalar, Any] = {}
-        for part, run in self._divided[traced]:
+        for part, run in self._divided[moves]:
             found |= zip(part.outputs, run([given[s.index] for s in part.inputs]), strict=True)
         return [found[s] for s in self.outputs]
 
