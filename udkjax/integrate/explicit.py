@@ -56,8 +56,8 @@ class March(NamedTuple):
     record: Record | None  # of one run alone
 
 
-def march(task: Task, q: Array, v: Array) -> March:
-    """Integrate from ts[0] to ts[-1]."""
+def march(task: Task, q: Array, v: Array, number: Array) -> March:
+    """Integrate from ts[0] to ts[-1]. The start waits for `number`, one that is there once those of the equations are."""
     lanes = q.shape[1:]
     start = Point(jnp.broadcast_to(task.ts[0], lanes), q, v, jnp.zeros_like(q))
     none, inner = jnp.zeros(lanes, int), len(task.ts) - 2
@@ -112,7 +112,7 @@ def march(task: Task, q: Array, v: Array) -> March:
         state = undoubted(state) if packing is None else when(running(unpacked(state)), undoubted, state)
         return jax.lax.cond(jnp.any(unpacked(state).doubt), lambda s: packed(again(unpacked(s))), lambda s: s, state)
 
-    begin = packed(first) if packing is None else after(task.number, packed(first))
+    begin = packed(first) if packing is None else after(number, packed(first))
     return unpacked(jax.lax.while_loop(lambda s: running(unpacked(s)), rounds, begin))
 
 

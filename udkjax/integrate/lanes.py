@@ -117,7 +117,7 @@ class Lanes:
 
 
 def _marched(problem: Problem, lanes: Lanes) -> Raw:
-    return raw_of(problem, lanes, march(task_of(problem, lanes), problem.q, problem.v))
+    return raw_of(problem, lanes, march(task_of(problem, lanes), problem.q, problem.v, number_of(problem.equations)))
 
 
 def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
@@ -131,7 +131,6 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
         None,
         problem.equations.branches,
         *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
-        _number_of(problem.equations),
         recorded,
     )
     if not problem.projected:
@@ -146,7 +145,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     return task
 
 
-def _number_of(equations: Motion) -> Array:
+def number_of(equations: Motion) -> Array:
     """One that is there once all of some equations are."""
     some = [x.ravel()[0] for x in jax.tree.leaves(equations) if eqx.is_inexact_array(x) and x.size]
     return sum(some, jnp.zeros(()))

@@ -10,7 +10,7 @@ from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 
 from udkjax.integrate.explicit import march
-from udkjax.integrate.lanes import Lanes, raw_of, serves, solve, task_of
+from udkjax.integrate.lanes import Lanes, number_of, raw_of, serves, solve, task_of
 from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.record import Record
 from udkjax.integrate.replay import walked_back
@@ -67,7 +67,7 @@ def _instantiated(x: Any) -> Any:
 
 def _marched(problem: Problem) -> tuple[Raw, Record]:
     lanes = Lanes(problem.equations)
-    m = march(task_of(problem, lanes, recorded=True), problem.q, problem.v)
+    m = march(task_of(problem, lanes, recorded=True), problem.q, problem.v, number_of(problem.equations))
     assert m.record is not None
     return raw_of(problem, lanes, m), m.record
 

@@ -91,15 +91,16 @@ def simulate(
     choices = (solver, adjoint, max_steps, _meter(progress))
 
     def run(mechanism: Any, careful: bool) -> tuple[Solution, Any, Any]:
-        moving = tuple(isinstance(x, Tracer) for x in jax.tree.leaves(mechanism))
         with _uncollected():
-            return _simulate(mechanism, ts, state, closure, *settings, *choices, careful, moving if any(moving) else ())
+            return _simulate(mechanism, ts, state, closure, *settings, *choices, careful, moving)
 
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
     if state is None and closure is None and isinstance(mechanism, Mechanism):
         closure = close(mechanism, start, forward=adjoint is not None and _by_jax(adjoint))
-    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, ts, state, closure, settings)))
+    moves = [isinstance(x, Tracer) for x in jax.tree.leaves(mechanism)]
+    moving = tuple(moves) if any(moves) else ()
+    traced = bool(moving) or any(isinstance(x, Tracer) for x in jax.tree.leaves((ts, state, closure, settings)))
     solution, missed, doubted = run(mechanism, careful=traced and careful)
     if isinstance(solution.code, Tracer):
         return solution if traced or not careful else run(mechanism, careful=True)[0]

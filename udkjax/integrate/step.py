@@ -47,7 +47,6 @@ class Task(NamedTuple):
     h: Array | None  # the first step; None: chosen
     max_steps: int
     method: Method
-    number: Array  # one that is there once those of the equations are
     recorded: bool = False  # whether the steps are kept, of a run that is not one of several lanes
 
 
