@@ -392,3 +392,30 @@ def test_derivatives_of_accelerations(linkage, placed, method):
     at = (jnp.array(-0.8), jnp.array(2.0))
     for found, known in zip(jax.jit(partial(derivatives, angular))(*at), derivatives(exact, *at), strict=True):
         assert_allclose(found, known, atol=1e-9)
+
+
+FEW = ("double_pendulum", "parallelogram", "slider_crank", "peaucellier")
+
+
+@pytest.mark.parametrize("name", [n if n in FEW else pytest.param(n, marks=pytest.mark.slow) for n in SMALL + LARGE])
+@pytest.mark.parametrize("known", (False, True))
+def test_numbers_that_are_traced_are_prepared_for_by_one_function(mechanisms, name, known):
+    """As they are without; where XLA knows them after all, and where some do not move, too."""
+    mechanism = mechanisms[name]
+    leaves, tree = jax.tree.flatten(mechanism)
+    factors = jnp.linspace(0.9, 1.1, 3)
+
+    def constants(factor, moving):
+        changed = tree.unflatten([factor * x if k % 3 else x for k, x in enumerate(leaves)])
+        return jnp.stack(prepare(changed, large=False, moving=moving).constants)
+
+    def all_of(moving):
+        f = partial(constants, moving=moving)
+        given = factors[0], factors
+        taken = jax.jit(lambda *x: [f(x[0]), jax.jacfwd(f)(x[0]), jax.grad(lambda y: f(y) @ f(y))(x[0]), jax.vmap(f)(x[1])])
+        return jax.jit(lambda: taken(*given))() if known else taken(*given)
+
+    plain = all_of(())
+    for moving in ((True,) * len(leaves), [k % 3 > 0 for k in range(len(leaves))]):
+        for found, expected in zip(all_of(tuple(moving)), plain, strict=True):
+            assert_allclose(found, expected, rtol=1e-13, atol=1e-13 * float(jnp.abs(expected).max()))

@@ -10,10 +10,7 @@ from jaxtyping import Array
 
 Tree = TypeVar("Tree")
 
-ONE = {
-    "inlineable": "false",
-    "xla_cpu_small_call": "true",
-}  # what XLA notes itself at the loops that it compiles into one function
+ONE = {"inlineable": "false", "xla_cpu_small_call": "true"}  # XLA notes the second at loops that it compiles into one function
 
 
 def apart(x: Array) -> Array:
@@ -43,7 +40,6 @@ def as_one(function: Callable[[Tree], Tree]) -> Callable[[Tree], Tree]:
     It must be arithmetic that uses all it is given: XLA asks only of loops whether they can be compiled so. Operations by
     themselves are started one by one, for a microsecond each, and some on other threads where more than nine are ready.
     """
-
     inner = jax.jit(function)
 
     def outer(x: Tree) -> Tree:
