@@ -14,7 +14,8 @@ import udkjax as udk
 from udkjax.integrate.lanes import LANES
 from udkjax.integrate.packing import Packing
 
-SEQUENTIAL = 9  # operations ready at once that XLA does one after the other in the same thread, however large their arrays
+SEQUENTIAL = 8  # operations that XLA does one after the other in the same thread, however large their arrays
+READY = 9  # so does it of more, where no more than these wait for nothing
 NOTHING = re.compile(r" (parameter|constant|tuple|get-tuple-element|bitcast)\(")
 TS = jnp.linspace(0.0, 2.0, 41)
 
@@ -55,7 +56,7 @@ def test_what_waits_for_nothing_is_handed_to_no_other_thread(derived, count):
         return udk.simulate(changed, TS[:2], start, adjoint=forward, careful=False, throw=False).q[-1, 0, 2]
 
     text = jax.jit(derived(angle)).lower((1.0,) * count).compile().as_text() or ""
-    assert 0 < ready(text.split("\nENTRY")[1]) <= SEQUENTIAL
+    assert 0 < ready(text.split("\nENTRY")[1]) <= READY
 
 
 def test_a_run_walked_back_starts_few_operations():

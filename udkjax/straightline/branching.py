@@ -58,6 +58,6 @@ def when(condition: Array, function: Callable[[Tree], Tree], x: Tree) -> Tree:
     """`function(x)` or x: a branch that does not keep XLA from compiling the loop that it is in into one function.
 
     Where XLA cannot know that the condition holds, it makes one function of `function`. An x that has been computed is better
-    than zeros: of more than eight operations that wait for nothing XLA hands some to other threads.
+    than zeros: of more than nine operations that wait for nothing XLA hands some to other threads.
     """
     return jax.lax.while_loop(lambda c: c[0], lambda c: (jnp.zeros_like(condition), function(c[1])), (condition, x))[1]

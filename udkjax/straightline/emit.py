@@ -100,7 +100,7 @@ class Program:
         return all(n.detail.primitive.name in SIMPLE if n.kind == "apply" else n.kind not in ("call", "pick") for n in nodes)
 
     def _by_what_moves(self, moves: Sequence[bool]) -> "list[tuple[Program, Callable[..., list[Any]]]]":
-        """The program of what depends on none of some inputs or is one of them, and that of all else, with how to run each."""
+        """The program of what is not computed of some inputs, and that of what is, with how to run each."""
         inputs = {s.index for s, m in zip(self.inputs, moves, strict=True) if m}
         moving = {*inputs}
         for index in self.order:
@@ -112,10 +112,10 @@ class Program:
             whole = Program(self.graph, self.inputs, outputs)
             return Program(self.graph, [s for s in self.inputs if whole.uses(s)], outputs)
 
-        still, handed_on = part(lambda s: s.index not in moving), part(lambda s: s.index in inputs)
-        late = part(lambda s: s.index in moving - inputs)
+        computed = moving - inputs
+        still, late = part(lambda s: s.index not in computed), part(lambda s: s.index in computed)
         run = as_one(late._run)
-        return [(still, still), (handed_on, handed_on), (late, lambda values: run(late._typed(values)) if late.outputs else [])]
+        return [(still, still), (late, lambda values: run(late._typed(values)) if late.outputs else [])]
 
     def _typed(self, values: Sequence[Any]) -> list[Any]:
         given = zip(values, (s.node.dtype for s in self.inputs), strict=True)
