@@ -279,6 +279,24 @@ def test_the_tangential_part_is_what_projection_leaves(mechanisms, nearby, metho
     assert jnp.abs(left_q - dq).max() > 1e-8  # something is taken back
 
 
+def test_the_distance_from_singular_configurations(linkage, placed):
+    """In proportion to the angle from the position in line, at the end of a step as by itself; nothing without constraints."""
+
+    @eqx.filter_jit
+    def distances(q, v):
+        equations, none = prepare(linkage).quick, jnp.zeros(12)
+        return equations.tangential(0.0, q, v, none, none).distance, equations.finished(0.0, q, v, none, none)[-1].distance
+
+    angles = np.array([1e-1, 1e-2, 1e-3])
+    alone, at_the_end = np.transpose([distances(*(x.ravel() for x in placed(angle, 1.3))) for angle in angles])
+    assert_allclose(alone, at_the_end, rtol=1e-6)
+    assert_allclose(alone / angles, alone[2] / angles[2], rtol=2e-2)
+    assert 0.2 < alone[2] / angles[2] < 5.0
+    assert not max(distances(*(x.ravel() for x in placed(0.0, 1.3)))) > 1e-7
+    free = prepare(udk.Mechanism({"stone": udk.Body(2.0, 0.1)})).quick
+    assert jnp.isinf(free.tangential(0.0, *jnp.zeros((4, 3))).distance)
+
+
 # --- few constraints, and more than there seemed
 
 

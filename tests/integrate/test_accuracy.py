@@ -66,12 +66,16 @@ def test_an_ordinary_run_has_no_step_rejected():
 
 @pytest.mark.parametrize("angle", [45, 60])
 def test_singular_configurations_cost_few_steps(angle):
-    """Against a run that meets none, which takes 425 at this tolerance; without care for what projection takes back 1,600."""
+    """Against a run that meets none, which takes 425 at the first tolerance; without care for what projection takes back 1,600.
+
+    Steps that do not know where the next one is are rejected 330 and 490 times.
+    """
     mech = udk.library.parallelogram(np.deg2rad(angle))
-    sol = udk.simulate(mech, TS, rtol=1e-11, atol=1e-11)
-    assert error(mech, sol) <= 2e-9
-    assert sol.stats["steps"] < 900
-    assert sol.stats["right_hand_sides"] < 13.5 * sol.stats["steps"]  # hardly one was taken again with care
+    for tol, steps, rejected in ((1e-11, 700, 70), (3e-12, 820, 120), (1e-12, 1000, 160)):
+        sol = udk.simulate(mech, TS, rtol=tol, atol=tol)
+        assert error(mech, sol) <= 200 * tol
+        assert sol.stats["steps"] < steps and sol.stats["rejected"] < rejected
+        assert sol.stats["right_hand_sides"] < 13.5 * sol.stats["steps"]  # hardly one was taken again with care
 
 
 def test_outputs_beside_singular_configurations():

@@ -18,9 +18,6 @@ from udkjax.straightline import Program, Scalar, frontier, vector
 # What a row left out may disagree by, relative to its terms, and still count as satisfied: far above rounding, and above what
 # states carry that are closed to the tolerances of an integration.
 CONSISTENT = 1e-6
-# A pivot, relative to its row's diagonal entry, that counts as near to a singular configuration: a thirtieth of a radian or so.
-# Rounding errors of accelerations grow with the third power of the distance's reciprocal: here they are some 1e-10.
-NEAR = 1e-3
 TINY = 1e-12  # m/s^2: rows at rest have terms of no size at all
 
 
@@ -33,7 +30,7 @@ class Code:
 
     and for elimination: `accelerations` (a, whether all pivots are safe), `nearer` (q and v after a Newton step to Psi = 0 and to
     Psi_dot = 0, whether safe), `closer` (the same of q alone), `arrival` (the same of v alone, and the accelerations with it),
-    `tangential` (of changes of q and v what projection leaves; whether all pivots are far from none), `finish` (`arrival` and
+    `tangential` (of changes of q and v what projection leaves; their `Factors.distance`), `finish` (`arrival` and
     `tangential`, with its pivots; whether safe).
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
@@ -94,10 +91,8 @@ class Code:
         a = [f + s for f, s in zip(loads[:n], self.spread(self.solved(loads[n:])), strict=True)]
         self.outputs["arrival"] = [*v, *a, safe]
         self.changes = [graph.input(f"d{k}", "change") for k in range(2 * self.n)]
-        far = all_of(self._dropping.above(NEAR), graph)
-        self.outputs["tangential"] = [*self._tangential(True), far]
-        far = all_of(self._gram.above(NEAR), graph)
-        self.outputs["finish"] = [*v, *a, *self._tangential(False), far, safe]
+        self.outputs["tangential"] = [*self._tangential(True), self._dropping.distance(graph)]
+        self.outputs["finish"] = [*v, *a, *self._tangential(False), self._gram.distance(graph), safe]
 
     def _safe(self, factors: Factors) -> Scalar:
         """Whether no pivot is too small to be trusted; a method that drops such rows does not ask."""

@@ -88,14 +88,14 @@ def finished(
     equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector
 ) -> tuple[Vector, Vector, Vector, Tangential]:
     """`arrived`, and what projection leaves of small changes there, by the same program."""
-    found, (dq, dv), (far, safe) = _arrived(equations, t, q, v, (dq, dv))
+    found, (dq, dv), (distance, safe) = _arrived(equations, t, q, v, (dq, dv))
     q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if _checks(equations) else found
-    return q, v, a, Tangential(dq, dv, far)
+    return q, v, a, Tangential(dq, dv, distance)
 
 
 @jax.custom_jvp
 def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector, changes: tuple[Vector, ...]) -> tuple[Any, Any, Any]:
-    """q, v and a, numbers in any case; what is left of changes; whether the end is far from singular, whether to be trusted."""
+    """q, v and a, numbers in any case; what is left of changes; how far the end is from singular, whether to be trusted."""
     program = equations.code.program("closer")
 
     def closer(state: Any) -> Any:
@@ -108,9 +108,9 @@ def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector, changes: tupl
     _, found, _, safe = jax.lax.while_loop(lambda s: (s[0] < STEPS) & ~(s[2] <= CLOSE), closer, start)
     q = stacked(found)
     *found, still = equations.call(equations.code.program("finish" if changes else "arrival"), t, q, v, *changes)
-    far = found.pop() if changes else still  # who asks for no changes does not ask how far, either
+    distance = found.pop() if changes else jnp.inf  # who asks for no changes does not ask how far, either
     v, a, *left = (stacked(found[k : k + len(q)]) for k in range(0, len(found), len(q)))
-    return (q, v, a), tuple(left), (far, safe & still)
+    return (q, v, a), tuple(left), (distance, safe & still)
 
 
 def _largest_change(new: Sequence[Array], old: Sequence[Array]) -> Array:
@@ -126,8 +126,8 @@ def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector,
     """What projection at q leaves of small changes: for estimates of errors, which nobody differentiates, nor do they branch."""
     if not equations.eliminates:
         return plain_tangential(equations, t, q, v, dq, dv)
-    *changes, far = equations.call(equations.code.program("tangential"), t, q, v, dq, dv)
-    return Tangential(stacked(changes[: len(q)]), stacked(changes[len(q) :]), far)
+    *changes, distance = equations.call(equations.code.program("tangential"), t, q, v, dq, dv)
+    return Tangential(stacked(changes[: len(q)]), stacked(changes[len(q) :]), distance)
 
 
 def _checked(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from udkjax.equations.code import CONSISTENT, NEAR, TINY
+from udkjax.equations.code import CONSISTENT, TINY
 from udkjax.equations.large_plain import branch, plain_accelerations, plain_correction, plain_project, plain_tangential
-from udkjax.equations.motion import FAR, Tangential, Vector
+from udkjax.equations.motion import FAR, NEAR, Tangential, Vector
 from udkjax.pinv.block_methods import factorized, solved
 from udkjax.pinv.blocks import by_block, flat
 
@@ -94,14 +94,14 @@ def tangential(equations: "LargeEquations", t: Any, q: Vector, v: Vector, dq: Ve
     if not len(rows.rows) or not equations.by_levels or equations.branches:
         return plain_tangential(equations, t, q, v, dq, dv)
     (D,) = equations.arrays(rows, ["D"], t, q, v)
-    factors, far = factorized(rows.pattern, D, NEAR, loop=equations.loop)
+    factors, far = factorized(rows.pattern, D, NEAR**2, loop=equations.loop)
 
     def left(x: Vector) -> Vector:
         residual = rows.pattern.matvec(D, by_block(x / root, 3))
         return x - root * flat(rows.pattern.rmatvec(D, solved(rows.pattern, factors, residual, equations.loop)))
 
     first, second = jax.lax.map(left, jnp.stack([dq, dv]))
-    return Tangential(first, second, far)
+    return Tangential(first, second, jnp.where(far, jnp.inf, 0.0))
 
 
 accelerations.defjvp(lambda watch, primals, tangents: jax.jvp(plain_accelerations, primals, tangents))

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from udkjax.equations.code import NEAR
 from udkjax.equations.layout import Selection
-from udkjax.equations.motion import Tangential, Vector
+from udkjax.equations.motion import NEAR, Tangential, Vector
 from udkjax.pinv.block_methods import BlockElimination, DenseParts, factorized
 from udkjax.pinv.blocks import flat
 
@@ -65,7 +64,8 @@ def plain_tangential(equations: "LargeEquations", t: Any, q: Vector, v: Vector, 
     def left(plus: Any, rows: Selection) -> Tangential:
         by_levels = isinstance(plus.method, BlockElimination)
         first, second = (x - root * (plus @ plus.method.matvec(plus.matrix, x / root)) for x in (dq, dv))
-        return Tangential(first, second, factorized(rows.pattern, plus.matrix, NEAR)[1] if by_levels else jnp.array(True))
+        far = factorized(rows.pattern, plus.matrix, NEAR**2)[1] if by_levels else jnp.array(True)
+        return Tangential(first, second, jnp.where(far, jnp.inf, 0.0))
 
     return by_method(equations, left, t, q, v)
 

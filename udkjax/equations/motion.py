@@ -13,6 +13,9 @@ from udkjax.straightline import Loop
 Vector = Float[Array, "n"]
 
 STEPS = 3  # of Newton's method in a projection, at most: the last of which usually finds nothing to do
+# The distance from a singular configuration that counts as near: the root of a pivot relative to its row's diagonal entry, which
+# is an angle of this size, or so. Rounding errors of accelerations grow with the third power of its reciprocal: to some 1e-10.
+NEAR = 0.03
 FAR = 1e-8  # m, rad: Newton's method converges quadratically, and leaves rounding errors of a residual that moves less
 
 
@@ -21,7 +24,7 @@ class Tangential(NamedTuple):
 
     dq: Vector
     dv: Vector
-    far: Any = True  # from singular configurations, as far as the method knows
+    distance: Any = jnp.inf  # from singular configurations, as `NEAR` measures it; infinite where the method does not know it
 
 
 class Closed(NamedTuple):

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from udkjax.integrate.crossing import DODGE, DODGES, PAST, SURE, ahead, around, far
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
 from udkjax.integrate.packing import Packing
@@ -32,9 +33,10 @@ from udkjax.straightline import after, apart, when
 
 # Of the step's size. With 0.9 every tenth step of an ordinary run is rejected, and most runs take 4 to 15 % more at equal error.
 SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
-# A stage on a singular configuration, or an end beside it, whose accelerations are not good enough to interpolate with, is there
-# by chance: a step that is a little shorter misses it, and costs less than care. Where a few do not help, one is on it.
-DODGE, DODGES = 0.8, 3
+# Where errors grow, a step as long as the one before may be foreseen to fail. It is made so short that its error should be
+# this much of the tolerance, errors growing by this factor at most. At equal error most runs take up to 8 % fewer right-hand
+# sides, those of linkages that swing to and fro 15 %.
+FORESEEN, STEEPEST = 0.5, 100.0
 BLOCK = 4  # output times that are interpolated together
 
 
@@ -43,8 +45,9 @@ class March(NamedTuple):
 
     here: Point
     back: tuple[Point, ...]  # the accepted states before, the latest last
-    far: Array  # whether here is far from singular configurations
+    distances: tuple[Array, ...]  # of accepted states from singular configurations, that of here the last
     h: Array
+    rate: Array  # of errors: that of the last accepted step over h to the power of the method's order
     code: Array  # RUNNING, DONE, ...
     doubt: Array  # whether the step has to be taken again with care
     dodged: Array  # how often in a row it was taken a little shorter instead
@@ -65,7 +68,9 @@ def march(task: Task, q: Array, v: Array, number: Array) -> March:
     # The first round is no step: it finds the accelerations, and with them the first step, where the others have their code.
     back, no = (start,) * (POINTS - 2), jnp.zeros(lanes, bool)
     record = blank(start, task.method.stages, task.max_steps) if task.recorded else None
-    first = March(start, back, no, jnp.zeros(lanes), none, no, none, none - 1, none - 1, none, none, outputs, record)
+    distances = (jnp.full(lanes, jnp.inf),) * (POINTS - 1)
+    counts = none, no, none, none - 1, none - 1, none, none
+    first = March(start, back, distances, jnp.zeros(lanes), jnp.full(lanes, jnp.inf), *counts, outputs, record)
 
     def running(m: March) -> Array:
         return jnp.any(m.code == RUNNING)
@@ -74,11 +79,10 @@ def march(task: Task, q: Array, v: Array, number: Array) -> March:
         t1, last = _end(task, m)
         trial = attempt(task, m.here, jnp.where(m.code == RUNNING, t1 - m.here.t, 0.0), t1, m.tried < 0)
         doubt = (m.code == RUNNING) & ~jnp.isfinite(trial.error) & task.doubts
-        beside = (m.code == RUNNING) & (trial.error < 1.0) & m.far & ~trial.far & ~last
+        beside = (m.code == RUNNING) & (trial.error < 1.0) & _comes_near(task, m, trial) & ~last
+        beside = when(jnp.any(beside), lambda b: b & ~_past(task, m, trial), beside)
         dodge = (doubt | beside) & (m.dodged < DODGES) & (m.tried >= 0)
-        error = jnp.where(dodge, (SAFETY / DODGE) ** task.method.order, trial.error)  # too large by as much
-        trial, doubt = trial._replace(error=error), doubt & ~dodge
-        m = m._replace(dodged=jnp.where(dodge, m.dodged + 1, 0))
+        m, doubt = m._replace(dodged=jnp.where(dodge, m.dodged + 1, 0)), doubt & ~dodge
         m = _decide(task, m, trial, last, (m.code == RUNNING) & ~doubt, careful=False)
         return m._replace(doubt=doubt) if task.careful else m._replace(code=jnp.where(doubt, DOUBTED, m.code))
 
@@ -125,12 +129,13 @@ def _end(task: Task, m: March) -> tuple[Array, Array]:
 
 def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array, careful: bool) -> March:
     """Accept or reject a step of the lanes that are `judged`, choose the next one, and write the outputs that are behind."""
-    accept = judged & (trial.error < 1.0)
-    error = jnp.where(jnp.isfinite(trial.error), jnp.maximum(trial.error, 1e-30), 1e30)
-    factor = SAFETY * jnp.exp(jnp.log(error) * (-1.0 / task.method.order))
-    factor = jnp.clip(factor, jnp.where(accept, 1.0, SHRINK), jnp.where(accept, GROW, SAFETY))
-    tried = m.tried + judged
-    h = jnp.where(judged, undifferentiated(trial.to.t - m.here.t) * factor, m.h)
+    dodge, tried = judged & (m.dodged > 0), m.tried + judged
+    accept = judged & (trial.error < 1.0) & ~dodge
+    step = undifferentiated(trial.to.t - m.here.t)
+    factor, rate = _factor(task, m, trial.error, step, accept)
+    h = jnp.where(judged, step * jnp.where(dodge, DODGE, factor), m.h)
+    failed = judged & ~accept & (tried > 0)
+    h = when(jnp.any(failed), lambda h: jnp.where(failed, _around(task, m, step, h), h), h)
     begun = judged & (tried == 0)
     h = when(jnp.any(begun), lambda h: jnp.where(begun, _first_step(task, trial.to), h), h)
     code = jnp.where(judged & (h < task.smallest), STEP_TOO_SMALL, m.code)
@@ -141,13 +146,56 @@ def _decide(task: Task, m: March, trial: Trial, last: Array, judged: Array, care
     if m.record is not None and trial.stages is not None:
         m = m._replace(record=noted(m.record, m.accepted + 2, (*old, trial.to), trial.stages, careful))
     *back, here = jax.tree.map(lambda x, y: jnp.where(accept, x, y), (*old[1:], trial.to), old)
-    far = jnp.where(accept, trial.far, m.far)
-    m = m._replace(far=far, h=h, code=code, tried=tried, accepted=m.accepted + accept)
+    distances = tuple(jnp.where(accept, x, y) for x, y in zip((*m.distances[1:], trial.distance), m.distances, strict=True))
+    m = m._replace(
+        distances=distances,
+        rate=jnp.where(accept & (tried > 0), rate, m.rate),
+        h=h,
+        code=code,
+        tried=tried,
+        accepted=m.accepted + accept,
+    )
     m = m._replace(evaluations=m.evaluations + jnp.where(judged, trial.evaluations, 0))
     if len(task.ts) > 2:
         until = jnp.where(accept & (m.accepted > 0), undifferentiated(trial.to.t), -jnp.inf)
         m = _write(task, m, (*old, here), until)
     return m._replace(here=here, back=tuple(back))
+
+
+def _factor(task: Task, m: March, error: Array, step: Array, accept: Array) -> tuple[Array, Array]:
+    """How many times as long the next step is; and the rate of this one's error."""
+    order = task.method.order
+    error = jnp.where(jnp.isfinite(error), jnp.maximum(error, 1e-30), 1e30)
+    rate = error / step ** int(order)
+    foreseen = error * jnp.minimum(rate / m.rate, STEEPEST)
+    steep = accept & (foreseen > 1.0)
+    aim = jnp.where(steep, foreseen * (SAFETY**order / FORESEEN), error)
+    factor = SAFETY * jnp.exp(jnp.log(aim) * (-1.0 / order))
+    return jnp.clip(factor, jnp.where(accept & ~steep, 1.0, SHRINK), jnp.where(accept, GROW, SAFETY)), rate
+
+
+def _comes_near(task: Task, m: March, trial: Trial) -> Array:
+    """Whether a step ends too close to a singular configuration to go on from there, which it did not begin."""
+    tolerance = task.rtol + task.atol
+    return far(m.distances[-1], m.h, tolerance) & ~far(trial.distance, m.h, tolerance)
+
+
+def _past(task: Task, m: March, trial: Trial) -> Array:
+    """Whether a step ends behind the singular configuration ahead, far enough."""
+    left = _ahead(m)
+    return (left > 0.0) & (left < SURE * m.h) & far(trial.distance, m.h, task.rtol + task.atol, PAST)
+
+
+def _around(task: Task, m: March, step: Array, otherwise: Array) -> Array:
+    """In place of a step that failed, one around the singular configuration ahead, or else `otherwise`."""
+    low, _ = task.method.clearings
+    left = _ahead(m)
+    end = m.distances[-1] * low * step / left
+    return around(task.method, left, step, far(end, step, task.rtol + task.atol), otherwise)
+
+
+def _ahead(m: March) -> Array:
+    return ahead(tuple(undifferentiated(point.t) for point in (*m.back, m.here)), m.distances)
 
 
 def _first_step(task: Task, start: Point) -> Array:

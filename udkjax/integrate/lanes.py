@@ -158,7 +158,7 @@ def _loop_of(problem: Problem, lanes: Lanes) -> Loop | None:
 
 def _all_of_it(t: Array, q: Array, v: Array, dq: Array, dv: Array) -> Tangential:
     """Errors where nothing takes any of them back."""
-    return Tangential(dq, dv, jnp.ones(t.shape, bool))
+    return Tangential(dq, dv, jnp.full(t.shape, jnp.inf))
 
 
 def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
@@ -220,7 +220,7 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
 
     tolerances = (jnp.broadcast_to(x, h.shape) for x in (task.rtol, task.atol))
     unknown = jnp.zeros((stages, *here.a.shape)) if task.recorded else None
-    nothing = Trial(here, jnp.full(h.shape, jnp.inf), doubt, jnp.zeros(h.shape, int), unknown)
+    nothing = Trial(here, jnp.full(h.shape, jnp.inf), jnp.zeros(h.shape), jnp.zeros(h.shape, int), unknown)
     return lanes.each(doubt, one, nothing, here, h, t1, begin, *tolerances)
 
 

@@ -49,7 +49,7 @@ def ended(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array) -
 
 
 def _counted(left: Tangential, dq: Array, dv: Array) -> Tangential:
-    return Tangential(left.dq + TAKEN_BACK * (dq - left.dq), left.dv + TAKEN_BACK * (dv - left.dv), jnp.asarray(left.far))
+    return Tangential(left.dq + TAKEN_BACK * (dq - left.dq), left.dv + TAKEN_BACK * (dv - left.dv), jnp.asarray(left.distance))
 
 
 def violation(equations: Motion, t: Any, y: Float[Array, "2n"]) -> Float[Array, ""]:

@@ -26,7 +26,7 @@ class Trial(NamedTuple):
 
     to: Point
     error: Array  # the largest error of any coordinate or velocity, relative to its tolerance
-    far: Array  # whether its end is far from singular configurations
+    distance: Array  # of its end from singular configurations
     evaluations: Array
     stages: Array | None = None  # accelerations (stages, n) of its stages, for the record
 
@@ -109,7 +109,7 @@ def judged(task: Task, here: Point, to: Point, left: Tangential, a: Array, evalu
     size = jnp.where(all_finite(to.a), size, jnp.nan)
     evaluations = jnp.broadcast_to(jnp.asarray(evaluations), size.shape)
     a = a.at[-1].set(to.a) if task.method.ends else a
-    return Trial(to, undifferentiated(size), left.far, evaluations, a if task.recorded else None)
+    return Trial(to, undifferentiated(size), undifferentiated(left.distance), evaluations, a if task.recorded else None)
 
 
 def _combine(weights: Any, a: Array) -> Array:

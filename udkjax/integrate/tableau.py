@@ -29,6 +29,14 @@ class Method(NamedTuple):
     def stages(self) -> int:
         return len(self.error_v)
 
+    @property
+    def clearings(self) -> tuple[float, float]:
+        """Fractions of a step far from all nodes: the middles of the widest gap between two and of the widest before it."""
+        nodes = np.unique(self.nodes)
+        middles, gaps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
+        widest = np.argmax(gaps)
+        return middles[np.argmax(gaps[: max(widest, 1)])], middles[widest]
+
 
 def row(text: str) -> np.ndarray:
     """Coefficients written as fractions."""

@@ -115,6 +115,14 @@ class Factors(NamedTuple):
         """Which pivots exceed this fraction of their row's diagonal entry: booleans, in the order of elimination."""
         return [greater(pivot, diagonal * fraction) for pivot, diagonal in self.pivots]
 
+    def distance(self, graph: Graph) -> Scalar:
+        """From dependence: the root of the smallest pivot relative to its row's diagonal entry, infinite without rows."""
+        one = graph.constant(1.0)
+        times = [absolute(diagonal * (one / pivot)) for pivot, diagonal in self.pivots]  # by the reciprocals that are there
+        while len(times) > 1:  # by halves, so that few wait for others
+            times = [*map(larger, times[::2], times[1::2]), *times[len(times) // 2 * 2 :]]
+        return one / graph.sqrt(times[0]) if times else graph.constant(np.inf)
+
 
 def factorize(rows: Sequence[Row], graph: Graph, drop: Scalar | None = None) -> Factors:
     """D D^T = L diag(p) L^T. A pivot that does not exceed `drop` times its row's diagonal entry takes its row out.
@@ -208,6 +216,11 @@ def absolute(a: Scalar) -> Scalar:
 def greater(a: Scalar, b: Scalar) -> Scalar:
     """a > b."""
     return a.graph.apply(lax.gt_p, {}, (a, b), bool, np.greater)
+
+
+def larger(a: Scalar, b: Scalar) -> Scalar:
+    """max(a, b)."""
+    return a.graph.apply(lax.max_p, {}, (a, b), a.node.dtype, np.maximum)
 
 
 def where(condition: Scalar, yes: Scalar, no: Scalar) -> Scalar:

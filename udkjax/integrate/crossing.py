@@ -1,0 +1,53 @@
+"""How steps come past singular configurations.
+
+Stages on one, or too close to it, are there by chance: their accelerations are no numbers, or amplify what the stage is off the
+constraint manifold. Another step misses it, and costs less than care: one whose nodes are far from where it is reached.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from udkjax.integrate.tableau import Method
+
+# What a step that failed is shortened to, where it is not known when the configuration is reached; how often in a row.
+DODGE, DODGES = 0.8, 3
+SHORTEST, LONGEST = 0.2, 0.95  # of a step, one that is taken in its place
+# Rounding errors of accelerations are some 3e-15 m/s^2 over the third power of the distance (those of the paper's linkage), and a
+# step's velocity has a twenty-fifth of them: they must be less than the tolerance. Where the configuration is still ahead of the
+# end of a step, four times as far away: close to it are many nodes of the next one.
+PAST, BEFORE = 1e-16, 8e-15
+# Of a step: a configuration that is expected by then lies behind its end, though it is expected a little too early, by up to a
+# tenth of a step. More than the larger of `Method.clearings`.
+SURE = 0.85
+
+
+def far(distance: Array, step: Array, tolerance: Array, rounding: float = BEFORE) -> Array:
+    """Whether a step may begin so far away from singular configurations."""
+    return distance**3 * tolerance > rounding * step
+
+
+def ahead(times: tuple[Array, ...], distances: tuple[Array, ...]) -> Array:
+    """The time that is left until a singular configuration; not positive, or not a number, where none is ahead.
+
+    The distances from it, at the last three accepted times, the latest last, go to zero by the first power of that time: it is
+    the root of a parabola.
+    """
+    (t2, t1, t0), (d2, d1, d0) = times, distances
+    slope, before = (d0 - d1) / (t0 - t1), (d1 - d2) / (t1 - t2)
+    curve = (slope - before) / (t0 - t2)
+    slope = slope + curve * (t0 - t1)
+    return -d0 / (slope - curve * (d0 / slope))
+
+
+def around(method: Method, left: Array, step: Array, far_enough: Array, otherwise: Array) -> Array:
+    """In place of a step that failed, one with its nodes far from the configuration, if it may have failed by that.
+
+    Where that is beyond the last nodes: one from whose end the next, if it is as long as this, has its nodes far from it.
+    """
+    low, high = method.clearings
+    share = left / step
+    across = left / jnp.where(share < low, low, high)
+    up_to = jnp.where((share < 1.0 + low) & far_enough, left - low * step, step)
+    found = jnp.where(share < high, across, up_to)
+    apt = (share > low / 2) & (found > SHORTEST * step) & (found < LONGEST * step)
+    return jnp.where(apt, found, otherwise)
