@@ -12,7 +12,7 @@ from udkjax.integrate.tableau import method_of
 METHODS = {"Dopri8": None, "Tsit5": diffrax.Tsit5(), "Dopri5": diffrax.Dopri5(), "Bosh3": diffrax.Bosh3(), "Heun": diffrax.Heun()}
 
 
-@pytest.fixture(params=METHODS.values(), ids=METHODS)
+@pytest.fixture(params=METHODS.values(), ids=list(METHODS))
 def method(request):
     return method_of(request.param)
 

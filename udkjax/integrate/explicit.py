@@ -105,7 +105,8 @@ def march(task: Task, q: Array, v: Array, number: Array) -> March:
             return state
         small, outputs, record = state
         m = packing.unpack(small)
-        return m._replace(h=undifferentiated(m.h), outputs=outputs, record=record)
+        h, rate, distances = undifferentiated((m.h, m.rate, m.distances))
+        return m._replace(h=h, rate=rate, distances=distances, outputs=outputs, record=record)
 
     def undoubted(state: Any) -> Any:
         return packed(jax.lax.while_loop(lambda m: running(m) & ~jnp.any(m.doubt), quick, unpacked(state)))
