@@ -18,7 +18,7 @@ def method(request):
 
 
 def test_the_time_that_is_left():
-    """Exact for a distance that is a parabola; nothing where it grows, stays, or is not known."""
+    """Exact for a distance that is a line, close for a parabola; nothing where it grows, stays, or is not known."""
     times = jnp.array([0.3, 0.5, 0.6])
 
     def left(distance):

@@ -30,7 +30,7 @@ def ahead(times: tuple[Array, ...], distances: tuple[Array, ...]) -> Array:
     """The time that is left until a singular configuration; not positive, or not a number, where none is ahead.
 
     The distances from it, at the last three accepted times, the latest last, go to zero by the first power of that time: it is
-    the root of a parabola.
+    the root of a parabola, to first order in its curvature.
     """
     (t2, t1, t0), (d2, d1, d0) = times, distances
     slope, before = (d0 - d1) / (t0 - t1), (d1 - d2) / (t1 - t2)
