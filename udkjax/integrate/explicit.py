@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from udkjax.integrate.crossing import DODGE, DODGES, PAST, SURE, ahead, around, far
+from udkjax.integrate.crossing import BEFORE, DODGE, DODGES, PAST, SURE, ahead, around, far
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
 from udkjax.integrate.packing import Packing
@@ -79,9 +79,10 @@ def march(task: Task, q: Array, v: Array, number: Array) -> March:
         t1, last = _end(task, m)
         trial = attempt(task, m.here, jnp.where(m.code == RUNNING, t1 - m.here.t, 0.0), t1, m.tried < 0)
         doubt = (m.code == RUNNING) & ~jnp.isfinite(trial.error) & task.doubts
-        beside = (m.code == RUNNING) & (trial.error < 1.0) & _comes_near(task, m, trial) & ~last
+        beside = (m.code == RUNNING) & (trial.error < 1.0) & ~_far(task, m, trial.distance) & ~last
         beside = when(jnp.any(beside), lambda b: b & ~_past(task, m, trial), beside)
-        dodge = (doubt | beside) & (m.dodged < DODGES) & (m.tried >= 0)
+        # Those that begin beside a singular configuration have their first stages there, however long they are.
+        dodge = (doubt | beside) & _far(task, m, m.distances[-1]) & (m.dodged < DODGES) & (m.tried >= 0)
         m, doubt = m._replace(dodged=jnp.where(dodge, m.dodged + 1, 0)), doubt & ~dodge
         m = _decide(task, m, trial, last, (m.code == RUNNING) & ~doubt, careful=False)
         return m._replace(doubt=doubt) if task.careful else m._replace(code=jnp.where(doubt, DOUBTED, m.code))
@@ -175,24 +176,22 @@ def _factor(task: Task, m: March, error: Array, step: Array, accept: Array) -> t
     return jnp.clip(factor, jnp.where(accept & ~steep, 1.0, SHRINK), jnp.where(accept, GROW, SAFETY)), rate
 
 
-def _comes_near(task: Task, m: March, trial: Trial) -> Array:
-    """Whether a step ends too close to a singular configuration to go on from there, which it did not begin."""
-    tolerance = task.rtol + task.atol
-    return far(m.distances[-1], m.h, tolerance) & ~far(trial.distance, m.h, tolerance)
+def _far(task: Task, m: March, distance: Array, rounding: float = BEFORE) -> Array:
+    """Whether a step as long as the one that is tried may begin so far away from singular configurations."""
+    return far(distance, m.h, task.rtol + task.atol, rounding)
 
 
 def _past(task: Task, m: March, trial: Trial) -> Array:
     """Whether a step ends behind the singular configuration ahead, far enough."""
     left = _ahead(m)
-    return (left > 0.0) & (left < SURE * m.h) & far(trial.distance, m.h, task.rtol + task.atol, PAST)
+    return (left > 0.0) & (left < SURE * m.h) & _far(task, m, trial.distance, PAST)
 
 
 def _around(task: Task, m: March, step: Array, otherwise: Array) -> Array:
     """In place of a step that failed, one around the singular configuration ahead, or else `otherwise`."""
     low, _ = task.method.clearings
     left = _ahead(m)
-    end = m.distances[-1] * low * step / left
-    return around(task.method, left, step, far(end, step, task.rtol + task.atol), otherwise)
+    return around(task.method, left, step, _far(task, m, m.distances[-1] * low * step / left), otherwise)
 
 
 def _ahead(m: March) -> Array:
