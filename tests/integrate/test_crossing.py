@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from udkjax.integrate.crossing import LONGEST, SHORTEST, ahead, around
+from udkjax.integrate.crossing import LONGEST, SHORTEST, ahead, around, far
 from udkjax.integrate.tableau import method_of
 
 METHODS = {"Dopri8": None, "Tsit5": diffrax.Tsit5(), "Dopri5": diffrax.Dopri5(), "Bosh3": diffrax.Bosh3(), "Heun": diffrax.Heun()}
@@ -28,6 +28,14 @@ def test_the_time_that_is_left():
     assert_allclose(left(3.0 * (0.8 - times)), 0.2, rtol=1e-14)
     for distance in (2.0 + times, 0.0 * times + 1.0, jnp.array([jnp.inf, jnp.inf, 0.4]), jnp.full(3, jnp.inf), times + jnp.nan):
         assert not (left(distance) > 0.0) or jnp.isinf(left(distance))
+
+
+def test_steps_begin_far_away_where_rounding_errors_allow_and_elimination_too():
+    """However short: those that begin where no pivot is trusted would be tried ever shorter."""
+    distances = jnp.array([1e-4, 1.2e-3, 2e-3, 1e-2, 0.1, jnp.inf])
+    assert_allclose(far(distances, jnp.array(0.03), jnp.array(2e-9)), [False, False, False, True, True, True])
+    assert_allclose(far(distances, jnp.array(1e-9), jnp.array(2e-9)), [False, False, True, True, True, True])
+    assert not far(jnp.array(jnp.nan), jnp.array(0.03), jnp.array(2e-9))
 
 
 def test_fractions_of_a_step_far_from_all_nodes(method):

@@ -16,6 +16,9 @@ SHORTEST, LONGEST = 0.2, 0.95  # of a step, one that is taken in its place
 # step's velocity has a twenty-fifth of them: they must be less than the tolerance. Where the configuration is still ahead of the
 # end of a step, four times as far away: close to it are many nodes of the next one.
 PAST, BEFORE = 1e-16, 8e-15
+# Elimination trusts no pivot that is closer than 1e-3 (`BRANCH_TOL`), and shorter steps that begin so close would get shorter and
+# shorter: they have no stage where it does.
+NEAREST = 1.5e-3
 # Of a step: a configuration that is expected by then lies behind its end, though it is expected a little too early, by up to a
 # tenth of a step. More than the larger of `Method.clearings`.
 SURE = 0.85
@@ -23,7 +26,7 @@ SURE = 0.85
 
 def far(distance: Array, step: Array, tolerance: Array, rounding: float = BEFORE) -> Array:
     """Whether a step may begin so far away from singular configurations."""
-    return distance**3 * tolerance > rounding * step
+    return (distance > NEAREST) & (distance**3 * tolerance > rounding * step)
 
 
 def ahead(times: tuple[Array, ...], distances: tuple[Array, ...]) -> Array:
