@@ -50,8 +50,8 @@ def test_linkage(angle, rate, bound):
     assert error(mech, sol) <= bound
     # At an angle of 1e-5 from the singular configuration, the row left out is closed to rounding over that angle.
     assert jnp.abs(udk.violation(mech, sol)).max() <= 1e-10
-    # In line at rest 366 to 405, by rounding: each return dwells there.
-    assert sol.stats["steps"] < 450
+    # In line at rest 377 to 421, by rounding: each return dwells there.
+    assert sol.stats["steps"] < 480
     energy = udk.energy(mech, sol).total
     assert_allclose(energy, energy[0], atol=20 * bound)
 
@@ -91,8 +91,8 @@ def test_runs_may_turn_back_in_singular_configurations(angle):
     mech = udk.library.parallelogram(np.deg2rad(angle))
     sol = udk.simulate(mech, TS, rtol=1e-12, atol=1e-12)
     assert error(mech, sol) <= 200e-12
-    assert sol.stats["steps"] < 1500 and sol.stats["rejected"] < 300
-    assert sol.stats["right_hand_sides"] < 20 * sol.stats["steps"]
+    assert sol.stats["steps"] < 2000 and sol.stats["rejected"] < 700  # 820 to 1,650, by rounding
+    assert sol.stats["right_hand_sides"] < 22 * sol.stats["steps"]
 
 
 @pytest.mark.parametrize("tol", [1e-9, 3e-10, 1e-10])
