@@ -35,8 +35,8 @@ from udkjax.straightline import Loop, Program
 RANK_TOL = 1e-4
 # Where only states beside singular configurations are judged by it: rows that count as redundant there, and are not, leave what
 # they hold back in velocities, as large as the threshold; rounding errors are as large as a unit over its square. This is the
-# third root of a unit. With 1e-4 Peaucellier's linkage may cross with errors of 1e-5 in its energy, at any tolerance, and one in ten
-# runs of it still does with 1e-5; with 1e-6 linkages that turn back in singular configurations take two fifths more steps.
+# third root of a unit. With 1e-4 Peaucellier's linkage may cross with errors of 1e-5 in its energy, at any tolerance, and some
+# runs of it still do with 1e-5; with 1e-6 linkages that turn back in singular configurations take two fifths more steps.
 RANK_TOL_BESIDE = 6e-6
 # Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
 # longer to trace and compile, the larger the scene (see the scaling benchmark).
