@@ -33,20 +33,18 @@ from udkjax.straightline import Loop, Program
 # Far above rounding and drift, far below the singular values of a mechanism in ordinary positions: with the states returned to
 # the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
 RANK_TOL = 1e-4
-# Where only states beside singular configurations are judged by it: rows that count as redundant there, and are not, leave what
-# they hold back in velocities, as large as the threshold; rounding errors are as large as a unit over its square. This is the
-# third root of a unit. With 1e-4 Peaucellier's linkage may cross with errors of 1e-5 in its energy, at any tolerance, and some
-# runs of it still do with 1e-5; with 1e-6 linkages that turn back in singular configurations take two fifths more steps.
-RANK_TOL_BESIDE = 6e-6
 # Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
 # longer to trace and compile, the larger the scene (see the scaling benchmark).
 LARGE = 150
 FEW = 20  # coordinates: up to so many, `finish` has not too many results for a fusion of lanes (straightline/fusion.py)
 NOTHING_LEFT = 1e-14  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
-# Varga's method compares diagonal entries of R, which are larger than singular values, with the largest norm of a column, which
-# is less than the largest of them. With this many times the threshold runs that cross singular configurations take as many steps
-# as by singular values (medians of 20 starts); with less up to two fifths more, with ten times N-four-bars are 3e-6 off.
-ROUGHLY = 3.0
+# Steps with care begin on the constraint manifold, and only those beside singular configurations take it. Rows that count as
+# redundant there and are not leave what they hold back in velocities, as large as the threshold, and rounding errors are as large
+# as a unit over its square: both are least at the third root of a unit, 6e-6. With this many times the `rank_tol` the threshold of
+# Varga's method is about that: it compares diagonal entries of R, which are larger than singular values, with the largest norm of
+# a column, which is less than the largest of them. With 3, Peaucellier's linkage may cross with errors of 1e-5 in its energy, at
+# any tolerance; with 0.03 linkages that turn back in singular configurations take two fifths more steps.
+WITH_CARE = 0.2
 ORDINARY = 100.0  # the ratio of masses up to which that holds: see `rank_tolerance`
 
 
@@ -212,7 +210,7 @@ class Equations(MechanismMotion):
     def careful(self) -> "Equations":
         """The same by Varga's method on all rows: without LAPACK it is compiled into one function with what is around it."""
         assert self.method.rank_tol is not None
-        return eqx.tree_at(lambda e: e.method, self, Varga(ROUGHLY * self.method.rank_tol, self.method.relative))
+        return eqx.tree_at(lambda e: e.method, self, Varga(WITH_CARE * self.method.rank_tol, self.method.relative))
 
     @property
     def forgiving(self) -> "Equations":
@@ -245,14 +243,11 @@ def prepare(
     grow with the scene. `large` says which, whatever the size. `moving` says of each leaf of the mechanism whether it is traced
     where all begins: of the others XLA may know the numbers, though they are traced here. Without it none is taken to be.
 
-    A method without a `rank_tol` gets `rank_tolerance`: a smaller one if it is `Auto`, which looks at all rows only where it is
-    beside singular configurations. Without knowledge of which rows are redundant (a mechanism that was built from traced numbers)
-    `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
+    A method without a `rank_tol` gets `rank_tolerance`. Without knowledge of which rows are redundant (a mechanism that was built
+    from traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
     """
     chosen: Any = Auto() if method is None else method
-    beside = isinstance(chosen, Auto) and mechanism.left_out is not None
-    usual = rank_tolerance(mechanism, RANK_TOL_BESIDE if beside else RANK_TOL)
-    tol = usual if chosen.rank_tol is None else chosen.rank_tol
+    tol = rank_tolerance(mechanism) if chosen.rank_tol is None else chosen.rank_tol
     chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)
     if isinstance(chosen, Elimination) and not chosen.relative:
         raise ValueError("Elimination compares each row with what remains of it: here its rank_tol must be relative")
@@ -290,8 +285,8 @@ def prepare_to_close(mechanism: Mechanism, large: bool | None = None) -> Any:
     return prepare_closing(mechanism)
 
 
-def rank_tolerance(mechanism: Mechanism, ordinary: float = RANK_TOL) -> Float[Array, ""]:
-    """Return the `ordinary` threshold, less where masses are far apart.
+def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:
+    """Return `RANK_TOL`, less where masses are far apart.
 
     Where a light body carries a heavy one the singular values of D = Psi_q M^(-1/2) are as far apart as the roots of the masses,
     in any position: a ratio of 1e8 brings a constraint between them down to 1e-4 of the largest.
@@ -301,4 +296,4 @@ def rank_tolerance(mechanism: Mechanism, ordinary: float = RANK_TOL) -> Float[Ar
     xp: Any = np if known else jnp  # while something else is traced, jnp would trace what is known, too
     masses = [xp.asarray(mass) for mass in masses]
     ratio = reduce(xp.minimum, masses) / reduce(xp.maximum, masses)
-    return jax.lax.stop_gradient(number(ordinary * xp.minimum(1.0, xp.sqrt(ORDINARY * ratio))))
+    return jax.lax.stop_gradient(number(RANK_TOL * xp.minimum(1.0, xp.sqrt(ORDINARY * ratio))))

@@ -17,8 +17,8 @@ class Auto(Dense):
 
     In a mechanism these are rows found independent when it was built, by straight-line code, until one of the pivots falls to
     `branch_tol` times its row's diagonal entry of D D^T: then it is the `SVD` of all rows. The equations arrange that, which know
-    the rows. Steps of explicit Runge-Kutta methods take `Varga` there, which takes a fraction of the time, with a threshold that
-    amounts to the same. Of a matrix of which nothing is known it is the `SVD`.
+    the rows. Steps of explicit Runge-Kutta methods take `Varga` there, which takes a fraction of the time, with a threshold of a
+    fifth of `rank_tol`. Of a matrix of which nothing is known it is the `SVD`.
     """
 
     branch_tol: Float[Array, ""] | None = eqx.field(converter=number, default=BRANCH_TOL)
