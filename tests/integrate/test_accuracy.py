@@ -87,7 +87,7 @@ def test_singular_configurations_cost_few_steps(angle):
 
 @pytest.mark.parametrize("angle", [-0.01, 0.0, 0.01, 0.3])
 def test_runs_may_turn_back_in_singular_configurations(angle):
-    """Or just short of them, or just behind. Where each step beside one is tried shorter before it gets care, 20,000 and more."""
+    """Or just short of them, or just behind. Where steps beside one are tried shorter before they get care, 3,500 to 52,000."""
     mech = udk.library.parallelogram(np.deg2rad(angle))
     sol = udk.simulate(mech, TS, rtol=1e-12, atol=1e-12)
     assert error(mech, sol) <= 200e-12
