@@ -116,19 +116,23 @@ def test_many_starts_cross_singular_configurations(linkage, placed):
     """One start flatters: 64 spread by 5 degrees about each of three, every one of which crosses."""
 
     @jax.jit
-    def runs(angles):
+    def runs(angles, tol):
         def run(angle):
-            sol = udk.simulate(linkage, COARSE, udk.State(*placed(angle, 0.0)), rtol=1e-9, atol=1e-9)
-            return sol.q, sol.v, sol.code
+            sol = udk.simulate(linkage, COARSE, udk.State(*placed(angle, 0.0)), rtol=tol, atol=tol)
+            with_care = (sol.stats["right_hand_sides"] - 1 - 13 * sol.stats["steps"]) / 14  # and 14 more where it is taken again
+            return sol.q, sol.v, sol.code, with_care
 
         return jax.lax.map(run, angles)
 
     degrees = np.concatenate([np.linspace(c - 5, c + 5, 64) for c in (60, 45, 0)])
-    q, v, code = (np.asarray(x) for x in runs(jnp.deg2rad(degrees)))
-    assert (code == udk.Result.successful).all()
-    errors = np.array([np.abs(exact(linkage, COARSE, a[0], b[0]) - a).max() for a, b in zip(q, v, strict=True)])
-    assert errors.max() < 2e-6, degrees[errors.argmax()]
-    assert np.median(errors) < 2e-7
+    for tol, largest, median in ((1e-9, 2e-6, 2e-7), (1e-10, 2e-7, 2e-8)):
+        q, v, code, with_care = (np.asarray(x) for x in runs(jnp.deg2rad(degrees), tol))
+        assert (code == udk.Result.successful).all()
+        errors = np.array([np.abs(exact(linkage, COARSE, a[0], b[0]) - a).max() for a, b in zip(q, v, strict=True)])
+        assert errors.max() < largest, degrees[errors.argmax()]
+        assert np.median(errors) < median
+        # Each takes as long as thirty others. Some that come to rest in a singular configuration need them: those about 0.
+        assert with_care[:128].sum() <= 10, with_care
 
 
 # --- what stabilization is worth

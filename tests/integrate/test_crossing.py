@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from udkjax.integrate.crossing import LONGEST, SHORTEST, ahead, around, far
+from udkjax.integrate.crossing import LONGEST, SHORTEST, ahead, around, far, passed
 from udkjax.integrate.tableau import method_of
 
 METHODS = {"Dopri8": None, "Tsit5": diffrax.Tsit5(), "Dopri5": diffrax.Dopri5(), "Bosh3": diffrax.Bosh3(), "Heun": diffrax.Heun()}
@@ -38,6 +38,22 @@ def test_steps_begin_far_away_where_rounding_errors_allow_and_elimination_too():
     assert not far(jnp.array(jnp.nan), jnp.array(0.03), jnp.array(2e-9))
 
 
+@pytest.mark.parametrize(
+    "left, after, expected",
+    [
+        (0.7, 0.12, True),  # as expected: 0.3 by a line
+        (0.7, 0.01, False),  # too close to be where it is expected: it may as well be still ahead
+        (0.9, 0.03, False),  # expected too late
+        (-0.1, 0.4, False),  # none ahead
+        (jnp.nan, 0.4, False),
+        (0.7, jnp.nan, False),
+        (0.7, jnp.inf, True),
+    ],
+)
+def test_a_configuration_is_passed_where_its_distance_says_so_too(left, after, expected):
+    assert passed(*map(jnp.asarray, (left, 1.0, 0.7, after))) == expected
+
+
 def test_fractions_of_a_step_far_from_all_nodes(method):
     nodes = np.unique(method.nodes)
     for fraction in method.clearings:
@@ -57,7 +73,7 @@ def test_another_step_is_shorter_and_has_its_nodes_elsewhere(method, enough):
         if found == 0.8 * step:
             continue
         taken += 1
-        assert SHORTEST * step < found < LONGEST * step and low / 2 < share < 1.0 + low
+        assert SHORTEST * step < found < LONGEST * step and low * SHORTEST < share < 1.0 + low
         if found < left:
             assert enough
             assert_allclose(left - found, low * step)

@@ -20,8 +20,9 @@ PAST, BEFORE = 1e-16, 8e-15
 # shorter: they have no stage where it does.
 NEAREST = 1.5e-3
 # Of a step: a configuration that is expected by then lies behind its end, though it is expected a little too early, by up to a
-# tenth of a step. More than the larger of `Method.clearings`.
-SURE = 0.85
+# tenth of a step. More than the larger of `Method.clearings`. Where it is far away, it may be expected by three tenths too early,
+# and just be ahead of the end: less than this much of the distance that the end should have by then.
+SURE, EXPECTED = 0.85, 0.3
 
 
 def far(distance: Array, step: Array, tolerance: Array, rounding: float = BEFORE) -> Array:
@@ -42,6 +43,11 @@ def ahead(times: tuple[Array, ...], distances: tuple[Array, ...]) -> Array:
     return -d0 / (slope - curve * (d0 / slope))
 
 
+def passed(left: Array, step: Array, before: Array, after: Array) -> Array:
+    """Whether a step has come past a configuration that was ahead, by its distances before and after it."""
+    return (left > 0.0) & (left < SURE * step) & (after * left > EXPECTED * before * (step - left))
+
+
 def around(method: Method, left: Array, step: Array, far_enough: Array, otherwise: Array) -> Array:
     """In place of a step that failed, one with its nodes far from the configuration, if it may have failed by that.
 
@@ -52,5 +58,5 @@ def around(method: Method, left: Array, step: Array, far_enough: Array, otherwis
     across = left / jnp.where(share < low, low, high)
     up_to = jnp.where((share < 1.0 + low) & far_enough, left - low * step, step)
     found = jnp.where(share < high, across, up_to)
-    apt = (share > low / 2) & (found > SHORTEST * step) & (found < LONGEST * step)
+    apt = (found > SHORTEST * step) & (found < LONGEST * step)
     return jnp.where(apt, found, otherwise)

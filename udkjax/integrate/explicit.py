@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from udkjax.integrate.crossing import BEFORE, DODGE, DODGES, PAST, SURE, ahead, around, far
+from udkjax.integrate.crossing import BEFORE, DODGE, DODGES, PAST, ahead, around, far, passed
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
 from udkjax.integrate.packing import Packing
@@ -183,8 +183,7 @@ def _far(task: Task, m: March, distance: Array, rounding: float = BEFORE) -> Arr
 
 def _past(task: Task, m: March, trial: Trial) -> Array:
     """Whether a step ends behind the singular configuration ahead, far enough."""
-    left = _ahead(m)
-    return (left > 0.0) & (left < SURE * m.h) & _far(task, m, trial.distance, PAST)
+    return passed(_ahead(m), m.h, m.distances[-1], trial.distance) & _far(task, m, trial.distance, PAST)
 
 
 def _around(task: Task, m: March, step: Array, otherwise: Array) -> Array:
