@@ -450,7 +450,7 @@ def test_in_a_loop_that_is_one_function_it_is_written_out(make):
 
 def test_batches_and_derivatives_of_such_loops_are_those_by_levels():
     """Batches of fronts would be too much to compile where they are no fusions."""
-    mech = udk.library.n_four_bar(5, 1.0)
+    mech = udk.library.n_four_bar(3, 1.0)
     equations = prepare(mech, large=True)
     q, v = mech.q0.ravel(), mech.v0.ravel() + jnp.linspace(0.1, 0.3, mech.q0.size)
     several = jnp.stack([v, 2 * v])

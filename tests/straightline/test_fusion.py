@@ -140,7 +140,7 @@ def test_what_is_no_straight_line_code_is_left_alone(linkage, choices):
     assert fusions(simulated(linkage, jnp.linspace(0.0, 0.05, 3), **choices)[0]) == 0
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_runs_that_are_differentiated_twice_hold_none(linkage, order):
     """The second derivative takes the plain form, which asks LAPACK: no loop that it is in is one function."""
 
