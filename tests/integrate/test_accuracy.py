@@ -131,7 +131,7 @@ def test_many_starts_cross_singular_configurations(linkage, placed):
         errors = np.array([np.abs(exact(linkage, COARSE, a[0], b[0]) - a).max() for a, b in zip(q, v, strict=True)])
         assert errors.max() < largest, degrees[errors.argmax()]
         assert np.median(errors) < median
-        # Each takes as long as thirty others. Some that come to rest in a singular configuration need them: those about 0.
+        # Each takes as long as fifty others. Some that come to rest in a singular configuration need them: those about 0.
         assert with_care[:128].sum() <= 10, with_care
 
 
