@@ -41,7 +41,7 @@ def test_steps_begin_far_away_where_rounding_errors_allow_and_elimination_too():
 @pytest.mark.parametrize(
     "left, after, expected",
     [
-        (0.7, 0.12, True),  # as expected: 0.3 by a line
+        (0.7, 0.12, True),  # enough of 0.3, which a line leads to expect
         (0.7, 0.01, False),  # too close to be where it is expected: it may as well be still ahead
         (0.9, 0.03, False),  # expected too late
         (-0.1, 0.4, False),  # none ahead

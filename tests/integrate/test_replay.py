@@ -48,7 +48,7 @@ def assert_same(found, expected, tol):
 def test_reverse_mode_is_forward_mode(gradient):
     """To rounding: along parameters, along the start, and along the output times, on which the last step's size depends too.
 
-    Of some hundred steps: 1.2e-13 of the largest derivative was seen.
+    With vectors of 512 bits they were 1.2e-13 of the largest derivative apart.
     """
     from diffrax import ForwardMode
 
