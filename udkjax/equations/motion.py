@@ -68,6 +68,11 @@ class Motion(eqx.Module):
         """The same without a branch, for states near the manifold: rows that depend on others are not asked to close further."""
         return self.quick
 
+    def known_to(self, tol: Any) -> "Motion":
+        """As `forgiving`, for states known to so many m, rad, m/s and rad/s: nor are rows that would make them less exact."""
+        del tol
+        return self.forgiving
+
     def within(self, loop: Loop) -> "Motion":
         """The same, to be evaluated in that loop, which XLA compiles into one function."""
         del loop

@@ -9,7 +9,7 @@ It is written twice. The plain form (plain.py) is the equation as it stands, on 
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import pairwise
 from typing import Any
@@ -38,6 +38,9 @@ RANK_TOL = 1e-4
 LARGE = 150
 FEW = 20  # coordinates: up to so many, `finish` has not too many results for a fusion of lanes (straightline/fusion.py)
 NOTHING_LEFT = 1e-14  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
+# Over the pivot: by how much rounding errors turn the velocities that a row allows (rad; up to a third of that in the paper's
+# linkage). Rows of larger pivots than the second are of use to linkages that turn back there, however small the tolerance.
+TURNED, USELESS = 1e-15, 1e-8
 # Steps with care begin on the constraint manifold, unless states are not projected, and only those beside singular configurations
 # take it. Rows that count as redundant there and are not leave what they hold back in velocities, as large as the threshold, and
 # rounding errors are as large as a unit over its square: both are least at the third root of a unit, 6e-6. With this many times
@@ -216,11 +219,19 @@ class Equations(MechanismMotion):
     @property
     def forgiving(self) -> "Equations":
         """The same without a branch: `Auto` drops rows that depend on others, but for rounding, as `Elimination` does."""
+        return self._dropping(lambda _: jnp.asarray(NOTHING_LEFT))
+
+    def known_to(self, tol: Any) -> "Equations":
+        """As `forgiving`: `Auto` drops rows by which velocities would be turned by more than `tol`, if their pivots are small."""
+        return self._dropping(lambda own: jnp.clip(TURNED / jax.lax.stop_gradient(tol), NOTHING_LEFT, jnp.minimum(own, USELESS)))
+
+    def _dropping(self, threshold: Callable[[Array], Array]) -> "Equations":
+        """The same without a branch, with another threshold of `Auto`, made of its own, below which it drops rows."""
         places = [s.index for s in self.code.constants]
         if not self.branches or self.code.drop.index not in places:
             return self.quick
         drop = places.index(self.code.drop.index)
-        constants = [jnp.asarray(NOTHING_LEFT) if k == drop else c for k, c in enumerate(self.constants)]
+        constants = [threshold(c) if k == drop else c for k, c in enumerate(self.constants)]
         return dataclasses.replace(self, constants=constants, branch=False, doubt=False)
 
     def within(self, loop: Loop) -> "Equations":

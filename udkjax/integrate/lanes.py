@@ -167,7 +167,7 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
 
     def outputs(given: tuple[Array, Array]) -> tuple[Array, Array]:
         first = lanes.over(violation, jnp.broadcast_to(problem.ts[0], lanes.shape), start)
-        each, ys = partial(_output, problem.projected), given[0][..., 1:, :]
+        each, ys = partial(_output, problem.rtol + problem.atol if problem.projected else None), given[0][..., 1:, :]
         ys, violated = _each_output(lanes, each, problem.ts[1:], ys, wide=problem.careful)
         ys = jnp.concatenate([start.T[..., None, :], ys], axis=-2)
         violated = jnp.concatenate([first[..., None], violated], axis=-1)
@@ -280,11 +280,12 @@ def _side_by_side(equations: Motion, function: Callable, ts: Array, ys: Array) -
     return jax.lax.while_loop(lambda state: (state[0] * FEW_STEPS < STEPS) & (state[1] > 0), more, start)[3:]
 
 
-def _output(projected: bool, steps: int, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array, Array]:
+def _output(tol: Array | None, steps: int, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array, Array]:
     """Interpolated states (2n, *lanes), returned to the manifold; how they violate the constraints; whether they still moved."""
     moving = jnp.zeros(lanes.shape, bool)
-    if projected:
+    if tol is not None:
+        tol = jnp.broadcast_to(tol, lanes.shape)
         inside = lanes.within(Loop(lanes.size is not None))  # what closes it is a loop
-        q, v, moving = inside.over(lambda e, t, y: e.forgiving.closed(t, *jnp.split(y, 2), steps), t, y)
+        q, v, moving = inside.over(lambda e, t, y, tol: e.known_to(tol).closed(t, *jnp.split(y, 2), steps), t, y, tol)
         y = jnp.concatenate([q, v])
     return y, lanes.over(violation, t, y), moving

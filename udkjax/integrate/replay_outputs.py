@@ -54,10 +54,13 @@ class Equations:
 def of_outputs(problem: Problem, raw: Raw, equations: Equations, sums: Sums, bars: Array) -> tuple[Sums, Array]:
     """Of the outputs before they were projected: the derivative of the projection is that at the state that it returns."""
 
+    tol = problem.rtol + problem.atol
+
     def one(sums: Sums, x: Any) -> tuple[Sums, Array]:
         k, t, y, bar, reached = x
         q, v = jnp.split(jnp.where(reached, y, jnp.concatenate([problem.q, problem.v])), 2)
-        found, t_bar, q, v = equations.pull(lambda e, *x: e.forgiving.as_projected(*x), sums, t, q, v, tuple(jnp.split(bar, 2)))
+        both = tuple(jnp.split(bar, 2))
+        found, t_bar, q, v = equations.pull(lambda e, *x: e.known_to(tol).as_projected(*x), sums, t, q, v, both)
         if found.ts is not None:
             found = found._replace(ts=found.ts.at[k].add(t_bar))
         sums, bar = jax.tree.map(lambda x, y: jnp.where(reached, x, y), (found, jnp.concatenate([q, v])), (sums, bar))
