@@ -100,6 +100,17 @@ def test_the_form_for_other_devices(pendulum, batch, monkeypatch):
     assert_allclose(found.stats["steps"], batch.stats["steps"])
 
 
+def test_outputs_of_a_batch_are_kept_once(pendulum):
+    """What is beside them is one chunk's, and what they violate the constraints by; nor are velocities kept that nobody uses."""
+    ts = np.linspace(0.0, 2.0, 801)
+
+    def outputs(rate):
+        return udk.simulate(pendulum, ts, udk.State(pendulum.q0, rate * pendulum.v0)).q[:, 0]
+
+    memory = jax.jit(jax.vmap(outputs)).lower(jnp.ones(1024)).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 1.5 * memory.output_size_in_bytes
+
+
 def test_a_member_that_fails_is_data(pendulum):
     name = pendulum.body_names[0]
 

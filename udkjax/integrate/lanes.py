@@ -22,7 +22,7 @@ from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import ended, lasting, violation
 from udkjax.integrate.step import Task, Trial, errors, judged, stage_state
 from udkjax.integrate.tableau import is_explicit, method_of
-from udkjax.straightline import Loop, apart, when
+from udkjax.straightline import Loop, apart, cut, when
 
 ROUND = 8  # lanes: what the widest vector units hold
 STEPS = 7  # to an output: where two branches of the manifold meet, Newton's method halves the distance in each
@@ -60,7 +60,8 @@ def _many(arrays: Any, batched: Any, static: Any, size: int) -> Raw:
         return _in_lanes(eqx.combine(members, static), eqx.combine(axes, static), lanes)
 
     raw = jax.lax.map(chunk, places)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:size], raw)
+    # One by one: what nobody uses is not kept. What is done to each of them as it is XLA does in place.
+    return Raw(*(cut([x.reshape(-1, *x.shape[2:])[:size]])[0] for x in raw))
 
 
 def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
@@ -179,7 +180,7 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
     ys, violated = when(m.tried >= 0, outputs, given) if lanes.size is None else outputs(given)
     number = jnp.arange(inner + 2).reshape(-1, *[1] * len(lanes.shape))
     reached = (number <= m.written) & (number <= inner) | (m.code == DONE)
-    return Raw(ys, violated, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
+    return Raw(*jnp.split(ys, 2, axis=1), violated, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
 
 
 # --- with care

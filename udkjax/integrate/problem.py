@@ -30,7 +30,8 @@ class Problem(eqx.Module):
 class Raw(NamedTuple):
     """A run as an integrator leaves it: `status` is one of those above, from `DONE` on."""
 
-    ys: Any  # (T, 2n), not yet reached ones of any value
+    q: Any  # (T, n), not yet reached ones of any value
+    v: Any
     violation: Any  # (T,) the largest of any row of Psi there (m, rad)
     reached: Any  # (T,)
     status: Any

@@ -33,7 +33,7 @@ from udkjax.straightline import when
 
 
 def walked_back(problem: Problem, moving: Problem, raw: Raw, record: Record, ys: Array, y: Array) -> Problem:
-    """From the cotangents of `Raw.ys` and `Raw.y` to those of the leaves of the problem that `moving` has: others are None."""
+    """From the cotangents of `Raw.q` and `Raw.v`, side by side, and of `Raw.y` to those of what `moving` has of the problem."""
     task, n = task_of(problem, Lanes(problem.equations), recorded=True), len(problem.q)
     timed = moving.ts is not None
     equations = Equations(problem.equations, moving.equations, timed)

@@ -66,7 +66,7 @@ def of_outputs(problem: Problem, raw: Raw, equations: Equations, sums: Sums, bar
         sums, bar = jax.tree.map(lambda x, y: jnp.where(reached, x, y), (found, jnp.concatenate([q, v])), (sums, bar))
         return sums, bar
 
-    rows = (jnp.arange(1, len(problem.ts)), problem.ts[1:], raw.ys[1:], bars, raw.reached[1:])
+    rows = (jnp.arange(1, len(problem.ts)), problem.ts[1:], jnp.concatenate([raw.q, raw.v], axis=1)[1:], bars, raw.reached[1:])
     return jax.lax.scan(one, sums, rows)
 
 

@@ -42,12 +42,12 @@ def reversible(problem: Problem, integrate: Callable[[Problem], Raw]) -> Raw:
         values, moves, raw, record = residual
         moving = eqx.filter(values, jax.tree.map(lambda x: x.size > 0, moves))
         problem = eqx.combine(values, static)
-        ys, y = (_instantiated(x) for x in (cotangents.ys, cotangents.y))
+        q, v, y = (_instantiated(x) for x in (cotangents.q, cotangents.v, cotangents.y))
         if replayed:
-            found = _pulled(problem, moving, raw, record, ys, y)
+            found = _pulled(problem, moving, raw, record, jnp.concatenate([q, v], axis=1), y)
         else:
             again = lambda moving: _by_diffrax(eqx.combine(moving, problem))  # noqa: E731
-            found = jax.vjp(again, moving)[1]((ys, y))[0]
+            found = jax.vjp(again, moving)[1]((q, v, y))[0]
         return (eqx.combine(found, jax.tree.map(jnp.zeros_like, values)),)
 
     run.defvjp(forward, backward, symbolic_zeros=True)
@@ -58,7 +58,7 @@ def _by_diffrax(problem: Problem) -> Any:
     from udkjax.integrate.by_diffrax import by_diffrax
 
     raw = by_diffrax(problem)
-    return raw.ys, raw.y
+    return raw.q, raw.v, raw.y
 
 
 def _instantiated(x: Any) -> Any:

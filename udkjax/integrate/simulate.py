@@ -153,11 +153,11 @@ def _simulate(
         raw = integrate(problem) if adjoint else reversible(problem, integrate)
     else:
         raw = _by_diffrax(problem, adjoint, meter)
-    ys = jnp.where(raw.reached[:, None], raw.ys, jnp.concatenate([q, v])).at[0].set(jnp.concatenate([q, v]))
+    later = (raw.reached & (jnp.arange(len(ts)) > 0))[:, None]
+    q, v = jnp.where(later, raw.q, q), jnp.where(later, raw.v, v)
     seen = undifferentiated(Run(equations, raw, ts, closed, missed, drift_tol))
     code, time, reached = outcome(seen)
-    ys = jnp.where(reached[:, None], ys, jnp.nan)
-    q, v = (y.reshape(len(ts), *start.q.shape) for y in jnp.split(ys, 2, axis=1))
+    q, v = (jnp.where(reached[:, None], y, jnp.nan).reshape(-1, *start.q.shape) for y in (q, v))
     stats = counts(raw, projected, len(ts))
     settings = (
         ("method", type(method).__name__),
