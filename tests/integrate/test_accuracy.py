@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 import udkjax as udk
 from udkjax.study import exact_coordinates
@@ -118,7 +118,7 @@ def test_outputs_in_singular_configurations(tol):
     """As exact as others: rows that rounding errors have made useless do not turn velocities: some were off by 0.2 rad/s."""
     mech = udk.library.parallelogram(np.deg2rad(60))
     angle = lambda ts: exact(mech, np.append(0.0, ts), mech.q0, mech.v0)[1:, 0, 2]  # noqa: E731
-    crossing = brentq(lambda t: angle(t)[0], 0.4, 0.7, xtol=1e-15)
+    crossing = root_scalar(lambda t: angle(t)[0], bracket=(0.4, 0.7), xtol=1e-15).root
     apart = np.logspace(-13, -2, 45)
     ts = np.concatenate([[0.0], crossing - apart[::-1], [crossing], crossing + apart, [1.0]])
     sol = udk.simulate(mech, ts, rtol=tol, atol=tol)

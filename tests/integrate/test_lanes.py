@@ -236,7 +236,7 @@ def test_outputs_side_by_side_are_those_one_after_another(placed):
 
     @partial(jax.jit, static_argnums=1)
     def closed(states, wide):
-        return lanes._each_output(one, partial(lanes._output, True), times, states, wide)
+        return lanes._each_output(one, partial(lanes._output, jnp.asarray(1e-6)), times, states, wide)
 
     (found, violated), (expected, violated_then) = closed(states, True), closed(states, False)
     ordinary = np.abs(angles) > 1e-4
