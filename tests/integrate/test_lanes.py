@@ -1,6 +1,7 @@
 """Batches of explicit Runge-Kutta runs: in lanes, each the same as alone, and as by diffrax."""
 
 from functools import partial
+from typing import Any
 
 import diffrax
 import jax
@@ -107,7 +108,7 @@ def test_outputs_of_a_batch_are_kept_once(pendulum):
     def outputs(rate):
         return udk.simulate(pendulum, ts, udk.State(pendulum.q0, rate * pendulum.v0)).q[:, 0]
 
-    memory = jax.jit(jax.vmap(outputs)).lower(jnp.ones(1024)).compile().memory_analysis()
+    memory: Any = jax.jit(jax.vmap(outputs)).lower(jnp.ones(1024)).compile().memory_analysis()
     assert memory.temp_size_in_bytes < 1.5 * memory.output_size_in_bytes
 
 

@@ -51,7 +51,8 @@ def by_diffrax(
     found = evaluations(run.controller_state)
     right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (problem.h is None))  # one chooses the first step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
-    return Raw(*jnp.split(ys, 2, axis=1), violated, reached, status, t_end[0], end[0], *steps, right_hand_sides)
+    q, v = jnp.split(ys, 2, axis=1)
+    return Raw(q, v, violated, reached, status, t_end[0], end[0], *steps, right_hand_sides)
 
 
 def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array, "2n"]:

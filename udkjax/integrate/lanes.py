@@ -180,7 +180,8 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
     ys, violated = when(m.tried >= 0, outputs, given) if lanes.size is None else outputs(given)
     number = jnp.arange(inner + 2).reshape(-1, *[1] * len(lanes.shape))
     reached = (number <= m.written) & (number <= inner) | (m.code == DONE)
-    return Raw(*jnp.split(ys, 2, axis=1), violated, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
+    q, v = jnp.split(ys, 2, axis=1)
+    return Raw(q, v, violated, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
 
 
 # --- with care
