@@ -125,7 +125,7 @@ def test_outputs_in_singular_configurations(tol):
     assert error(mech, sol) < 10 * tol
     rate = -np.sqrt(2 * 3.5 * 9.81 / 3.05 * (np.sin(np.deg2rad(60)) - np.sin(angle(ts))).clip(0))
     assert_allclose(sol.v[:, :3, 2], np.repeat(rate[:, None], 3, axis=1), atol=max(50 * tol, 1e-6))
-    assert np.abs(udk.violation(mech, sol)).max() < tol
+    assert np.abs(udk.violation(mech, sol)).max() < max(tol, 1e-9)  # rows that are dropped stay as they were interpolated
 
 
 def test_many_starts_cross_singular_configurations(linkage, placed):
