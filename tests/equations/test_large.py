@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.equations import large, redundancy
-from udkjax.equations.udwadia_kalaba import prepare
+from udkjax.equations.programs import prepare
 from udkjax.pinv.blocks import Sums
 from udkjax.straightline import Loop
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.equations.udwadia_kalaba import prepare
+from udkjax.equations.programs import prepare
 from udkjax.straightline import Loop, fusion
 
 TRIED = jax.__version_info__[:2] in fusion.KNOWN

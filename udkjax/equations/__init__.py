@@ -11,6 +11,9 @@ from udkjax.equations.formulations import NullSpaceQR as NullSpaceQR
 from udkjax.equations.formulations import NullSpaceSVD as NullSpaceSVD
 from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
 from udkjax.equations.partitioning import CoordinatePartitioning as CoordinatePartitioning
+from udkjax.equations.programs import Baumgarte as Baumgarte
+from udkjax.equations.programs import Equations as Equations
+from udkjax.equations.programs import prepare as prepare
 from udkjax.equations.quantities import Energy as Energy
 from udkjax.equations.quantities import accelerations as accelerations
 from udkjax.equations.quantities import energy as energy
@@ -18,9 +21,6 @@ from udkjax.equations.quantities import equations_of as equations_of
 from udkjax.equations.quantities import reactions as reactions
 from udkjax.equations.quantities import violation as violation
 from udkjax.equations.redundancy import redundant_rows as redundant_rows
-from udkjax.equations.udwadia_kalaba import Baumgarte as Baumgarte
-from udkjax.equations.udwadia_kalaba import Equations as Equations
-from udkjax.equations.udwadia_kalaba import prepare as prepare
 from udkjax.scene import mechanism as _mechanism
 
 _mechanism.find_redundant_rows = redundant_rows

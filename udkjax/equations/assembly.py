@@ -22,8 +22,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.equations.closing import HALVINGS, ITERATIONS, assembled, assembled_by_numpy, assembled_by_scipy, direction, limited
 from udkjax.equations.motion import MechanismMotion
+from udkjax.equations.programs import is_large, prepare_to_close
 from udkjax.equations.redundancy import dependent_constraints, redundant_rows
-from udkjax.equations.udwadia_kalaba import is_large, prepare_to_close
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 

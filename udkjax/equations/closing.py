@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from udkjax.equations.code import code, scalars
-from udkjax.equations.udwadia_kalaba import rank_tolerance
+from udkjax.equations.programs import rank_tolerance
 from udkjax.scene.mechanism import Mechanism
 
 STRIDE = 0.3  # rad and m: the longest change of a coordinate in one Gauss-Newton step

@@ -20,7 +20,7 @@ from udkjax.equations.plain import plain_accelerations, plain_project, plain_tan
 from udkjax.straightline import along
 
 if TYPE_CHECKING:
-    from udkjax.equations.udwadia_kalaba import Equations
+    from udkjax.equations.programs import Equations
 
 FAR = 1e-13  # m, rad: what a Newton step that moves q by less leaves of Psi_dot are rounding errors
 CLOSE = 1e-8  # m, rad: and of Psi, since Newton's method converges quadratically

@@ -17,7 +17,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.motion import Closed, Motion, Tangential, Vector
-from udkjax.equations.udwadia_kalaba import RANK_TOL
+from udkjax.equations.programs import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
 from udkjax.pinv.rule import beyond

@@ -1,6 +1,6 @@
 """The Udwadia-Kalaba equation for scenes of hundreds and thousands of bodies.
 
-The same equation as in udwadia_kalaba.py, on arrays over all elements of a kind (alike.py) in place of scalars, so that the
+The same equation as in programs.py, on arrays over all elements of a kind (alike.py) in place of scalars, so that the
 program does not grow with the scene. D is kept in blocks, one for each constraint and body; D D^T is eliminated by the levels of
 its elimination tree (pinv/blocks.py). For dense methods, and for singular values, D of each part of a scene that touches no
 other is a matrix (rows, coordinates), for what that costs.

@@ -22,7 +22,7 @@ from udkjax.equations.motion import Vector
 from udkjax.equations.plain import plain_accelerations, plain_correction
 
 if TYPE_CHECKING:
-    from udkjax.equations.udwadia_kalaba import Equations
+    from udkjax.equations.programs import Equations
 
 
 class Linear(eqx.Module):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.formulations import Formulation, Rewritten, along
 from udkjax.equations.motion import MechanismMotion, Motion, Vector
-from udkjax.equations.udwadia_kalaba import RANK_TOL
+from udkjax.equations.programs import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 from udkjax.scene.fields import number

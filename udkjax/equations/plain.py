@@ -11,7 +11,7 @@ from udkjax.equations.motion import Tangential, Vector
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse, SparseElimination
 
 if TYPE_CHECKING:
-    from udkjax.equations.udwadia_kalaba import Equations
+    from udkjax.equations.programs import Equations
 
 
 def plain_accelerations(equations: "Equations", t: Any, q: Vector, v: Vector) -> Vector:

@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.equations.code import code, scalars
-from udkjax.equations.udwadia_kalaba import is_large
+from udkjax.equations.programs import is_large
 from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:

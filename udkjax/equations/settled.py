@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations.assembly import Closure, State, close
-from udkjax.equations.udwadia_kalaba import is_large, prepare, rank_tolerance
+from udkjax.equations.programs import is_large, prepare, rank_tolerance
 from udkjax.pinv import Auto
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism

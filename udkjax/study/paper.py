@@ -18,7 +18,7 @@ import numpy as np
 
 from udkjax.equations import Baumgarte, energy
 from udkjax.equations.assembly import State, assemble
-from udkjax.equations.udwadia_kalaba import prepare
+from udkjax.equations.programs import prepare
 from udkjax.integrate import Projection, Result, simulate
 from udkjax.integrate.solvers import solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga

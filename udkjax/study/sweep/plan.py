@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.programs import Baumgarte
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import Column, Dimension, structure_of
 from udkjax.study.sweep.designs import Design
