@@ -81,7 +81,7 @@ def study(smoke: bool) -> xarray.Dataset:
         residual = np.abs(udk.violation(mechanism, flat))
         psi[row] = residual.max(axis=1).reshape(len(q), -1)
         if name == "none, chosen rows":
-            chosen = np.delete(residual, mechanism.left_out or (), axis=1).max(axis=1)
+            chosen = np.delete(residual, udk.analyse(mechanism).redundant_rows or (), axis=1).max(axis=1)
         error[row] = np.abs(np.asarray(q) - exact).max(axis=(2, 3))
     dims, shape = ("treatment", "kind", "delta", "time"), (len(names), 2, len(deltas), OUTPUTS)
     data = xarray.Dataset(

@@ -23,6 +23,7 @@ from udkjax.environment import (
 if TYPE_CHECKING:  # the public names, for type checkers and editors; a test compares them with those below
     from udkjax import equations as equations
     from udkjax import pinv as pinv
+    from udkjax.equations import Analysis as Analysis
     from udkjax.equations import Augmented as Augmented
     from udkjax.equations import Baumgarte as Baumgarte
     from udkjax.equations import ConstrainedSystem as ConstrainedSystem
@@ -30,6 +31,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.equations import NullSpaceQR as NullSpaceQR
     from udkjax.equations import NullSpaceSVD as NullSpaceSVD
     from udkjax.equations import accelerations as accelerations
+    from udkjax.equations import analyse as analyse
     from udkjax.equations import check as check
     from udkjax.equations import energy as energy
     from udkjax.equations import reactions as reactions
@@ -120,7 +122,7 @@ _NAMES = {
     "udkjax.pinv": "SVD Varga Greville Householder GramSchmidt Elimination Auto",
     "udkjax.equations.assembly": "AssemblyError State assemble",
     "udkjax.equations": """
-        ConstrainedSystem Baumgarte accelerations check violation energy reactions
+        ConstrainedSystem Baumgarte Analysis analyse accelerations check violation energy reactions
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
     "udkjax.study.identify": """
         identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck
@@ -135,8 +137,6 @@ __all__ = [*_MODULES, *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str):
-    if name in _MODULES or name in _HOME:
-        import_module("udkjax.equations")  # with it, mechanisms find their redundant rows when they are built
     if name in _MODULES:
         value = import_module(_MODULES[name])
     elif name in _HOME:

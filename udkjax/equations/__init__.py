@@ -1,5 +1,7 @@
 """What moves a mechanism: pure functions of its numbers, time, coordinates and velocities."""
 
+from udkjax.equations.analysis import Analysis as Analysis
+from udkjax.equations.analysis import analyse as analyse
 from udkjax.equations.assembly import AssemblyError as AssemblyError
 from udkjax.equations.assembly import Check as Check
 from udkjax.equations.assembly import State as State
@@ -20,7 +22,3 @@ from udkjax.equations.quantities import energy as energy
 from udkjax.equations.quantities import equations_of as equations_of
 from udkjax.equations.quantities import reactions as reactions
 from udkjax.equations.quantities import violation as violation
-from udkjax.equations.redundancy import redundant_rows as redundant_rows
-from udkjax.scene import mechanism as _mechanism
-
-_mechanism.find_redundant_rows = redundant_rows

@@ -20,16 +20,22 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from udkjax.equations.closing import HALVINGS, ITERATIONS, assembled, assembled_by_numpy, assembled_by_scipy, direction, limited
-from udkjax.equations.motion import MechanismMotion
-from udkjax.equations.programs import is_large, prepare_to_close
-from udkjax.equations.redundancy import dependent_constraints, redundant_rows
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.closing import (
+    CLOSED,
+    ITERATIONS,
+    DenseRows,
+    TracedRows,
+    close_position,
+    damped_step,
+    is_closed,
+)
+from udkjax.equations.code import is_large
+from udkjax.equations.programs import prepare_to_close
+from udkjax.equations.redundancy import dependent_constraints
+from udkjax.equations.scales import Scales
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
-
-# Of the size of the coordinates (m, rad): what counts as closed. Rounding leaves 1e-15; a scene that cannot be closed leaves what
-# its lengths are wrong by.
-CLOSED = 1e-9
 
 
 class State(eqx.Module):
@@ -60,41 +66,72 @@ class Closure(NamedTuple):
     psi: Float[Array, "m"]
     psi_dot: Float[Array, "m"]
     rank: Int[Array, ""]
+    scales: Scales
+
+    @property
+    def is_closed(self) -> Any:
+        """Whether the residuals are within `CLOSED` of the scene's scales, or rounding."""
+        parts = (self.state.q.ravel(), self.state.v.ravel(), self.psi, self.psi_dot)
+        if not _known(self):
+            return is_closed(self.scales, *parts, jnp)
+        scales, *parts = jax.tree.map(np.asarray, (self.scales, *parts))
+        return is_closed(scales, *parts, np)
 
 
-def assemble(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None, throw: bool = True) -> State:
+def assemble(
+    mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None, throw: bool = True, analysis: Analysis | None = None
+) -> State:
     """Close a mechanism at time t (s), from `state` or from the initial guess of its bodies.
 
     A state that satisfies all constraints is returned as it is, up to rounding. Differentiable to second order with respect to
-    every number of the mechanism and the guess, also where constraints are redundant. Raises `AssemblyError`, which names the
-    joints that stay open; with `throw=False`, or when numbers are traced, the best state found is returned instead.
+    every number of the mechanism and the guess, also where constraints are redundant. `analysis` is that of `udkjax.analyse`, by
+    default made here. Raises `AssemblyError`, which names the joints that stay open; with `throw=False`, or when numbers are
+    traced, the best state found is returned instead.
     """
-    closure = close(mechanism, t, state)
+    closure = close(mechanism, t, state, analysis=analysis)
     if throw:
         require_closed(mechanism, closure)
     return closure.state
 
 
-def close(mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None, forward: bool = False) -> Closure:
+def close(
+    mechanism: Mechanism,
+    t: ArrayLike = 0.0,
+    state: State | None = None,
+    forward: bool = False,
+    analysis: Analysis | None = None,
+) -> Closure:
     """As `assemble`, with the residuals instead of an error.
 
     Where all numbers are known the closure is, too, also while something else is traced. With `forward` it has derivatives by
     forward mode only, which take no more steps than closing does.
     """
     if not _known((mechanism, t, state)):
-        return _close(mechanism, t, state, forward)
+        analysis = analyse(mechanism) if analysis is None else analysis
+        return _close(mechanism.bare, analysis, t, state, forward)
     of, when, found = _latest.get(id(mechanism), (None, 0.0, None))
     if found is not None and state is None and of is not None and of() is mechanism and when == np.asarray(t).item():
         return found
     with jax.ensure_compile_time_eval():
+        scales = (analyse(mechanism) if analysis is None else analysis).scales
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
-        by_numpy = assembled_by_scipy if is_large(mechanism) else assembled_by_numpy
-        q, v, psi, psi_dot, rank = by_numpy(mechanism, t, guess.q, guess.v)
-        found = Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), number(psi), number(psi_dot), jax.device_put(np.asarray(rank)))
+        q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
+        with np.errstate(all="ignore"):  # what is not finite does not close
+            q, v, psi, psi_dot, rank = _rows(mechanism, scales).assembled(np.asarray(t).item(), q, v)
+        state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
+        found = Closure(state_found, number(psi), number(psi_dot), jax.device_put(np.asarray(rank)), scales)
     if state is None:
         key = id(mechanism)
         _latest[key] = (weakref.ref(mechanism, lambda _: _latest.pop(key, None)), np.asarray(t).item(), found)
     return found
+
+
+def _rows(mechanism: Mechanism, scales: Scales) -> Any:
+    if not is_large(mechanism):
+        return DenseRows(mechanism, scales)
+    from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
+
+    return SparseRows(mechanism)
 
 
 # How each mechanism that still exists was last assembled: who simulates it again need not close it again.
@@ -102,46 +139,39 @@ _latest: dict[int, tuple[Any, float, Closure | None]] = {}
 
 
 @eqx.filter_jit
-def _close(mechanism: Mechanism, t: ArrayLike, state: State | None, forward: bool) -> Closure:
+def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State | None, forward: bool) -> Closure:
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
     closed = _closed_forward if forward else _closed
-    q, v, psi, psi_dot, rank = assembled(prepare_to_close(mechanism), closed, number(t), q, v)
-    return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank))
+    rows = TracedRows(prepare_to_close(mechanism, analysis=analysis))
+    q, v, psi, psi_dot, rank = rows.assembled(closed, number(t), q, v)
+    return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales)
 
 
 def _known(tree: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def is_closed(closure: Closure) -> Any:
-    """Whether the residuals are rounding errors (see `CLOSED`)."""
-    xp: Any = np if _known(closure) else jnp
-    parts = (closure.state.q, closure.state.v, closure.psi, closure.psi_dot)
-    q, v, psi, psi_dot = (xp.max(xp.abs(xp.asarray(x)), initial=0.0) for x in parts)
-    tol = max(CLOSED, 64.0 * float(jnp.finfo(closure.psi.dtype).eps))
-    return (psi <= tol * (1.0 + q)) & (psi_dot <= tol * (1.0 + v))
-
-
 def require_closed(mechanism: Mechanism, closure: Closure) -> None:
     """Raise an `AssemblyError` where a closure is not closed; traced values pass."""
-    closed = is_closed(closure)
+    closed = closure.is_closed
     if isinstance(closed, Tracer) or closed:
         return
-    equations = prepare_to_close(mechanism)
-    worst: dict[str, float] = {}
-    q, psi, psi_dot = (np.asarray(x) for x in (closure.state.q, closure.psi, closure.psi_dot))
-    open_position = bool(np.abs(psi).max() > CLOSED * (1.0 + np.abs(q).max()))
+    names = analyse(mechanism).row_names
+    psi, psi_dot, rows = (np.asarray(x) for x in (closure.psi, closure.psi_dot, closure.scales.rows))
+    open_position = bool(np.max(np.abs(psi) / rows) > CLOSED) or not np.all(np.isfinite(psi))
     residual = psi if open_position else psi_dot
-    for (name, _), r in zip(equations.row_names, residual, strict=True):
-        worst[name] = max(worst.get(name, 0.0), abs(float(r)))
-    listed = sorted((n for n in worst if worst[n] > CLOSED), key=lambda n: -worst[n])
-    names = ", ".join(f'"{n}" ({worst[n]:.2g})' for n in listed[:8]) + (", ..." if len(listed) > 8 else "")
+    worst: dict[str, tuple[float, float]] = {}  # over the row's scale, and as it is
+    for (name, _), r, unit in zip(names, residual, rows, strict=True):
+        worst[name] = max(worst.get(name, (0.0, 0.0)), (abs(float(r)) / float(unit), abs(float(r))))
+    largest = max(size for size, _ in worst.values())
+    listed = sorted((n for n in worst if not worst[n][0] <= CLOSED * largest), key=lambda n: -worst[n][0])
+    text = ", ".join(f'"{n}" ({worst[n][1]:.2g})' for n in listed[:8]) + (", ..." if len(listed) > 8 else "")
     if open_position:
-        cause = f"the mechanism cannot be closed near its initial guess; open (m, rad): {names}"
+        cause = f"the mechanism cannot be closed near its initial guess; open (m, rad): {text}"
         cure = "check the points and lengths of these joints, or bring the initial positions and angles closer to a closed state"
     else:
-        cause = f"no velocities satisfy all constraints in this position; left over (m/s, rad/s): {names}"
+        cause = f"no velocities satisfy all constraints in this position; left over (m/s, rad/s): {text}"
         cure = "a driver asks for a motion that the joints forbid here: start elsewhere, or change the driver's motion"
     raise AssemblyError(f"{cause}. {cure[0].upper()}{cure[1:]}.", closure.state)
 
@@ -164,19 +194,18 @@ class Check(NamedTuple):
 def check(mechanism: Mechanism) -> Check:
     """Count rows, rank and degrees of freedom, name redundant rows, and say how well the initial guess closes."""
     closure = close(mechanism)
-    equations = prepare_to_close(mechanism)
-    before = equations.violation(0.0, mechanism.q0.ravel(), mechanism.v0.ravel())[0]
-    names, rows = equations.row_names, len(before)
-    closed = bool(is_closed(closure))
-    left_out = redundant_rows(mechanism) if closed else None
-    rank = int(closure.rank) if left_out is None else rows - len(left_out)
+    before = prepare_to_close(mechanism).violation(0.0, mechanism.q0.ravel(), mechanism.v0.ravel())[0]
+    rows = len(before)
+    closed = bool(closure.is_closed)
+    found = analyse(mechanism)
+    rank = int(closure.rank) if found.rank is None or not closed else found.rank
     return Check(
         bodies=len(mechanism.body_names),
         coordinates=3 * len(mechanism.body_names),
         rows=rows,
         rank=rank,
         degrees_of_freedom=3 * len(mechanism.body_names) - rank,
-        redundant=tuple(names[i] for i in left_out or ()),
+        redundant=found.redundant if closed else (),
         dependent=dependent_constraints(mechanism, np.asarray(closure.state.q)) if closed else (),
         residual_before=float(jnp.abs(before).max(initial=0.0)),
         residual_after=float(jnp.abs(closure.psi).max(initial=0.0)),
@@ -184,50 +213,16 @@ def check(mechanism: Mechanism) -> Check:
     )
 
 
-def _size(equations: MechanismMotion, t: Any, q: Any) -> Any:
-    return jnp.linalg.norm(equations.violation(t, q, q)[0])
+_closed = jax.custom_jvp(close_position)
 
 
-def _step(equations: MechanismMotion, t: Any, q: Any) -> tuple[Any, Any]:
-    """One damped step, and whether it made the residual smaller."""
-    step = limited(direction(equations, t, q), jnp)
-    here, ahead = jax.lax.stop_gradient((q, step))
-    equations = jax.lax.stop_gradient(equations)
-    size = _size(equations, t, here)
-
-    def worse(trial):
-        scale, k = trial
-        return (k < HALVINGS) & ~(_size(equations, t, here + scale * ahead) < size)
-
-    scale, k = jax.lax.while_loop(worse, lambda trial: (0.5 * trial[0], trial[1] + 1), (jnp.ones(()), 0))
-    better = k < HALVINGS
-    return jnp.where(better, q + scale * step, q), better
-
-
-def _steps(equations: MechanismMotion, t: Any, q: Any) -> Any:
-    """Steps until none makes the residual smaller."""
-
-    def unfinished(carry):
-        _, better, k = carry
-        return better & (k < ITERATIONS)
-
-    def body(carry):
-        q, _, k = carry
-        return *_step(equations, t, q), k + 1
-
-    return jax.lax.while_loop(unfinished, body, (q, jnp.array(True), 0))[0]
-
-
-_closed = jax.custom_jvp(_steps)
-
-
-def _closed_forward(equations: MechanismMotion, t: Any, q: Any) -> Any:
+def _closed_forward(rows: TracedRows, t: Any, q: Any) -> Any:
     """The same; forward mode follows the steps as they are, and one more, which projects the tangent: see `_closed_plain`."""
-    q = _steps(equations, t, q)
-    return q + direction(equations, t, q)
+    q = close_position(rows, t, q)
+    return q + rows.correction(t, q)
 
 
-def _closed_plain(equations: MechanismMotion, t: Any, q: Any) -> Any:
+def _closed_plain(rows: TracedRows, t: Any, q: Any) -> Any:
     """The same steps as `_closed`, in a loop of fixed length that reverse mode can follow.
 
     A step that no longer lowers the residual is taken in the derivative all the same: at a closed state it changes nothing but
@@ -235,9 +230,8 @@ def _closed_plain(equations: MechanismMotion, t: Any, q: Any) -> Any:
     """
 
     def body(q, _):
-        ahead, better = _step(equations, t, q)
-        settled = q + direction(equations, t, q)
-        return jnp.where(better, ahead, settled), None
+        ahead, better = damped_step(rows, t, q)
+        return jnp.where(better, ahead, q + rows.correction(t, q)), None
 
     return jax.lax.scan(body, q, None, length=ITERATIONS)[0]
 

@@ -15,10 +15,12 @@ from udkjax.pinv.sparse import Factors, Row, absolute, all_of, factorize, greate
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Program, Scalar, frontier, vector
 
+# Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
+# longer to trace and compile, the larger the scene (see the scaling benchmark).
+LARGE = 150
 # What a row left out may disagree by, relative to its terms, and still count as satisfied: far above rounding, and above what
 # states carry that are closed to the tolerances of an integration.
 CONSISTENT = 1e-6
-TINY = 1e-12  # m/s^2: rows at rest have terms of no size at all
 
 
 class Code:
@@ -137,7 +139,8 @@ class Code:
         terms = [entry * (a[k] - self.equations.free[k]) for k, entry in self.equations.psi_q[i].items()]
         b = self.b(i)
         size = sum((absolute(term) for term in terms), absolute(b))
-        return greater(size * CONSISTENT + TINY, absolute(sum(terms, zero) - b))
+        missed = greater(absolute(sum(terms, zero) - b), size * CONSISTENT)
+        return self.graph.constant(1.0) - missed
 
     def program(self, name: str) -> Program:
         if name not in self._programs:
@@ -158,6 +161,11 @@ def _code(tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool, 
     return Code(expressions(tree, shapes), left_out, baumgarte, elimination)
 
 
+def is_large(mechanism: Mechanism) -> bool:
+    """Whether a scene has more than `LARGE` elements."""
+    return len(mechanism.body_names) + len(mechanism.constraints) + len(mechanism.force_names) > LARGE
+
+
 def code(mechanism: Mechanism, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None) -> Code:
     """Return the code for a mechanism's structure; `elimination` is None, "drop" or "check"."""
     return _code(*structure(mechanism), left_out, baumgarte, elimination)
@@ -165,7 +173,7 @@ def code(mechanism: Mechanism, left_out: tuple[int, ...], baumgarte: bool, elimi
 
 def structure(mechanism: Mechanism) -> tuple[Any, tuple]:
     """Return what the code depends on: the tree of the mechanism and the shapes of its numbers, not their values."""
-    leaves, tree = jax.tree.flatten(mechanism)
+    leaves, tree = jax.tree.flatten(mechanism.bare)
     return tree, tuple((np.shape(leaf), jax.numpy.result_type(leaf)) for leaf in leaves)
 
 

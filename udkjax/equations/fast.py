@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool
 
 from udkjax.equations.code import scalars, stacked
 from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, those
+from udkjax.equations.motion import FAR as NEWTON_FAR
 from udkjax.equations.motion import STEPS, Closed, Tangential, Vector
 from udkjax.equations.plain import plain_accelerations, plain_project, plain_tangential
 from udkjax.straightline import along
@@ -22,8 +23,8 @@ from udkjax.straightline import along
 if TYPE_CHECKING:
     from udkjax.equations.programs import Equations
 
-FAR = 1e-13  # m, rad: what a Newton step that moves q by less leaves of Psi_dot are rounding errors
-CLOSE = 1e-8  # m, rad: and of Psi, since Newton's method converges quadratically
+# Of the characteristic length, and rad: a Newton step that moves q by less leaves rounding errors of Psi_dot.
+FAR = 1e-13
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -63,7 +64,7 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
         k, q, _, _, safe = state
         *found, still = equations.call(program, t, *q, *vs)
         q1, v1 = found[: len(q)], found[len(q) :]
-        return k + 1, q1, v1, _largest_change(q1, q), safe & still
+        return k + 1, q1, v1, _largest_change(equations, q1, q), safe & still
 
     def more(state: Any) -> Any:
         return (state[0] < steps) & ~(state[3] <= FAR)
@@ -101,11 +102,11 @@ def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector, changes: tupl
     def closer(state: Any) -> Any:
         k, q, _, safe = state
         *found, still = equations.call(program, t, *q, *vs)
-        return k + 1, found, _largest_change(found, q), safe & still
+        return k + 1, found, _largest_change(equations, found, q), safe & still
 
     vs = scalars([v])
     start = 0, scalars([q]), jnp.inf, jnp.array(True)
-    _, found, _, safe = jax.lax.while_loop(lambda s: (s[0] < STEPS) & ~(s[2] <= CLOSE), closer, start)
+    _, found, _, safe = jax.lax.while_loop(lambda s: (s[0] < STEPS) & ~(s[2] <= NEWTON_FAR), closer, start)
     q = stacked(found)
     *found, still = equations.call(equations.code.program("finish" if changes else "arrival"), t, q, v, *changes)
     distance = found.pop() if changes else jnp.inf  # who asks for no changes does not ask how far, either
@@ -113,13 +114,19 @@ def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector, changes: tupl
     return (q, v, a), tuple(left), (distance, safe & still)
 
 
-def _largest_change(new: Sequence[Array], old: Sequence[Array]) -> Array:
-    """Of any number; by halves, so that few wait for others."""
+def _largest_change(equations: "Equations", new: Sequence[Array], old: Sequence[Array]) -> Array:
+    """Of any coordinate: lengths over the characteristic length, angles in rad."""
     changes = [jnp.abs(x - y) for x, y in zip(new, old, strict=True)]
-    while len(changes) > 1:
-        pairs = zip(changes[::2], changes[1::2], strict=False)
-        changes = [*(jnp.maximum(a, b) for a, b in pairs), *changes[len(changes) // 2 * 2 :]]
-    return changes[0]
+    lengths = _largest([x for k, x in enumerate(changes) if k % 3 < 2])
+    return jnp.maximum(lengths / equations.scales.length, _largest(changes[2::3]))
+
+
+def _largest(numbers: list[Array]) -> Array:
+    """By halves, so that few wait for others."""
+    while len(numbers) > 1:
+        pairs = zip(numbers[::2], numbers[1::2], strict=False)
+        numbers = [*(jnp.maximum(a, b) for a, b in pairs), *numbers[len(numbers) // 2 * 2 :]]
+    return numbers[0]
 
 
 def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:

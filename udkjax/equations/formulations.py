@@ -17,7 +17,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.motion import Closed, Motion, Tangential, Vector
-from udkjax.equations.programs import RANK_TOL
+from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
 from udkjax.pinv.rule import beyond
@@ -149,6 +149,12 @@ class Rewritten(Motion):
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         return self.equations.violation(t, q, v)
 
+    def size(self, dq: Vector) -> Any:
+        return self.equations.size(dq)
+
+    def excess(self, psi: Vector) -> Any:
+        return self.equations.excess(psi)
+
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
         return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
 
@@ -194,7 +200,15 @@ class Formulated(Rewritten):
 
 @eqx.filter_custom_jvp
 def _accelerations(formulated: Formulated, t: Any, q: Vector, v: Vector) -> Vector:
-    return formulated.formulation.solve(*formulated.matrices(t, q, v))
+    """In the scene's own units, in which coordinates, rows and masses are of order one: thresholds of the rank are relative."""
+    M, F, A, c = formulated.matrices(t, q, v)
+    scales = getattr(formulated.equations, "scales", None)
+    if scales is None:
+        return formulated.formulation.solve(M, F, A, c)
+    unit = scales.coordinates(len(F))
+    inertia = scales.mass * scales.length**2
+    M, F = M * unit[:, None] * unit / inertia, unit * F / inertia
+    return unit * formulated.formulation.solve(M, F, A * unit / scales.rows[:, None], c / scales.rows)
 
 
 @_accelerations.def_jvp

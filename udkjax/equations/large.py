@@ -17,10 +17,12 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.equations import large_fast
 from udkjax.equations.alike import Fields
+from udkjax.equations.analysis import Analysis
 from udkjax.equations.code import structure
 from udkjax.equations.large_plain import by_method, plain_accelerations
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
 from udkjax.equations.motion import STEPS, Closed, MechanismMotion, Tangential, Vector
+from udkjax.equations.scales import Scales
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.block_methods import BlockElimination, DenseParts
 from udkjax.pinv.blocks import by_block, flat
@@ -45,6 +47,7 @@ class LargeEquations(MechanismMotion):
 
     numbers: dict[str, Any]
     method: Pseudoinverse
+    scales: Scales
     layout: Layout = eqx.field(static=True)
     branch: bool = eqx.field(static=True, default=True)  # whether to turn to dense matrices, or to say NaN where that is needed
     doubt: bool = eqx.field(static=True, default=True)  # whether to say anything of pivots that are small
@@ -106,13 +109,14 @@ class LargeEquations(MechanismMotion):
 
     def jacobian(self, t: Any, q: Vector) -> Float[Array, "m n"]:
         """Psi_q of all rows, dense."""
-        D, _, root = self.weighted(t, q)
-        return D / root
+        D = self.arrays(self.layout.all, ["D"], t, q, q)[0]
+        return self.layout.all.dense(D) / flat(self.numbers["root"])
 
     def weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """D, Psi and M^(-1/2) of all rows, dense."""
+        """D and Psi, their rows weighted, and M^(-1/2) of all rows, dense."""
         D, psi = self.arrays(self.layout.all, ["D", "psi"], t, q, q)
-        return self.layout.all.dense(D), self.layout.all.listed(psi), flat(self.numbers["root"])
+        w = self.scales.weights
+        return w[:, None] * self.layout.all.dense(D), w * self.layout.all.listed(psi), flat(self.numbers["root"])
 
     def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Kinetic and potential energy (J)."""
@@ -231,16 +235,17 @@ class LargeEquations(MechanismMotion):
         return fall + self.numbers["root"] ** 2 * self.layout.loaded(jnp.concatenate(parts, -1))
 
 
-def prepare_large(mechanism: Mechanism, method: Pseudoinverse, gains: Sequence[Any]) -> LargeEquations:
+def prepare_large(mechanism: Mechanism, method: Pseudoinverse, gains: Sequence[Any], analysis: Analysis) -> LargeEquations:
     """As `prepare`, with the method's thresholds decided."""
-    found = layout(*structure(mechanism), mechanism.left_out or (), bool(gains))
-    return LargeEquations(found.numbers(mechanism, gains), method, found)
+    found = layout(*structure(mechanism), analysis.redundant_rows or (), bool(gains))
+    return LargeEquations(found.numbers(mechanism, gains), method, analysis.scales, found)
 
 
-def prepare_closing(mechanism: Mechanism) -> LargeEquations:
+def prepare_closing(mechanism: Mechanism, analysis: Analysis) -> LargeEquations:
     """Prepare a mechanism to be closed: with D^+ of all rows by elimination, which `DAMPING` keeps from dividing by nothing."""
-    found = layout(*structure(mechanism), mechanism.left_out or (), False)
-    return LargeEquations(found.numbers(mechanism, ()), BlockElimination(found.all.pattern, 0.0, DAMPING), found)
+    found = layout(*structure(mechanism), analysis.redundant_rows or (), False)
+    method = BlockElimination(found.all.pattern, 0.0, DAMPING)
+    return LargeEquations(found.numbers(mechanism, ()), method, analysis.scales, found)
 
 
 def _violation(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:

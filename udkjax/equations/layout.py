@@ -13,12 +13,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations.alike import Fields, Group, constraint_kind, force_kind, groups, stack
-from udkjax.equations.motion import Vector
 from udkjax.pinv.blocks import BlockPattern, Sums, by_block
 from udkjax.pinv.places import take
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Loop
 from udkjax.straightline.trigonometry import sincos
+
+Vector = Float[Array, "n"]
 
 
 class Selection:

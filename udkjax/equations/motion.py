@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from udkjax.equations.scales import Scales
 from udkjax.straightline import Loop
 
 Vector = Float[Array, "n"]
@@ -16,7 +17,9 @@ STEPS = 3  # of Newton's method in a projection, at most: the last of which usua
 # The distance from a singular configuration that counts as near: the root of a pivot relative to its row's diagonal entry, which
 # is an angle of this size, or so. Rounding errors of accelerations grow with the third power of its reciprocal: to some 1e-10.
 NEAR = 0.03
-FAR = 1e-8  # m, rad: Newton's method converges quadratically, and leaves rounding errors of a residual that moves less
+# Of the characteristic length, and rad: a Newton step that moves q by less leaves rounding errors, since it converges
+# quadratically.
+FAR = 1e-8
 
 
 class Tangential(NamedTuple):
@@ -78,6 +81,14 @@ class Motion(eqx.Module):
         del loop
         return self
 
+    def size(self, dq: Vector) -> Any:
+        """The largest of a change of coordinates, in units of the system's own. By default these are one."""
+        return jnp.max(jnp.abs(dq), initial=0.0)
+
+    def excess(self, psi: Vector) -> Any:
+        """The largest violation of any row of Psi, in units of the system's own. By default these are one."""
+        return jnp.max(jnp.abs(psi), initial=0.0)
+
     @abstractmethod
     def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
         """a. With `watch`, also rows that were left out are looked at."""
@@ -117,8 +128,8 @@ class Motion(eqx.Module):
         def again(state: Any) -> Any:
             k, q, v, _ = state
             q1, v1 = self.project(t, q, v)
-            moved = jnp.max(jnp.abs(jnp.concatenate([q1 - q, v1 - v])), initial=0.0)
-            return k + 1, q1, v1, moved > FAR
+            fastest = jnp.max(jnp.abs(v1), initial=0.0)
+            return k + 1, q1, v1, (self.size(q1 - q) > FAR) | (jnp.max(jnp.abs(v1 - v), initial=0.0) > FAR * fastest)
 
         return Closed(*jax.lax.while_loop(lambda s: (s[0] < steps) & s[-1], again, (0, q, v, jnp.array(True)))[1:])
 
@@ -157,6 +168,16 @@ class Motion(eqx.Module):
 class MechanismMotion(Motion):
     """The equations of motion of a mechanism, whose coordinates and velocities are x, y, angle of each body in turn."""
 
+    scales: eqx.AbstractVar[Scales]
+
+    def size(self, dq: Vector) -> Any:
+        """The largest of a change of coordinates: lengths over the characteristic length, angles in rad."""
+        return self.scales.size(dq)
+
+    def excess(self, psi: Vector) -> Any:
+        """The largest violation of any row of Psi, each over the row's scale."""
+        return self.scales.violation(psi)
+
     @property
     @abstractmethod
     def row_names(self) -> list[tuple[str, int]]:
@@ -177,8 +198,8 @@ class MechanismMotion(Motion):
 
     @abstractmethod
     def weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """D, Psi and M^(-1/2), of all rows."""
+        """D and Psi, their rows weighted by `Scales.weights`, and M^(-1/2), of all rows."""
 
     @abstractmethod
     def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Any, Array, Vector]:
-        """D^+ by the method, what it is to be applied to (`b`, `psi` or `psi_dot`), and M^(-1/2)."""
+        """D^+ by the method, what it is to be applied to (`b`, `psi` or `psi_dot`), and M^(-1/2); rows are weighted."""

@@ -16,17 +16,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.equations.closing import STRIDE
 from udkjax.equations.formulations import Formulation, Rewritten, along
 from udkjax.equations.motion import MechanismMotion, Motion, Vector
-from udkjax.equations.programs import RANK_TOL
+from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 from udkjax.scene.fields import number
 
 ITERATIONS = 10  # Newton's, from a prediction that is good: three or four are usual
-# m and rad: a dependent coordinate that lies farther from where the step predicts it might be that of another assembly of the
-# mechanism. Such a step is rejected, and a shorter one taken.
-STRIDE = 0.3
 
 
 class CoordinatePartitioning(Formulation):
@@ -34,10 +32,10 @@ class CoordinatePartitioning(Formulation):
 
     The choice is made at the start of every step, by QR of D with column pivoting, and held until the step's end: so it is never
     worse conditioned than the mechanism is. Dependent coordinates are carried along only as the first guess of Newton's method:
-    they do not enter the error estimate. A stage at which Newton's method does not converge, or ends farther than 0.3 m or rad
-    from that guess, is not a number: the step is tried shorter. So the constraints hold wherever the equations are evaluated.
-    There is nothing for `Baumgarte` to feed back (refused), and nothing for `Projection` to do: with it and without, a step ends
-    with the dependent coordinates solved for.
+    they do not enter the error estimate. A stage at which Newton's method does not converge, or ends farther than 0.3 rad, or 0.3
+    of the characteristic length, from that guess, is not a number: the step is tried shorter. So the constraints hold wherever
+    the equations are evaluated. There is nothing for `Baumgarte` to feed back (refused), and nothing for `Projection` to do: with
+    it and without, a step ends with the dependent coordinates solved for.
 
     Redundant rows are satisfied in the sense of least squares. In a singular configuration, where less than `rank_tol` of the
     longest column of D is left, there are more independent coordinates for a step, which the next ones constrain again: the
@@ -76,7 +74,8 @@ class Partitioned(Rewritten):
         """v and a at the state that the independent coordinates and velocities determine."""
         held = self.held(t, q, v)
         closed, v = _completed(held, t, q, v)
-        near = jnp.max(jnp.abs(closed - q), initial=0.0) <= STRIDE
+        # Farther from where the step predicts it, it might be another assembly of the mechanism: a shorter step is taken.
+        near = self.equations.size(closed - q) <= STRIDE
         return jnp.where(near, v, jnp.nan), _accelerations(held, t, closed, v)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
@@ -124,7 +123,7 @@ def _completed(held: Partitioned, t: Any, q: Vector, v: Vector) -> tuple[Vector,
     def step(state):
         q, _, k = state
         ahead = _newton(held, t, q)
-        return ahead, jnp.max(jnp.abs(ahead - q)) / (1 + jnp.max(jnp.abs(ahead))), k + 1
+        return ahead, held.equations.size(ahead - q), k + 1
 
     q, change, _ = jax.lax.while_loop(unfinished, step, (q, jnp.array(jnp.inf, q.dtype), 0))
     q = jnp.where(change <= tol, q, jnp.nan)
@@ -151,7 +150,8 @@ def _newton(held: Partitioned, t: Any, q: Vector) -> Vector:
 
 def _velocity(held: Partitioned, t: Any, q: Vector, v: Vector) -> Vector:
     D, _, root = held.equations.weighted(t, q)
-    return jnp.where(held.dependent, v - root * (held._plus(D) @ held.violation(t, q, v)[1]), v)
+    rate = held.equations.scales.weights * held.violation(t, q, v)[1]
+    return jnp.where(held.dependent, v - root * (held._plus(D) @ rate), v)
 
 
 @jax.custom_jvp
@@ -159,7 +159,8 @@ def _accelerations(held: Partitioned, t: Any, q: Vector, v: Vector) -> Vector:
     M, F, A, c = held.matrices(t, q, v)
     if not len(A):
         return F / jnp.diag(M)
-    root = 1 / jnp.sqrt(jnp.diag(M))
+    root, w = 1 / jnp.sqrt(jnp.diag(M)), held.equations.scales.weights
+    A, c = w[:, None] * A, w * c
     plus = held._plus(A * root)
     free = jnp.diag(jnp.where(held.dependent, 0.0, 1.0))
     return along(M, F, free - root[:, None] * (plus @ (A @ free)), root * (plus @ c))

@@ -10,7 +10,6 @@ It is written twice. The plain form (plain.py) is the equation as it stands, on 
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import reduce
 from itertools import pairwise
 from typing import Any
 
@@ -18,24 +17,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations import fast
-from udkjax.equations.code import Code, code, scalars, stacked
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.code import Code, code, is_large, scalars, stacked
 from udkjax.equations.motion import Closed, MechanismMotion, Tangential, Vector
 from udkjax.equations.plain import plain_accelerations
+from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, Varga
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Loop, Program
 
-# Far above rounding and drift, far below the singular values of a mechanism in ordinary positions: with the states returned to
-# the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
-RANK_TOL = 1e-4
-# Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
-# longer to trace and compile, the larger the scene (see the scaling benchmark).
-LARGE = 150
 FEW = 20  # coordinates: up to so many, `finish` has not too many results for a fusion of lanes (straightline/fusion.py)
 NOTHING_LEFT = 1e-14  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
 # Over the pivot: by how much rounding errors turn the velocities that a row allows (rad; up to a third of that in the paper's
@@ -49,7 +43,6 @@ TURNED, USELESS = 1e-15, 1e-8
 # configurations take up to a quarter less steps, but Peaucellier's may cross with errors of 1e-5 in its energy, at any tolerance;
 # with 0.03 they take up to two fifths more.
 WITH_CARE = 0.2
-ORDINARY = 100.0  # the ratio of masses up to which that holds: see `rank_tolerance`
 
 
 class Baumgarte(eqx.Module):
@@ -73,6 +66,7 @@ class Equations(MechanismMotion):
 
     constants: list[Array]  # the subexpressions of parameters alone that the programs use, computed once
     method: Pseudoinverse
+    scales: Scales
     code: Code = eqx.field(static=True)
     branch: bool = eqx.field(
         static=True, default=True
@@ -94,7 +88,7 @@ class Equations(MechanismMotion):
         if not self.code.pattern.shape[0]:
             return jnp.zeros(0)
         plus, b, _ = equations.linearized("rows", t, q, v)
-        return -(plus.T @ (plus @ b))
+        return -self.scales.weights * (plus.T @ (plus @ b))
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
@@ -144,13 +138,14 @@ class Equations(MechanismMotion):
 
     def jacobian(self, t: Any, q: Vector) -> Float[Array, "m n"]:
         """Psi_q of all rows."""
-        D, _, root = self.weighted(t, q)
-        return D / root
+        values, _, root = self.arrays("closure", t, q, q)
+        return self.code.pattern.dense(values) / root
 
     def weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """D, Psi and M^(-1/2), of all rows."""
+        """D and Psi, their rows weighted, and M^(-1/2), of all rows."""
         values, psi, root = self.arrays("closure", t, q, q)
-        return self.code.pattern.dense(values), psi, root
+        w = self.scales.weights
+        return w[:, None] * self.code.pattern.dense(values), w * psi, root
 
     def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Kinetic and potential energy (J)."""
@@ -201,9 +196,10 @@ class Equations(MechanismMotion):
         return [stacked(outputs[i:j]) for i, j in pairwise(bounds)]
 
     def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Plus, Array, Vector]:
-        """D^+ of all rows by a dense method, the right-hand side of the program `name`, and M^(-1/2)."""
+        """D^+ of all rows by a dense method, the right-hand side of the program `name`, and M^(-1/2); rows are weighted."""
         values, residual, *vectors = self.arrays(name, t, q, v)
-        return self.method.plus(self.code.pattern.dense(values)), residual, vectors[-1]
+        w = self.scales.weights
+        return self.method.plus(w[:, None] * self.code.pattern.dense(values)), w * residual, vectors[-1]
 
     @property
     def quick(self) -> "Equations":
@@ -248,16 +244,20 @@ def prepare(
     baumgarte: Baumgarte | None = None,
     large: bool | None = None,
     moving: Sequence[bool] = (),
+    analysis: Analysis | None = None,
 ) -> Any:
     """Prepare a mechanism for a method (default `Auto`). Its numbers may be traced; its structure decides what is compiled.
 
     Returns `Equations`, straight-line code, or of a scene of more than `LARGE` elements `LargeEquations`, whose program does not
     grow with the scene. `large` says which, whatever the size. `moving` says of each leaf of the mechanism whether it is traced
     where all begins: of the others XLA may know the numbers, though they are traced here. Without it none is taken to be.
+    `analysis` is that of `analyse`, by default made here.
 
     A method without a `rank_tol` gets `rank_tolerance`. Without knowledge of which rows are redundant (a mechanism that was built
     from traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
     """
+    analysis = analyse(mechanism) if analysis is None else analysis
+    mechanism, redundant = mechanism.bare, analysis.redundant_rows
     chosen: Any = Auto() if method is None else method
     tol = rank_tolerance(mechanism) if chosen.rank_tol is None else chosen.rank_tol
     chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)
@@ -267,11 +267,11 @@ def prepare(
     if is_large(mechanism) if large is None else large:
         from udkjax.equations.large import prepare_large  # and with it SciPy, which small scenes do without
 
-        return prepare_large(mechanism, chosen, gains)
-    left_out, elimination, drop = mechanism.left_out or (), None, number(0.0)
+        return prepare_large(mechanism, chosen, gains, analysis)
+    left_out, elimination, drop = redundant or (), None, number(0.0)
     if isinstance(chosen, Elimination):
         elimination, drop = "drop", tol**2
-    elif isinstance(chosen, Auto) and mechanism.left_out is None:
+    elif isinstance(chosen, Auto) and redundant is None:
         chosen = chosen.exact
     elif isinstance(chosen, Auto):
         elimination, drop = "check", chosen.branch_tol
@@ -280,32 +280,13 @@ def prepare(
     numbers = [*scalars(leaves), *gains, drop]
     moves = [move for leaf, move in zip(leaves, moving or [False] * len(leaves), strict=True) for _ in range(np.size(leaf))]
     constants = [jnp.asarray(c) for c in programs.prologue.early(numbers, [*moves, *[False] * (len(numbers) - len(moves))])]
-    return Equations(constants, chosen, programs)
+    return Equations(constants, chosen, analysis.scales, programs)
 
 
-def is_large(mechanism: Mechanism) -> bool:
-    """Whether a scene has more than `LARGE` elements."""
-    return len(mechanism.body_names) + len(mechanism.constraints) + len(mechanism.force_names) > LARGE
-
-
-def prepare_to_close(mechanism: Mechanism, large: bool | None = None) -> Any:
+def prepare_to_close(mechanism: Mechanism, large: bool | None = None, analysis: Analysis | None = None) -> Any:
     """As `prepare`, to close a mechanism: with all rows, by singular values, or in large scenes by elimination with damping."""
     if not (is_large(mechanism) if large is None else large):
-        return prepare(mechanism, SVD(), large=False)
+        return prepare(mechanism, SVD(), large=False, analysis=analysis)
     from udkjax.equations.large import prepare_closing
 
-    return prepare_closing(mechanism)
-
-
-def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:
-    """Return `RANK_TOL`, less where masses are far apart.
-
-    Where a light body carries a heavy one the singular values of D = Psi_q M^(-1/2) are as far apart as the roots of the masses,
-    in any position: a ratio of 1e8 brings a constraint between them down to 1e-4 of the largest.
-    """
-    masses = [body.mass for body in mechanism.bodies.values()]
-    known = not any(isinstance(mass, Tracer) for mass in masses)
-    xp: Any = np if known else jnp  # while something else is traced, jnp would trace what is known, too
-    masses = [xp.asarray(mass) for mass in masses]
-    ratio = reduce(xp.minimum, masses) / reduce(xp.maximum, masses)
-    return jax.lax.stop_gradient(number(RANK_TOL * xp.minimum(1.0, xp.sqrt(ORDINARY * ratio))))
+    return prepare_closing(mechanism.bare, analyse(mechanism) if analysis is None else analysis)

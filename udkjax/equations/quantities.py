@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.motion import Motion
@@ -34,15 +35,16 @@ def equations_of(
     baumgarte: Baumgarte | None = None,
     formulation: Formulation | None = None,
     moving: Sequence[bool] = (),
+    analysis: Analysis | None = None,
 ) -> Motion:
     """Prepare the equations of motion of whatever has some, by the Udwadia-Kalaba equation or another formulation.
 
-    `moving` is that of `prepare`.
+    `moving` and `analysis` are those of `prepare`.
     """
     if isinstance(system, ConstrainedSystem):
         equations = prepare_general(system, method, baumgarte)
     else:
-        equations = prepare(system, method, baumgarte, moving=moving)
+        equations = prepare(system, method, baumgarte, moving=moving, analysis=analysis)
     return equations if formulation is None else formulation.of(equations)
 
 
@@ -55,6 +57,7 @@ def accelerations(
     stabilization: Baumgarte | None = None,
     multipliers: bool = False,
     formulation: Formulation | None = None,
+    analysis: Analysis | None = None,
 ) -> Any:
     """Return a (bodies, 3) at time t (s), coordinates q and velocities v; with `multipliers` also lambda, one a row of Psi.
 
@@ -62,9 +65,9 @@ def accelerations(
     in the rows' order and with the sign of M a + Psi_q^T lambda = F). The state need not be closed. `Auto` looks at the rows that
     it leaves out, too: where they are not satisfied they were not redundant after all, and it takes singular values of all rows.
     `Auto` and `Elimination` take lambda from singular values: a choice of rows has no minimum-norm multipliers. A `formulation`
-    finds a in another way, but not lambda. For a `ConstrainedSystem` q, v and a are (n,).
+    finds a in another way, but not lambda. `analysis` is that of `analyse`. For a `ConstrainedSystem` q, v and a are (n,).
     """
-    equations = equations_of(mechanism, method, stabilization, formulation)
+    equations = equations_of(mechanism, method, stabilization, formulation, analysis=analysis)
     t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
     a = equations.accelerations(t, q.ravel(), v.ravel(), watch=True).reshape(q.shape)
     return (a, equations.multipliers(t, q.ravel(), v.ravel())) if multipliers else a
@@ -96,7 +99,7 @@ def reactions(
     `method` (default `SVD`) decides the rank; give the run's `Baumgarte` to include what it adds.
     """
     by_row = _along(mechanism, solution, _loads, SVD() if method is None else method, stabilization)
-    row_names = [name for name, _ in prepare(mechanism, SVD()).row_names]
+    row_names = [name for name, _ in analyse(mechanism).row_names]
     result: dict[str, dict[str, Array]] = {}
     for name, element in mechanism.constraints.items():
         load = by_row[:, [k for k, n in enumerate(row_names) if n == name]].sum(1)
@@ -123,11 +126,14 @@ def _loads(equations: Any, t: Any, q: Any, v: Any) -> Array:
 
 
 def _along(mechanism: Any, solution: Any, quantity: Callable, method: Any = None, baumgarte: Any = None) -> Any:
-    return _evaluate(mechanism, solution.ts, solution.q, solution.v, quantity, SVD() if method is None else method, baumgarte)
+    analysis, method = None, SVD() if method is None else method
+    if isinstance(mechanism, Mechanism):
+        analysis, mechanism = analyse(mechanism), mechanism.bare
+    return _evaluate(mechanism, analysis, solution.ts, solution.q, solution.v, quantity, method, baumgarte)
 
 
 @eqx.filter_jit
-def _evaluate(mechanism, ts, q, v, quantity, method, baumgarte):
-    equations = equations_of(mechanism, method, baumgarte)
+def _evaluate(mechanism, analysis, ts, q, v, quantity, method, baumgarte):
+    equations = equations_of(mechanism, method, baumgarte, analysis=analysis)
     ts, q, v = jnp.asarray(ts), jnp.asarray(q).reshape(len(ts), -1), jnp.asarray(v).reshape(len(ts), -1)
     return jax.vmap(lambda t, q, v: quantity(equations, t, q, v))(ts, q, v)

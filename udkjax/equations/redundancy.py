@@ -1,4 +1,4 @@
-"""Which rows of Psi are redundant: found once, when a mechanism is built, so that no run computes them.
+"""Which rows of Psi are redundant: found once, by `analyse`, so that no run computes them.
 
 Redundancy is a matter of numbers (three equal cranks), not of topology alone, and a single position does not show it: at a
 singular configuration more rows are dependent than elsewhere. So the mechanism is closed and led along a random motion, and rows
@@ -8,30 +8,23 @@ the right choice where the other vanishes, and the motion tells which. All of it
 compiled for it.
 """
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
 import numpy as np
-from jax.core import Tracer
 
-from udkjax.equations.code import code, scalars
-from udkjax.equations.programs import is_large
+from udkjax.equations.closing import STRIDE, DenseRows, close_position, is_closed
+from udkjax.equations.code import is_large
+from udkjax.equations.scales import known_scales
 from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:
     from udkjax.equations.sparse_rows import SparseRows
 
-# Relative to the largest singular value, with rows scaled to length one, at a closed position: redundant rows leave rounding
-# errors (1e-13 of positions closed to 1e-12), rows that are merely close to a singular configuration leave more.
+# Relative to the largest singular value, with rows of length one, at a closed position: redundant rows leave rounding errors,
+# rows that are merely close to a singular configuration leave more.
 RANK_TOL = 1e-8
 CLEAR = 1e-4
-CLOSED = 1e-11  # relative to the size of the coordinates: what closing attains in double precision
-TICK = 0.05  # s: drivers move on from one position to the next
-ITERATIONS = 100
 SAMPLES = 24  # positions to look at where the first shows rows that depend on each other
-DAMPING = 1e-3  # of rows of length one
-TURN = 0.35  # rad or m: the length of one step of the random motion, long enough to leave a singular configuration
 ORDINARY = 0.05  # a position counts as ordinary if its smallest singular value is this part of the largest
 
 
@@ -71,10 +64,7 @@ class Position(NamedTuple):
 
 @np.errstate(all="ignore")  # what is not finite does not close
 def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
-    """Return the rows of Psi to leave out, or None: the guess cannot be closed or moved, or numbers are traced."""
-    leaves = jax.tree.leaves(mechanism)
-    if any(isinstance(leaf, Tracer) for leaf in leaves):
-        return None
+    """Return the rows of Psi to leave out, or None: the guess cannot be closed or moved. All numbers are known."""
     rows = rows_of(mechanism)
     if not rows.count:
         return ()
@@ -101,11 +91,12 @@ def positions_of(rows: Any, q: np.ndarray) -> list[Any]:
         last = found[-1]
         heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(rows.size) / np.sqrt(rows.size)
         heading = last.along(heading)  # onward, so that the motion gets around
-        moved = last.q + TURN * rows.root * heading / max(np.abs(rows.root * heading).max(), 1e-300)
-        position = rows.close(TICK * (k + 1), moved)
+        step = rows.metric * heading
+        moved = last.q + STRIDE * step / max(rows.scales.size(step, np), 1e-300)
+        position = rows.close(rows.tick * (k + 1), moved)
         if position is None or not position.clear or not np.any(heading):  # stuck: jump
             heading = random.standard_normal(rows.size)
-            position = rows.close(TICK * (k + 1), first.q + TURN * random.uniform(-1.0, 1.0, rows.size))
+            position = rows.close(rows.tick * (k + 1), first.q + STRIDE * rows.metric * random.uniform(-1.0, 1.0, rows.size))
         found.extend([] if position is None else [position])
     found = [p for p in found if p.clear]
     if not found or (len(found) == 1 and found[0] is first and first.rank < rows.size):
@@ -136,10 +127,10 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
     return tuple(dict.fromkeys(names))
 
 
-def rows_of(mechanism: Mechanism, large: bool | None = None) -> "Rows | SparseRows":
+def rows_of(mechanism: Mechanism, large: bool | None = None) -> "KinematicRows | SparseRows":
     """Psi and D of a mechanism with known numbers: dense, or for large scenes sparse."""
     if not (is_large(mechanism) if large is None else large):
-        return Rows(mechanism)
+        return KinematicRows(mechanism)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 
     return SparseRows(mechanism)
@@ -161,58 +152,37 @@ def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-class Rows:
-    """Psi and D of a mechanism with known numbers, evaluated by NumPy."""
+class KinematicRows(DenseRows):
+    """The rows of a mechanism with known numbers in a metric without masses: (A, A, 1) for each body, A the longest arm."""
 
     samples = SAMPLES
 
     def __init__(self, mechanism: Mechanism):
-        self._code = code(mechanism, (), False, None)
-        self._constants = self._code.prologue([*map(float, scalars(jax.tree.map(np.asarray, jax.tree.leaves(mechanism)))), 0.0])
-        self.count, self.size = self._code.pattern.shape
-        self.names = self._code.equations.row_names
-        self._closure: Callable = self._code.program("closure")
-        slots = self._code.pattern.slots
-        self._split = [slots, slots + self.count]
-        self.root = np.asarray(self._evaluate(0.0, np.zeros(self.size))[2])
-
-    def _evaluate(self, t: float, q: np.ndarray) -> list[np.ndarray]:
-        outputs = self._closure([*self._constants, float(t), *map(float, q), *[0.0] * self.size])
-        return np.split(np.array(outputs, float), self._split)
+        super().__init__(mechanism, known_scales(mechanism))
+        self.metric = np.tile([float(self.scales.arm), float(self.scales.arm), 1.0], self.size // 3)
+        self.tick = tick(self.scales)
 
     def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
-        values, psi, _ = self._evaluate(t, q)
-        D = self._code.pattern.dense(values, np)
+        D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
         length[length == 0.0] = 1.0
-        return psi, length, D / length[:, None]
+        return self._run("psi", t, q, q), length, D / length[:, None]
 
     def parts_of(self, positions: list[Position]) -> list[tuple[np.ndarray, list[Position]]]:
         """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""
         return [(np.arange(self.count), positions)]
 
     def close(self, t: float, q: np.ndarray) -> Position | None:
-        """Levenberg-Marquardt in the mass metric, with steps of limited length; None where it does not close.
+        """Return a closed position near q, or None."""
+        q = close_position(self, t, q, np)
+        psi, _, D = self.at(t, q)
+        still = np.zeros_like(q)
+        if not np.all(np.isfinite(D)) or not is_closed(self.scales, q, still, psi, 0 * psi, np):
+            return None
+        return Position(t, q, *np.linalg.svd(D))
 
-        Damped: a random motion out of a singular configuration ends far from closure in badly determined directions.
-        """
-        damping = DAMPING
-        psi, length, D = self.at(t, q)
-        for _ in range(ITERATIONS):
-            if not (np.all(np.isfinite(psi)) and np.all(np.isfinite(D))):
-                return None
-            u, sigma, vt = np.linalg.svd(D)
-            if np.abs(psi).max() <= CLOSED * (1.0 + np.abs(q).max()):
-                return Position(t, q, u, sigma, vt)
-            gain = sigma / (sigma**2 + damping)
-            step = -self.root * (vt[: len(sigma)].T @ (gain * (u[:, : len(sigma)].T @ (psi / length))))
-            ahead = q + step * min(1.0, TURN / max(np.abs(step).max(), 1e-300))
-            trial = self.at(t, ahead)
-            if np.linalg.norm(trial[0]) < np.linalg.norm(psi):
-                q, (psi, length, D), damping = ahead, trial, 0.1 * damping
-            elif damping > 1e6:
-                return None
-            else:
-                damping = max(100.0 * damping, 1e-12)
-        return None
+
+def tick(scales: Any) -> float:
+    """The time (s) by which drivers move on from one position to the next: they turn about as far as the random motion."""
+    return STRIDE / float(scales.rate) if scales.rate > 0.0 else 0.0

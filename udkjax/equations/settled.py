@@ -12,32 +12,39 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.assembly import Closure, State, close
-from udkjax.equations.programs import is_large, prepare, rank_tolerance
+from udkjax.equations.closing import rounding
+from udkjax.equations.code import is_large
+from udkjax.equations.programs import prepare
+from udkjax.equations.scales import rank_tolerance
 from udkjax.pinv import Auto
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
-ROUNDING = 32.0  # eps of the size of the coordinates: what is left of Psi in a guess that was computed to be closed
 
-
-def close_all(mechanisms: Mechanism, t: ArrayLike = 0.0, states: State | None = None) -> Closure:
+def close_all(
+    mechanisms: Mechanism, t: ArrayLike = 0.0, states: State | None = None, analysis: Analysis | None = None
+) -> Closure:
     """Close a batch of mechanisms of one structure at time t (s), each at its own where there are several.
 
     Leaves have the members first, and so has the closure. From `states`, or from the guesses of their bodies. Each as `close`
     does, up to rounding; only the rank of a member that was closed before is not looked at further than whether it exceeds that
-    of the rows not left out. Differentiable forward.
+    of the rows not left out. `analysis` is that of all of them, or batched as they are. Differentiable forward.
     """
+    analysis = analyse(mechanisms) if analysis is None else analysis
     size = len(jax.tree.leaves(mechanisms)[0])
+    one_for_all = analysis.scales.length.ndim == 0
+    analyses = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), analysis) if one_for_all else analysis
     ts = jnp.broadcast_to(number(t), size)
 
     def one(k: Any) -> Closure:
-        mechanism, t, state = jax.tree.map(lambda leaf: leaf[k], (mechanisms, ts, states))
-        return close(mechanism, t, state, forward=True)
+        mechanism, t, state, analysis = jax.tree.map(lambda leaf: leaf[k], (mechanisms, ts, states, analyses))
+        return close(mechanism, t, state, forward=True, analysis=analysis)
 
-    if mechanisms.left_out is None or is_large(mechanisms) or not mechanisms.constraints:
+    if analysis.redundant_rows is None or is_large(mechanisms) or not mechanisms.constraints:
         return jax.lax.map(one, jnp.arange(size))
-    found, settled = jax.vmap(_as_it_is)(mechanisms, ts, states)
+    found, settled = jax.vmap(_as_it_is)(analyses, mechanisms, ts, states)
 
     def next_one(carry: tuple[Array, Closure]) -> tuple[Array, Closure]:
         left, found = carry
@@ -47,34 +54,34 @@ def close_all(mechanisms: Mechanism, t: ArrayLike = 0.0, states: State | None = 
     return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), next_one, (~settled, found))[1]
 
 
-def _as_it_is(mechanism: Mechanism, t: Float[Array, ""], state: State | None) -> tuple[Closure, Bool[Array, ""]]:
+def _as_it_is(
+    analysis: Analysis, mechanism: Mechanism, t: Float[Array, ""], state: State | None
+) -> tuple[Closure, Bool[Array, ""]]:
     """The guess, moved by rounding errors at most, and whether that is its closure."""
-    equations = prepare(mechanism, Auto()).quick
+    equations = prepare(mechanism, Auto(), analysis=analysis).quick
     q, v = (mechanism.q0.ravel(), mechanism.v0.ravel()) if state is None else (state.q.ravel(), state.v.ravel())
-    D, psi, _ = equations.weighted(t, q)
-    psi_dot = equations.violation(t, q, v)[1]
-    eps = ROUNDING * float(jnp.finfo(psi.dtype).eps)
-    settled = (_size(psi) <= eps * (1.0 + _size(q))) & (_size(psi_dot) <= eps * (1.0 + _size(v)))
+    D = equations.weighted(t, q)[0]
+    psi, psi_dot = equations.violation(t, q, v)
+    scales = analysis.scales
+    eps, rate = rounding(scales, q, jnp), jnp.maximum(scales.rate, scales.size(v))
+    settled = (scales.violation(psi) <= eps) & (scales.violation(psi_dot) <= eps * rate)
     q1, v1 = equations.project(t, q, v)  # for its tangents, which are those of a closed state
     settled &= jnp.all(jnp.isfinite(q1)) & jnp.all(jnp.isfinite(v1))
-    kept = np.setdiff1d(np.arange(len(psi)), np.array(mechanism.left_out, int))
-    if mechanism.left_out:
-        settled &= _redundant(jax.lax.stop_gradient(D), kept, mechanism)
+    redundant = np.array(analysis.redundant_rows, int)
+    kept = np.setdiff1d(np.arange(len(psi)), redundant)
+    if len(redundant):
+        D = jax.lax.stop_gradient(D)
+        settled &= _redundant(D[kept], D[redundant], rank_tolerance(mechanism))
     state = State(q1.reshape(-1, 3), v1.reshape(-1, 3))
-    return Closure(state, psi, psi_dot, jnp.asarray(len(kept))), settled
+    return Closure(state, psi, psi_dot, jnp.asarray(len(kept)), scales), settled
 
 
-def _redundant(D: Float[Array, "m n"], kept: np.ndarray, mechanism: Mechanism) -> Bool[Array, ""]:
-    """Whether the rows left out lie in the span of those kept.
+def _redundant(K: Float[Array, "r n"], L: Float[Array, "k n"], rank_tol: Any) -> Bool[Array, ""]:
+    """Whether the rows L that are left out lie in the span of the rows K that are kept.
 
     What they are outside of it bounds the next singular value of D, and the longest row is a lower bound of the largest one.
     """
-    K, L = D[kept], D[np.array(mechanism.left_out)]
     factor = jnp.linalg.cholesky(K @ K.T)
     outside = L - jax.scipy.linalg.cho_solve((factor, True), K @ L.T).T @ K
-    longest = jnp.sqrt(jnp.max(jnp.sum(D**2, axis=1)))
-    return jnp.sqrt(jnp.sum(outside**2)) <= rank_tolerance(mechanism) * longest
-
-
-def _size(x: Any) -> Any:
-    return jnp.max(jnp.abs(x), initial=0.0)
+    longest = jnp.sqrt(jnp.maximum(jnp.max(jnp.sum(K**2, axis=1)), jnp.max(jnp.sum(L**2, axis=1))))
+    return jnp.sqrt(jnp.sum(outside**2)) <= rank_tol * longest

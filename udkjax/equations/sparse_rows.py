@@ -15,9 +15,11 @@ from scipy.sparse import coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
+from udkjax.equations.closing import close_position, is_closed
 from udkjax.equations.code import structure
 from udkjax.equations.layout import layout
-from udkjax.equations.redundancy import SAMPLES
+from udkjax.equations.redundancy import SAMPLES, tick
+from udkjax.equations.scales import RANK_TOL, known_scales
 from udkjax.pinv.sparse import minimum_degree
 from udkjax.scene.mechanism import Mechanism
 
@@ -25,10 +27,7 @@ from udkjax.scene.mechanism import Mechanism
 NOTHING = 1e-11
 CLEAR = 1e-8
 NEGLIGIBLE = 1e-6  # of a combination of rows of length one: what does not count as being part of it
-DAMPING = (1e-3, 1e-11)  # of closing: at first, and the least that keeps redundant rows from dividing by nothing
-ITERATIONS = 100
-CLOSED = 1e-11  # as in redundancy.py
-TURN = 0.35
+DAMPING = RANK_TOL**2  # of D D^T in closing: what truncation at `RANK_TOL` is to singular values
 COLUMNS = 64  # solved for at a time
 MANY = 300  # rows: of larger scenes a third of the positions, since each of them takes the longer
 
@@ -59,7 +58,7 @@ class SparsePosition(NamedTuple):
 
     def along(self, heading: np.ndarray) -> np.ndarray:
         """The part of a motion that the constraints allow."""
-        solve = splu(csc_array(self.D @ self.D.T + DAMPING[1] * eye_array(self.D.shape[0])), **_SYMMETRIC).solve
+        solve = splu(csc_array(self.D @ self.D.T + DAMPING * eye_array(self.D.shape[0])), **_SYMMETRIC).solve
         for _ in range(2):
             heading = heading - self.D.T @ solve(self.D @ heading)
         return heading
@@ -93,10 +92,6 @@ def _beside(parts: list[Any], rows: int) -> Any:
     return coo_array((np.concatenate([p.data for p in parts]), place), shape=(rows, shift[-1]))
 
 
-def _limited(step: np.ndarray) -> np.ndarray:
-    return step * min(1.0, TURN / max(np.abs(step).max(), 1e-300))
-
-
 class SparseRows:
     """Psi and D of a mechanism with known numbers; D sparse. The interface is that of `redundancy.Rows`."""
 
@@ -106,7 +101,9 @@ class SparseRows:
         self.count, self.size = self._layout.count, 3 * self._layout.bodies
         self.names = self._layout.row_names
         self.samples = SAMPLES if self.count <= MANY else SAMPLES // 3
-        self.root = np.asarray(numbers["root"]).T.ravel()
+        self.metric = np.asarray(numbers["root"]).T.ravel()
+        self.scales = known_scales(mechanism)
+        self.tick = tick(self.scales)
         self._evaluate = lambda t, q, v: self._layout.position(numbers, t, q, v)
 
     @cached_property
@@ -134,45 +131,39 @@ class SparseRows:
         length[length == 0.0] = 1.0
         return csr_array(D.multiply(1 / length[:, None])), length
 
+    def residual(self, t: float, q: np.ndarray) -> np.ndarray:
+        return np.asarray(self._evaluate(t, q, q)[0]) / self.scales.rows
+
+    def correction(self, t: float, q: np.ndarray) -> np.ndarray:
+        psi, length, D = self.at(t, q)
+        return self._solve(D, psi / length)
+
+    def _solve(self, D: Any, residual: np.ndarray) -> np.ndarray:
+        """-M^(-1/2) D^T (D D^T + damping)^(-1) of a residual."""
+        if not np.all(np.isfinite(D.data)):
+            return np.full(self.size, np.nan)
+        system = csc_array(D @ D.T + DAMPING * eye_array(self.count))
+        return -self.metric * (D.T @ splu(system, **_SYMMETRIC).solve(residual))
+
     def close(self, t: float, q: np.ndarray) -> SparsePosition | None:
         """Return a closed position near q, or None."""
-        q, psi, D = self._settled(t, q, CLOSED)
-        return self._position(t, q, D) if np.abs(psi).max() <= CLOSED * (1.0 + np.abs(q).max()) else None
-
-    def _settled(self, t: float, q: np.ndarray, enough: float) -> tuple[np.ndarray, np.ndarray, Any]:
-        """Levenberg-Marquardt in the mass metric, with steps of limited length, until Psi is small enough or grows no smaller."""
-        damping, least = DAMPING
-        psi, length, D = self.at(t, q)
-        for _ in range(ITERATIONS):
-            size = np.abs(psi).max()
-            if not (np.isfinite(size) and np.all(np.isfinite(D.data))) or size <= enough * (1.0 + np.abs(q).max()):
-                break
-            ahead = q + _limited(self._correction(D, psi / length, damping))
-            trial = self.at(t, ahead)
-            if np.linalg.norm(trial[0]) < np.linalg.norm(psi):
-                q, (psi, length, D), damping = ahead, trial, max(0.1 * damping, least)
-            elif damping > 1e6 or size <= CLOSED * (1.0 + np.abs(q).max()):
-                break
-            else:
-                damping = max(100.0 * damping, least)
-        return q, psi, D
-
-    def _correction(self, D: Any, residual: np.ndarray, damping: float) -> np.ndarray:
-        """-M^(-1/2) D^T (D D^T + damping)^(-1) of a residual."""
-        system = csc_array(D @ D.T + damping * eye_array(self.count))
-        return -self.root * (D.T @ splu(system, **_SYMMETRIC).solve(residual))
+        q = close_position(self, t, q, np)
+        psi, _, D = self.at(t, q)
+        if not np.all(np.isfinite(D.data)) or not is_closed(self.scales, q, 0 * q, psi, 0 * psi, np):
+            return None
+        return self._position(t, q, D)
 
     def assembled(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
         """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
         if not self.count:
             return q, v, np.zeros(0), np.zeros(0), 0
-        q, psi, D = self._settled(t, q, 0.0)
+        q = close_position(self, t, q, np)
+        psi, length, D = self.at(t, q)
         if not np.all(np.isfinite(D.data)):
             return q, v, psi, psi, 0
         rank = self._position(t, q, D).rank
         for _ in range(3):  # what the first leaves because of its damping, and of rounding
-            _, rate, values = (np.asarray(x) for x in self._evaluate(t, q, v))
-            v = v + self._correction(D, rate / self._scaled(values)[1], DAMPING[1])
+            v = v + self._solve(D, np.asarray(self._evaluate(t, q, v)[1]) / length)
         return q, v, psi, np.asarray(self._evaluate(t, q, v)[1]), rank
 
     def parts_of(self, positions: list[SparsePosition]) -> list[tuple[np.ndarray, list["Part"]]]:

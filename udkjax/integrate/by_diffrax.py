@@ -61,8 +61,8 @@ def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array,
 
 
 def _first_step(problem: Problem, y0: Array) -> Array:
-    ts, equations = problem.ts, undifferentiated(problem.equations.quick)
-    return first_step(y0, derivative(ts[0], undifferentiated(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol)
+    ts, equations, unit = problem.ts, undifferentiated(problem.equations.quick), jnp.concatenate(problem.units())
+    return first_step(y0, derivative(ts[0], undifferentiated(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol, unit)
 
 
 def _controller(problem: Problem) -> diffrax.PIDController:
@@ -70,4 +70,5 @@ def _controller(problem: Problem) -> diffrax.PIDController:
     settings: dict[str, Any] = {"norm": optx.max_norm, "dtmin": problem.smallest, "force_dtmin": False}
     if is_explicit(problem.solver):  # the same steps as in lanes
         settings |= {"safety": SAFETY, "factormin": SHRINK, "factormax": GROW}
-    return diffrax.PIDController(rtol=problem.rtol, atol=problem.atol, **settings)
+    atol: Any = problem.atol * jnp.concatenate(problem.units())
+    return diffrax.PIDController(rtol=problem.rtol, atol=atol, **settings)

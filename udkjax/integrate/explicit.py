@@ -27,7 +27,7 @@ from udkjax.integrate.interpolation import POINTS, Point, interpolated
 from udkjax.integrate.packing import Packing
 from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
 from udkjax.integrate.record import Record, blank, noted
-from udkjax.integrate.step import Task, Trial, attempt
+from udkjax.integrate.step import Task, Trial, attempt, tolerance
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.straightline import after, apart, when
 
@@ -178,7 +178,7 @@ def _factor(task: Task, m: March, error: Array, step: Array, accept: Array) -> t
 
 def _far(task: Task, m: March, distance: Array, rounding: float = BEFORE) -> Array:
     """Whether a step as long as the one that is tried may begin so far away from singular configurations."""
-    return far(distance, m.h, task.rtol + task.atol, rounding)
+    return far(distance, m.h * task.rate, undifferentiated(tolerance(task, m.here.v)), rounding)
 
 
 def _past(task: Task, m: March, trial: Trial) -> Array:
@@ -203,7 +203,7 @@ def _first_step(task: Task, start: Point) -> Array:
     if task.h is not None:
         return jnp.minimum(task.h, undifferentiated(span))
     y, slope = jnp.concatenate([start.q, start.v]), jnp.concatenate([start.v, start.a])
-    return first_step(y, slope, span, task.rtol, task.atol)
+    return first_step(y, slope, span, task.rtol, task.atol, jnp.concatenate(task.units))
 
 
 # --- outputs

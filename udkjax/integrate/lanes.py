@@ -18,10 +18,12 @@ from udkjax.equations.motion import Motion, Tangential
 from udkjax.integrate.batched import CHUNKED, batched
 from udkjax.integrate.explicit import March, march
 from udkjax.integrate.interpolation import Point
+from udkjax.integrate.norms import largest
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import ended, lasting, violation
 from udkjax.integrate.step import Task, Trial, errors, judged, stage_state
 from udkjax.integrate.tableau import is_explicit, method_of
+from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.straightline import Loop, apart, cut, when
 
 ROUND = 8  # lanes: what the widest vector units hold
@@ -131,7 +133,8 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
         partial(over, ended),
         None,
         problem.equations.branches,
-        *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
+        *(problem.ts, problem.rtol, problem.atol, problem.units(lanes.shape), problem.rate, problem.smallest),
+        *(problem.h, problem.max_steps, method_of(problem.solver)),
         recorded,
     )
     if not problem.projected:
@@ -141,7 +144,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
 
         task = task._replace(arrived=as_it_is, lasting=_all_of_it)
         task = task._replace(ended=lambda t, q, v, dq, dv: (*as_it_is(t, q, v), _all_of_it(t, q, v, dq, dv)))
-    if problem.equations.branches and problem.careful:
+    if problem.equations.branches and problem.fallback:
         task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
     return task
 
@@ -168,8 +171,8 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
 
     def outputs(given: tuple[Array, Array]) -> tuple[Array, Array]:
         first = lanes.over(violation, jnp.broadcast_to(problem.ts[0], lanes.shape), start)
-        each, ys = partial(_output, problem.rtol + problem.atol if problem.projected else None), given[0][..., 1:, :]
-        ys, violated = _each_output(lanes, each, problem.ts[1:], ys, wide=problem.careful)
+        each, ys = partial(_output, problem if problem.projected else None), given[0][..., 1:, :]
+        ys, violated = _each_output(lanes, each, problem.ts[1:], ys, wide=problem.fallback)
         ys = jnp.concatenate([start.T[..., None, :], ys], axis=-2)
         violated = jnp.concatenate([first[..., None], violated], axis=-1)
         return (ys, violated) if lanes.size is None else (jnp.moveaxis(ys, 0, -1), violated.T)
@@ -191,7 +194,7 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
     """A step taken again of the lanes in doubt: by a method that looks at all rows where elimination finds nothing."""
     stages = task.method.stages
 
-    def one(equations: Motion, here: Point, h: Array, t1: Array, begin: Array, rtol: Array, atol: Array) -> Trial:
+    def one(equations: Motion, here: Point, h: Array, t1: Array, begin: Array, rtol: Array, atol: Array, units: Any) -> Trial:
         def stage(equations: Motion, carry: Any) -> Any:
             i, a, _, _, _ = carry
             t, q, v = stage_state(task.method, here, h, a[:stages], i)
@@ -214,7 +217,7 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
         start, none = jnp.where(begin, stages, 0), jnp.zeros((stages + 1, *here.a.shape))
         first = start, none, here.q, here.v, jnp.array(False)
         _, a, q1, v1, _ = jax.lax.while_loop(lambda c: c[0] <= stages, more, first)
-        mine, evaluations = task._replace(rtol=rtol, atol=atol), jnp.where(begin, 2, 2 * stages + 1)
+        mine, evaluations = task._replace(rtol=rtol, atol=atol, units=units), jnp.where(begin, 2, 2 * stages + 1)
         to, found = Point(t1, q1, v1, a[stages]), a[:stages]
         final = partial(lasting, equations) if projected else _all_of_it
         left = final(t1, q1, v1, *errors(task.method, h, found, to.a if task.method.ends else None))
@@ -223,7 +226,8 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
     tolerances = (jnp.broadcast_to(x, h.shape) for x in (task.rtol, task.atol))
     unknown = jnp.zeros((stages, *here.a.shape)) if task.recorded else None
     nothing = Trial(here, jnp.full(h.shape, jnp.inf), jnp.zeros(h.shape), jnp.zeros(h.shape, int), unknown)
-    return lanes.each(doubt, one, nothing, here, h, t1, begin, *tolerances)
+    units = tuple(jnp.broadcast_to(unit, here.q.shape) for unit in task.units)
+    return lanes.each(doubt, one, nothing, here, h, t1, begin, *tolerances, units)
 
 
 # --- outputs
@@ -282,12 +286,19 @@ def _side_by_side(equations: Motion, function: Callable, ts: Array, ys: Array) -
     return jax.lax.while_loop(lambda state: (state[0] * FEW_STEPS < STEPS) & (state[1] > 0), more, start)[3:]
 
 
-def _output(tol: Array | None, steps: int, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array, Array]:
+def _output(problem: Problem | None, steps: int, lanes: Lanes, t: Array, y: Array) -> tuple[Array, Array, Array]:
     """Interpolated states (2n, *lanes), returned to the manifold; how they violate the constraints; whether they still moved."""
     moving = jnp.zeros(lanes.shape, bool)
-    if tol is not None:
-        tol = jnp.broadcast_to(tol, lanes.shape)
+    if problem is not None:
+        tol = jnp.broadcast_to(output_tolerance(problem, y), lanes.shape)
         inside = lanes.within(Loop(lanes.size is not None))  # what closes it is a loop
         q, v, moving = inside.over(lambda e, t, y, tol: e.known_to(tol).closed(t, *jnp.split(y, 2), steps), t, y, tol)
         y = jnp.concatenate([q, v])
     return y, lanes.over(violation, t, y), moving
+
+
+def output_tolerance(problem: Problem, y: Array) -> Array:
+    """What the fastest velocity of a state (2n, *lanes) may err, in its unit."""
+    v = y[len(y) // 2 :]
+    unit = problem.units(y.shape[1:])[1]
+    return undifferentiated(problem.atol + problem.rtol * largest(jnp.abs(v) / unit))

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from udkjax.integrate.problem import DONE, DOUBTED, STEP_LIMIT, Raw
+from udkjax.integrate.problem import DONE, STEP_LIMIT, Raw
 from udkjax.integrate.solution import Result
 from udkjax.straightline import when
 
@@ -28,7 +28,6 @@ class Run(eqx.Module):
 def outcome(run: Run) -> tuple[Array, Array, Bool[Array, "T"]]:
     """Return the `Result`, the time (s) that belongs to it, and which of the output times count."""
     code = jnp.where(run.raw.status == STEP_LIMIT, Result.step_limit, _stopped(run))
-    code = jnp.where(run.raw.status == DOUBTED, Result.needs_care, code)
     code = jnp.where(run.raw.status == DONE, Result.successful, code)
     code, time, reached = _drift(run, code)
     first = jnp.arange(len(run.ts)) == 0

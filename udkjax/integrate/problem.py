@@ -3,9 +3,12 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion
+from udkjax.integrate.undifferentiated import undifferentiated
 
 RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, DOUBTED = range(5)  # what a run may be
 
@@ -21,10 +24,19 @@ class Problem(eqx.Module):
     atol: Array
     smallest: Array  # step (s)
     h: Array | None  # the first step; None: chosen
+    length: Array | None  # of the system, which `atol` is relative to (m); None: its coordinates are of order one as they are
+    rate: Array  # of the system and the run (1/s)
     solver: Any = eqx.field(static=True)
     projected: bool = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
-    careful: bool = eqx.field(static=True, default=True)  # whether steps that want care get it; else a run ends as `DOUBTED`
+    fallback: bool = eqx.field(static=True, default=True)  # whether steps that elimination cannot take are; else they end a run
+
+    def units(self, lanes: tuple[int, ...] = ()) -> tuple[Any, Any]:
+        """What `atol` is relative to, of coordinates and of velocities, (n, *lanes) or to be broadcast so."""
+        one = jnp.ones((len(self.q), *[1] * len(lanes)))
+        if self.length is not None:
+            one = jnp.where(np.arange(len(self.q)).reshape(one.shape) % 3 == 2, one, self.length)
+        return undifferentiated((one, one * self.rate))
 
 
 class Raw(NamedTuple):
@@ -32,7 +44,7 @@ class Raw(NamedTuple):
 
     q: Any  # (T, n), not yet reached ones of any value
     v: Any
-    violation: Any  # (T,) the largest of any row of Psi there (m, rad)
+    violation: Any  # (T,) the largest of any row of Psi there, over its scale
     reached: Any  # (T,)
     status: Any
     t: Any

@@ -53,11 +53,11 @@ def _counted(left: Tangential, dq: Array, dv: Array) -> Tangential:
 
 
 def violation(equations: Motion, t: Any, y: Float[Array, "2n"]) -> Float[Array, ""]:
-    """The largest of any row of Psi, also of those that the method leaves out."""
+    """The largest of any row of Psi over its scale, also of those that the method leaves out."""
     if not equations.constrained:
         return jnp.zeros(())
     equations, t, y = undifferentiated((equations, t, y))
-    return jnp.max(jnp.abs(equations.violation(t, *jnp.split(y, 2))[0]), initial=0.0)
+    return equations.excess(equations.violation(t, *jnp.split(y, 2))[0])
 
 
 def project_all(equations: Any, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from udkjax.equations.motion import Motion
 from udkjax.integrate.explicit import BLOCK
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
+from udkjax.integrate.lanes import output_tolerance
 from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.record import as_array, as_point
 
@@ -54,12 +55,11 @@ class Equations:
 def of_outputs(problem: Problem, raw: Raw, equations: Equations, sums: Sums, bars: Array) -> tuple[Sums, Array]:
     """Of the outputs before they were projected: the derivative of the projection is that at the state that it returns."""
 
-    tol = problem.rtol + problem.atol
-
     def one(sums: Sums, x: Any) -> tuple[Sums, Array]:
         k, t, y, bar, reached = x
         q, v = jnp.split(jnp.where(reached, y, jnp.concatenate([problem.q, problem.v])), 2)
         both = tuple(jnp.split(bar, 2))
+        tol = output_tolerance(problem, jnp.concatenate([q, v]))
         found, t_bar, q, v = equations.pull(lambda e, *x: e.known_to(tol).as_projected(*x), sums, t, q, v, both)
         if found.ts is not None:
             found = found._replace(ts=found.ts.at[k].add(t_bar))

@@ -12,13 +12,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.equations.assembly import Closure, State, close, is_closed, require_closed
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.assembly import Closure, State, close, require_closed
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.partitioning import Partitioned
 from udkjax.equations.programs import Baumgarte
 from udkjax.equations.quantities import equations_of
-from udkjax.equations.redundancy import redundant_rows
 from udkjax.integrate.batched import one_by_one
 from udkjax.integrate.lanes import serves, solve
 from udkjax.integrate.outcome import Run, counts, outcome
@@ -36,8 +36,9 @@ if TYPE_CHECKING:
     import diffrax
 
 MAX_STEPS = 100_000
-# m and rad. Projection leaves rounding errors, unless the rows that it does not see drift. Without it drift is what one looks at,
-# up to where a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are 2e-3 open.
+# Of the rows' scales. Projection leaves rounding errors, unless the rows that it does not see drift. Without it drift is what one
+# looks at, up to where a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
+# 2e-3 open.
 DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-3
 SMALLEST_STEP = 100.0  # ulps of the end time: below it time does not advance
 
@@ -58,7 +59,7 @@ def simulate(
     formulation: Formulation | None = None,
     throw: bool = True,
     progress: Any = None,
-    careful: bool = True,
+    analysis: Analysis | None = None,
 ) -> Solution:
     """Integrate the motion of a mechanism; return its states at the times `ts` (T,), in s. The motion starts at ts[0].
 
@@ -66,12 +67,14 @@ def simulate(
     before as one that was found here. `method` is any pseudoinverse
     (default `Auto`), `stabilization` is `Projection()`, a `Baumgarte` or None, `solver` any diffrax solver for ordinary
     differential equations (default Dopri8: of those measured in benchmarks/ the fastest at equal error, but for the tightest
-    tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity. `dt0` is the first
-    step that is tried, in s; by default it is chosen. `formulation` finds the accelerations in
+    tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity: x may err by
+    rtol |x| + atol L, an angle by rtol |angle| + atol, their rates by 1/T of that, with L the characteristic length of the
+    mechanism (`analyse`) and T the shortest of its characteristic time, the time in which its initial velocities move it by L,
+    and the span of `ts`. So the same tolerances mean the same accuracy at any scale. (L = T = 1 for a `ConstrainedSystem`.)
+    `dt0` is the first step that is tried, in s; by default it is chosen. `formulation` finds the accelerations in
     another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`, `NullSpaceSVD` or `CoordinatePartitioning`;
-    `method` then serves projection and derivatives. `progress=True` prints how far the run is. `careful=False` leaves out what
-    steps beside singular configurations take, a fifth to three fifths of what there is to compile: a run that comes to one ends
-    there (`Result.needs_care`). It also projects outputs one by one, not side by side, which is slower and compiles faster.
+    `method` then serves projection and derivatives. `progress=True` prints how far the run is. `analysis` is that of `analyse`,
+    by default made here; a mechanism all of whose numbers are traced needs one to be fast.
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. For forward mode give `adjoint=diffrax.ForwardMode()`; reverse mode works as it is. Explicit Runge-Kutta methods
@@ -79,7 +82,7 @@ def simulate(
     than these two and a progress meter by `diffrax.diffeqsolve`.
 
     A run that does not reach its end raises `SimulationError`, which carries the solution; with `throw=False`, or when numbers
-    are traced, `Solution.result` tells instead. A violation of Psi above `drift_tol` (m, rad) at an output time ends the
+    are traced, `Solution.result` tells instead. A violation of Psi above `drift_tol` (of L, or rad) at an output time ends the
     solution there. A guess that cannot be closed raises `AssemblyError`.
     """
     ts = _times(ts)
@@ -90,25 +93,29 @@ def simulate(
     settings = (number(rtol), number(atol), method, stabilization, drift, _step(dt0), formulation)
     choices = (solver, adjoint, max_steps, _meter(progress))
 
-    def run(mechanism: Any, careful: bool) -> tuple[Solution, Any, Any]:
+    def run(analysis: Analysis | None, fallback: bool) -> tuple[Solution, Any, Any]:
         with _uncollected():
-            return _simulate(mechanism, ts, state, closure, *settings, *choices, careful, moving)
+            return _simulate(bare, analysis, ts, state, closure, *settings, *choices, fallback, moving)
 
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
-    if state is None and closure is None and isinstance(mechanism, Mechanism):
-        closure = close(mechanism, start, forward=adjoint is not None and _by_jax(adjoint))
+    bare: Any = mechanism
+    if isinstance(mechanism, Mechanism):
+        analysis, bare = analyse(mechanism) if analysis is None else analysis, mechanism.bare
+        if state is None and closure is None:
+            closure = close(mechanism, start, forward=adjoint is not None and _by_jax(adjoint), analysis=analysis)
     moves = [isinstance(x, Tracer) for x in jax.tree.leaves(mechanism)]
     moving = tuple(moves) if any(moves) else ()
     traced = bool(moving) or any(isinstance(x, Tracer) for x in jax.tree.leaves((ts, state, closure, settings)))
-    solution, missed, doubted = run(mechanism, careful=traced and careful)
-    if isinstance(solution.code, Tracer):
-        return solution if traced or not careful else run(mechanism, careful=True)[0]
-    if doubted and careful:  # few runs meet what elimination cannot solve: only these compile what can
-        solution, missed, _ = run(mechanism, careful=True)
-    if isinstance(mechanism, Mechanism) and missed:  # the numbers made rows independent that were left out: choose again
-        mechanism = mechanism.with_left_out(redundant_rows(mechanism))
-        solution, *_ = run(mechanism, careful=careful)
+    solution, missed, doubted = run(analysis, fallback=traced)
+    if isinstance(solution.code, Tracer):  # the times, or something around, are traced after all
+        return solution if traced else run(analysis, fallback=True)[0]
+    if doubted:  # few runs meet what elimination cannot solve: only these compile what can
+        solution, missed, _ = run(analysis, fallback=True)
+    if (
+        isinstance(mechanism, Mechanism) and missed and mechanism.is_known
+    ):  # an analysis of other numbers, in which a row depended
+        solution, *_ = run(analyse(mechanism), fallback=True)
     if throw and isinstance(mechanism, Mechanism) and closure is not None:
         require_closed(mechanism, closure)
     if throw and solution.result != Result.successful:
@@ -119,6 +126,7 @@ def simulate(
 @Kept
 def _simulate(
     mechanism,
+    analysis,
     ts,
     state,
     closure,
@@ -133,20 +141,20 @@ def _simulate(
     adjoint,
     max_steps,
     meter,
-    careful,
+    fallback,
     moving,
 ):
-    """Return the solution; whether it takes rows that the method leaves out; whether it takes care that was not to be taken."""
+    """Return the solution, whether it takes rows that the method leaves out, and whether it takes a fallback that is not there."""
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
-    equations = equations_of(mechanism, method, baumgarte, formulation, moving)
+    equations = equations_of(mechanism, method, baumgarte, formulation, moving, analysis)
     projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, Partitioned))
     start, closed, missed = _start(equations, state, closure)
     # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
     loose_rtol, loose_atol = (jnp.where(closed, tol, 1e3) for tol in (rtol, atol))
     ulp = jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
     q, v = start.q.ravel(), start.v.ravel()
-    numbers = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0)
-    problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, careful=careful)
+    numbers = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v))
+    problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, fallback=fallback)
     if meter is None and _by_jax(adjoint):
         single = partial(_by_diffrax, adjoint=adjoint, meter=None)
         integrate = solve if serves(problem) else partial(one_by_one, single=single)
@@ -176,8 +184,16 @@ def _start(equations: Any, state: State | None, closure: Closure | None) -> tupl
     if state is not None:
         return state, jnp.array(True), jnp.array(False)
     assert closure is not None
-    closed, kept = jnp.asarray(is_closed(closure)), len(closure.psi) - len(equations.left_out)
+    closed, kept = jnp.asarray(closure.is_closed), len(closure.psi) - len(equations.left_out)
     return closure.state, closed, closed & (closure.rank > kept)
+
+
+def _units(analysis: Analysis | None, ts: Array, v: Array) -> tuple[Array | None, Array]:
+    """The length and the rate that `atol` is relative to."""
+    if analysis is None:
+        return None, jnp.ones(())
+    scales = analysis.scales
+    return undifferentiated((scales.length, jnp.maximum(jnp.maximum(scales.rate, scales.size(v)), 1 / (ts[-1] - ts[0]))))
 
 
 def _times(ts: ArrayLike | Sequence[float]) -> Float[Array, "T"]:

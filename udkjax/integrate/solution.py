@@ -22,7 +22,6 @@ class Result(IntEnum):
     not_finite = 3
     drift = 4
     could_not_assemble = 5
-    needs_care = 6
 
 
 CAUSES = {
@@ -33,8 +32,7 @@ CAUSES = {
     Result.not_finite: "a number that is not finite appeared; look at the loads and motions of the scene at this time "
     "(and, with `Augmented()`, at its redundant joints: plain LU cannot do with them)",
     Result.drift: "the constraints are violated by more than `drift_tol`: stabilize (`Projection()`), or, where the numbers "
-    "of the scene make rows independent that were found redundant when it was built, build it anew or take method=SVD()",
-    Result.needs_care: "a step beside a singular configuration takes care, which `careful=False` leaves out",
+    "of the scene make rows independent that its analysis found redundant, analyse it anew or take method=SVD()",
     Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for the joints that stay open",
 }
 

@@ -43,6 +43,8 @@ class Task(NamedTuple):
     ts: Array  # (T, *lanes)
     rtol: Array
     atol: Array
+    units: tuple[Array, Array]  # of q and of v, which `atol` is relative to
+    rate: Array
     smallest: Array  # step
     h: Array | None  # the first step; None: chosen
     max_steps: int
@@ -105,7 +107,7 @@ def errors(method: Method, h: Array, a: Array, end: Array | None = None) -> list
 
 def judged(task: Task, here: Point, to: Point, left: Tangential, a: Array, evaluations: Any) -> Trial:
     """A step with what lasts of its errors."""
-    size = jnp.maximum(_relative(task, left.dq, here.q, to.q), _relative(task, left.dv, here.v, to.v))
+    size = jnp.maximum(_relative(task, 0, left.dq, here.q, to.q), _relative(task, 1, left.dv, here.v, to.v))
     size = jnp.where(all_finite(to.a), size, jnp.nan)
     evaluations = jnp.broadcast_to(jnp.asarray(evaluations), size.shape)
     a = a.at[-1].set(to.a) if task.method.ends else a
@@ -120,6 +122,11 @@ def _combine(weights: Any, a: Array) -> Array:
     return cut([total])[0] if a.ndim > 2 else total
 
 
-def _relative(task: Task, error: Array, y0: Array, y1: Array) -> Array:
-    scale = task.atol + task.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
+def tolerance(task: Task, v: Array) -> Array:
+    """What the fastest velocity may err, in its unit."""
+    return task.atol + task.rtol * largest(jnp.abs(v) / task.units[1])
+
+
+def _relative(task: Task, which: int, error: Array, y0: Array, y1: Array) -> Array:
+    scale = task.atol * task.units[which] + task.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
     return largest(jnp.abs(error) / scale)

@@ -1,6 +1,6 @@
 """A mechanism: the pytree of everything that exists in a scene, checked, with named access to every number."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -24,21 +24,29 @@ Element = TypeVar("Element", bound=eqx.Module)
 _FIXED = Frame(0.0, 0.0, 0.0, 1.0, 0.0)
 
 
-# Which rows of Psi are redundant is a question to the equations, a floor above: imported, they put their answer here. It has
-# to be given when a mechanism is built, since its numbers may be traced ever after.
-def _not_asked(mechanism: "Mechanism") -> tuple[int, ...] | None:
-    return None
+class Origin:
+    """The known numbers that a mechanism with traced ones was made from. It is hashable, and equal where its numbers are."""
 
+    def __init__(self, mechanism: "Mechanism"):
+        self.mechanism = mechanism
+        leaves, structure = jax.tree.flatten(mechanism)
+        self._key = structure, tuple(np.asarray(leaf).tobytes() for leaf in leaves)
+        self._hash = hash(self._key)
 
-find_redundant_rows: Callable[["Mechanism"], tuple[int, ...] | None] = _not_asked
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Origin) and self._key == other._key)
 
 
 class Mechanism(eqx.Module):
     """Bodies, joints, drivers and force elements, each under its name, and gravity.
 
-    A pytree whose leaves are all of its numbers; names, topology and types are static. Names, orders and rows are the user's:
-    `constraints` are the joints in their order, then the drivers. `forces` may be a list: an element without a name is called
-    TYPE1, TYPE2, ... by its place among those of its type. Numbers that a joint leaves to the initial guess are filled in here.
+    Data alone: what follows from it, such as which rows are redundant, is for `udkjax.analyse` to find. A pytree whose leaves
+    are all of its numbers; names, topology and types are static. Names, orders and rows are the user's: `constraints` are the
+    joints in their order, then the drivers. `forces` may be a list: an element without a name is called TYPE1, TYPE2, ... by its
+    place among those of its type. Numbers that a joint leaves to the initial guess are filled in here.
 
     Raises `SceneError`, which lists every mistake. Numbers that are traced are not looked at; their shapes are.
     """
@@ -49,7 +57,7 @@ class Mechanism(eqx.Module):
     joint_names: tuple[str, ...] = eqx.field(static=True)
     driver_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
-    left_out: tuple[int, ...] | None = eqx.field(static=True)  # rows of Psi known to be redundant; None: not yet looked for
+    origin: Origin | None = eqx.field(static=True)  # of traced numbers: the known ones that they stand for, if there are any
     # JAX sorts the keys of a dict: tuples keep the user's order.
     _bodies: tuple[Body, ...]
     _joints: tuple[Joint, ...]
@@ -64,7 +72,7 @@ class Mechanism(eqx.Module):
         forces: Mapping[str, ForceElement] | Sequence[ForceElement] | None = None,
         gravity: Numbers = (0.0, -9.81),
         name: str = "",
-        left_out: tuple[int, ...] | None = None,
+        origin: Origin | None = None,
     ):
         forces = forces or {}
         given = {
@@ -74,14 +82,13 @@ class Mechanism(eqx.Module):
             "force": list(forces.items() if isinstance(forces, Mapping) else zip(numbered(forces), forces, strict=True)),
         }
         found = _checked(given, gravity, name)
-        self.name, self.gravity, self.left_out = name, number(gravity), left_out
+        self.name, self.gravity = name, number(gravity)
         self.body_names, self._bodies = _columns(found["body"])
         known = dict(found["body"])
         self.joint_names, self._joints = _columns([(key, _resolved(c, known)) for key, c in found["joint"]])
         self.driver_names, self._drivers = _columns([(key, _resolved(c, known)) for key, c in found["driver"]])
         self.force_names, self._forces = _columns(found["force"])
-        if left_out is None:
-            self.left_out = find_redundant_rows(self)
+        self.origin = origin if any(isinstance(leaf, Tracer) for leaf in self._numbers) else None
 
     @property
     def bodies(self) -> Mapping[str, Body]:
@@ -122,13 +129,24 @@ class Mechanism(eqx.Module):
         """The initial guess of the velocities (m/s, rad/s)."""
         return _side_by_side([body.velocity for body in self._bodies], [body.angular_velocity for body in self._bodies])
 
-    def with_left_out(self, rows: tuple[int, ...] | None) -> "Mechanism":
-        """Return the mechanism with another choice of rows of Psi to leave out as redundant."""
+    @property
+    def bare(self) -> "Mechanism":
+        """The same without its `origin`: what is compiled for it serves every origin."""
+        if self.origin is None:
+            return self
         copy = object.__new__(type(self))
         for field, value in vars(self).items():
-            object.__setattr__(copy, field, value)
-        object.__setattr__(copy, "left_out", rows)
+            object.__setattr__(copy, field, None if field == "origin" else value)
         return copy
+
+    @property
+    def is_known(self) -> bool:
+        """Whether no number is traced."""
+        return not any(isinstance(leaf, Tracer) for leaf in self._numbers)
+
+    @property
+    def _numbers(self) -> list[Any]:
+        return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
 
     def parameters(self) -> dict[str, Array]:
         """Return every number of the scene under its name, such as `body.link1.mass`; absent ones (a damping) are left out."""
@@ -138,11 +156,14 @@ class Mechanism(eqx.Module):
         """Return the mechanism with some of its numbers replaced; pure, and values may be traced.
 
         `values` maps names as in `parameters`, or those of one entry (`joint.A.points[1][0]`), to values of exactly the same
-        shape: a batch of values belongs inside `vmap`. A number that was absent is then there. Numbers that a joint once took
-        from the initial guess stay as they are; the constants of gears and racks follow the guess. Raises `SceneError`.
+        shape: a batch of values belongs inside `vmap`. A mechanism with traced values remembers the known numbers that it was
+        made from (`origin`), so that their analysis serves it. A number that was absent is then there. Numbers that a joint
+        once took from the initial guess stay as they are; the constants of gears and racks follow the guess. Raises `SceneError`.
         """
         new, gravity = replaced(self, values)
-        return Mechanism(new["body"], new["joint"], new["driver"], new["force"], gravity, self.name, self.left_out)
+        traced = any(isinstance(value, Tracer) for value in jax.tree.leaves(dict(values)))
+        origin = Origin(self) if traced and self.is_known else self.origin
+        return Mechanism(new["body"], new["joint"], new["driver"], new["force"], gravity, self.name, origin)
 
 
 def attached(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ NUMBERS = {
     "alpha": "1/s",
     "beta": "1/s",
     "t1": "s",
-    "drift_tol": "m, rad",
+    "drift_tol": "1",
     "dt0": "s",
 }
 _FIELDS = {

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from udkjax.equations.analysis import analyse
 from udkjax.equations.redundancy import ORDINARY, chosen_rows, positions_of, rows_of
 from udkjax.scene.checks import quoted
 from udkjax.scene.fields import Numbers
@@ -28,7 +29,7 @@ ALONG = 1e-6
 DIFFERENCE = 1e-5  # of a parameter's value: the step of the central differences
 # Of a parameter's size, which is its value, or less where that changes a row by more than the row's own size: the step after
 # which a mechanism must close again. What opens to second order does so by 1e-4 of the size, ten million times what is left of
-# closing (redundancy.CLOSED).
+# closing (closing.CLOSED).
 STEP = 1e-2
 SMALL = 1e-5  # of the size by effect: a value as small as this, such as that of a coordinate, counts as zero
 FEW = 4  # positions that are closed again
@@ -40,11 +41,10 @@ def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], 
     `apply(mechanism, x)` puts the values x (P,) in; it is pure, and x may be traced. A message names the constraints that close
     the loop, the parameters that would open it, and the ties that keep it closed.
     """
-    if mechanism.left_out == () or not names:
+    redundant = analyse(mechanism).redundant_rows
+    if redundant == () or not names:
         return []
-    # Traced, so that no step of differences is refused for its sign; and as it was when its redundant rows were looked for, so
-    # that the graph is there already.
-    placed = jax.jit(lambda x: apply(mechanism, x).with_left_out(None))
+    placed = jax.jit(lambda x: apply(mechanism, x).bare)  # traced, so that no step of differences is refused for its sign
     x = np.asarray(x, float)
     steps = DIFFERENCE * np.where(x != 0.0, np.abs(x), min(_spread(placed(x)), 1.0))
     moving = [i for i, step in enumerate(np.diag(steps)) if _constraints(placed(x + step)) != _constraints(placed(x - step))]
@@ -53,7 +53,7 @@ def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], 
     names = [names[i] for i in moving]
     at = np.eye(len(x))[moving]
     loops = Loops(mechanism, lambda change: placed(x + change @ at), x[moving], steps[moving])
-    if mechanism.left_out and loops.redundant < len(mechanism.left_out):
+    if redundant and loops.redundant < len(redundant):
         return [
             f"the first guesses of {listed(names)} open a loop that closes with the scene's own values: it has more "
             "constraints than it needs, and only certain values satisfy all of them; start from such values"
@@ -102,7 +102,7 @@ class Loops:
             columns.append(np.array(moved) / (2 * step.sum()))
         slope = np.stack(columns, -1)  # (positions, rows, P)
         # The natural size of a row: the longest arm at which it turns a body, which is 1 for rows of angles.
-        arms = np.max([length * np.abs(dense(D[:, 2::3]) / rows.root[2::3]).max(1) for _, length, D in at], axis=0)
+        arms = np.max([length * np.abs(dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in at], axis=0)
         most = np.abs(slope / np.where(arms > 0.0, arms, spread)[:, None]).max((0, 1))
         by_effect = 1.0 / np.where(most > 0.0, most, np.inf)
         own = np.abs(self.x)

@@ -8,8 +8,8 @@ from typing import Any, get_args
 import jax
 import numpy as np
 
-from udkjax.equations.assembly import AssemblyError, close, is_closed, require_closed
-from udkjax.equations.redundancy import redundant_rows
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.assembly import AssemblyError, close, require_closed
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result
 from udkjax.scene.checks import SceneError, suggestion
@@ -35,7 +35,7 @@ DECIDED = (
     "adjoint",
     "throw",
     "progress",
-    "careful",
+    "analysis",
 )  # not settings that one may give
 
 
@@ -88,7 +88,7 @@ def _begun(
     Whether a mechanism without redundant rows closes is seen by the first run, which the fit begins with: to look before would
     cost more than the run.
     """
-    if unknowns.own and mechanism.left_out == ():
+    if unknowns.own and analyse(mechanism).redundant_rows == ():
         try:
             problem = Problem(mechanism, unknowns, records, settings)
             first = problem.evaluate(np.zeros((1, problem.K)), (max(tol, LOOSE), max(tol, LOOSE)))
@@ -96,15 +96,16 @@ def _begun(
                 return problem
         except AssemblyError:
             pass
-    mechanism, unknowns = _closable(mechanism, unknowns, seed)
-    _require_legal(mechanism, unknowns)
-    return Problem(mechanism, unknowns, records, settings)
+    analysis, unknowns = _closable(mechanism, unknowns, seed)
+    if analysis.redundant_rows:
+        _require_legal(mechanism, unknowns)
+    return Problem(mechanism, unknowns, records, {**settings, "analysis": analysis})
 
 
 def _require_legal(mechanism: Mechanism, unknowns: Unknowns) -> None:
     """Raise where the parameters would open a loop. What is legal is so for other numbers too with the same redundant rows."""
     structure = jax.tree.structure(mechanism), unknowns.targets
-    if not mechanism.left_out or structure in _legal:
+    if structure in _legal:
         return
     wrong = illegal(mechanism, lambda mech, x: applied(mech, unknowns.targets, x), unknowns.start, unknowns.names)
     if wrong:
@@ -130,19 +131,15 @@ def _check(settings: Mapping[str, Any], strategy: str) -> None:
         raise IdentificationError(problems)
 
 
-def _closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tuple[Mechanism, Unknowns]:
-    """The mechanism with the redundant rows of its first guess, or, where that cannot be closed, of the nearest that can."""
+def _closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tuple[Analysis, Unknowns]:
+    """The analysis of the mechanism at its first guess, or, where that cannot be closed, at the nearest that can."""
     for k, x in enumerate([unknowns.start, *_nearby(unknowns, seed)]):
         try:
             placed = mechanism if k == 0 and unknowns.own else applied(mechanism, unknowns.targets, x)
         except SceneError:
             continue
-        closure = close(placed)
-        if is_closed(closure):
-            rows = mechanism.left_out
-            if rows is None or int(closure.rank) != len(closure.psi) - len(rows):
-                rows = redundant_rows(placed)
-            return mechanism.with_left_out(rows), dataclasses.replace(unknowns, start=np.asarray(x, float))
+        if close(placed).is_closed:
+            return analyse(placed), dataclasses.replace(unknowns, start=np.asarray(x, float))
     placed = applied(mechanism, unknowns.targets, unknowns.start)
     require_closed(placed, close(placed))
     raise AssertionError

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from udkjax.equations.analysis import analyse
 from udkjax.integrate.solution import Result
 from udkjax.scene.checks import quoted
 from udkjax.scene.mechanism import Mechanism
@@ -57,7 +58,7 @@ class Problem:
         self.K = len(unknowns.names) + sum(len(start.names) for start in self.starts)
         self._numbers()
         self._conditions = _conditions(mechanism, self.records)
-        self.program = Program(mechanism, unknowns.targets, self.channels, settings or {})
+        self.program = Program(mechanism, unknowns.targets, self.channels, {"analysis": analyse(mechanism), **(settings or {})})
 
     @property
     def all_names(self) -> tuple[str, ...]:

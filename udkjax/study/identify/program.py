@@ -22,7 +22,7 @@ from udkjax.equations.settled import close_all
 from udkjax.integrate.batched import CHUNKED
 from udkjax.integrate.lanes import LANES
 from udkjax.integrate.simulate import simulate
-from udkjax.integrate.solution import Result, Solution
+from udkjax.integrate.solution import Solution
 from udkjax.integrate.solvers import forward_mode
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.channels import Channel, Quantity, measured
@@ -77,7 +77,6 @@ class Program:
         self._latest: OrderedDict[bytes, Predicted] = OrderedDict()
         self._arrays, fixed = eqx.partition((mechanism, self.settings), eqx.is_array)
         self._static = Static(fixed, targets, channels, ends)
-        self._careful = False  # few runs meet a singular configuration: only these compile what it takes there
 
     def __call__(self, members: Members, tol: tuple[float, float]) -> Predicted:
         """Compute members, by relative and absolute tolerances of the integration."""
@@ -108,11 +107,7 @@ class Program:
         return state.q, state.v
 
     def _piece(self, members: Members, tol: tuple[float, float]) -> tuple:
-        found = jax.tree.map(np.asarray, _computed(self._static, self._careful, self._arrays, members, tol))
-        if self._careful or not (found[2] == Result.needs_care).any():
-            return found
-        self._careful = True
-        return self._piece(members, tol)
+        return jax.tree.map(np.asarray, _computed(self._static, self._arrays, members, tol))
 
 
 class Static:
@@ -141,8 +136,8 @@ def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
     return x[np.minimum(np.arange(first, first + count), len(x) - 1)]
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _computed(static, careful, arrays, members, tol):
+@partial(jax.jit, static_argnums=0)
+def _computed(static, arrays, members, tol):
     mechanism, settings = eqx.combine(arrays, static.fixed)
     targets, channels, ends = static.rest
     several = len(members.x) > 1
@@ -160,13 +155,13 @@ def _computed(static, careful, arrays, members, tol):
     def one(members, x, shift):
         member = jax.tree.map(lambda leaf: leaf[0], members._replace(x=x, shift=shift))
         mech, state = _member(mechanism, member, targets)
-        closure = close(mech, member.ts[0], state, forward=True)
-        return jax.tree.map(lambda leaf: leaf[None], _run(mech, member.ts, closure, tol, settings, channels, ends, careful))
+        closure = close(mech, member.ts[0], state, forward=True, analysis=settings["analysis"])
+        return jax.tree.map(lambda leaf: leaf[None], _run(mech, member.ts, closure, tol, settings, channels, ends))
 
     def every(members):
         mechs, states = jax.vmap(lambda member: _member(mechanism, member, targets))(members)
-        closures = close_all(mechs, members.ts[:, 0], states)
-        return jax.vmap(lambda m, ts, c: _run(m, ts, c, tol, settings, channels, ends, careful))(mechs, members.ts, closures)
+        closures = close_all(mechs, members.ts[:, 0], states, settings["analysis"])
+        return jax.vmap(lambda m, ts, c: _run(m, ts, c, tol, settings, channels, ends))(mechs, members.ts, closures)
 
     size = members.x.shape[1] + members.shift.shape[1]
     outputs, slopes, code = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(size))
@@ -191,8 +186,8 @@ def _guessing(mechanism: Mechanism, q: Any, v: Any) -> Mechanism:
     return mechanism.with_parameters(values)
 
 
-def _run(mechanism, ts, closure, tol, settings, channels, ends, careful):
-    solution: Solution = simulate(mechanism, ts, closure, *tol, adjoint=forward_mode(), throw=False, careful=careful, **settings)
+def _run(mechanism, ts, closure, tol, settings, channels, ends):
+    solution: Solution = simulate(mechanism, ts, closure, *tol, adjoint=forward_mode(), throw=False, **settings)
     y = measured(mechanism, solution, channels)
     if not ends:
         return (y,), solution.code

@@ -76,7 +76,7 @@ def start_unknowns(mechanism: Mechanism, unknowns: Unknowns, record: Record, lab
     free = np.eye(len(q))
     if rows.count:
         position = rows.close(record.t0, q)
-        free = rows.root[:, None] * position.vt[position.rank :].T
+        free = rows.metric[:, None] * position.vt[position.rank :].T
     chosen = _telling(free)
     basis = free @ np.linalg.inv(free[chosen])
     names: list[str] = []

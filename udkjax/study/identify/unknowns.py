@@ -87,15 +87,14 @@ class Unknowns:
 
 def applied(mechanism: Mechanism, targets: Sequence[Target], x: Any) -> Mechanism:
     """The mechanism with the values x (P,) in, in the order of the parameters. Pure; x may be traced."""
-    left_out, base, values = mechanism.left_out, parameters_of(mechanism), {}
+    base, values = parameters_of(mechanism), {}
     for k, target in enumerate(targets):
         if target.function is not None:
             mechanism = target.function(mechanism.with_parameters(values) if values else mechanism, x[k])
             values = {}
         else:
             values |= {name: x[k] * entry_of(base, name) if target.scaled else x[k] for name in target.names}
-    mechanism = mechanism.with_parameters(values) if values else mechanism
-    return mechanism.with_left_out(left_out) if mechanism.left_out is None else mechanism
+    return mechanism.with_parameters(values) if values else mechanism
 
 
 def entry_of(known: Mapping[str, Any], name: str) -> Array:

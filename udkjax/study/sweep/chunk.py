@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from udkjax.equations.redundancy import redundant_rows
+from udkjax.equations.analysis import analyse
 from udkjax.integrate.batched import CHUNKED
 from udkjax.integrate.lanes import LANES, ROUND
 from udkjax.integrate.solution import Result
@@ -128,12 +128,12 @@ def _named(names: Sequence[str], kept: Any, slopes: Any) -> dict[str, Any]:
     return found
 
 
-def program(plan: Plan, group: Group, left_out: tuple[int, ...] | None = None) -> Program:
+def program(plan: Plan, group: Group, redundant: tuple[int, ...] | None = None) -> Program:
     """The program of a group: made once for each process."""
-    key = plan.token, group.index, left_out
+    key = plan.token, group.index, redundant
     with _lock:
         if key not in _programs:
-            _programs[key] = Program(Recipe(plan, group, left_out), jax.local_devices())
+            _programs[key] = Program(Recipe(plan, group, redundant), jax.local_devices())
             while len(_programs) > PROGRAMS:
                 _programs.popitem(last=False)
         _programs.move_to_end(key)
@@ -148,7 +148,7 @@ def run(plan: Plan, chunk: Chunk) -> dict[str, np.ndarray]:
     group = plan.groups[chunk.group]
     mine = program(plan, group)
     found = mine(chunk.members)
-    if mine.recipe.left_out and mine.recipe.varied:
+    if mine.recipe.redundant and mine.recipe.varied:
         for rows, which in _others(mine.recipe, chunk.members, found[RESULT]).items():
             again = program(plan, group, rows)(chunk.members[which])
             for name, values in again.items():
@@ -163,8 +163,8 @@ def _others(recipe: Recipe, members: np.ndarray, result: np.ndarray) -> dict[tup
     if len(drifted):
         mechanisms = _mechanisms(recipe, members[drifted])
         for k, mechanism in zip(drifted.tolist(), mechanisms, strict=True):
-            rows = redundant_rows(mechanism)
-            if rows is not None and rows != recipe.left_out:
+            rows = analyse(mechanism).redundant_rows
+            if rows is not None and rows != recipe.redundant:
                 found.setdefault(rows, []).append(k)
     return {rows: np.array(which) for rows, which in found.items()}
 

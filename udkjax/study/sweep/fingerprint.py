@@ -74,7 +74,7 @@ def _value(value: Any) -> Any:
         return value
     if isinstance(value, Mechanism):
         numbers = {name: _value(x) for name, x in value.parameters().items()}
-        return {"scene": scene_text(value), "parameters": numbers, "left_out": list(value.left_out or ())}
+        return {"scene": scene_text(value), "parameters": numbers}
     if isinstance(value, float | np.ndarray | np.number | jax.Array):
         array = np.asarray(value)
         if array.size <= SHORT:

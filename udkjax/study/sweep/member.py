@@ -4,6 +4,7 @@ A `Recipe` is the part of a plan that one program is compiled from. Its numbers 
 members share, and those of each member.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from udkjax.equations.analysis import analyse
 from udkjax.equations.assembly import Closure, State, close
 from udkjax.equations.settled import close_all
 from udkjax.integrate.simulate import simulate
@@ -31,9 +33,9 @@ STRAIGHT = (type(None), Auto, Elimination)  # methods by straight-line code, whi
 
 
 class Recipe:
-    """How the members of a group are computed; `left_out`: the rows of Psi to leave out, where not those of the mechanism."""
+    """How the members of a group are computed; `redundant`: the rows of Psi to leave out, where not those of the mechanism."""
 
-    def __init__(self, plan: Plan, group: Group, left_out: tuple[int, ...] | None = None):
+    def __init__(self, plan: Plan, group: Group, redundant: tuple[int, ...] | None = None):
         self.plan, self.group = plan, group
         self.names = tuple(plan.derivatives)
         self.numbers = tuple(column for column in plan.columns if not column.chosen)
@@ -47,19 +49,15 @@ class Recipe:
                 if len(places) > 1 and jax.tree.leaves(eqx.filter(fixed[setting], eqx.is_array)):
                     arrays, static = stacked([column.values[k] for k in places])
                     self._own[setting] = column.name, arrays, static, np.array(places)
-        if left_out is not None:
-            fixed["mechanism"] = fixed["mechanism"].with_left_out(left_out)
-            if "mechanism" in self._own:
-                name, arrays, _, places = self._own["mechanism"]
-                same, static = eqx.partition(fixed["mechanism"], eqx.is_array)
-                self._own["mechanism"] = (
-                    name,
-                    jax.tree.unflatten(jax.tree.structure(same), jax.tree.leaves(arrays)),
-                    static,
-                    places,
-                )
+        analysis = analyse(fixed["mechanism"])
+        self.redundant = analysis.redundant_rows if redundant is None else redundant
+        fixed["analysis"] = dataclasses.replace(analysis, redundant_rows=self.redundant)
+        if "mechanism" in self._own:  # each has scales of its own
+            name, _, _, places = self._own["mechanism"]
+            column = next(column for column in plan.columns if column.name == name)
+            found = [dataclasses.replace(analyse(column.values[k]), redundant_rows=self.redundant) for k in places]
+            self._own["analysis"] = name, *stacked(found), places
         given = {setting for setting in fixed if setting not in self._own}
-        self.left_out = fixed["mechanism"].left_out
         arrays, self._static = eqx.partition({setting: fixed[setting] for setting in given}, eqx.is_array)
         targets = [target for column in self.numbers for target in (("",) if callable(column.of) else column.of)]
         self.varied = "mechanism" in self._own or any(target not in NUMBERS for target in targets)
@@ -70,7 +68,7 @@ class Recipe:
         self.in_lanes = (
             is_explicit(fixed.get("solver"))
             and isinstance(fixed.get("method"), STRAIGHT)
-            and self.left_out is not None
+            and self.redundant is not None
             and fixed.get("formulation") is None
         )
 
@@ -85,7 +83,7 @@ class Recipe:
 
     def mechanism(self, shared: Any, own: Any, shift: Mapping[str, Array]) -> Mechanism:
         """The mechanism of one member. `shift` is added to what derivatives are taken by."""
-        mechanism = base = self._setting("mechanism", shared, own)
+        mechanism = self._setting("mechanism", shared, own)
         values: dict[str, Any] = {}
         for column in self.numbers:
             x = own[1][column.name] + shift.get(column.name, 0.0)
@@ -100,8 +98,7 @@ class Recipe:
         mechanism = mechanism.with_parameters(values) if values else mechanism
         parameters = {name: at(mechanism, name) + by for name, by in shift.items() if name not in own[1]}
         mechanism = mechanism.with_parameters(parameters) if parameters else mechanism
-        # A mechanism that a function built anew, of traced numbers, does not know its redundant rows.
-        return mechanism.with_left_out(base.left_out) if mechanism.left_out is None else mechanism
+        return mechanism
 
     def settings(self, shared: Any, own: Any, shift: Mapping[str, Array]) -> dict[str, Any]:
         """The settings of one member, output times among them."""
@@ -129,23 +126,24 @@ class Recipe:
         """What is kept of members: leaves of `own` have the members first, and so has what is kept."""
         if self.varied:
             mechanisms = jax.vmap(lambda own: self.mechanism(shared, own, shift))(own)
-            closures = close_all(mechanisms, self.plan.ts[0]) if self.assembled else None
+            analyses = self._setting("analysis", shared, own)
+            closures = close_all(mechanisms, self.plan.ts[0], analysis=analyses) if self.assembled else None
             return jax.vmap(lambda *x: self._run(shared, shift, *x))(own, mechanisms, closures)
         mechanism = self.mechanism(shared, own, shift) if self.names else self._setting("mechanism", shared, own)
-        closure = self._closure(shared, mechanism)
+        closure = self._closure(shared, own, mechanism)
         return jax.vmap(lambda own: self._run(shared, shift, own, mechanism, closure))(own)
 
     def single(self, shared: Any, own: Any, shift: Mapping[str, Array]) -> Kept:
         """What is kept of one member, and of no more."""
         own = jax.tree.map(lambda x: x[0], own)
         mechanism = self.mechanism(shared, own, shift)
-        found = self._run(shared, shift, own, mechanism, self._closure(shared, mechanism))
+        found = self._run(shared, shift, own, mechanism, self._closure(shared, own, mechanism))
         return jax.tree.map(lambda x: x[None], found)
 
-    def _closure(self, shared: Any, mechanism: Mechanism) -> Closure | None:
+    def _closure(self, shared: Any, own: Any, mechanism: Mechanism) -> Closure | None:
         if shared[1] is not None or not self.assembled:
             return shared[1]
-        return close(mechanism, self.plan.ts[0], forward=True)
+        return close(mechanism, self.plan.ts[0], forward=True, analysis=self._setting("analysis", shared, own))
 
     def _run(self, shared: Any, shift: Any, own: Any, mechanism: Mechanism, closure: Closure | None) -> Kept:
         settings = self.settings(shared, own, shift)

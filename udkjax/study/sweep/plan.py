@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
+from udkjax.equations.analysis import analyse
 from udkjax.equations.programs import Baumgarte
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import Column, Dimension, structure_of
@@ -206,7 +207,9 @@ def planned(
 
 def _kinds(column: Column) -> np.ndarray:
     """For each of the choices of an axis the number of its structure."""
-    structures = [structure_of(value) for value in column.values]
+    structures = [
+        (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in column.values
+    ]
     return np.array([structures.index(structure) for structure in structures])
 
 

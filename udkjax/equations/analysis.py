@@ -1,0 +1,129 @@
+"""What the numbers of a mechanism say before it moves: rank, redundant rows, and characteristic length, time and mass.
+
+Every threshold of the package that compares lengths, times or rows of unlike units takes its unit from here, so that a mechanism
+of a micrometre and one of a kilometre behave alike.
+
+The length L is the longest arm by which a constraint turns a body at the initial guess, which Psi_q tells by itself,
+|dPsi/dangle| / |dPsi/d(x, y)|, or a radius of gyration sqrt(I/m), if one is longer. It does not depend on where the origin is.
+The rate 1/T is the fastest at which anything changes there: velocities over L, roots of free accelerations a_F over L, and the
+same of the drivers. A row's scale is what a displacement of L, or a turn of one radian, changes in it.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from threading import Lock
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.equations.code import code, is_large, structure
+from udkjax.equations.layout import layout
+from udkjax.equations.redundancy import redundant_rows
+from udkjax.equations.scales import Scales, known_scales, traced_scales
+from udkjax.scene.mechanism import Mechanism
+
+MOST = 256  # analyses at hand; the one that was made first makes room
+
+
+class Analysis(eqx.Module):
+    """What `analyse` finds of a mechanism. A pytree: its scales are arrays, everything else is static."""
+
+    scales: Scales
+    coordinates: int = eqx.field(static=True)
+    row_names: tuple[tuple[str, int], ...] = eqx.field(static=True)  # of Psi: the constraint and the row within it
+    # Rows of Psi to leave out; None where they are not known: the guess cannot be closed or moved, or all numbers are traced.
+    redundant_rows: tuple[int, ...] | None = eqx.field(static=True)
+
+    @property
+    def redundant(self) -> tuple[tuple[str, int], ...]:
+        """The redundant rows by name: the constraint, and the row within it."""
+        return tuple(self.row_names[i] for i in self.redundant_rows or ())
+
+    @property
+    def rank(self) -> int | None:
+        """The rank of Psi_q outside of singular configurations; None where it is not known."""
+        return None if self.redundant_rows is None else len(self.row_names) - len(self.redundant_rows)
+
+    @property
+    def degrees_of_freedom(self) -> int | None:
+        """Coordinates less the rank; None where that is not known."""
+        return None if self.rank is None else self.coordinates - self.rank
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """The characteristic length (m)."""
+        return self.scales.length
+
+    @property
+    def time(self) -> Float[Array, ""]:
+        """The characteristic time (s); infinite where nothing moves and nothing pulls."""
+        return 1 / self.scales.rate
+
+    @property
+    def mass(self) -> Float[Array, ""]:
+        """The characteristic mass (kg): that of the heaviest body."""
+        return self.scales.mass
+
+
+def analyse(mechanism: Mechanism) -> Analysis:
+    """Find the rank, the redundant rows and the scales of a mechanism; cached by structure and numbers.
+
+    Which rows are redundant depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of
+    the known one that it was made from by `with_parameters`: rows that are left out are watched, and a run whose numbers made one
+    of them independent says so. One whose numbers are all traced, as an argument of a function under `jit`, has no origin: its
+    redundant rows stay unknown, and `Auto` then takes singular values throughout, which is right and a hundred times slower.
+    Analyse before the trace, and hand it on: `simulate(mechanism, ts, analysis=analysis)`.
+    """
+    if not mechanism.is_known:
+        if mechanism.origin is not None:
+            return analyse(mechanism.origin.mechanism)
+        mechanism = mechanism.bare
+        return Analysis(traced_scales(mechanism), 3 * len(mechanism.body_names), _row_names(mechanism), None)
+    mechanism = mechanism.bare
+    kind = structure(mechanism)
+    return _analyses.get((kind, _bytes(mechanism)), lambda: _analysed(mechanism, kind))
+
+
+class _Cache:
+    """What was made for each key, until too much was made since."""
+
+    def __init__(self):
+        self._found: OrderedDict[Any, Any] = OrderedDict()
+        self._lock = Lock()
+
+    def get(self, key: Any, make: Callable[[], Any]) -> Any:
+        with self._lock:
+            if key in self._found:
+                self._found.move_to_end(key)
+                return self._found[key]
+        found = make()
+        with self._lock:
+            self._found[key] = found
+            while len(self._found) > MOST:
+                self._found.popitem(last=False)
+        return found
+
+
+_analyses, _redundant = _Cache(), _Cache()
+
+
+def _analysed(mechanism: Mechanism, kind: Any) -> Analysis:
+    with jax.ensure_compile_time_eval():  # while something else is traced, too
+        scales = known_scales(mechanism)
+        # Masses and loads decide nothing about rows: mechanisms that differ in them alone share what was found.
+        geometry = list(mechanism.constraints.values()), mechanism.q0
+        rows = _redundant.get((kind, _bytes(geometry)), lambda: redundant_rows(mechanism))
+        return Analysis(scales, 3 * len(mechanism.body_names), _row_names(mechanism), rows)
+
+
+def _row_names(mechanism: Mechanism) -> tuple[tuple[str, int], ...]:
+    if is_large(mechanism):
+        return tuple(layout(*structure(mechanism), (), False).row_names)
+    return tuple(code(mechanism, (), False, None).equations.row_names)
+
+
+def _bytes(tree: Any) -> bytes:
+    return b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree))

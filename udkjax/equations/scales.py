@@ -1,0 +1,155 @@
+"""The characteristic length, rate and mass of a mechanism, which every threshold is relative to, and what rests on them alone.
+
+See analysis.py for what they mean. They are computed alike by NumPy, where all numbers are known, and by JAX in a trace.
+"""
+
+from functools import reduce
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from udkjax.equations.code import code, is_large, scalars, structure
+from udkjax.equations.layout import layout
+from udkjax.scene.fields import number
+from udkjax.scene.mechanism import Mechanism
+
+# Relative to the largest singular value of D: far above rounding and drift, far below the singular values of a mechanism in
+# ordinary positions. With the states returned to the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
+RANK_TOL = 1e-4
+ORDINARY = 100.0  # the ratio of masses up to which that holds: see `rank_tolerance`
+
+
+class Scales(eqx.Module):
+    """What to measure lengths, rates, masses and rows of Psi by; arrays without derivatives."""
+
+    length: Float[Array, ""]  # m
+    arm: Float[Array, ""]  # m; the longest of a constraint, masses aside; `length` where there is none
+    rate: Float[Array, ""]  # 1/s; 0 where nothing moves and nothing pulls
+    mass: Float[Array, ""]  # kg
+    rows: Float[Array, "m"]  # m, rad or whatever the row is in
+
+    @property
+    def weights(self) -> Float[Array, "m"]:
+        """What rows of D are multiplied by so that one rank threshold serves them all: 1 for rows in metres, L for radians."""
+        return self.length / self.rows
+
+    def coordinates(self, n: int) -> Float[Array, "n"]:
+        """What coordinates are measured by: L, L and one radian for each body."""
+        return jnp.tile(jnp.stack([self.length, self.length, jnp.ones_like(self.length)]), n // 3)
+
+    def size(self, q: Any, xp: Any = jnp) -> Any:
+        """The largest of a change of coordinates (n,): lengths over L, angles in rad."""
+        x = xp.abs(q.reshape(-1, 3))
+        return xp.maximum(xp.max(x[:, :2], initial=0.0) / self.length, xp.max(x[:, 2], initial=0.0))
+
+    def violation(self, psi: Any, xp: Any = jnp) -> Any:
+        """The largest of a violation (m,) of the rows of Psi, each over its scale."""
+        return xp.max(xp.abs(psi) / self.rows, initial=0.0)
+
+
+def known_scales(mechanism: Mechanism) -> Scales:
+    """The scales of a mechanism whose numbers are known, by NumPy."""
+    mechanism = jax.tree.map(np.asarray, mechanism)
+    q, v = (np.asarray(x, float).ravel() for x in (mechanism.q0, mechanism.v0))
+    with np.errstate(all="ignore"):  # what is not finite is no scale
+        found = _scales(mechanism, *(_large if is_large(mechanism) else _small)(mechanism, q, v, np), np)
+    return jax.tree.map(number, found)
+
+
+def traced_scales(mechanism: Mechanism) -> Scales:
+    """The same in a trace; without derivatives."""
+    mechanism = jax.lax.stop_gradient(mechanism)
+    q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
+    return jax.lax.stop_gradient(_scales(mechanism, *(_large if is_large(mechanism) else _small)(mechanism, q, v, jnp), jnp))
+
+
+def _small(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
+    """Where Psi_q has entries, their values, a_F, Psi_t and gamma at the initial guess, by the scene's programs."""
+    programs = code(mechanism, (), False, None)
+    rows, columns = programs.pattern.shape
+    given = [*scalars(jax.tree.leaves(mechanism)), 0.0]
+    constants = programs.prologue([*map(float, given)] if xp is np else given)
+
+    def run(name: str, v: Any) -> Any:
+        state = [0.0, *scalars([q]), *scalars([v])] if xp is jnp else [0.0, *q.tolist(), *v.tolist()]
+        return xp.stack([xp.asarray(x, float) for x in programs.program(name)([*constants, *state])])
+
+    if not rows:
+        free, root = xp.split(run("rows", v), 2)
+        none = xp.zeros(0)
+        return (np.zeros(0, int), np.zeros(0, int)), none, free, none, none
+    slots = programs.pattern.slots
+    values, b, free, root = xp.split(run("rows", v), [slots, slots + rows, slots + rows + columns])
+    psi_q = programs.pattern.dense(values, xp) / root
+    places = np.nonzero(programs.pattern.dense(np.ones(slots), np))
+    return places, psi_q[places], free, run("psi_dot", 0 * v), b + psi_q @ free
+
+
+def _large(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
+    """The same of a large scene by its blocks, without gamma: the drivers' own accelerations do not count."""
+    found = layout(*structure(mechanism), (), False)
+    numbers = found.numbers(mechanism, ())
+    _, rate, values = found.position(numbers, 0.0, q, 0 * v)
+    row, column, place = found.all.entries
+    root = xp.asarray(numbers["root"]).T.ravel()
+    entries = xp.asarray(values).ravel()[place] / root[column]
+    free = xp.tile(xp.append(xp.asarray(mechanism.gravity), 0.0), len(q) // 3)
+    return (row, column), entries, free, xp.asarray(rate), xp.zeros(found.count)
+
+
+def _scales(mechanism: Mechanism, places: Any, psi_q: Any, free: Any, psi_t: Any, gamma: Any, xp: Any) -> Scales:
+    rows, columns = places
+    bodies = mechanism.bodies.values()
+    inertia, mass = (xp.stack([xp.asarray(getattr(body, name)) for body in bodies]) for name in ("inertia", "mass"))
+    length = arm = xp.max(xp.sqrt(inertia / mass))
+    pair, of_entry = np.unique(rows * len(mass) + columns // 3, return_inverse=True)  # of a row and a body
+    turns = columns % 3 == 2
+
+    def summed(values: Any) -> Any:
+        if xp is np:
+            return np.bincount(of_entry, values, len(pair))
+        return jnp.zeros(len(pair)).at[of_entry].add(values)
+
+    moved = xp.sqrt(summed(xp.where(turns, 0.0, psi_q**2)))
+    turned = summed(xp.where(turns, xp.abs(psi_q), 0.0))
+    if len(pair):
+        by_place = moved > jnp.finfo(float).eps * xp.max(moved)
+        arm = xp.where(by_place, turned / xp.where(by_place, moved, 1.0), 0.0)
+        arm = xp.max(xp.where(xp.isfinite(arm), arm, 0.0))
+        arm = xp.where(arm > 0.0, arm, length)
+        length = xp.maximum(length, arm)
+    change = xp.maximum(moved * length, turned)
+    row, count = pair // len(mass), len(psi_t)
+    if xp is np:
+        scale = np.zeros(count)
+        np.maximum.at(scale, row, change)
+    else:
+        scale = jnp.zeros(count).at[row].max(change)
+    scale = xp.where(xp.isfinite(scale) & (scale > 0.0), scale, length)  # a row that nothing moves here: as if in metres
+
+    def fastest(x: Any) -> Any:
+        return xp.max(xp.where(xp.isfinite(x), xp.abs(x), 0.0), initial=0.0)
+
+    unit = xp.tile(xp.stack([length, length, xp.ones_like(length)]), len(mass))
+    v = xp.asarray(mechanism.v0).ravel()
+    rates = [fastest(v / unit), xp.sqrt(fastest(free / unit)), fastest(psi_t / scale), xp.sqrt(fastest(gamma / scale))]
+    return Scales(length, arm, reduce(xp.maximum, rates), xp.max(mass), scale)
+
+
+def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:
+    """Return `RANK_TOL`, less where masses are far apart.
+
+    Where a light body carries a heavy one the singular values of D = Psi_q M^(-1/2) are as far apart as the roots of the masses,
+    in any position: a ratio of 1e8 brings a constraint between them down to 1e-4 of the largest.
+    """
+    masses = [body.mass for body in mechanism.bodies.values()]
+    known = not any(isinstance(mass, Tracer) for mass in masses)
+    xp: Any = np if known else jnp  # while something else is traced, jnp would trace what is known, too
+    masses = [xp.asarray(mass) for mass in masses]
+    ratio = reduce(xp.minimum, masses) / reduce(xp.maximum, masses)
+    return jax.lax.stop_gradient(number(RANK_TOL * xp.minimum(1.0, xp.sqrt(ORDINARY * ratio))))
