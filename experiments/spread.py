@@ -22,6 +22,7 @@ that their size does not matter: it is exact to rounding for all masses. The lin
 the condition of the coupler's rotation, by every method; the rods' lengths cost nothing.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -118,14 +119,16 @@ def families(smoke: bool) -> dict[str, tuple[np.ndarray, list[udk.Mechanism], np
     result = {}
     for name, (decades, make, exact) in found.items():
         mechanisms = [make(s) for s in decades]
-        same = [mech.with_left_out(mechanisms[0].left_out) for mech in mechanisms]
-        result[name] = decades, same, np.array([exact(mech) for mech in mechanisms])
+        result[name] = decades, mechanisms, np.array([exact(mech) for mech in mechanisms])
     return result
 
 
-def stacked(mechanisms: list[udk.Mechanism]) -> Any:
-    """Return mechanisms as one, whose numbers have an axis in front."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *mechanisms)
+def stacked(mechanisms: list[udk.Mechanism]) -> tuple[Any, Any]:
+    """Return mechanisms as one, whose numbers have an axis in front, and so their analyses, with the first's redundant rows."""
+    analyses = [udk.analyse(mech) for mech in mechanisms]
+    analyses = [dataclasses.replace(found, redundant_rows=analyses[0].redundant_rows) for found in analyses]
+    mechs, found = (jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees) for trees in (mechanisms, analyses))
+    return mechs, found
 
 
 def accelerations(mechanisms: list[udk.Mechanism], make: Any) -> np.ndarray:
@@ -134,7 +137,8 @@ def accelerations(mechanisms: list[udk.Mechanism], make: Any) -> np.ndarray:
     @eqx.filter_jit
     def run(tols, mechanisms):
         def one(tol):
-            return jax.lax.map(lambda m: udk.accelerations(m, 0.0, m.q0, m.v0, make(rank_tol=tol)), mechanisms)
+            method = make(rank_tol=tol)
+            return jax.lax.map(lambda x: udk.accelerations(x[0], 0.0, x[0].q0, x[0].v0, method, analysis=x[1]), mechanisms)
 
         return jax.lax.map(one, tols)
 
@@ -156,10 +160,10 @@ def runs(mechanisms: list[udk.Mechanism], make: Any) -> np.ndarray:
 
     @eqx.filter_jit
     def run(tols, mechanisms, ts):
-        def one(mech: Any, ts: Any, tol: Any):
-            state = udk.State(mech.q0, mech.v0)
-            sol = udk.simulate(mech, ts, state, TOL, TOL, make(rank_tol=tol), max_steps=20_000, throw=False, drift_tol=jnp.inf)
-            return sol.q[:, :3, 2]
+        def one(given: Any, ts: Any, tol: Any):
+            mech, analysis = given
+            choices: dict[str, Any] = {"max_steps": 20_000, "throw": False, "drift_tol": jnp.inf, "analysis": analysis}
+            return udk.simulate(mech, ts, udk.State(mech.q0, mech.v0), TOL, TOL, make(rank_tol=tol), **choices).q[:, :3, 2]
 
         return jax.lax.map(lambda tol: jax.lax.map(lambda x: one(x[0], x[1], tol), (mechanisms, ts)), tols)
 
@@ -184,7 +188,6 @@ def study(smoke: bool) -> xarray.Dataset:
     for family, sizes in () if smoke else (("masses", {"spread": SPREADS}), ("lengths", {"decade": np.arange(-3.0, 4.0)})):
         ((key, values),) = sizes.items()
         mechanisms = [linkage(**{key: s, "rate": 0.0}) for s in values]
-        mechanisms = [mech.with_left_out(mechanisms[0].left_out) for mech in mechanisms]
         errors = [runs(mechanisms, METHODS[n]) for n in tracked(RUN, f"spread, runs, {family}")]
         variables[f"{family}_run"] = (
             ("run_by", "threshold", f"decades_{family}"),

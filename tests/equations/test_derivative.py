@@ -91,7 +91,7 @@ def test_the_end_of_a_step_is_a_projection_and_the_accelerations_there(scene, or
     The error has no derivative.
     """
     mechanism = driven() if scene == "driven" else getattr(udk.library, scene)()
-    random = np.random.default_rng(1)
+    random, analysis = np.random.default_rng(1), udk.analyse(mechanism)
     q, v = (x.ravel() + 1e-7 * random.standard_normal(x.size) for x in (mechanism.q0, mechanism.v0))
     inputs = (mechanism, jnp.array(0.3), q, v)
     dots = jax.tree.map(lambda x: jnp.asarray(random.standard_normal(np.shape(x))), inputs)
@@ -111,7 +111,7 @@ def test_the_end_of_a_step_is_a_projection_and_the_accelerations_there(scene, or
 
     def derivatives(form, mechanism, t, q, v):
         def function(mechanism, t, q, v):
-            return form(prepare(mechanism, udk.Auto(), large=False).quick, t, q, v)
+            return form(prepare(mechanism, udk.Auto(), large=False, analysis=analysis).quick, t, q, v)
 
         def along(*at):
             return jax.jvp(function, at, dots)
@@ -121,7 +121,7 @@ def test_the_end_of_a_step_is_a_projection_and_the_accelerations_there(scene, or
         return along(*at) if order == 1 else jax.jvp(along, at, dots), inner(jax.vjp(function, *at)[1](weights), dots)
 
     def closed(mechanism, t, q, v):
-        close = lambda _, state: prepare(mechanism, udk.Auto(), large=False).project(t, *state)  # noqa: E731
+        close = lambda _, state: prepare(mechanism, udk.Auto(), large=False, analysis=analysis).project(t, *state)  # noqa: E731
         q, v = jax.lax.fori_loop(0, 6, close, (q, v))
         return mechanism, t, q + 1e-9 * jnp.cos(jnp.arange(q.size)), v + 1e-9
 

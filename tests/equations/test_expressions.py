@@ -143,7 +143,6 @@ def mech():
             "gust": Drag(["a", "ground"], jnp.array([[0.4, 0.1], [0.0, 0.7]])),
         },
         gravity=(0.3, -9.81),
-        left_out=(),  # not looked for
     )
 
 

@@ -53,7 +53,7 @@ def test_what_waits_for_nothing_is_handed_to_no_other_thread(derived, count):
     def angle(values):
         changed = mechanism.with_parameters(dict(zip(names, values, strict=False)))
         start, forward = udk.State(mechanism.q0, mechanism.v0), diffrax.ForwardMode()
-        return udk.simulate(changed, TS[:2], start, adjoint=forward, careful=False, throw=False).q[-1, 0, 2]
+        return udk.simulate(changed, TS[:2], start, adjoint=forward, throw=False).q[-1, 0, 2]
 
     text = jax.jit(derived(angle)).lower((1.0,) * count).compile().as_text() or ""
     assert 0 < ready(text.split("\nENTRY")[1]) <= READY
@@ -70,20 +70,19 @@ def test_a_run_walked_back_starts_few_operations():
     assert len(started(jax.jit(jax.grad(angle)).lower(1.0).compile().as_text() or "")["ENTRY"]) <= 40
 
 
-def compiled(mechanism, careful):
-    run = lambda state, tol: udk.simulate(mechanism, TS, state, tol, tol, careful=careful, throw=False).q  # noqa: E731
+def compiled(mechanism):
+    run = lambda state, tol: udk.simulate(mechanism, TS, state, tol, tol, throw=False).q  # noqa: E731
     return started(jax.jit(run).lower(udk.assemble(mechanism), jnp.asarray(1e-8)).compile().as_text() or "")
 
 
-@pytest.mark.parametrize("careful", [True, False])
-def test_a_run_starts_few_operations(careful):
+def test_a_run_starts_few_operations():
     """The steps are one function, the outputs another; only steps that want care are in neither."""
-    computations = compiled(udk.library.parallelogram(), careful)
+    computations = compiled(udk.library.parallelogram())
     entry = computations["ENTRY"]
     assert len(entry) <= 26
-    assert sum("xla_cpu_small_call" in line for line in entry) == 2 - careful
+    assert sum("xla_cpu_small_call" in line for line in entry) == 1
     loops = [name for line in entry if " while(" in line for name in re.findall(r"body=%?([\w.\-]+)", line)]
-    assert len(loops) == careful
+    assert len(loops) == 1
     for body in loops:
         assert len(computations[body]) <= SEQUENTIAL
         assert sum("xla_cpu_small_call" in line for line in computations[body]) == 1
@@ -97,7 +96,7 @@ def test_lanes_of_many_coordinates_are_one_function_too():
     pins = {f"pin{k}": udk.Revolute(["ground", f"rod{k}"], [[k, 0.0], [0.0, 0.75]]) for k in range(count)}
     mechanism = udk.Mechanism(rods, pins)
     start = udk.State(mechanism.q0, mechanism.v0)
-    run = jax.vmap(lambda tol: udk.simulate(mechanism, TS[:2], start, tol, tol, careful=False, throw=False).q)
+    run = jax.vmap(lambda tol: udk.simulate(mechanism, TS[:2], start, tol, tol, throw=False).q)
     entry = started(jax.jit(run).lower(np.full(LANES, 1e-8)).compile().as_text() or "")["ENTRY"]
     in_lanes = [line for line in entry if f"[{3 * count},{LANES}]" in line]
     assert any("xla_cpu_small_call" in line for line in in_lanes)

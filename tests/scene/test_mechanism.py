@@ -86,9 +86,18 @@ def test_the_constants_of_gears_follow_the_initial_guess(everything, psi):
     )  # an ordinary parameter since it was made
 
 
-def test_rows_left_out_are_kept(everything):
-    known = udk.Mechanism(everything.bodies, everything.joints, everything.drivers, everything.forces, left_out=(3, 5))
-    assert known.with_parameters({"gravity": [0.0, 0.0]}).left_out == (3, 5)
+def test_traced_numbers_remember_the_known_ones_that_they_were_made_from(everything):
+    seen = []
+
+    @jax.jit
+    def twice(mass):
+        once = everything.with_parameters({"body.a.mass": mass})
+        seen.extend([once.origin, once.with_parameters({"gravity": [0.0, 0.0]}).origin])
+        return once.with_parameters({"body.b.mass": mass}).bodies["a"].mass
+
+    twice(2.0)
+    assert seen[0] is not None and seen[0] == seen[1] and seen[0].mechanism is everything
+    assert everything.origin is None and everything.with_parameters({"body.a.mass": 2.0}).origin is None
 
 
 @pytest.mark.parametrize(

@@ -160,7 +160,7 @@ def test_a_loop_of_gigabytes_holds_none(linkage):
 
     def lowered(outputs):
         ts = jax.ShapeDtypeStruct((outputs,), float)
-        return jax.jit(lambda ts: udk.simulate(linkage, ts, throw=False, careful=False).q[-1]).lower(ts)
+        return jax.jit(lambda ts: udk.simulate(linkage, ts, throw=False).q[-1]).lower(ts)
 
     few, many = lowered(100), lowered(10**6)
     assert fusions(few.as_text()) == 4  # accelerations, what ends a step (two); and projection of the outputs

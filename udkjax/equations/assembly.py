@@ -71,11 +71,10 @@ class Closure(NamedTuple):
     @property
     def is_closed(self) -> Any:
         """Whether the residuals are within `CLOSED` of the scene's scales, or rounding."""
-        parts = (self.state.q.ravel(), self.state.v.ravel(), self.psi, self.psi_dot)
-        if not _known(self):
-            return is_closed(self.scales, *parts, jnp)
-        scales, *parts = jax.tree.map(np.asarray, (self.scales, *parts))
-        return is_closed(scales, *parts, np)
+        given: Any = self.scales, self.state.q, self.state.v, self.psi, self.psi_dot
+        xp: Any = np if _known(given) else jnp
+        scales, q, v, psi, psi_dot = jax.tree.map(xp.asarray, given)
+        return is_closed(scales, q.ravel(), v.ravel(), psi, psi_dot, xp)
 
 
 def assemble(
@@ -213,7 +212,9 @@ def check(mechanism: Mechanism) -> Check:
     )
 
 
-_closed = jax.custom_jvp(close_position)
+@jax.custom_jvp
+def _closed(rows: TracedRows, t: Any, q: Any) -> Any:
+    return close_position(rows, t, q)
 
 
 def _closed_forward(rows: TracedRows, t: Any, q: Any) -> Any:

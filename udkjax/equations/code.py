@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from udkjax.equations.derivative import Derivative
 from udkjax.equations.expressions import Expressions, expressions
-from udkjax.pinv.sparse import Factors, Row, absolute, all_of, factorize, greater, multipliers, pattern, transpose_times
+from udkjax.pinv.sparse import Factors, Row, absolute, all_of, at_least, factorize, multipliers, pattern, transpose_times
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Program, Scalar, frontier, vector
 
@@ -139,8 +139,7 @@ class Code:
         terms = [entry * (a[k] - self.equations.free[k]) for k, entry in self.equations.psi_q[i].items()]
         b = self.b(i)
         size = sum((absolute(term) for term in terms), absolute(b))
-        missed = greater(absolute(sum(terms, zero) - b), size * CONSISTENT)
-        return self.graph.constant(1.0) - missed
+        return at_least(size * CONSISTENT, absolute(sum(terms, zero) - b))
 
     def program(self, name: str) -> Program:
         if name not in self._programs:

@@ -56,7 +56,7 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
     """
     if not equations.eliminates:
         return plain_project(equations, t, q, v), (jnp.array(True), jnp.array(False))
-    program = equations.code.program("nearer")
+    program, far = equations.code.program("nearer"), FAR * equations.scales.length
 
     # On scalars until all is done: vectors that a loop carries have the batch first under vmap, where the programs have it last.
 
@@ -67,12 +67,12 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
         return k + 1, q1, v1, _largest_change(equations, q1, q), safe & still
 
     def more(state: Any) -> Any:
-        return (state[0] < steps) & ~(state[3] <= FAR)
+        return (state[0] < steps) & ~(state[3] <= far)
 
     vs = scalars([v])
     start = 0, scalars([q]), vs, jnp.inf, jnp.array(True)
     _, *found, change, safe = jax.lax.while_loop(more, nearer, start)
-    found, moving = [stacked(x) for x in found], ~(change <= FAR)
+    found, moving = [stacked(x) for x in found], ~(change <= far)
     if equations.branches:
         return _branched(equations, safe, tuple(found), plain_project, t, q, v), (jnp.array(True), moving & safe)
     return tuple(found), (safe if _checks(equations) else jnp.array(True), moving)
@@ -97,7 +97,7 @@ def finished(
 @jax.custom_jvp
 def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector, changes: tuple[Vector, ...]) -> tuple[Any, Any, Any]:
     """q, v and a, numbers in any case; what is left of changes; how far the end is from singular, whether to be trusted."""
-    program = equations.code.program("closer")
+    program, far = equations.code.program("closer"), NEWTON_FAR * equations.scales.length
 
     def closer(state: Any) -> Any:
         k, q, _, safe = state
@@ -106,7 +106,7 @@ def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector, changes: tupl
 
     vs = scalars([v])
     start = 0, scalars([q]), jnp.inf, jnp.array(True)
-    _, found, _, safe = jax.lax.while_loop(lambda s: (s[0] < STEPS) & ~(s[2] <= NEWTON_FAR), closer, start)
+    _, found, _, safe = jax.lax.while_loop(lambda s: (s[0] < STEPS) & ~(s[2] <= far), closer, start)
     q = stacked(found)
     *found, still = equations.call(equations.code.program("finish" if changes else "arrival"), t, q, v, *changes)
     distance = found.pop() if changes else jnp.inf  # who asks for no changes does not ask how far, either
@@ -115,10 +115,10 @@ def _arrived(equations: "Equations", t: Any, q: Vector, v: Vector, changes: tupl
 
 
 def _largest_change(equations: "Equations", new: Sequence[Array], old: Sequence[Array]) -> Array:
-    """Of any coordinate: lengths over the characteristic length, angles in rad."""
+    """Of any coordinate (m), angles times the characteristic length."""
     changes = [jnp.abs(x - y) for x, y in zip(new, old, strict=True)]
     lengths = _largest([x for k, x in enumerate(changes) if k % 3 < 2])
-    return jnp.maximum(lengths / equations.scales.length, _largest(changes[2::3]))
+    return jnp.maximum(lengths, equations.scales.length * _largest(changes[2::3]))
 
 
 def _largest(numbers: list[Array]) -> Array:

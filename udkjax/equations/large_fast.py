@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from udkjax.equations.code import CONSISTENT, TINY
+from udkjax.equations.code import CONSISTENT
 from udkjax.equations.large_plain import branch, plain_accelerations, plain_correction, plain_project, plain_tangential
 from udkjax.equations.motion import FAR, NEAR, Tangential, Vector
 from udkjax.pinv.block_methods import factorized, solved
@@ -39,7 +39,7 @@ def _satisfied(equations: "LargeEquations", t: Any, q: Vector, v: Vector, free: 
     rows = equations.layout.all
     D, b = equations.arrays(rows, ["D", "b"], t, q, v, free)
     sum_of = rows.pattern.matvec
-    return jnp.all(jnp.abs(sum_of(D, x) - b) <= CONSISTENT * (sum_of(jnp.abs(D), jnp.abs(x)) + jnp.abs(b)) + TINY)
+    return jnp.all(jnp.abs(sum_of(D, x) - b) <= CONSISTENT * (sum_of(jnp.abs(D), jnp.abs(x)) + jnp.abs(b)))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(4,))
@@ -80,7 +80,7 @@ def _fast_project(equations: "LargeEquations", t: Any, q: Vector, v: Vector, ste
         factors, still = factorized(rows.pattern, D, equations.drop, loop=equations.loop)
         y = solved(rows.pattern, factors, jnp.where(closed, psi_dot, psi), equations.loop)
         x = flat(root * rows.pattern.rmatvec(D, y))
-        near = (jnp.max(jnp.abs(x)) <= FAR) | (k + 1 >= steps)
+        near = (equations.size(x) <= FAR) | (k + 1 >= steps)
         return k + 1, jnp.where(closed, q, q - x), jnp.where(closed, v - x, v), near, closed, safe & still
 
     start = 0, q, v, *(jnp.array(x) for x in (False, False, True))

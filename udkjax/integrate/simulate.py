@@ -144,7 +144,7 @@ def _simulate(
     fallback,
     moving,
 ):
-    """Return the solution, whether it takes rows that the method leaves out, and whether it takes a fallback that is not there."""
+    """Return the solution, whether it takes rows that the method leaves out, and whether it wants a fallback not there."""
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
     equations = equations_of(mechanism, method, baumgarte, formulation, moving, analysis)
     projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, Partitioned))

@@ -218,6 +218,11 @@ def greater(a: Scalar, b: Scalar) -> Scalar:
     return a.graph.apply(lax.gt_p, {}, (a, b), bool, np.greater)
 
 
+def at_least(a: Scalar, b: Scalar) -> Scalar:
+    """a >= b."""
+    return a.graph.apply(lax.ge_p, {}, (a, b), bool, np.greater_equal)
+
+
 def larger(a: Scalar, b: Scalar) -> Scalar:
     """max(a, b)."""
     return a.graph.apply(lax.max_p, {}, (a, b), a.node.dtype, np.maximum)

@@ -119,7 +119,7 @@ def test_a_tie_that_is_legal_at_one_position_only_is_refused(monkeypatch):
     There the mechanism closes, and its rank is what it was: to first order, at that position, nothing is wrong.
     """
     mechanism, arms, angle = triangle()
-    assert mechanism.left_out is not None and len(mechanism.left_out) == 1
+    assert len(udk.analyse(mechanism).redundant) == 1
     e = np.array([np.cos(angle), np.sin(angle)])
 
     def apply(mechanism, x):
@@ -175,7 +175,7 @@ def test_bars_of_a_scissor_lift_stay_equal_in_pairs():
 def test_loops_of_which_none_is_overconstrained_move_freely(compilations):
     """Four-bars in a row have rows that depend on each other in singular configurations alone: nothing is looked at."""
     bars = udk.library.n_four_bar(3)
-    assert bars.left_out == ()
+    assert udk.analyse(bars).redundant_rows == ()
     apply = lengths("link0", "link1", "coupler2")
     assert compilations(lambda: illegal(bars, apply, [1.0, 1.0, 1.0], ["a", "b", "c"])) == []
     assert illegal(bars, apply, [1.0, 1.0, 1.0], ["a", "b", "c"]) == []

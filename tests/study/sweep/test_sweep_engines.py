@@ -72,7 +72,7 @@ def cart():
 
 @pytest.mark.slow
 def test_rows_that_become_independent_count_again(cart):
-    assert cart.left_out == (2,)
+    assert udk.analyse(cart).redundant_rows == (2,)
     ts = [0.0, 0.5, 1.0]
     data = udk.sweep(cart, {"axis": udk.Axis([0.0, 0.3], of="joint.c.axis")}, ts, "states", progress=False)
     for k, axis in enumerate((0.0, 0.3)):
