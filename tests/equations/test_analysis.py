@@ -1,0 +1,106 @@
+"""What `analyse` says of a mechanism, whatever was imported or analysed before."""
+
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations import closing, redundancy
+
+
+def test_a_duplicated_joint_is_named():
+    plain = udk.library.four_bar()
+    first = next(iter(plain.joints))
+    doubled = udk.analyse(udk.Mechanism(plain.bodies, {**plain.joints, "again": plain.joints[first]}))
+    own = udk.analyse(plain)
+    assert own.redundant == () and own.degrees_of_freedom == doubled.degrees_of_freedom == 1
+    assert doubled.redundant == (("again", 0), ("again", 1)) and doubled.rank == own.rank
+
+
+def test_the_length_is_that_of_the_longest_arm_wherever_the_origin_is():
+    mechanism = udk.library.parallelogram()
+    assert_allclose(udk.analyse(mechanism).length, 1.0)  # the coupler's, from its centre of mass to a pin
+    assert_allclose(udk.analyse(mechanism).time, np.sqrt(1.0 / 9.81))
+    away = {name: value + 1e3 for name, value in mechanism.parameters().items() if name.endswith("position")}
+    pins = {f"joint.A{k}.points": np.asarray(mechanism.joints[f"A{k}"].points) + [[1e3, 1e3], [0.0, 0.0]] for k in (1, 2, 3)}
+    moved = udk.analyse(mechanism.with_parameters(away | pins))
+    assert_allclose(moved.length, 1.0, rtol=1e-12)
+    assert moved.redundant_rows == udk.analyse(mechanism).redundant_rows
+
+
+def test_what_the_rows_are_measured_by():
+    """A row in metres changes by L where its body moves by L; one in radians by one; a gear's by its radius."""
+    scales = udk.analyse(udk.library.planetary_gear()).scales
+    names = udk.analyse(udk.library.planetary_gear()).row_names
+    block = udk.Mechanism({"block": udk.Body(1.0, 0.04)}, {"rail": udk.Prismatic(["ground", "block"], np.zeros((2, 2)), 0.0)})
+    assert_allclose(udk.analyse(block).scales.rows, [0.2, 1.0])
+    assert_allclose(udk.analyse(block).scales.weights, [1.0, 0.2])
+    assert len(names) == len(scales.rows)
+
+
+def test_masses_and_loads_decide_nothing_about_rows(monkeypatch):
+    """Mechanisms that differ in these alone share what was found."""
+    mechanism = udk.library.parallelogram(-0.6)
+    udk.analyse(mechanism)
+    monkeypatch.setattr("udkjax.equations.analysis.redundant_rows", None)
+    for name in ("body.coupler.mass", "body.link1.inertia", "gravity"):
+        changed = mechanism.with_parameters({name: 2.0 * mechanism.parameters()[name]})
+        assert udk.analyse(changed).redundant_rows == udk.analyse(mechanism).redundant_rows
+
+
+def test_a_traced_mechanism_has_the_analysis_of_the_known_one_that_it_was_made_from():
+    mechanism, seen = udk.library.parallelogram(), []
+
+    @jax.jit
+    def trace(mass, whole):
+        seen.append(udk.analyse(mechanism.with_parameters({"body.coupler.mass": mass})))
+        seen.append(udk.analyse(whole))
+        return mass
+
+    trace(1.5, mechanism)
+    assert seen[0] is udk.analyse(mechanism)
+    assert seen[1].redundant_rows is None and seen[1].rank is None and seen[1].row_names == seen[0].row_names
+
+
+@pytest.mark.parametrize("first", ["udkjax", "udkjax.equations", "udkjax.scene"])
+def test_nothing_depends_on_the_order_of_imports(first):
+    code = f"""
+import {first}
+from udkjax.scene import library
+mechanism = library.parallelogram()
+import udkjax as udk
+print(udk.analyse(mechanism).redundant_rows, udk.accelerations(mechanism, 0.0, mechanism.q0, mechanism.v0)[0, 2])
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split(") ")
+    assert found[0] == "(9,"
+    assert_allclose(float(found[1]), -3.5 * 9.81 * np.cos(-np.pi / 4) / 3.05, rtol=1e-12)
+
+
+THRESHOLDS = [(closing, "CLOSED"), (closing, "ROUNDING"), (closing, "STRIDE"), (redundancy, "RANK_TOL"), (redundancy, "CLEAR")]
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+@pytest.mark.parametrize(("module", "name"), THRESHOLDS, ids=[name for _, name in THRESHOLDS])
+def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, module, name, factor):
+    """The same rows are redundant, and what closed closes, to rounding."""
+    scenes = {
+        kind: getattr(udk.library, kind)()
+        for kind in ("parallelogram", "scissor_lift", "planetary_gear", "peaucellier", "excavator")
+    }
+    expected = {kind: udk.analyse(mechanism).redundant_rows for kind, mechanism in scenes.items()}
+    monkeypatch.setattr(module, name, factor * getattr(module, name))
+    if module is closing and hasattr(redundancy, name):
+        monkeypatch.setattr(redundancy, name, factor * getattr(redundancy, name))
+    for kind, mechanism in scenes.items():
+        rows = redundancy.redundant_rows(mechanism)
+        assert rows is not None and len(rows) == len(expected[kind])
+        scales = udk.analyse(mechanism).scales
+        off = mechanism.q0.ravel() + 1e-3 * scales.coordinates(3 * len(mechanism.bodies)) * np.cos(np.arange(mechanism.q0.size))
+        *_, psi, psi_dot, _ = closing.DenseRows(mechanism, scales).assembled(
+            0.0, np.asarray(off), np.asarray(mechanism.v0).ravel()
+        )
+        assert np.max(np.abs(psi) / np.asarray(scales.rows)) < 1e-11 and np.abs(psi_dot).max() < 1e-9

@@ -1,0 +1,116 @@
+"""A mechanism of a micrometre behaves as one of a kilometre, in milliseconds or seconds, of milligrams or tons."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from tests.scaling import scaled
+
+SCENES = {
+    "parallelogram": udk.library.parallelogram,
+    "excavator": udk.library.excavator,
+    "slider crank": udk.library.slider_crank,
+    "planetary gear": udk.library.planetary_gear,
+    "trammel": udk.library.elliptic_trammel,
+}
+UNITS = [
+    (1e-6, 1.0, 1.0),
+    (1e-3, 1.0, 1.0),
+    (1e3, 1.0, 1.0),
+    (1.0, 1e-3, 1.0),
+    (1.0, 1.0, 1e-9),
+    (1.0, 1.0, 1e6),
+    (1e-6, 1e-3, 1e-9),
+]
+TS = np.linspace(0.0, 2.0, 21)
+TOL = 1e-9
+# Rounding errors of the first, tiny steps and of interpolation, over what they are divided by: far below the tolerance. Of rates
+# there are more: second differences of positions are among what they are interpolated from.
+POSITION, RATE = 1e-10, 2e-9
+
+
+def deviation(mechanism, units, method=None):
+    """How far the motion in other units is from that in our own: coordinates and velocities, in our own."""
+    length, time, _ = units
+    run = lambda mech, ts: udk.simulate(mech, ts, rtol=TOL, atol=TOL, method=method)  # noqa: E731
+    own, other = run(mechanism, TS), run(scaled(mechanism, *units), TS * time)
+    unit = np.array([length, length, 1.0])
+    return np.abs(other.q / unit - own.q).max(), np.abs(other.v * time / unit - own.v).max()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_motion_is_the_same_in_all_units(name):
+    for units in UNITS:
+        dq, dv = deviation(SCENES[name](), units)
+        assert dq < POSITION and dv < RATE, units
+
+
+@pytest.mark.parametrize("method", [udk.SVD(), udk.Varga()], ids=["SVD", "Varga"])
+def test_and_by_methods_that_compare_rows_of_metres_with_rows_of_radians(method):
+    for units in UNITS:
+        dq, dv = deviation(udk.library.slider_crank(), units, method)
+        assert dq < POSITION and dv < RATE, units
+
+
+@pytest.mark.parametrize("name", [*SCENES, "scissor lift"])
+def test_the_analysis_is_the_same_in_all_units(name):
+    mechanism = (SCENES | {"scissor lift": udk.library.scissor_lift})[name]()
+    own = udk.analyse(mechanism)
+    for units in UNITS:
+        other = udk.analyse(scaled(mechanism, *units))
+        assert (other.redundant, other.rank, other.degrees_of_freedom) == (own.redundant, own.rank, own.degrees_of_freedom)
+        assert_allclose([other.length, other.time, other.mass], np.multiply(units, [own.length, own.time, own.mass]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("units", UNITS)
+def test_the_same_is_refused_in_all_units(units):
+    """A loop that is one percent out of closure does not close, however small it is; nor does one that an offset breaks."""
+    mechanism = scaled(udk.library.parallelogram(), *units)
+    point = np.asarray(mechanism.parameters()["joint.B2.points"])
+    for off in (0.01, 1e-6):
+        opened = mechanism.with_parameters({"joint.B2.points": point + off * units[0] * np.array([[1.0, 0.0], [0.0, 0.0]])})
+        with pytest.raises(udk.AssemblyError, match="B2"):
+            udk.assemble(opened)
+        assert not udk.check(opened).closed
+    assert udk.check(mechanism).closed and udk.check(mechanism).redundant == (("B2", 1),)
+
+
+@pytest.mark.parametrize("radius", [1.0, 1e-2, 1e-4, 1e-7])
+def test_a_block_on_a_rail_is_held_however_small_its_radius_of_gyration(radius):
+    """One row of a prismatic joint is in metres, the other in radians."""
+    block = udk.Mechanism(
+        {"block": udk.Body(2.0, 2.0 * radius**2)}, {"rail": udk.Prismatic(["ground", "block"], np.zeros((2, 2)), 0.0)}
+    )
+    for method in (udk.SVD(), udk.Varga(), udk.Auto()):
+        sol = udk.simulate(block, [0.0, 1.0], method=method)
+        assert_allclose(sol.q, 0.0, atol=1e-12)
+        assert_allclose(udk.reactions(block, sol, method)["rail"]["block"][-1], [0.0, 2.0 * 9.81, 0.0], atol=1e-9)
+
+
+def test_reactions_are_the_same_in_all_units():
+    mechanism = udk.library.slider_crank()
+    own = udk.reactions(mechanism, udk.simulate(mechanism, TS))
+    for length, time, mass in UNITS:
+        small = scaled(mechanism, length, time, mass)
+        other = udk.reactions(small, udk.simulate(small, TS * time))
+        force = mass * length / time**2
+        for name, bodies in own.items():
+            for body, load in bodies.items():
+                size = float(jnp.abs(load).max())
+                assert_allclose(other[name][body] / (force * np.array([1.0, 1.0, length])), load, rtol=0, atol=1e-8 * (1 + size))
+
+
+def test_under_jit_a_call_computes_the_same():
+    """Within rounding: the programs are compiled apart."""
+    mechanism = udk.library.parallelogram(0.3, -1.0)
+    analysis, eager = udk.analyse(mechanism), udk.simulate(mechanism, TS)
+    for function, argument in (
+        (lambda m: udk.simulate(mechanism.with_parameters({"body.coupler.mass": m}), TS), mechanism.bodies["coupler"].mass),
+        (lambda mech: udk.simulate(mech, TS, analysis=analysis), mechanism),
+    ):
+        found = jax.jit(function)(argument)
+        assert_allclose(found.q, eager.q, rtol=0, atol=1e-10)
+        assert int(found.code) == int(eager.code)
