@@ -18,6 +18,7 @@ from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, t
 from udkjax.equations.motion import FAR as NEWTON_FAR
 from udkjax.equations.motion import STEPS, Closed, Tangential, Vector
 from udkjax.equations.plain import plain_accelerations, plain_project, plain_tangential
+from udkjax.pinv import SVD
 from udkjax.straightline import along
 
 if TYPE_CHECKING:
@@ -75,13 +76,13 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
     found, moving = [stacked(x) for x in found], ~(change <= far)
     if equations.branches:
         return _branched(equations, safe, tuple(found), plain_project, t, q, v), (jnp.array(True), moving & safe)
-    return tuple(found), (safe if _checks(equations) else jnp.array(True), moving)
+    return tuple(found), (safe if equations.refuses else jnp.array(True), moving)
 
 
 def arrived(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector]:
     """q and v on the manifold, and the accelerations there: by Newton steps in position, and one program of all the rest."""
     found, _, (_, safe) = _arrived(equations, t, q, v, ())
-    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if _checks(equations) else found
+    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if equations.refuses else found
     return q, v, a
 
 
@@ -90,7 +91,7 @@ def finished(
 ) -> tuple[Vector, Vector, Vector, Tangential]:
     """`arrived`, and what projection leaves of small changes there, by the same program."""
     found, (dq, dv), (distance, safe) = _arrived(equations, t, q, v, (dq, dv))
-    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if _checks(equations) else found
+    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if equations.refuses else found
     return q, v, a, Tangential(dq, dv, distance)
 
 
@@ -138,19 +139,14 @@ def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector,
 
 
 def _checked(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
-    """Take what elimination gave where its pivots are safe, or where it drops the others itself; else turn to singular values."""
+    """Take what elimination gave where its pivots are safe, or their rows dropped; else do as the policy says."""
     if equations.branches:
         return _branched(equations, safe, fast, plain, *state)
-    return jnp.where(safe, fast, jnp.nan) if _checks(equations) else fast
-
-
-def _checks(equations: "Equations") -> bool:
-    """Whether to mark what pivots that are not safe have to do with, instead of dropping their rows."""
-    return equations.doubt and equations.code.elimination == "check"
+    return jnp.where(safe, fast, jnp.nan) if equations.refuses else fast
 
 
 def _branched(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
-    return jax.lax.cond(safe, lambda: fast, lambda: plain(equations.exact(), *state))
+    return jax.lax.cond(safe, lambda: fast, lambda: plain(equations.by(SVD), *state))
 
 
 # --- derivatives

@@ -49,11 +49,7 @@ class GeneralEquations(Motion):
     def branches(self) -> bool:
         return False
 
-    @property
-    def quick(self) -> "GeneralEquations":
-        return self
-
-    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         free, weight, plus, b = self._equation(t, q, v)
         return free if plus is None else free + weight(plus @ b)
 

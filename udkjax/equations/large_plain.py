@@ -83,7 +83,7 @@ def by_method(equations: "LargeEquations", use: Any, t: Any, q: Vector, v: Vecto
     plus = equations.elimination.plus(equations.arrays(layout.kept, ["D"], t, q, v)[0])
     if not equations.branches:
         return use(plus, layout.kept)
-    return branch(plus.rank > 0, lambda: use(plus, layout.kept), lambda: by_method(equations.exact(), use, t, q, v))
+    return branch(plus.rank > 0, lambda: use(plus, layout.kept), lambda: by_method(equations.dense_form, use, t, q, v))
 
 
 class _Unconstrained:

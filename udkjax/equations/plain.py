@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from udkjax.equations.code import stacked
 from udkjax.equations.motion import Tangential, Vector
-from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse, SparseElimination
+from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, SparseElimination
 
 if TYPE_CHECKING:
     from udkjax.equations.programs import Equations
@@ -79,7 +79,7 @@ def _by_method(equations: "Equations", use: Any, name: str, t: Any, q: Vector, v
     if not isinstance(method, Auto | Elimination):
         return dense(method)
     if equations.branches:
-        return dense(equations.exact().method)
+        return dense(equations.by(SVD).method)
     tol: Any = jnp.sqrt(jnp.asarray(method.branch_tol)) if isinstance(method, Auto) else method.rank_tol
     return use(SparseElimination(programs.kept_pattern, tol).plus(equations.arrays(name + "_kept", t, q, v)[0]), name + "_kept")
 

@@ -9,7 +9,7 @@ It is written twice. The plain form (plain.py) is the equation as it stands, on 
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -24,6 +24,7 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.code import Code, code, is_large, scalars, stacked
 from udkjax.equations.motion import Closed, MechanismMotion, Tangential, Vector
 from udkjax.equations.plain import plain_accelerations
+from udkjax.equations.rank_policy import REVEAL, RankPolicy
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, Varga
 from udkjax.scene.fields import number
@@ -31,10 +32,6 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Loop, Program
 
 FEW = 20  # coordinates: up to so many, `finish` has not too many results for a fusion of lanes (straightline/fusion.py)
-NOTHING_LEFT = 1e-14  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
-# Over the pivot: by how much rounding errors turn the velocities that a row allows (rad; up to a third of that in the paper's
-# linkage). Rows of larger pivots than the second are of use to linkages that turn back there, however small the tolerance.
-TURNED, USELESS = 1e-15, 1e-8
 # Steps with care begin on the constraint manifold, unless states are not projected, and only those beside singular configurations
 # take it. Rows that count as redundant there and are not leave what they hold back in velocities, as large as the threshold, and
 # rounding errors are as large as a unit over its square: both are least at the third root of a unit, 6e-6. With this many times
@@ -68,23 +65,18 @@ class Equations(MechanismMotion):
     method: Pseudoinverse
     scales: Scales
     code: Code = eqx.field(static=True)
-    branch: bool = eqx.field(
-        static=True, default=True
-    )  # whether `Auto` turns to singular values itself, or says NaN where it should
-    doubt: bool = eqx.field(static=True, default=True)  # whether it says anything of rows that elimination drops
+    policy: RankPolicy = REVEAL  # of `Auto`, which eliminates rows that are known to be independent
     loop: Loop | None = eqx.field(static=True, default=None)  # in which its programs run
 
-    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
-        """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+        """a = a_F + M^(-1/2) D^+ b."""
         if not self.eliminates:
             return plain_accelerations(self, t, q, v)
-        return fast.accelerations(
-            "accelerations_watched" if watch and isinstance(self.method, Auto) else "accelerations", self, t, q, v
-        )
+        return fast.accelerations("accelerations_watched" if self.branches else "accelerations", self, t, q, v)
 
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         """lambda = -(D^+)^T D^+ b of all rows."""
-        equations = self.exact() if self.code.elimination else self
+        equations = self.by(SVD) if self.code.elimination else self
         if not self.code.pattern.shape[0]:
             return jnp.zeros(0)
         plus, b, _ = equations.linearized("rows", t, q, v)
@@ -170,7 +162,7 @@ class Equations(MechanismMotion):
 
     @property
     def branches(self) -> bool:
-        return self.branch and self.eliminates and self.code.elimination == "check"
+        return self.policy.action == "reveal" and self.eliminates and self.code.elimination == "check"
 
     @property
     def eliminates(self) -> bool:
@@ -202,40 +194,30 @@ class Equations(MechanismMotion):
         return self.method.plus(w[:, None] * self.code.pattern.dense(values)), w * residual, vectors[-1]
 
     @property
-    def quick(self) -> "Equations":
-        """The same without a branch: what `Auto` cannot solve by elimination is not a number."""
-        return dataclasses.replace(self, branch=False)
+    def refuses(self) -> bool:
+        """Whether what a small pivot has to do with is not a number."""
+        return self.policy.action == "refuse" and self.code.elimination == "check"
 
-    @property
-    def careful(self) -> "Equations":
-        """The same by Varga's method on all rows: without LAPACK it is compiled into one function with what is around it."""
+    def with_policy(self, policy: RankPolicy) -> "Equations":
+        """The same with another decision about small pivots of `Auto`, which is the only method that has one to make."""
+        constants, places = self.constants, [s.index for s in self.code.constants]
+        if policy.threshold is not None and self.code.elimination == "check" and self.code.drop.index in places:
+            drop = places.index(self.code.drop.index)
+            constants = [policy.threshold if k == drop else c for k, c in enumerate(constants)]
+        return dataclasses.replace(self, constants=constants, policy=policy)
+
+    def by(self, method: type[Pseudoinverse], share: float = 1.0) -> "Equations":
+        """The same by another method on all rows, with a share of this one's rank threshold."""
         assert self.method.rank_tol is not None
-        return eqx.tree_at(lambda e: e.method, self, Varga(WITH_CARE * self.method.rank_tol, self.method.relative))
+        return eqx.tree_at(lambda e: e.method, self, method(share * self.method.rank_tol, self.method.relative))
 
     @property
-    def forgiving(self) -> "Equations":
-        """The same without a branch: `Auto` drops rows that depend on others, but for rounding, as `Elimination` does."""
-        return self._dropping(lambda _: jnp.asarray(NOTHING_LEFT))
-
-    def known_to(self, tol: Any) -> "Equations":
-        """As `forgiving`: `Auto` drops rows by which velocities would be turned by more than `tol`, if their pivots are small."""
-        return self._dropping(lambda own: jnp.clip(TURNED / jax.lax.stop_gradient(tol), NOTHING_LEFT, jnp.minimum(own, USELESS)))
-
-    def _dropping(self, threshold: Callable[[Array], Array]) -> "Equations":
-        """The same without a branch, with another threshold of `Auto`, made of its own, below which it drops rows."""
-        places = [s.index for s in self.code.constants]
-        if not self.branches or self.code.drop.index not in places:
-            return self.quick
-        drop = places.index(self.code.drop.index)
-        constants = [threshold(c) if k == drop else c for k, c in enumerate(self.constants)]
-        return dataclasses.replace(self, constants=constants, branch=False, doubt=False)
+    def rank_revealing(self) -> "Equations":
+        """The same by Varga's method on all rows: without LAPACK it is compiled into one function with what is around it."""
+        return self.by(Varga, WITH_CARE)
 
     def within(self, loop: Loop) -> "Equations":
         return dataclasses.replace(self, loop=loop)
-
-    def exact(self) -> "Equations":
-        """The same by singular values of all rows: what `Auto` turns to."""
-        return eqx.tree_at(lambda e: e.method, self, SVD(self.method.rank_tol, self.method.relative))
 
 
 def prepare(
@@ -272,7 +254,7 @@ def prepare(
     if isinstance(chosen, Elimination):
         elimination, drop = "drop", tol**2
     elif isinstance(chosen, Auto) and redundant is None:
-        chosen = chosen.exact
+        chosen = chosen.rank_revealing
     elif isinstance(chosen, Auto):
         elimination, drop = "check", chosen.branch_tol
     programs = code(mechanism, left_out if elimination else (), baumgarte is not None, elimination)
@@ -280,7 +262,7 @@ def prepare(
     numbers = [*scalars(leaves), *gains, drop]
     moves = [move for leaf, move in zip(leaves, moving or [False] * len(leaves), strict=True) for _ in range(np.size(leaf))]
     constants = [jnp.asarray(c) for c in programs.prologue.early(numbers, [*moves, *[False] * (len(numbers) - len(moves))])]
-    return Equations(constants, chosen, analysis.scales, programs)
+    return Equations(constants=constants, method=chosen, scales=analysis.scales, code=programs)
 
 
 def prepare_to_close(mechanism: Mechanism, large: bool | None = None, analysis: Analysis | None = None) -> Any:

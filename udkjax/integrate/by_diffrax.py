@@ -9,6 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion
+from udkjax.equations.rank_policy import REFUSE
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.explicit import GROW, SAFETY, SHRINK
@@ -61,7 +62,7 @@ def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array,
 
 
 def _first_step(problem: Problem, y0: Array) -> Array:
-    ts, equations, unit = problem.ts, undifferentiated(problem.equations.quick), jnp.concatenate(problem.units())
+    ts, equations, unit = problem.ts, undifferentiated(problem.equations.with_policy(REFUSE)), jnp.concatenate(problem.units())
     return first_step(y0, derivative(ts[0], undifferentiated(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol, unit)
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from udkjax.equations.rank_policy import REFUSE
 from udkjax.integrate.counting import again, tally
 from udkjax.integrate.multistep import Multistep
 from udkjax.integrate.projection import lasting, project
@@ -36,7 +37,7 @@ class Constrained(Wrapper):
         if not args.branches:
             return self._attempt(terms, t0, t1, y0, args, solver_state, made_jump)
         state = (solver_state, made_jump)
-        quick = _in_a_loop(self, terms, t0, t1, y0, args.quick, *state)
+        quick = _in_a_loop(self, terms, t0, t1, y0, args.with_policy(REFUSE), *state)
         doubt = ~jnp.all(jnp.isfinite(quick[0]))
 
         def careful():

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from udkjax.equations.motion import Motion, Tangential
+from udkjax.equations.rank_policy import REFUSE, drop_within
 from udkjax.integrate.batched import CHUNKED, batched
 from udkjax.integrate.explicit import March, march
 from udkjax.integrate.interpolation import Point
@@ -127,8 +128,8 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     """What to march along."""
     over = lanes.within(None if recorded else _loop_of(problem, lanes)).over
     task = Task(
-        partial(over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
-        partial(over, lambda e, t, q, v: e.quick.arrived(t, q, v)),
+        partial(over, lambda e, t, q, v: e.with_policy(REFUSE).accelerations(t, q, v)),
+        partial(over, lambda e, t, q, v: e.with_policy(REFUSE).arrived(t, q, v)),
         partial(over, lasting),
         partial(over, ended),
         None,
@@ -205,14 +206,14 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
             return i + 1, jax.lax.dynamic_update_index_in_dim(a, found, i, 0), q, v, ~jnp.all(jnp.isfinite(found))
 
         def more(carry: Any) -> Any:  # a loop that XLA compiles into one function, and what it cannot
-            quick = equations.quick.within(Loop())
+            quick = equations.with_policy(REFUSE).within(Loop())
             carry = jax.lax.while_loop(lambda c: (c[0] <= stages) & ~c[-1], partial(stage, quick), carry)
             return jax.lax.cond(carry[-1], again, lambda c: c, carry)
 
         def again(carry: Any) -> Any:
             i, a, *state = carry
             a = a.at[i - 1].set(0.0)  # what is not a number would be none with a weight of 0, too
-            return *stage(equations.careful, (i - 1, a, *state))[:-1], jnp.array(False)
+            return *stage(equations.rank_revealing, (i - 1, a, *state))[:-1], jnp.array(False)
 
         start, none = jnp.where(begin, stages, 0), jnp.zeros((stages + 1, *here.a.shape))
         first = start, none, here.q, here.v, jnp.array(False)
@@ -292,7 +293,9 @@ def _output(problem: Problem | None, steps: int, lanes: Lanes, t: Array, y: Arra
     if problem is not None:
         tol = jnp.broadcast_to(output_tolerance(problem, y), lanes.shape)
         inside = lanes.within(Loop(lanes.size is not None))  # what closes it is a loop
-        q, v, moving = inside.over(lambda e, t, y, tol: e.known_to(tol).closed(t, *jnp.split(y, 2), steps), t, y, tol)
+        q, v, moving = inside.over(
+            lambda e, t, y, tol: e.with_policy(drop_within(tol)).closed(t, *jnp.split(y, 2), steps), t, y, tol
+        )
         y = jnp.concatenate([q, v])
     return y, lanes.over(violation, t, y), moving
 

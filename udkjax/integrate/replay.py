@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.equations.rank_policy import REFUSE
 from udkjax.integrate.explicit import BLOCK
 from udkjax.integrate.interpolation import POINTS
 from udkjax.integrate.lanes import Lanes, task_of
@@ -87,7 +88,7 @@ def _step(problem, task, equations, outputs, end, record, walk, careful: bool) -
     begin, timed = k == 1, equations.timed
     s = method.stages
     first = jnp.where(begin, s, 0 if careful else 1)
-    own = (lambda e: e) if careful else (lambda e: e.quick)
+    own = (lambda e: e) if careful else (lambda e: e.with_policy(REFUSE))
     used = int(np.nonzero(np.any(method.v != 0, axis=0))[0].max())  # the last stage that the step makes use of
 
     def stage(c):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from udkjax.equations.motion import Motion
+from udkjax.equations.rank_policy import drop_within
 from udkjax.integrate.explicit import BLOCK
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
 from udkjax.integrate.lanes import output_tolerance
@@ -60,7 +61,7 @@ def of_outputs(problem: Problem, raw: Raw, equations: Equations, sums: Sums, bar
         q, v = jnp.split(jnp.where(reached, y, jnp.concatenate([problem.q, problem.v])), 2)
         both = tuple(jnp.split(bar, 2))
         tol = output_tolerance(problem, jnp.concatenate([q, v]))
-        found, t_bar, q, v = equations.pull(lambda e, *x: e.known_to(tol).as_projected(*x), sums, t, q, v, both)
+        found, t_bar, q, v = equations.pull(lambda e, *x: e.with_policy(drop_within(tol)).as_projected(*x), sums, t, q, v, both)
         if found.ts is not None:
             found = found._replace(ts=found.ts.at[k].add(t_bar))
         sums, bar = jax.tree.map(lambda x, y: jnp.where(reached, x, y), (found, jnp.concatenate([q, v])), (sums, bar))
