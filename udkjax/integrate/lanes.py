@@ -75,6 +75,8 @@ def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
 
     lanes = Lanes(problem.equations, axes.equations, size)
     problem = dataclasses.replace(problem, ts=last(problem.ts, axes.ts), q=every(problem.q, axes.q), v=every(problem.v, axes.v))
+    if problem.breakpoints is not None:
+        problem = dataclasses.replace(problem, breakpoints=last(problem.breakpoints, axes.breakpoints))
     raw = _marched(problem, lanes)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), raw)
 
@@ -134,6 +136,9 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
         *(problem.ts, problem.rtol, problem.atol, problem.smallest, problem.h, problem.max_steps, method_of(problem.solver)),
         recorded,
     )
+    if problem.breakpoints is not None:
+        shared = problem.breakpoints.ndim == 1 and lanes.size is not None
+        task = task._replace(breakpoints=problem.breakpoints[:, None] if shared else problem.breakpoints)
     if not problem.projected:
 
         def as_it_is(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:

@@ -25,6 +25,7 @@ class Problem(eqx.Module):
     projected: bool = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
     careful: bool = eqx.field(static=True, default=True)  # whether steps that want care get it; else a run ends as `DOUBTED`
+    breakpoints: Float[Array, "k"] | None = None  # the times where the motion is not smooth, in any order; None: it is
 
 
 class Raw(NamedTuple):

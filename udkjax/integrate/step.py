@@ -48,6 +48,7 @@ class Task(NamedTuple):
     max_steps: int
     method: Method
     recorded: bool = False  # whether the steps are kept, of a run that is not one of several lanes
+    breakpoints: Array | None = None  # (K, *lanes) times where the motion is not smooth
 
 
 def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial:

@@ -122,6 +122,12 @@ class Mechanism(eqx.Module):
         """The initial guess of the velocities (m/s, rad/s)."""
         return _side_by_side([body.velocity for body in self._bodies], [body.angular_velocity for body in self._bodies])
 
+    @property
+    def breakpoints(self) -> Float[Array, "k"] | None:
+        """The times (s) where the motion is not smooth, as the elements name them, in any order; None where none does."""
+        named = [jnp.ravel(number(e.breakpoints)) for e in (*self.constraints.values(), *self._forces) if len(e.breakpoints)]
+        return jnp.concatenate(named) if named else None
+
     def with_left_out(self, rows: tuple[int, ...] | None) -> "Mechanism":
         """Return the mechanism with another choice of rows of Psi to leave out as redundant."""
         copy = object.__new__(type(self))
