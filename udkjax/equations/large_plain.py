@@ -93,7 +93,7 @@ class _Unconstrained:
         return 0.0
 
 
-def branch(safe: Bool[Array, ""], fast: Any, careful: Any) -> Any:
-    """One of two results; under vmap, `careful` is taken for all as soon as one is in need of it."""
+def branch(safe: Bool[Array, ""], fast: Any, fallback: Any) -> Any:
+    """One of two results; under vmap, `fallback` is taken for all as soon as one is in need of it."""
     where = lambda a, b: jnp.where(safe, a, b)  # noqa: E731
-    return jax.lax.cond(eqxi.unvmap_all(safe), fast, lambda: jax.tree.map(where, fast(), careful()))
+    return jax.lax.cond(eqxi.unvmap_all(safe), fast, lambda: jax.tree.map(where, fast(), fallback()))

@@ -78,6 +78,8 @@ def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
 
     lanes = Lanes(problem.equations, axes.equations, size)
     problem = dataclasses.replace(problem, ts=last(problem.ts, axes.ts), q=every(problem.q, axes.q), v=every(problem.v, axes.v))
+    if problem.breakpoints is not None:
+        problem = dataclasses.replace(problem, breakpoints=last(problem.breakpoints, axes.breakpoints))
     raw = _marched(problem, lanes)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), raw)
 
@@ -138,6 +140,9 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
         *(problem.h, problem.max_steps, method_of(problem.solver)),
         recorded,
     )
+    if problem.breakpoints is not None:
+        shared = problem.breakpoints.ndim == 1 and lanes.size is not None
+        task = task._replace(breakpoints=problem.breakpoints[:, None] if shared else problem.breakpoints)
     if not problem.projected:
 
         def as_it_is(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -146,7 +151,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
         task = task._replace(arrived=as_it_is, lasting=_all_of_it)
         task = task._replace(ended=lambda t, q, v, dq, dv: (*as_it_is(t, q, v), _all_of_it(t, q, v, dq, dv)))
     if problem.equations.branches and problem.fallback:
-        task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
+        task = task._replace(fallback=partial(_fallback_step, task, problem.projected, lanes))
     return task
 
 
@@ -191,7 +196,9 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
 # --- with care
 
 
-def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Point, h: Array, t1: Array, begin: Array) -> Trial:
+def _fallback_step(
+    task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Point, h: Array, t1: Array, begin: Array
+) -> Trial:
     """A step taken again of the lanes in doubt: by a method that looks at all rows where elimination finds nothing."""
     stages = task.method.stages
 

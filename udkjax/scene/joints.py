@@ -33,6 +33,11 @@ class Constraint(eqx.Module):
         """The bodies whose frames `residual` gets, in that order."""
         return self.bodies
 
+    @property
+    def breakpoints(self) -> Float[Array, "k"] | Sequence[Any]:
+        """The times (s) where Psi is not smooth, though it and its rate are continuous. By default none."""
+        return ()
+
     def resolved(self, *frames: Frame) -> Self:
         """Return the same with every number that the initial guess decides, given the attached bodies' frames there."""
         return self
