@@ -1,7 +1,6 @@
 """Mechanisms whose Psi_q is constant: whether a pivot is small depends on their numbers alone, which may be traced."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -23,8 +22,8 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_derivatives_alone_and_under_jit(name):
+@pytest.mark.parametrize("name", [n if n in ("angle", "gears") else pytest.param(n, marks=pytest.mark.slow) for n in SCENES])
+def test_reverse_mode_under_jit(name):
     mechanism, field = SCENES[name]
     parameter = f"body.one.{field}"
     value = float(getattr(mechanism.bodies["one"], field))
@@ -36,6 +35,3 @@ def test_derivatives_alone_and_under_jit(name):
     step = 1e-4
     expected = (end(value + step) - end(value - step)) / (2 * step)
     assert_allclose(jax.jit(jax.grad(end))(value), expected, rtol=1e-6)
-    assert_allclose(jax.grad(end)(value), expected, rtol=1e-6)
-    several = jax.jit(jax.vmap(jax.grad(end)))(jnp.array([value, 1.1 * value]))
-    assert_allclose(several[0], expected, rtol=1e-6)
