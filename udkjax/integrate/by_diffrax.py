@@ -79,8 +79,8 @@ def _controller(problem: Problem) -> Any:
 class _FrozenSteps(diffrax.PIDController):
     """Chooses sizes of steps that have no derivatives.
 
-    Those of the controller follow the size of the step before: where a breakpoint has cut one short, the ones behind it, up to ten
-    times as long each, would have derivatives along it that grow as fast.
+    Those of the controller follow the size of the step before: where a breakpoint has cut one short, the ones behind it, up to
+    ten times as long each, would have derivatives along it that grow as fast.
     """
 
     def adapt_step_size(self, *args: Any, **kwargs: Any) -> Any:

@@ -6,6 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion
+from udkjax.integrate.pieces import Pieces
 
 RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, DOUBTED = range(5)  # what a run may be
 
@@ -26,6 +27,7 @@ class Problem(eqx.Module):
     max_steps: int = eqx.field(static=True)
     careful: bool = eqx.field(static=True, default=True)  # whether steps that want care get it; else a run ends as `DOUBTED`
     breakpoints: Float[Array, "k"] | None = None  # the times where the motion is not smooth, in any order; None: it is
+    pieces: Pieces | None = None  # in which the motion is smooth, of those that have some; None: nothing has
 
 
 class Raw(NamedTuple):
