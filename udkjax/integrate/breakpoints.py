@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool
 
 UNIT = 0.01  # of the smallest step: what times are rounded by
 BEFORE, BEHIND = 2 * UNIT, UNIT  # of the smallest step: how far away from a breakpoint a step ends, and the next one begins
+GAP = BEFORE + BEHIND
 SAME = 0.5  # of the smallest step: breakpoints that are so close count as one
 
 

@@ -20,6 +20,7 @@ from udkjax.integrate.batched import CHUNKED, batched
 from udkjax.integrate.explicit import March, march
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.norms import largest
+from udkjax.integrate.pieces import Pieces
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import ended, lasting, violation
 from udkjax.integrate.step import Task, Trial, errors, judged, stage_state
@@ -76,7 +77,7 @@ def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
     def every(x: Array, axis: int | None) -> Array:
         return jnp.broadcast_to(x[..., None], (*x.shape, size)) if axis is None else last(x, axis)
 
-    lanes = Lanes(problem.equations, axes.equations, size)
+    lanes = Lanes(problem.equations, axes.equations, size, axes_of_pieces=axes.pieces)
     problem = dataclasses.replace(problem, ts=last(problem.ts, axes.ts), q=every(problem.q, axes.q), v=every(problem.v, axes.v))
     if problem.breakpoints is not None:
         problem = dataclasses.replace(problem, breakpoints=last(problem.breakpoints, axes.breakpoints))
@@ -87,14 +88,21 @@ def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
 class Lanes:
     """Equations evaluated for one state, or for lanes of states (n, L), with equations of their own where `axes` says so."""
 
-    def __init__(self, equations: Motion, axes: Any = None, size: int | None = None, loop: Loop | None = None):
+    def __init__(
+        self,
+        equations: Motion,
+        axes: Any = None,
+        size: int | None = None,
+        loop: Loop | None = None,
+        axes_of_pieces: Any = None,
+    ):
         self.equations, self.size, self.shape = equations, size, () if size is None else (size,)
         self._arrays, self._static = eqx.partition(equations, eqx.is_array)
-        self._axes, self._loop = axes, loop
+        self._axes, self._loop, self._axes_of_pieces = axes, loop, axes_of_pieces
 
     def within(self, loop: Loop | None) -> "Lanes":
         """The same, whose programs run in this loop where they are evaluated for all lanes."""
-        return Lanes(self.equations, self._axes, self.size, loop)
+        return Lanes(self.equations, self._axes, self.size, loop, self._axes_of_pieces)
 
     def over(self, function: Callable, *states: Array) -> Any:
         """`function(equations, t, q, v)` of each lane."""
@@ -106,6 +114,15 @@ class Lanes:
         if self.size is None:
             return lane(self._arrays, *states)
         return jax.vmap(lane, in_axes=(self._axes, *[-1] * len(states)), out_axes=-1)(self._arrays, *states)
+
+    def piece(self, pieces: Pieces, *states: Array) -> Array:
+        """In which pieces the state of each lane is."""
+        if self.size is None:
+            return pieces(*states)
+        arrays, static = eqx.partition(pieces, eqx.is_array)
+        axes = jax.tree.map(lambda axis: axis if type(axis) is int else None, self._axes_of_pieces)
+        lane = lambda arrays, *state: eqx.combine(arrays, static)(*state)  # noqa: E731
+        return jax.vmap(lane, in_axes=(axes, *[-1] * len(states)), out_axes=-1)(arrays, *states)
 
     def each(self, which: Array, function: Callable, otherwise: Any, *states: Any) -> Any:
         """`function(equations, *states)` of the lanes in question, one at a time; the others get what is `otherwise`."""
@@ -143,6 +160,8 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     if problem.breakpoints is not None:
         shared = problem.breakpoints.ndim == 1 and lanes.size is not None
         task = task._replace(breakpoints=problem.breakpoints[:, None] if shared else problem.breakpoints)
+    if problem.pieces is not None:
+        task = task._replace(piece=partial(lanes.piece, problem.pieces))
     if not problem.projected:
 
         def as_it_is(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:

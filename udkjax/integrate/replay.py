@@ -143,12 +143,18 @@ def _step(problem, task, equations, outputs, end, record, walk, fallback: bool) 
 
 def _begins(problem: Problem | Task, k: Array, before: Array, to: Array) -> Array:
     """Whether what leads to point k at time `to` is no step, but the start, or a new one."""
-    return (k == 1) if problem.breakpoints is None else (k == 1) | is_new_start(before, to, problem.smallest)
+    return (k == 1) | is_new_start(before, to, problem.smallest) if _restarts(problem) else k == 1
+
+
+def _restarts(problem: Problem | Task) -> bool:
+    """Whether the run may start anew on its way."""
+    pieces = problem.piece if isinstance(problem, Task) else problem.pieces
+    return problem.breakpoints is not None or pieces is not None
 
 
 def _since(problem: Problem, record: Record, k: Array, total: Array, window: tuple[Point, ...]) -> Array:
     """The time since when the step to point k, the last of the window, has written outputs."""
-    if problem.breakpoints is None:
+    if not _restarts(problem):
         return window[-2].t
     times = jnp.stack([point.t for point in window])
     before = record.times[jnp.maximum(k - POINTS, 0)]

@@ -75,7 +75,7 @@ def of_outputs(problem: Problem, raw: Raw, equations: Equations, sums: Sums, bar
 def of_points(
     problem: Problem, equations: Equations, outputs: Array, points: tuple[Point, ...], walk: Walk, since: Array
 ) -> Walk:
-    """The outputs on the polynomial of a step, those since some time, hand their cotangents to the points that it goes by."""
+    """The outputs on the polynomial of a step, those since some time, hand their cotangents to its points."""
     inner = len(problem.ts) - 2
     if not inner:
         return walk

@@ -51,6 +51,7 @@ class Task(NamedTuple):
     method: Method
     recorded: bool = False  # whether the steps are kept, of a run that is not one of several lanes
     breakpoints: Array | None = None  # (K, *lanes) times where the motion is not smooth
+    piece: Callable[..., Array] | None = None  # of lanes: (t, q, v) -> in which of its smooth pieces each element is (k, *lanes)
 
 
 def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial:

@@ -34,6 +34,13 @@ class ForceElement(eqx.Module):
         """The times (s) where the loads are not smooth: steps end there, and no interpolation reaches across. By default none."""
         return ()
 
+    def piece(self, t: Any, *frames: Frame) -> Any:
+        """Return which of their smooth pieces the loads are in, as a whole number, or None: they are smooth (the default).
+
+        Where pieces meet, loads are continuous. No interpolation reaches from one piece to another.
+        """
+        return None
+
 
 class Spring(ForceElement):
     """V = 1/2 stiffness (|d| - length)^2 between two points, d from point 1 to point 2, and a damper beside it.
