@@ -11,6 +11,7 @@ import udkjax as udk
 from benchmarks.common import Compiled, alternate, machine, ratio, report
 from benchmarks.scripts import by_cholesky, by_pinv
 from udkjax.equations import prepare
+from udkjax.equations.rank_policy import REFUSE
 
 EVALUATIONS, ROUNDS = 1000, 31
 
@@ -25,7 +26,7 @@ def candidates(mechanism) -> dict:
     return {
         "script, jnp.linalg.pinv": by_pinv,
         "script, Cholesky": by_cholesky,
-        "udkjax Auto, a stage": ours(prepare(mechanism, udk.Auto()).quick),
+        "udkjax Auto, a stage": ours(prepare(mechanism, udk.Auto()).with_policy(REFUSE)),
         **{f"udkjax {type(m).__name__}": ours(prepare(mechanism, m)) for m in methods},
     }
 

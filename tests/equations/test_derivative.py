@@ -9,6 +9,7 @@ import udkjax as udk
 from udkjax import GROUND
 from udkjax.equations import prepare
 from udkjax.equations.plain import plain_accelerations, plain_correction
+from udkjax.equations.rank_policy import REFUSE, drop_dependent
 from udkjax.straightline import Loop
 
 ELIMINATION = udk.Elimination()
@@ -56,7 +57,7 @@ def test_first_derivatives_are_those_of_the_plain_form(scene, method, baumgarte)
     dots = jax.tree.map(lambda x: jnp.asarray(random.standard_normal(np.shape(x))), inputs)
 
     def of(form):
-        return lambda mechanism, t, q, v: form(prepare(mechanism, method, baumgarte, large=False).quick, t, q, v)
+        return lambda mechanism, t, q, v: form(prepare(mechanism, method, baumgarte, large=False).with_policy(REFUSE), t, q, v)
 
     def both(fast, plain, at, weights):
         fast, plain = of(fast), of(plain)
@@ -106,12 +107,14 @@ def test_the_end_of_a_step_is_a_projection_and_the_accelerations_there(scene, or
     def one_after_another(equations, t, q, v):
         q, v = equations.project(t, q, v)
         found = q, v, equations.accelerations(t, q, v)
-        left = jax.lax.stop_gradient(equations.forgiving).tangential(t, *jax.lax.stop_gradient((q, v)), *error)
+        left = jax.lax.stop_gradient(equations.with_policy(drop_dependent())).tangential(
+            t, *jax.lax.stop_gradient((q, v)), *error
+        )
         return *found, *found, *left
 
     def derivatives(form, mechanism, t, q, v):
         def function(mechanism, t, q, v):
-            return form(prepare(mechanism, udk.Auto(), large=False, analysis=analysis).quick, t, q, v)
+            return form(prepare(mechanism, udk.Auto(), large=False, analysis=analysis).with_policy(REFUSE), t, q, v)
 
         def along(*at):
             return jax.jvp(function, at, dots)
@@ -151,7 +154,7 @@ def linkage():
 
 def test_a_state_that_elimination_cannot_solve_spoils_no_derivative(linkage, placed):
     """In line the rank drops: no number, which the caller replaces, and a derivative that nothing times it leaves zero."""
-    equations = prepare(linkage, udk.Auto()).quick
+    equations = prepare(linkage, udk.Auto()).with_policy(REFUSE)
     q, v = (x.ravel() for x in placed(0.0, 1.0))
 
     def chosen(q, v):
@@ -174,7 +177,7 @@ def test_a_state_that_elimination_cannot_solve_spoils_no_derivative(linkage, pla
 
 def test_batches_of_states_and_of_directions(linkage, placed):
     """In any nesting, forward and reverse, the same numbers."""
-    equations = prepare(linkage, udk.Auto()).quick
+    equations = prepare(linkage, udk.Auto()).with_policy(REFUSE)
     q, v = (x.reshape(-1, 12) for x in jax.vmap(placed)(jnp.array([-0.7, 0.4, 1.9]), jnp.array([1.0, -2.0, 0.5])))
     a = lambda q, v: equations.accelerations(0.0, q, v)  # noqa: E731
 
@@ -212,7 +215,9 @@ def test_in_a_loop_value_and_directions_are_found_by_one_program():
 
     def changes(loop):
         def state(gravity, q, v):
-            equations = prepare(mechanism.with_parameters({"gravity": jnp.array([0.0, -gravity])}), ELIMINATION).quick
+            equations = prepare(mechanism.with_parameters({"gravity": jnp.array([0.0, -gravity])}), ELIMINATION).with_policy(
+                REFUSE
+            )
             equations = equations if loop is None else equations.within(loop)
 
             def once(c):

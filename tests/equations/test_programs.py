@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax.equations import prepare
 from udkjax.equations.plain import plain_accelerations, plain_project
+from udkjax.equations.rank_policy import REFUSE
 
 CLASSES = (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)
 METHODS = {cls.__name__: cls() for cls in CLASSES}
@@ -213,7 +214,7 @@ def test_the_fast_form_is_the_plain_form(nearby, method, name):
 
     @eqx.filter_jit
     def both(mech, qs, vs):
-        equations = prepare(mech, method, udk.Baumgarte(2.0, 3.0)).quick
+        equations = prepare(mech, method, udk.Baumgarte(2.0, 3.0)).with_policy(REFUSE)
         forms = (equations.accelerations, lambda *s: plain_accelerations(equations, *s), equations.project,
                  lambda *s: plain_project(equations, *s))  # fmt: skip
         return [jax.lax.map(lambda s, form=form: form(0.0, *s), (qs, vs)) for form in forms]
@@ -233,7 +234,7 @@ def test_the_careful_form_is_that_by_singular_values(linkage, placed, angle, sla
     @eqx.filter_jit
     def both(q, v):
         equations, off = prepare(linkage), 1e-6 * jnp.sin(jnp.arange(12.0))
-        forms = equations.careful, equations.exact()
+        forms = equations.rank_revealing, equations.by(udk.SVD)
         return [(form.accelerations(0.0, q, v), *form.project(0.0, q + off, v + off)) for form in forms], (q + off, v + off)
 
     (careful, exact), off = both(*(x.ravel() for x in placed(angle, 1.3)))
@@ -266,7 +267,7 @@ def test_the_tangential_part_is_what_projection_leaves(mechanisms, nearby, metho
 
     @eqx.filter_jit
     def parts(mech, q, v, dq, dv):
-        equations, t = prepare(mech, method).quick, 0.0
+        equations, t = prepare(mech, method).with_policy(REFUSE), 0.0
         q, v = equations.project(t, *equations.project(t, q, v))
         *left, _ = equations.tangential(t, q, v, dq, dv)
         moved = equations.project(t, q + dq, v)[0] - q, equations.project(t, q, v + 1e7 * dv)[1] - v
@@ -284,7 +285,7 @@ def test_the_distance_from_singular_configurations(linkage, placed):
 
     @eqx.filter_jit
     def distances(q, v):
-        equations, none = prepare(linkage).quick, jnp.zeros(12)
+        equations, none = prepare(linkage).with_policy(REFUSE), jnp.zeros(12)
         return equations.tangential(0.0, q, v, none, none).distance, equations.finished(0.0, q, v, none, none)[-1].distance
 
     angles = np.array([1e-1, 1e-2, 1e-3])
@@ -293,7 +294,7 @@ def test_the_distance_from_singular_configurations(linkage, placed):
     assert_allclose(alone / angles, alone[2] / angles[2], rtol=2e-2)
     assert 0.2 < alone[2] / angles[2] < 5.0
     assert not max(distances(*(x.ravel() for x in placed(0.0, 1.3)))) > 1e-7
-    free = prepare(udk.Mechanism({"stone": udk.Body(2.0, 0.1)})).quick
+    free = prepare(udk.Mechanism({"stone": udk.Body(2.0, 0.1)})).with_policy(REFUSE)
     assert jnp.isinf(free.tangential(0.0, *jnp.zeros((4, 3))).distance)
 
 
@@ -307,7 +308,7 @@ def test_closing_goes_on_until_nothing_moves(nearby, method, name):
 
     @eqx.filter_jit
     def found(mech, q, v):
-        equations, t = prepare(mech, method).quick, 0.0
+        equations, t = prepare(mech, method).with_policy(REFUSE), 0.0
         *first, _ = equations.closed(t, q, v, 7)
         return first, equations.closed(t, *first, 7)[:2], equations.violation(t, *first)
 

@@ -12,6 +12,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.equations.motion import Tangential
+from udkjax.equations.rank_policy import REFUSE
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, count_evaluations, evaluations
 from udkjax.integrate.multistep import Multistep, from_controller
@@ -127,7 +128,7 @@ class Branching(eqx.Module):
 
     @property
     def forgiving(self):
-        return self.quick
+        return self.with_policy(REFUSE)
 
     def project(self, t, q, v):
         return q, v
@@ -184,7 +185,7 @@ class Remembers(Multistep):
 def test_a_projection_is_no_jump_to_a_multistep_method(calls, jumped):
     """It would forget its history. A Runge-Kutta method only forgets its last stage."""
     solver = Constrained(Remembers(), True)
-    equations, y0 = Branching(calls).quick, jnp.array([1.0, 0.0])
+    equations, y0 = Branching(calls).with_policy(REFUSE), jnp.array([1.0, 0.0])
     terms = diffrax.ODETerm(lambda t, y, equations: equations.derivative(t, y))
     *_, dense, state, _ = solver.step(terms, 0.0, 0.1, y0, equations, solver.init(terms, 0.0, 0.1, y0, equations), jumped)
     assert dense["jump"] is jumped

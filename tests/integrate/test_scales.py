@@ -104,8 +104,8 @@ def test_reactions_are_the_same_in_all_units():
 
 
 def test_under_jit_a_call_computes_the_same():
-    """Within rounding: the programs are compiled apart."""
-    mechanism = udk.library.parallelogram(0.3, -1.0)
+    """Within rounding: the programs are compiled apart. (Runs through singular configurations amplify it a thousand times.)"""
+    mechanism = udk.library.parallelogram()
     analysis, eager = udk.analyse(mechanism), udk.simulate(mechanism, TS)
     for function, argument in (
         (lambda m: udk.simulate(mechanism.with_parameters({"body.coupler.mass": m}), TS), mechanism.bodies["coupler"].mass),

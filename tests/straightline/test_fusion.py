@@ -10,6 +10,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.equations.programs import prepare
+from udkjax.equations.rank_policy import REFUSE
 from udkjax.straightline import Loop, fusion
 
 TRIED = jax.__version_info__[:2] in fusion.KNOWN
@@ -23,7 +24,7 @@ def linkage():
 
 def looped(mechanism, loop):
     """States after three evaluations that each wait for the one before, in a loop of which XLA does not know how long it is."""
-    equations = prepare(mechanism).quick.within(loop)
+    equations = prepare(mechanism).with_policy(REFUSE).within(loop)
 
     def run(q, v):
         def again(_, state):

@@ -30,7 +30,10 @@ HALVINGS = 12
 class Rows(Protocol):
     """What closing asks of the rows of Psi."""
 
-    scales: Scales
+    @property
+    def scales(self) -> Scales:
+        """The scene's."""
+        ...
 
     def residual(self, t: Any, q: Any) -> Any:
         """Psi, each row over its scale."""

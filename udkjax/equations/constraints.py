@@ -38,7 +38,7 @@ def psi_dot(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Arr
 
 
 def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
-    """gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt: what Psi_q a must be for Psi_ddot = Psi_q a - gamma to vanish (m/s^2, rad/s^2).
+    """gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt, with which Psi_ddot = Psi_q a - gamma (m/s^2, rad/s^2).
 
     It is minus the rate of Psi_dot along the motion of constant v.
     """

@@ -17,6 +17,7 @@ from udkjax.equations.code import scalars, stacked
 from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, numbers_moving_of, those, those_numbers
 from udkjax.equations.motion import FAR as NEWTON_FAR
 from udkjax.equations.motion import STEPS, Closed, Tangential, Vector
+from udkjax.pinv import SVD
 from udkjax.straightline import along
 
 if TYPE_CHECKING:
@@ -71,15 +72,15 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
     _, *found, change, safe = jax.lax.while_loop(more, nearer, start)
     found, moving = [stacked(x) for x in found], ~(change <= far)
     if equations.branches:
-        found = jax.lax.cond(safe, lambda: tuple(found), lambda: equations.exact().project(t, q, v))
+        found = jax.lax.cond(safe, lambda: tuple(found), lambda: equations.by(SVD).project(t, q, v))
         return found, (jnp.array(True), moving & safe)
-    return tuple(found), (safe if _checks(equations) else jnp.array(True), moving)
+    return tuple(found), (safe if equations.refuses else jnp.array(True), moving)
 
 
 def arrived(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector]:
     """q and v on the manifold, and the accelerations there: by Newton steps in position, and one program of all the rest."""
     found, _, (_, safe) = _arrived(equations, t, q, v, ())
-    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if _checks(equations) else found
+    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if equations.refuses else found
     return q, v, a
 
 
@@ -88,7 +89,7 @@ def finished(
 ) -> tuple[Vector, Vector, Vector, Tangential]:
     """`arrived`, and what projection leaves of small changes there, by the same program."""
     found, (dq, dv), (distance, safe) = _arrived(equations, t, q, v, (dq, dv))
-    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if _checks(equations) else found
+    q, v, a = (jnp.where(safe, x, jnp.nan) for x in found) if equations.refuses else found
     return q, v, a, Tangential(dq, dv, distance)
 
 
@@ -134,15 +135,10 @@ def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector,
 
 
 def _checked(equations: "Equations", safe: Bool[Array, ""], a: Vector, t: Any, q: Vector, v: Vector) -> Vector:
-    """Take what elimination gave where its pivots are safe, or where it drops the others itself; else turn to singular values."""
+    """Take what elimination gave where its pivots are safe, or their rows dropped; else do as the policy says."""
     if equations.branches:
-        return jax.lax.cond(safe, lambda: a, lambda: equations.exact().accelerations(t, q, v))
-    return jnp.where(safe, a, jnp.nan) if _checks(equations) else a
-
-
-def _checks(equations: "Equations") -> bool:
-    """Whether to mark what pivots that are not safe have to do with, instead of dropping their rows."""
-    return equations.doubt and equations.code.elimination == "check"
+        return jax.lax.cond(safe, lambda: a, lambda: equations.by(SVD).accelerations(t, q, v))
+    return jnp.where(safe, a, jnp.nan) if equations.refuses else a
 
 
 # --- derivatives

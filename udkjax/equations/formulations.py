@@ -167,10 +167,6 @@ class Rewritten(Motion):
         """Only a projection may branch, once a step: no reason to take a whole step without branching first."""
         return False
 
-    @property
-    def quick(self) -> Motion:
-        return self
-
 
 class Formulated(Rewritten):
     """A formulation for given states. Projection, and the rows that it leaves out, are those of the equations inside."""
@@ -178,7 +174,7 @@ class Formulated(Rewritten):
     equations: Motion
     formulation: Solved
 
-    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         return _accelerations(self, t, q, v)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:

@@ -12,7 +12,7 @@ from udkjax.equations.motion import Motion, Tangential, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
-from udkjax.scene.fields import number
+from udkjax.scene.fields import number, optional
 
 
 class ConstrainedSystem(eqx.Module):
@@ -21,13 +21,14 @@ class ConstrainedSystem(eqx.Module):
     `mass(q)` returns M (n, n), symmetric positive definite; `force(t, q, v)` returns F (n,); `constraint(t, q)` returns Psi (m,),
     or is None; `velocity_constraint(t, q, v)` returns phi (k,), nonholonomic or not, or is None. All of them are differentiated:
     write them in jax.numpy. Numbers to be traced or differentiated belong into an equinox module whose methods these are.
-    Simulate it from a `State` with q and v (n,).
+    `breakpoints` are the times (s) where force or constraints are not smooth. Simulate it from a `State` with q and v (n,).
     """
 
     mass: Callable[[Any], Any]
     force: Callable[[Any, Any, Any], Any]
     constraint: Callable[[Any, Any], Any] | None = None
     velocity_constraint: Callable[[Any, Any, Any], Any] | None = None
+    breakpoints: Float[Array, "k"] | None = eqx.field(converter=optional, default=None)
 
 
 class GeneralEquations(Motion):
@@ -49,11 +50,7 @@ class GeneralEquations(Motion):
     def branches(self) -> bool:
         return False
 
-    @property
-    def quick(self) -> "GeneralEquations":
-        return self
-
-    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         free, weight, plus, b = self._equation(t, q, v)
         return free if plus is None else free + weight(plus @ b)
 

@@ -22,6 +22,7 @@ from udkjax.equations.code import structure
 from udkjax.equations.large_plain import by_method, plain_accelerations
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
 from udkjax.equations.motion import STEPS, Closed, MechanismMotion, Tangential, Vector
+from udkjax.equations.rank_policy import REVEAL, RankPolicy
 from udkjax.equations.scales import Scales
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.block_methods import BlockElimination, DenseParts
@@ -49,14 +50,13 @@ class LargeEquations(MechanismMotion):
     method: Pseudoinverse
     scales: Scales
     layout: Layout = eqx.field(static=True)
-    branch: bool = eqx.field(static=True, default=True)  # whether to turn to dense matrices, or to say NaN where that is needed
-    doubt: bool = eqx.field(static=True, default=True)  # whether to say anything of pivots that are small
+    policy: RankPolicy = REVEAL  # where it drops rows, small pivots are taken for what they are
     dense: bool = eqx.field(static=True, default=False)  # whether the method is applied to D of all rows as a matrix
     loop: Loop | None = eqx.field(static=True, default=None)  # in which its programs run
 
-    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
-        """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
-        return _compiled(large_fast.accelerations if self.by_levels else _plainly, self, t, q, v, watch)
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+        """a = a_F + M^(-1/2) D^+ b."""
+        return _compiled(large_fast.accelerations if self.by_levels else _plainly, self, t, q, v)
 
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         """lambda = -(D^+)^T D^+ b of all rows: by elimination where none is left out, else by singular values."""
@@ -70,7 +70,7 @@ class LargeEquations(MechanismMotion):
             b = self.arrays(rows, ["b"], t, q, v, self.free(t, q, v))[0]
             return rows.listed(by_block(-(plus.T @ (plus @ flat(b))), rows.height))
 
-        return by_method(self.exact() if self.by_levels and self.left_out else self, solve, t, q, v)
+        return by_method(self.dense_form if self.by_levels and self.left_out else self, solve, t, q, v)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
@@ -167,24 +167,19 @@ class LargeEquations(MechanismMotion):
 
     @property
     def branches(self) -> bool:
-        return self.branch and self.by_levels and self.constrained
+        return self.policy.action == "reveal" and self.by_levels and self.constrained
 
-    @property
-    def quick(self) -> "LargeEquations":
-        """The same without a branch: what cannot be solved by elimination is not a number."""
-        return dataclasses.replace(self, branch=False)
-
-    @property
-    def forgiving(self) -> "LargeEquations":
-        """The same without a branch: small pivots are taken for what they are."""
-        return dataclasses.replace(self, branch=False, doubt=False)
+    def with_policy(self, policy: RankPolicy) -> "LargeEquations":
+        """The same with another decision about small pivots."""
+        return dataclasses.replace(self, policy=policy)
 
     def within(self, loop: Loop) -> "LargeEquations":
         return dataclasses.replace(self, loop=loop)
 
-    def exact(self) -> "LargeEquations":
+    @property
+    def dense_form(self) -> "LargeEquations":
         """The same on all rows as a matrix: what to turn to where rows are not independent."""
-        method = self.method.exact if isinstance(self.method, Auto) else self.method
+        method = self.method.rank_revealing if isinstance(self.method, Auto) else self.method
         return dataclasses.replace(self, method=method, dense=True)
 
     # --- pieces
@@ -238,14 +233,14 @@ class LargeEquations(MechanismMotion):
 def prepare_large(mechanism: Mechanism, method: Pseudoinverse, gains: Sequence[Any], analysis: Analysis) -> LargeEquations:
     """As `prepare`, with the method's thresholds decided."""
     found = layout(*structure(mechanism), analysis.redundant_rows or (), bool(gains))
-    return LargeEquations(found.numbers(mechanism, gains), method, analysis.scales, found)
+    return LargeEquations(numbers=found.numbers(mechanism, gains), method=method, scales=analysis.scales, layout=found)
 
 
 def prepare_closing(mechanism: Mechanism, analysis: Analysis) -> LargeEquations:
     """Prepare a mechanism to be closed: with D^+ of all rows by elimination, which `DAMPING` keeps from dividing by nothing."""
     found = layout(*structure(mechanism), analysis.redundant_rows or (), False)
     method = BlockElimination(found.all.pattern, 0.0, DAMPING)
-    return LargeEquations(found.numbers(mechanism, ()), method, analysis.scales, found)
+    return LargeEquations(numbers=found.numbers(mechanism, ()), method=method, scales=analysis.scales, layout=found)
 
 
 def _violation(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
@@ -264,5 +259,5 @@ def _called(function: Any, *arguments: Any) -> Any:
     return function(*arguments)
 
 
-def _plainly(equations: LargeEquations, t: Any, q: Vector, v: Vector, _: bool) -> Vector:
+def _plainly(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> Vector:
     return plain_accelerations(equations, t, q, v)

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from udkjax.equations.large import LargeEquations
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(4,))
-def accelerations(equations: "LargeEquations", t: Any, q: Vector, v: Vector, watch: bool) -> Vector:
-    """a = a_F + M^(-1/2) D^+ b of the rows kept; with `watch`, those left out are looked at."""
+@jax.custom_jvp
+def accelerations(equations: "LargeEquations", t: Any, q: Vector, v: Vector) -> Vector:
+    """a = a_F + M^(-1/2) D^+ b of the rows kept; where the policy is to reveal the rank, those left out are looked at."""
     layout, root = equations.layout, equations.numbers["root"]
     free = equations.free(t, q, v)
     if not len(layout.kept.rows):
@@ -29,7 +29,7 @@ def accelerations(equations: "LargeEquations", t: Any, q: Vector, v: Vector, wat
     factors, safe = factorized(pattern, D, equations.drop, loop=equations.loop)
     x = pattern.rmatvec(D, solved(pattern, factors, b, equations.loop))
     a = flat(free + root * x)
-    if watch and layout.left_out:
+    if equations.branches and layout.left_out:
         safe = safe & _satisfied(equations, t, q, v, free, x)
     return _checked(equations, safe, a, plain_accelerations, t, q, v)
 
@@ -104,13 +104,13 @@ def tangential(equations: "LargeEquations", t: Any, q: Vector, v: Vector, dq: Ve
     return Tangential(first, second, jnp.where(far, jnp.inf, 0.0))
 
 
-accelerations.defjvp(lambda watch, primals, tangents: jax.jvp(plain_accelerations, primals, tangents))
+accelerations.defjvp(lambda primals, tangents: jax.jvp(plain_accelerations, primals, tangents))
 
 
 def _checked(equations: "LargeEquations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
     """Take what elimination gave where its pivots are safe; else turn to the dense method, or say that it is not a number."""
-    if not equations.doubt:
+    if equations.policy.action == "drop":
         return fast
     if not equations.branches:
         return jax.tree.map(lambda x: jnp.where(safe, x, jnp.nan), fast)
-    return branch(safe, lambda: fast, lambda: plain(equations.exact(), *state))
+    return branch(safe, lambda: fast, lambda: plain(equations.dense_form, *state))

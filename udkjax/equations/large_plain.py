@@ -83,7 +83,7 @@ def by_method(equations: "LargeEquations", use: Any, t: Any, q: Vector, v: Vecto
     plus = equations.elimination.plus(equations.arrays(layout.kept, ["D"], t, q, v)[0])
     if not equations.branches:
         return use(plus, layout.kept)
-    return branch(plus.rank > 0, lambda: use(plus, layout.kept), lambda: by_method(equations.exact(), use, t, q, v))
+    return branch(plus.rank > 0, lambda: use(plus, layout.kept), lambda: by_method(equations.dense_form, use, t, q, v))
 
 
 class _Unconstrained:
@@ -93,7 +93,7 @@ class _Unconstrained:
         return 0.0
 
 
-def branch(safe: Bool[Array, ""], fast: Any, careful: Any) -> Any:
-    """One of two results; under vmap, `careful` is taken for all as soon as one is in need of it."""
+def branch(safe: Bool[Array, ""], fast: Any, fallback: Any) -> Any:
+    """One of two results; under vmap, `fallback` is taken for all as soon as one is in need of it."""
     where = lambda a, b: jnp.where(safe, a, b)  # noqa: E731
-    return jax.lax.cond(eqxi.unvmap_all(safe), fast, lambda: jax.tree.map(where, fast(), careful()))
+    return jax.lax.cond(eqxi.unvmap_all(safe), fast, lambda: jax.tree.map(where, fast(), fallback()))

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from udkjax.equations.rank_policy import RankPolicy
 from udkjax.equations.scales import Scales
 from udkjax.straightline import Loop
 
@@ -54,27 +55,17 @@ class Motion(eqx.Module):
     @property
     @abstractmethod
     def branches(self) -> bool:
-        """Whether evaluating them takes a branch to singular values."""
+        """Whether evaluating them takes a branch to a rank-revealing method."""
 
-    @property
-    @abstractmethod
-    def quick(self) -> "Motion":
-        """The same without a branch: what cannot be solved so is not a number."""
-
-    @property
-    def careful(self) -> "Motion":
-        """The same for states of which `quick` says nothing. By default, equations that branch themselves."""
+    def with_policy(self, policy: RankPolicy) -> "Motion":
+        """The same with another decision where the rank is in question. By default there is none to make."""
+        del policy
         return self
 
     @property
-    def forgiving(self) -> "Motion":
-        """The same without a branch, for states near the manifold: rows that depend on others are not asked to close further."""
-        return self.quick
-
-    def known_to(self, tol: Any) -> "Motion":
-        """As `forgiving`, for states known to so many m, rad, m/s and rad/s: nor are rows that would make them less exact."""
-        del tol
-        return self.forgiving
+    def rank_revealing(self) -> "Motion":
+        """The same by a rank-revealing method on all rows, for states that `refuse` says nothing of. By default, as they are."""
+        return self
 
     def within(self, loop: Loop) -> "Motion":
         """The same, to be evaluated in that loop, which XLA compiles into one function."""
@@ -90,8 +81,8 @@ class Motion(eqx.Module):
         return jnp.max(jnp.abs(psi), initial=0.0)
 
     @abstractmethod
-    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
-        """a. With `watch`, also rows that were left out are looked at."""
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+        """a."""
 
     @abstractmethod
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:

@@ -66,7 +66,7 @@ class Partitioned(Rewritten):
     formulation: CoordinatePartitioning
     dependent: Any = None  # which coordinates are, (n,), if that is held
 
-    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         """a = a_p + N z at the state as it is."""
         return _accelerations(self.held(t, q, v), t, q, v)
 

@@ -4,7 +4,7 @@ For every other pseudoinverse, and for all derivatives beyond the first, it is e
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -18,6 +18,7 @@ from udkjax.equations import fast
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.code import Code, code, is_large, scalars, stacked
 from udkjax.equations.motion import Closed, MechanismMotion, Tangential, Vector
+from udkjax.equations.rank_policy import REVEAL, RankPolicy
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -26,10 +27,6 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Loop, Program
 
 FEW = 20  # coordinates: up to so many, `finish` has not too many results for a fusion of lanes (straightline/fusion.py)
-NOTHING_LEFT = 1e-14  # of a row's square: pivots below are rounding errors; Newton's method corrects those of pivots above
-# Over the pivot: by how much rounding errors turn the velocities that a row allows (rad; up to a third of that in the paper's
-# linkage). Rows of larger pivots than the second are of use to linkages that turn back there, however small the tolerance.
-TURNED, USELESS = 1e-15, 1e-8
 # Steps with care begin on the constraint manifold, unless states are not projected, and only those beside singular configurations
 # take it. Rows that count as redundant there and are not leave what they hold back in velocities, as large as the threshold, and
 # rounding errors are as large as a unit over its square: both are least at the third root of a unit, 6e-6. With this many times
@@ -49,20 +46,16 @@ class Equations(MechanismMotion):
     constants: list[Array]  # the subexpressions of parameters alone that the programs use, computed once
     textbook: TextbookEquations  # the same as it stands, of the rows kept
     code: Code = eqx.field(static=True)
-    branch: bool = eqx.field(
-        static=True, default=True
-    )  # whether `Auto` turns to singular values itself, or says NaN where it should
-    doubt: bool = eqx.field(static=True, default=True)  # whether it says anything of rows that elimination drops
+    policy: RankPolicy = REVEAL  # of `Auto`, which eliminates rows that are known to be independent
     loop: Loop | None = eqx.field(static=True, default=None)  # in which its programs run
 
-    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
-        """a = a_F + M^(-1/2) D^+ b. With `watch`, `Auto` also looks at the rows left out."""
-        watched = watch and isinstance(self.method, Auto)
-        return fast.accelerations("accelerations_watched" if watched else "accelerations", self, t, q, v)
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+        """a = a_F + M^(-1/2) D^+ b."""
+        return fast.accelerations("accelerations_watched" if self.branches else "accelerations", self, t, q, v)
 
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         """lambda = -(D^+)^T D^+ b of all rows, by singular values."""
-        return self.exact().multipliers(t, q, v)
+        return self.by(SVD).multipliers(t, q, v)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
@@ -148,7 +141,7 @@ class Equations(MechanismMotion):
 
     @property
     def branches(self) -> bool:
-        return self.branch and self.code.elimination == "check"
+        return self.policy.action == "reveal" and self.code.elimination == "check"
 
     def run(self, name: str, t: Any, q: Any, v: Any) -> list[Any]:
         """Evaluate one of the programs."""
@@ -173,39 +166,29 @@ class Equations(MechanismMotion):
         return self._on_all_rows(self.method).linearized(name, t, q, v)
 
     @property
-    def quick(self) -> "Equations":
-        """The same without a branch: what `Auto` cannot solve by elimination is not a number."""
-        return dataclasses.replace(self, branch=False)
+    def refuses(self) -> bool:
+        """Whether what a small pivot has to do with is not a number."""
+        return self.policy.action == "refuse" and self.code.elimination == "check"
+
+    def with_policy(self, policy: RankPolicy) -> "Equations":
+        """The same with another decision about small pivots of `Auto`, which is the only method that has one to make."""
+        constants, places = self.constants, [s.index for s in self.code.constants]
+        if policy.threshold is not None and self.code.elimination == "check" and self.code.drop.index in places:
+            drop = places.index(self.code.drop.index)
+            constants = [policy.threshold if k == drop else c for k, c in enumerate(constants)]
+        return dataclasses.replace(self, constants=constants, policy=policy)
+
+    def by(self, method: type[Pseudoinverse], share: float = 1.0) -> TextbookEquations:
+        """The same by another method on all rows, with a share of this one's rank threshold."""
+        return self._on_all_rows(method(share * self.method.rank_tol, self.method.relative))
 
     @property
-    def careful(self) -> TextbookEquations:
+    def rank_revealing(self) -> TextbookEquations:
         """The same by Varga's method on all rows, which takes a fraction of the time that singular values take."""
-        return self._on_all_rows(Varga(WITH_CARE * self.method.rank_tol, self.method.relative))
-
-    @property
-    def forgiving(self) -> "Equations":
-        """The same without a branch: `Auto` drops rows that depend on others, but for rounding, as `Elimination` does."""
-        return self._dropping(lambda _: jnp.asarray(NOTHING_LEFT))
-
-    def known_to(self, tol: Any) -> "Equations":
-        """As `forgiving`: `Auto` drops rows by which velocities would be turned by more than `tol`, if their pivots are small."""
-        return self._dropping(lambda own: jnp.clip(TURNED / jax.lax.stop_gradient(tol), NOTHING_LEFT, jnp.minimum(own, USELESS)))
-
-    def _dropping(self, threshold: Callable[[Array], Array]) -> "Equations":
-        """The same without a branch, with another threshold of `Auto`, made of its own, below which it drops rows."""
-        places = [s.index for s in self.code.constants]
-        if not self.branches or self.code.drop.index not in places:
-            return self.quick
-        drop = places.index(self.code.drop.index)
-        constants = [threshold(c) if k == drop else c for k, c in enumerate(self.constants)]
-        return dataclasses.replace(self, constants=constants, branch=False, doubt=False)
+        return self.by(Varga, WITH_CARE)
 
     def within(self, loop: Loop) -> "Equations":
         return dataclasses.replace(self, loop=loop)
-
-    def exact(self) -> TextbookEquations:
-        """The same by singular values of all rows: what `Auto` turns to."""
-        return self._on_all_rows(SVD(self.method.rank_tol, self.method.relative))
 
     def _on_all_rows(self, method: Pseudoinverse) -> TextbookEquations:
         return dataclasses.replace(self.textbook, method=method, redundant=(), loop=self.loop)
@@ -213,7 +196,7 @@ class Equations(MechanismMotion):
     @property
     def plain(self) -> TextbookEquations:
         """The textbook's form of the same function, which derivatives are taken of where the programs have none."""
-        return self.exact() if self.branches else dataclasses.replace(self.textbook, loop=self.loop)
+        return self.by(SVD) if self.branches else dataclasses.replace(self.textbook, loop=self.loop)
 
     def constants_of(self, mechanism: Mechanism, baumgarte: Baumgarte | None) -> list[Array]:
         """The constants as a function of the numbers of the scene and the gains."""
@@ -233,9 +216,9 @@ def prepare(
     """Prepare a mechanism for a method (default `Auto`). Its numbers may be traced; its structure decides what is compiled.
 
     Returns `Equations`, straight-line code, for elimination, `TextbookEquations` for every other method; or of a scene of more
-    than `LARGE` elements `LargeEquations`, whose program does not grow with the scene. `large` says so, whatever the size. `moving` says of each leaf of the mechanism whether it is traced
-    where all begins: of the others XLA may know the numbers, though they are traced here. Without it none is taken to be.
-    `analysis` is that of `analyse`, by default made here.
+    than `LARGE` elements `LargeEquations`, whose program does not grow with the scene. `large` says which, whatever the size.
+    `moving` says of each leaf of the mechanism whether it is traced where all begins: of the others XLA may know the numbers,
+    though they are traced here. Without it none is taken to be. `analysis` is that of `analyse`, by default made here.
 
     A method without a `rank_tol` gets `rank_tolerance`. Without knowledge of which rows are redundant (a mechanism that was built
     from traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
@@ -255,8 +238,9 @@ def prepare(
     elimination, drop = "drop", tol**2
     if isinstance(chosen, Auto) and redundant is not None:
         elimination, drop = "check", chosen.branch_tol
+        elimination, drop = "check", chosen.branch_tol
     elif not isinstance(chosen, Elimination):
-        chosen = chosen.exact if isinstance(chosen, Auto) else chosen
+        chosen = chosen.rank_revealing if isinstance(chosen, Auto) else chosen
         return TextbookEquations(mechanism, chosen, baumgarte, analysis.scales)
     programs = code(mechanism, redundant or (), baumgarte is not None, elimination)
     leaves = jax.tree.leaves(mechanism)
@@ -264,7 +248,7 @@ def prepare(
     moves = [move for leaf, move in zip(leaves, moving or [False] * len(leaves), strict=True) for _ in range(np.size(leaf))]
     constants = [jnp.asarray(c) for c in programs.prologue.early(numbers, [*moves, *[False] * (len(numbers) - len(moves))])]
     textbook = TextbookEquations(mechanism, chosen, baumgarte, analysis.scales, redundant or ())
-    return Equations(constants, textbook, programs)
+    return Equations(constants=constants, textbook=textbook, code=programs)
 
 
 def prepare_to_close(mechanism: Mechanism, large: bool | None = None, analysis: Analysis | None = None) -> Any:

@@ -70,7 +70,7 @@ def accelerations(
     """
     equations = equations_of(mechanism, method, stabilization, formulation, analysis=analysis)
     t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
-    a = equations.accelerations(t, q.ravel(), v.ravel(), watch=True).reshape(q.shape)
+    a = equations.accelerations(t, q.ravel(), v.ravel()).reshape(q.shape)
     return (a, equations.multipliers(t, q.ravel(), v.ravel())) if multipliers else a
 
 

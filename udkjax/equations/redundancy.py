@@ -133,7 +133,7 @@ def rows_of(mechanism: Mechanism, large: bool | None = None) -> "KinematicRows |
         return KinematicRows(mechanism)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 
-    return SparseRows(mechanism)
+    return SparseRows(mechanism, kinematic=True)
 
 
 def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:

@@ -57,7 +57,7 @@ def known_scales(mechanism: Mechanism) -> Scales:
     mechanism = jax.tree.map(np.asarray, mechanism)
     q, v = (np.asarray(x, float).ravel() for x in (mechanism.q0, mechanism.v0))
     with np.errstate(all="ignore"):  # what is not finite is no scale
-        found = _scales(mechanism, *(_large if is_large(mechanism) else _small)(mechanism, q, v, np), np)
+        found = _scales(mechanism, (_large if is_large(mechanism) else _small)(mechanism, q, v, np), np)
     return jax.tree.map(number, found)
 
 
@@ -65,7 +65,7 @@ def traced_scales(mechanism: Mechanism) -> Scales:
     """The same in a trace; without derivatives."""
     mechanism = jax.lax.stop_gradient(mechanism)
     q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
-    return jax.lax.stop_gradient(_scales(mechanism, *(_large if is_large(mechanism) else _small)(mechanism, q, v, jnp), jnp))
+    return jax.lax.stop_gradient(_scales(mechanism, (_large if is_large(mechanism) else _small)(mechanism, q, v, jnp), jnp))
 
 
 def _small(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
@@ -102,8 +102,8 @@ def _large(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
     return (row, column), entries, free, xp.asarray(rate), xp.zeros(found.count)
 
 
-def _scales(mechanism: Mechanism, places: Any, psi_q: Any, free: Any, psi_t: Any, gamma: Any, xp: Any) -> Scales:
-    rows, columns = places
+def _scales(mechanism: Mechanism, guess: tuple[Any, ...], xp: Any) -> Scales:
+    (rows, columns), psi_q, free, psi_t, gamma = guess
     bodies = mechanism.bodies.values()
     inertia, mass = (xp.stack([xp.asarray(getattr(body, name)) for body in bodies]) for name in ("inertia", "mass"))
     length = arm = xp.max(xp.sqrt(inertia / mass))

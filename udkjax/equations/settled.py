@@ -17,6 +17,7 @@ from udkjax.equations.assembly import Closure, State, close
 from udkjax.equations.closing import rounding
 from udkjax.equations.code import is_large
 from udkjax.equations.programs import prepare
+from udkjax.equations.rank_policy import REFUSE
 from udkjax.equations.scales import rank_tolerance
 from udkjax.pinv import Auto
 from udkjax.scene.fields import number
@@ -58,7 +59,7 @@ def _as_it_is(
     analysis: Analysis, mechanism: Mechanism, t: Float[Array, ""], state: State | None
 ) -> tuple[Closure, Bool[Array, ""]]:
     """The guess, moved by rounding errors at most, and whether that is its closure."""
-    equations = prepare(mechanism, Auto(), analysis=analysis).quick
+    equations = prepare(mechanism, Auto(), analysis=analysis).with_policy(REFUSE)
     q, v = (mechanism.q0.ravel(), mechanism.v0.ravel()) if state is None else (state.q.ravel(), state.v.ravel())
     D = equations.weighted(t, q)[0]
     psi, psi_dot = equations.violation(t, q, v)

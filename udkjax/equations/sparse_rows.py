@@ -10,6 +10,7 @@ dozen in most scenes, is decided about by itself, by singular values.
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
@@ -93,16 +94,22 @@ def _beside(parts: list[Any], rows: int) -> Any:
 
 
 class SparseRows:
-    """Psi and D of a mechanism with known numbers; D sparse. The interface is that of `redundancy.Rows`."""
+    """Psi and D of a mechanism with known numbers; D sparse. The metric is M^(-1/2), or, to look for redundant rows, (A, A, 1).
 
-    def __init__(self, mechanism: Mechanism):
+    The interface is that of `closing.DenseRows` and of `redundancy.KinematicRows`.
+    """
+
+    def __init__(self, mechanism: Mechanism, kinematic: bool = False):
         self._layout = layout(*structure(mechanism), (), False)
         numbers = self._layout.numbers(mechanism, ())
         self.count, self.size = self._layout.count, 3 * self._layout.bodies
         self.names = self._layout.row_names
         self.samples = SAMPLES if self.count <= MANY else SAMPLES // 3
-        self.metric = np.asarray(numbers["root"]).T.ravel()
-        self.scales = known_scales(mechanism)
+        self.scales = jax.tree.map(np.asarray, known_scales(mechanism))
+        root = np.asarray(numbers["root"]).T.ravel()
+        arm = float(self.scales.arm)
+        self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
+        self._stretch = self.metric / root
         self.tick = tick(self.scales)
         self._evaluate = lambda t, q, v: self._layout.position(numbers, t, q, v)
 
@@ -126,7 +133,7 @@ class SparseRows:
 
     def _scaled(self, values: np.ndarray) -> tuple[Any, np.ndarray]:
         row, column, place = self._places
-        D = csr_array((values.ravel()[place], (row, column)), shape=(self.count, self.size))
+        D = csr_array((values.ravel()[place] * self._stretch[column], (row, column)), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
         length[length == 0.0] = 1.0
         return csr_array(D.multiply(1 / length[:, None])), length
@@ -139,7 +146,7 @@ class SparseRows:
         return self._solve(D, psi / length)
 
     def _solve(self, D: Any, residual: np.ndarray) -> np.ndarray:
-        """-M^(-1/2) D^T (D D^T + damping)^(-1) of a residual."""
+        """-W D^T (D D^T + damping)^(-1) of a residual."""
         if not np.all(np.isfinite(D.data)):
             return np.full(self.size, np.nan)
         system = csc_array(D @ D.T + DAMPING * eye_array(self.count))

@@ -33,7 +33,7 @@ class TextbookEquations(MechanismMotion):
     redundant: tuple[int, ...] = eqx.field(static=True, default=())
     loop: Loop | None = eqx.field(static=True, default=None)  # in which they are evaluated
 
-    def accelerations(self, t: Any, q: Vector, v: Vector, watch: bool = False) -> Vector:
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         """a = a_F + M^(-1/2) D^+ b."""
         return uk.accelerations(self._here, t, q, v, self.method, self.baumgarte, self.weights)
 

@@ -6,9 +6,9 @@ A mechanism's constraints Psi(t, q) = 0, masses M and loads F give, with
 
     a = a_F + M^(-1/2) D^+ b,        lambda = -(D^+)^T D^+ b,        M a + Psi_q^T lambda = F,
 
-whatever the rank of D: the accelerations that satisfy the constraints, or violate them least, and are nearest to a_F in the metric
-of M (Gauss's principle), and the multipliers of least norm. Every symbol is a function, on arrays, to be differentiated to any
-order; every faster form is held against these. t, q and v are those of constraints.py; `method` is any pseudoinverse.
+whatever the rank of D: the accelerations that satisfy the constraints, or violate them least, and of these the nearest to a_F in
+the metric of M (Gauss's principle), and the multipliers of least norm. Every symbol is a function on arrays, differentiable
+to any order; every faster form is held against these. t, q and v are those of constraints.py; `method` is any pseudoinverse.
 
 Rows of Psi in metres and rows in radians have singular values of different units. Weights w (m,) of the rows make them comparable
 to one another, so that one threshold of the rank serves all (`Scales.weights`: 1 for metres, a length for radians): D and b stand

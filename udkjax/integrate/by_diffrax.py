@@ -9,6 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion
+from udkjax.equations.rank_policy import REFUSE
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.explicit import GROW, SAFETY, SHRINK
@@ -61,14 +62,28 @@ def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array,
 
 
 def _first_step(problem: Problem, y0: Array) -> Array:
-    ts, equations, unit = problem.ts, undifferentiated(problem.equations.quick), jnp.concatenate(problem.units())
+    ts, equations, unit = problem.ts, undifferentiated(problem.equations.with_policy(REFUSE)), jnp.concatenate(problem.units())
     return first_step(y0, derivative(ts[0], undifferentiated(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol, unit)
 
 
-def _controller(problem: Problem) -> diffrax.PIDController:
+def _controller(problem: Problem) -> Any:
     # Every coordinate and velocity meets its tolerance: the mean over a large mechanism would hide one that does not.
     settings: dict[str, Any] = {"norm": optx.max_norm, "dtmin": problem.smallest, "force_dtmin": False}
     if is_explicit(problem.solver):  # the same steps as in lanes
         settings |= {"safety": SAFETY, "factormin": SHRINK, "factormax": GROW}
-    atol: Any = problem.atol * jnp.concatenate(problem.units())
-    return diffrax.PIDController(rtol=problem.rtol, atol=atol, **settings)
+    tolerances: dict[str, Any] = {"rtol": problem.rtol, "atol": problem.atol * jnp.concatenate(problem.units())}
+    if problem.breakpoints is None:
+        return diffrax.PIDController(**tolerances, **settings)
+    return diffrax.ClipStepSizeController(_FrozenSteps(**tolerances, **settings), jump_ts=problem.breakpoints)
+
+
+class _FrozenSteps(diffrax.PIDController):
+    """Chooses sizes of steps that have no derivatives.
+
+    Those of the controller follow the size of the step before: where a breakpoint has cut one short, the ones behind it, up to
+    ten times as long each, would have derivatives along it that grow as fast.
+    """
+
+    def adapt_step_size(self, *args: Any, **kwargs: Any) -> Any:
+        keep, t0, t1, *rest = super().adapt_step_size(*args, **kwargs)
+        return keep, t0, t0 + undifferentiated(t1 - t0), *rest

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from udkjax.equations.rank_policy import REFUSE
 from udkjax.integrate.counting import again, tally
 from udkjax.integrate.multistep import Multistep
 from udkjax.integrate.projection import lasting, project
@@ -36,14 +37,14 @@ class Constrained(Wrapper):
         if not args.branches:
             return self._attempt(terms, t0, t1, y0, args, solver_state, made_jump)
         state = (solver_state, made_jump)
-        quick = _in_a_loop(self, terms, t0, t1, y0, args.quick, *state)
+        quick = _in_a_loop(self, terms, t0, t1, y0, args.with_policy(REFUSE), *state)
         doubt = ~jnp.all(jnp.isfinite(quick[0]))
 
-        def careful():
+        def fallback():
             y1, error, *rest = _arrays(self._attempt(terms, t0, t1, y0, args, *state))
             return y1, again(quick[1], error), *rest
 
-        return _second_thoughts(doubt, careful, quick)
+        return _second_thoughts(doubt, fallback, quick)
 
     def _attempt(self, terms, t0, t1, y0, equations, solver_state, made_jump):
         equations, solver = equations.held(t0, *jnp.split(y0, 2)), self.solver
@@ -100,7 +101,7 @@ def _arrays(tree: Any) -> Any:
     return jax.tree.map(jnp.asarray, tree)
 
 
-def _second_thoughts(doubt: Any, careful: Any, quick: Any) -> Any:
-    """What was found without branching, or, where that is doubtful, what `careful` finds."""
+def _second_thoughts(doubt: Any, fallback: Any, quick: Any) -> Any:
+    """What was found without branching, or, where that is doubtful, what `fallback` finds."""
     where = lambda a, b: jnp.where(doubt, a, b)  # noqa: E731
-    return jax.lax.cond(eqxi.unvmap_any(doubt), lambda: jax.tree.map(where, careful(), quick), lambda: quick)
+    return jax.lax.cond(eqxi.unvmap_any(doubt), lambda: jax.tree.map(where, fallback(), quick), lambda: quick)

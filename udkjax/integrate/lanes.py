@@ -15,10 +15,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from udkjax.equations.motion import Motion, Tangential
+from udkjax.equations.rank_policy import REFUSE, drop_within
 from udkjax.integrate.batched import CHUNKED, batched
 from udkjax.integrate.explicit import March, march
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.norms import largest
+from udkjax.integrate.pieces import Pieces
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import ended, lasting, violation
 from udkjax.integrate.step import Task, Trial, errors, judged, stage_state
@@ -75,8 +77,10 @@ def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
     def every(x: Array, axis: int | None) -> Array:
         return jnp.broadcast_to(x[..., None], (*x.shape, size)) if axis is None else last(x, axis)
 
-    lanes = Lanes(problem.equations, axes.equations, size)
+    lanes = Lanes(problem.equations, axes.equations, size, axes_of_pieces=axes.pieces)
     problem = dataclasses.replace(problem, ts=last(problem.ts, axes.ts), q=every(problem.q, axes.q), v=every(problem.v, axes.v))
+    if problem.breakpoints is not None:
+        problem = dataclasses.replace(problem, breakpoints=last(problem.breakpoints, axes.breakpoints))
     raw = _marched(problem, lanes)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), raw)
 
@@ -84,14 +88,21 @@ def _in_lanes(problem: Problem, axes: Any, size: int) -> Raw:
 class Lanes:
     """Equations evaluated for one state, or for lanes of states (n, L), with equations of their own where `axes` says so."""
 
-    def __init__(self, equations: Motion, axes: Any = None, size: int | None = None, loop: Loop | None = None):
+    def __init__(
+        self,
+        equations: Motion,
+        axes: Any = None,
+        size: int | None = None,
+        loop: Loop | None = None,
+        axes_of_pieces: Any = None,
+    ):
         self.equations, self.size, self.shape = equations, size, () if size is None else (size,)
         self._arrays, self._static = eqx.partition(equations, eqx.is_array)
-        self._axes, self._loop = axes, loop
+        self._axes, self._loop, self._axes_of_pieces = axes, loop, axes_of_pieces
 
     def within(self, loop: Loop | None) -> "Lanes":
         """The same, whose programs run in this loop where they are evaluated for all lanes."""
-        return Lanes(self.equations, self._axes, self.size, loop)
+        return Lanes(self.equations, self._axes, self.size, loop, self._axes_of_pieces)
 
     def over(self, function: Callable, *states: Array) -> Any:
         """`function(equations, t, q, v)` of each lane."""
@@ -103,6 +114,15 @@ class Lanes:
         if self.size is None:
             return lane(self._arrays, *states)
         return jax.vmap(lane, in_axes=(self._axes, *[-1] * len(states)), out_axes=-1)(self._arrays, *states)
+
+    def piece(self, pieces: Pieces, *states: Array) -> Array:
+        """In which pieces the state of each lane is."""
+        if self.size is None:
+            return pieces(*states)
+        arrays, static = eqx.partition(pieces, eqx.is_array)
+        axes = jax.tree.map(lambda axis: axis if type(axis) is int else None, self._axes_of_pieces)
+        lane = lambda arrays, *state: eqx.combine(arrays, static)(*state)  # noqa: E731
+        return jax.vmap(lane, in_axes=(axes, *[-1] * len(states)), out_axes=-1)(arrays, *states)
 
     def each(self, which: Array, function: Callable, otherwise: Any, *states: Any) -> Any:
         """`function(equations, *states)` of the lanes in question, one at a time; the others get what is `otherwise`."""
@@ -127,8 +147,8 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
     """What to march along."""
     over = lanes.within(None if recorded else _loop_of(problem, lanes)).over
     task = Task(
-        partial(over, lambda e, t, q, v: e.quick.accelerations(t, q, v)),
-        partial(over, lambda e, t, q, v: e.quick.arrived(t, q, v)),
+        partial(over, lambda e, t, q, v: e.with_policy(REFUSE).accelerations(t, q, v)),
+        partial(over, lambda e, t, q, v: e.with_policy(REFUSE).arrived(t, q, v)),
         partial(over, lasting),
         partial(over, ended),
         None,
@@ -137,6 +157,11 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
         *(problem.h, problem.max_steps, method_of(problem.solver)),
         recorded,
     )
+    if problem.breakpoints is not None:
+        shared = problem.breakpoints.ndim == 1 and lanes.size is not None
+        task = task._replace(breakpoints=problem.breakpoints[:, None] if shared else problem.breakpoints)
+    if problem.pieces is not None:
+        task = task._replace(piece=partial(lanes.piece, problem.pieces))
     if not problem.projected:
 
         def as_it_is(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -145,7 +170,7 @@ def task_of(problem: Problem, lanes: Lanes, recorded: bool = False) -> Task:
         task = task._replace(arrived=as_it_is, lasting=_all_of_it)
         task = task._replace(ended=lambda t, q, v, dq, dv: (*as_it_is(t, q, v), _all_of_it(t, q, v, dq, dv)))
     if problem.equations.branches and problem.fallback:
-        task = task._replace(careful=partial(_careful, task, problem.projected, lanes))
+        task = task._replace(fallback=partial(_fallback_step, task, problem.projected, lanes))
     return task
 
 
@@ -190,7 +215,9 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
 # --- with care
 
 
-def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Point, h: Array, t1: Array, begin: Array) -> Trial:
+def _fallback_step(
+    task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Point, h: Array, t1: Array, begin: Array
+) -> Trial:
     """A step taken again of the lanes in doubt: by a method that looks at all rows where elimination finds nothing."""
     stages = task.method.stages
 
@@ -205,14 +232,14 @@ def _careful(task: Task, projected: bool, lanes: Lanes, doubt: Array, here: Poin
             return i + 1, jax.lax.dynamic_update_index_in_dim(a, found, i, 0), q, v, ~jnp.all(jnp.isfinite(found))
 
         def more(carry: Any) -> Any:  # a loop that XLA compiles into one function, and what it cannot
-            quick = equations.quick.within(Loop())
+            quick = equations.with_policy(REFUSE).within(Loop())
             carry = jax.lax.while_loop(lambda c: (c[0] <= stages) & ~c[-1], partial(stage, quick), carry)
             return jax.lax.cond(carry[-1], again, lambda c: c, carry)
 
         def again(carry: Any) -> Any:
             i, a, *state = carry
             a = a.at[i - 1].set(0.0)  # what is not a number would be none with a weight of 0, too
-            return *stage(equations.careful, (i - 1, a, *state))[:-1], jnp.array(False)
+            return *stage(equations.rank_revealing, (i - 1, a, *state))[:-1], jnp.array(False)
 
         start, none = jnp.where(begin, stages, 0), jnp.zeros((stages + 1, *here.a.shape))
         first = start, none, here.q, here.v, jnp.array(False)
@@ -292,7 +319,9 @@ def _output(problem: Problem | None, steps: int, lanes: Lanes, t: Array, y: Arra
     if problem is not None:
         tol = jnp.broadcast_to(output_tolerance(problem, y), lanes.shape)
         inside = lanes.within(Loop(lanes.size is not None))  # what closes it is a loop
-        q, v, moving = inside.over(lambda e, t, y, tol: e.known_to(tol).closed(t, *jnp.split(y, 2), steps), t, y, tol)
+        q, v, moving = inside.over(
+            lambda e, t, y, tol: e.with_policy(drop_within(tol)).closed(t, *jnp.split(y, 2), steps), t, y, tol
+        )
         y = jnp.concatenate([q, v])
     return y, lanes.over(violation, t, y), moving
 

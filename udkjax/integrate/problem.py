@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion
+from udkjax.integrate.pieces import Pieces
 from udkjax.integrate.undifferentiated import undifferentiated
 
 RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, DOUBTED = range(5)  # what a run may be
@@ -30,13 +31,16 @@ class Problem(eqx.Module):
     projected: bool = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
     fallback: bool = eqx.field(static=True, default=True)  # whether steps that elimination cannot take are; else they end a run
+    breakpoints: Float[Array, "k"] | None = None  # the times where the motion is not smooth, in any order; None: it is
+    pieces: Pieces | None = None  # in which the motion is smooth, of those that have some; None: nothing has
 
     def units(self, lanes: tuple[int, ...] = ()) -> tuple[Any, Any]:
         """What `atol` is relative to, of coordinates and of velocities, (n, *lanes) or to be broadcast so."""
         one = jnp.ones((len(self.q), *[1] * len(lanes)))
         if self.length is not None:
             one = jnp.where(np.arange(len(self.q)).reshape(one.shape) % 3 == 2, one, self.length)
-        return undifferentiated((one, one * self.rate))
+        q, v = jnp.broadcast_arrays(one, one * self.rate)
+        return undifferentiated((q, v))
 
 
 class Raw(NamedTuple):

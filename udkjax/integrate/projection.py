@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion, Tangential
+from udkjax.equations.rank_policy import REFUSE, drop_dependent
 from udkjax.integrate.undifferentiated import undifferentiated
 
 # How much of an error counts that projection takes back. What lasts of it is what it does to the rest while the step is taken.
@@ -34,12 +35,12 @@ def lasting(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array)
     Close to dependent rows it need not be exact, and does not branch.
     """
     q, v, dq, dv = undifferentiated((q, v, dq, dv))
-    return _counted(undifferentiated(equations.forgiving).tangential(t, q, v, dq, dv), dq, dv)
+    return _counted(undifferentiated(equations.with_policy(drop_dependent())).tangential(t, q, v, dq, dv), dq, dv)
 
 
 def ended(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array) -> tuple[Array, Array, Array, Tangential]:
     """The end of a step with errors dq and dv: q and v on the manifold, the accelerations there, and the errors `lasting`."""
-    quick = equations.quick
+    quick = equations.with_policy(REFUSE)
     if not quick.finishes:
         q, v, a = quick.arrived(t, q, v)
         return q, v, a, lasting(equations, t, q, v, dq, dv)
@@ -66,7 +67,7 @@ def project_all(equations: Any, ts: Float[Array, "T"], ys: Float[Array, "T 2n"])
     An interpolated state lies off it by the error of the interpolation: it takes one projection more than a step.
     """
 
-    quick = jax.vmap(lambda t, y: _twice(equations.quick, t, y))(ts, ys)
+    quick = jax.vmap(lambda t, y: _twice(equations.with_policy(REFUSE), t, y))(ts, ys)
     if not equations.branches:
         return quick
     doubts = ~jnp.all(jnp.isfinite(quick), axis=1)

@@ -20,7 +20,7 @@ class Record(NamedTuple):
     """Arrays of n coordinates for methods of s stages; the step to point k is in the row (k - 1) mod `KEPT` of what is kept."""
 
     times: Float[Array, "N"]  # of all points
-    careful: Bool[Array, "N"]  # whether the step to a point was taken with care
+    fallback: Bool[Array, "N"]  # whether the step to a point was taken with care
     stages: Float[Array, "kept s n"]  # accelerations of the stages
     points: Float[Array, "kept+3 3 n"]  # q, v and a at the end of each step kept, and of the three points before them
     marks: Float[Array, "M 3 3 n"]  # q, v and a of the last three points, at every point whose number is a multiple of `KEPT`
@@ -39,7 +39,7 @@ def blank(here: Point, stages: int, max_steps: int) -> Record:
     )
 
 
-def noted(record: Record, k: Array, points: tuple[Point, ...], stages: Array, careful: bool) -> Record:
+def noted(record: Record, k: Array, points: tuple[Point, ...], stages: Array, fallback: bool) -> Record:
     """The record with the step to point k, the last of `points`. Of a step that is not accepted, the next one overwrites it.
 
     So no step has to be told from another; and a mark is written at every step: that at a multiple of `KEPT` is the last.
@@ -48,7 +48,7 @@ def noted(record: Record, k: Array, points: tuple[Point, ...], stages: Array, ca
     row, last = (k - 1) % kept, [as_array(p) for p in points[-BEHIND:]]
     return Record(
         record.times.at[k].set(points[-1].t),
-        record.careful.at[k].set(careful),
+        record.fallback.at[k].set(fallback),
         record.stages.at[row].set(stages),
         record.points.at[BEHIND + row].set(last[-1]),
         record.marks.at[-(-k // kept)].set(jnp.stack(last)),

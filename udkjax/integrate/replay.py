@@ -22,8 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.equations.rank_policy import REFUSE
+from udkjax.integrate.breakpoints import breakpoint_at, is_new_start
 from udkjax.integrate.explicit import BLOCK
-from udkjax.integrate.interpolation import POINTS
+from udkjax.integrate.interpolation import POINTS, Point
 from udkjax.integrate.lanes import Lanes, task_of
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.record import BEHIND, Record, as_point, noted
@@ -35,9 +37,9 @@ from udkjax.straightline import when
 def walked_back(problem: Problem, moving: Problem, raw: Raw, record: Record, ys: Array, y: Array) -> Problem:
     """From the cotangents of `Raw.q` and `Raw.v`, side by side, and of `Raw.y` to those of what `moving` has of the problem."""
     task, n = task_of(problem, Lanes(problem.equations), recorded=True), len(problem.q)
-    timed = moving.ts is not None
+    timed = moving.ts is not None or moving.breakpoints is not None
     equations = Equations(problem.equations, moving.equations, timed)
-    sums = Sums(jax.tree.map(jnp.zeros_like, moving.equations), jnp.zeros_like(problem.ts) if timed else None)
+    sums = Sums(*jax.tree.map(jnp.zeros_like, (moving.equations, moving.ts, moving.breakpoints)))
     outputs = jnp.where(raw.reached[:, None], ys, 0.0)
     first, outputs = outputs[0], outputs[1:]
     if problem.projected:
@@ -49,16 +51,16 @@ def walked_back(problem: Problem, moving: Problem, raw: Raw, record: Record, ys:
     k, kept = raw.accepted + 1, len(record.stages)
     window = jnp.zeros((POINTS, 3, n)).at[-1, :2].set(end.reshape(2, n))
     start = Walk(k, (k - 1) // kept, jnp.clip(jnp.sum(raw.reached) - 1, 0, inner), window, jnp.zeros(POINTS), sums)
-    quick = partial(_step, problem, task, equations, outputs, (k, done), careful=False)
-    slow = partial(_step, problem, task, equations, outputs, (k, done), careful=True)
+    quick = partial(_step, problem, task, equations, outputs, (k, done), fallback=False)
+    slow = partial(_step, problem, task, equations, outputs, (k, done), fallback=True)
 
     def rounds(carry: tuple[Walk, Record]) -> tuple[Walk, Record]:
         walk, record = carry
         head = record._replace(points=record.points.at[:BEHIND].set(record.marks[walk.segment]))
         base = walk.segment * kept
-        walk = jax.lax.while_loop(lambda w: (w.k > base) & ~head.careful[w.k], partial(quick, head), walk)
-        if task.careful is not None:
-            walk = when((walk.k > base) & head.careful[walk.k], partial(slow, head), walk)
+        walk = jax.lax.while_loop(lambda w: (w.k > base) & ~head.fallback[w.k], partial(quick, head), walk)
+        if task.fallback is not None:
+            walk = when((walk.k > base) & head.fallback[walk.k], partial(slow, head), walk)
         if len(record.marks) > 2:  # there are more steps than are kept
             again = partial(_again, task)
             segment = (walk.k - 1) // kept
@@ -69,25 +71,25 @@ def walked_back(problem: Problem, moving: Problem, raw: Raw, record: Record, ys:
     walk, _ = jax.lax.while_loop(lambda c: c[0].k > 0, rounds, (start, record))
     numbers, ts = walk.sums.numbers, None if walk.sums.ts is None else walk.sums.ts.at[0].add(walk.t[-1])
     q, v = walk.window[-1, 0] + first[:n], walk.window[-1, 1] + first[n:]
-    found = {"equations": numbers, "ts": ts, "q": q, "v": v}
+    found = {"equations": numbers, "ts": ts, "q": q, "v": v, "breakpoints": walk.sums.breakpoints}
     asked = {name: x for name, x in found.items() if jax.tree.leaves(getattr(moving, name))}
     return dataclasses.replace(jax.tree.map(jnp.zeros_like, moving), **asked)
 
 
-def _step(problem, task, equations, outputs, end, record, walk, careful: bool) -> Walk:
+def _step(problem, task, equations, outputs, end, record, walk, fallback: bool) -> Walk:
     """The step to point k, walked back."""
     k, kept, method = walk.k, len(record.stages), task.method
     row = k - 1 - walk.segment * kept
     points = jax.lax.dynamic_slice_in_dim(record.points, row, POINTS)
     times = record.times[jnp.maximum(k - jnp.arange(BEHIND, -1, -1), 0)]
     window = tuple(as_point(times[i], points[i]) for i in range(POINTS))
-    walk = of_points(problem, equations, outputs, window, walk)
+    walk = of_points(problem, equations, outputs, window, walk, _since(problem, record, k, end[0], window))
     here, to = window[-2:]
     stages, h = jax.lax.dynamic_index_in_dim(record.stages, row, keepdims=False), to.t - here.t
-    begin, timed = k == 1, equations.timed
+    begin, timed = _begins(problem, k, here.t, to.t), equations.timed
     s = method.stages
-    first = jnp.where(begin, s, 0 if careful else 1)
-    own = (lambda e: e) if careful else (lambda e: e.quick)
+    first = jnp.where(begin, s, 0 if fallback else 1)
+    own = (lambda e: e) if fallback else (lambda e: e.with_policy(REFUSE))
     used = int(np.nonzero(np.any(method.v != 0, axis=0))[0].max())  # the last stage that the step makes use of
 
     def stage(c):
@@ -119,17 +121,48 @@ def _step(problem, task, equations, outputs, end, record, walk, careful: bool) -
     none = jnp.zeros_like(here.q)
     start = (jnp.asarray(s), walk.sums, a, none, none, zero, zero)
     _, sums, a, q_bar, v_bar, t_bar, h_bar = jax.lax.while_loop(lambda c: c[0] >= first, stage, start)
-    a0 = none if careful else jnp.where(begin, 0.0, a[0])
+    a0 = none if fallback else jnp.where(begin, 0.0, a[0])
     shifted = jnp.concatenate([jnp.zeros_like(walk.window[:1]), walk.window[:-1]])
     shifted = shifted.at[-1].add(jnp.stack([q_bar, v_bar, a0]))
     t = walk.t
-    if sums.ts is not None:
+    if timed:
         total, done = end
-        last = (k == total) & done  # it ends at the last output time; the others where their size takes them
-        ending = walk.t[-1] + h_bar
-        sums = sums._replace(ts=sums.ts.at[-1].add(jnp.where(last, ending, 0.0)))
+        # It ends at the last output time, or at a breakpoint; the others where their size takes them.
+        last, ending = (k == total) & done, walk.t[-1] + h_bar
+        if sums.ts is not None:
+            sums = sums._replace(ts=sums.ts.at[-1].add(jnp.where(last, ending, 0.0)))
+        if problem.breakpoints is not None:
+            place, beside = breakpoint_at(problem.breakpoints, to.t, problem.smallest)
+            beside &= ~begin & ~last
+            if sums.breakpoints is not None:
+                sums = sums._replace(breakpoints=sums.breakpoints.at[place].add(jnp.where(beside, ending, 0.0)))
+            last |= beside
         t = jnp.concatenate([jnp.zeros(1), walk.t[:-1]]).at[-1].add(t_bar + jnp.where(last, -h_bar, walk.t[-1]))
     return Walk(k - 1, walk.segment, walk.left, shifted, t, sums)
+
+
+def _begins(problem: Problem | Task, k: Array, before: Array, to: Array) -> Array:
+    """Whether what leads to point k at time `to` is no step, but the start, or a new one."""
+    return (k == 1) | is_new_start(before, to, problem.smallest) if _restarts(problem) else k == 1
+
+
+def _restarts(problem: Problem | Task) -> bool:
+    """Whether the run may start anew on its way."""
+    pieces = problem.piece if isinstance(problem, Task) else problem.pieces
+    return problem.breakpoints is not None or pieces is not None
+
+
+def _since(problem: Problem, record: Record, k: Array, total: Array, window: tuple[Point, ...]) -> Array:
+    """The time since when the step to point k, the last of the window, has written outputs."""
+    if not _restarts(problem):
+        return window[-2].t
+    times = jnp.stack([point.t for point in window])
+    before = record.times[jnp.maximum(k - POINTS, 0)]
+    anew = is_new_start(jnp.append(before, times[:-1]), times, problem.smallest)
+    next_time = record.times[jnp.minimum(k + 1, len(record.times) - 1)]
+    enough = ~jnp.any(anew[1:]) | (k == total) | is_new_start(times[-1], next_time, problem.smallest)
+    start = jnp.max(jnp.where(anew, times, -jnp.inf))  # the latest
+    return jnp.where(jnp.any(anew), jnp.where(enough & ~anew[-1], start, jnp.inf), window[-2].t)
 
 
 def _again(task: Task, record: Record, segment: Array) -> Record:
@@ -139,21 +172,21 @@ def _again(task: Task, record: Record, segment: Array) -> Record:
     times = record.times[jnp.maximum(base - jnp.arange(BEHIND - 1, -1, -1), 0)]
     window = tuple(as_point(times[i], record.marks[segment, i]) for i in range(BEHIND))
 
-    def step(take: Callable, careful: bool, c: Any) -> Any:
+    def step(take: Callable, fallback: bool, c: Any) -> Any:
         k, window, record = c
         here, t1 = window[-1], record.times[k]
-        trial = take(here, t1 - here.t, t1, k == 1)
-        record = noted(record, k, (*window, trial.to), trial.stages, careful)
+        trial = take(here, t1 - here.t, t1, _begins(task, k, here.t, t1))
+        record = noted(record, k, (*window, trial.to), trial.stages, fallback)
         return k + 1, (*window[1:], trial.to), record
 
     def inside(c: Any) -> Array:
         return c[0] <= base + kept
 
     def rounds(c: Any) -> Any:
-        c = jax.lax.while_loop(lambda c: inside(c) & ~c[2].careful[c[0]], partial(step, partial(attempt, task), False), c)
-        if task.careful is None:
+        c = jax.lax.while_loop(lambda c: inside(c) & ~c[2].fallback[c[0]], partial(step, partial(attempt, task), False), c)
+        if task.fallback is None:
             return c
-        careful = partial(task.careful, jnp.array(True))
-        return when(inside(c) & c[2].careful[c[0]], partial(step, careful, True), c)
+        fallback = partial(task.fallback, jnp.array(True))
+        return when(inside(c) & c[2].fallback[c[0]], partial(step, fallback, True), c)
 
     return jax.lax.while_loop(inside, rounds, (base + 1, window, record))[2]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from udkjax.equations.motion import Motion
+from udkjax.equations.rank_policy import drop_within
 from udkjax.integrate.explicit import BLOCK
 from udkjax.integrate.interpolation import POINTS, Point, interpolated
 from udkjax.integrate.lanes import output_tolerance
@@ -17,10 +18,11 @@ from udkjax.integrate.record import as_array, as_point
 
 
 class Sums(NamedTuple):
-    """Cotangents that every evaluation adds to: of the numbers in the equations, and of all times, or None."""
+    """Cotangents that every evaluation adds to: of the numbers in the equations, of all times, and of breakpoints, or None."""
 
     numbers: Any
     ts: Float[Array, "T"] | None
+    breakpoints: Float[Array, "k"] | None
 
 
 class Walk(NamedTuple):
@@ -60,7 +62,7 @@ def of_outputs(problem: Problem, raw: Raw, equations: Equations, sums: Sums, bar
         q, v = jnp.split(jnp.where(reached, y, jnp.concatenate([problem.q, problem.v])), 2)
         both = tuple(jnp.split(bar, 2))
         tol = output_tolerance(problem, jnp.concatenate([q, v]))
-        found, t_bar, q, v = equations.pull(lambda e, *x: e.known_to(tol).as_projected(*x), sums, t, q, v, both)
+        found, t_bar, q, v = equations.pull(lambda e, *x: e.with_policy(drop_within(tol)).as_projected(*x), sums, t, q, v, both)
         if found.ts is not None:
             found = found._replace(ts=found.ts.at[k].add(t_bar))
         sums, bar = jax.tree.map(lambda x, y: jnp.where(reached, x, y), (found, jnp.concatenate([q, v])), (sums, bar))
@@ -70,8 +72,10 @@ def of_outputs(problem: Problem, raw: Raw, equations: Equations, sums: Sums, bar
     return jax.lax.scan(one, sums, rows)
 
 
-def of_points(problem: Problem, equations: Equations, outputs: Array, points: tuple[Point, ...], walk: Walk) -> Walk:
-    """The outputs on the polynomial of a step hand their cotangents to the points that it goes through."""
+def of_points(
+    problem: Problem, equations: Equations, outputs: Array, points: tuple[Point, ...], walk: Walk, since: Array
+) -> Walk:
+    """The outputs on the polynomial of a step, those since some time, hand their cotangents to its points."""
     inner = len(problem.ts) - 2
     if not inner:
         return walk
@@ -80,7 +84,7 @@ def of_points(problem: Problem, equations: Equations, outputs: Array, points: tu
     def behind(walk: Walk) -> tuple[Array, Array]:
         start = jnp.maximum(walk.left - BLOCK, 0)
         number = start + jnp.arange(BLOCK)
-        return start, (number < walk.left) & (jax.lax.dynamic_slice_in_dim(times, start, BLOCK) > points[-2].t)
+        return start, (number < walk.left) & (jax.lax.dynamic_slice_in_dim(times, start, BLOCK) > since)
 
     def more(walk: Walk) -> Walk:
         start, which = behind(walk)
@@ -95,13 +99,15 @@ def of_points(problem: Problem, equations: Equations, outputs: Array, points: tu
         _, back = jax.vjp(polynomial, window, *([ts, at] if equations.timed else []))
         found, *more = back(bars)
         walk = walk._replace(left=walk.left - jnp.sum(which), window=walk.window + found)
-        if walk.sums.ts is not None:
+        if equations.timed:
             of_points, of_outputs = more
+            walk = walk._replace(t=walk.t + of_points)
+        if walk.sums.ts is not None:
             spread = jax.lax.dynamic_slice_in_dim(walk.sums.ts, 1, inner)
             places = jnp.minimum(start + jnp.arange(BLOCK), inner - 1)
             spread = spread.at[places].add(jnp.where(which, of_outputs, 0.0))
             sums = walk.sums._replace(ts=jax.lax.dynamic_update_slice_in_dim(walk.sums.ts, spread, 1, 0))
-            walk = walk._replace(t=walk.t + of_points, sums=sums)
+            walk = walk._replace(sums=sums)
         return walk
 
     return jax.lax.while_loop(lambda w: jnp.any(behind(w)[1]), more, walk)

@@ -23,35 +23,37 @@ def reversible(problem: Problem, integrate: Callable[[Problem], Raw]) -> Raw:
     is walked back, not to keep them all. Else the derivatives are those of the same problem by diffrax, which keeps checkpoints.
     None are taken along numbers that do not depend on what is differentiated.
     """
-    arrays, static = eqx.partition(problem, eqx.is_inexact_array)
+    arrays, rest = eqx.partition(problem, eqx.is_inexact_array)
+    # Counts and answers, such as whether a pivot of numbers alone is small, may be traced as well: no closure must hold them.
+    discrete, static = eqx.partition(rest, eqx.is_array)
     replayed = serves(problem)
 
     @jax.custom_vjp
-    def run(arrays: Any) -> Raw:
-        return integrate(eqx.combine(arrays, static))
+    def run(arrays: Any, discrete: Any) -> Raw:
+        return integrate(eqx.combine(arrays, discrete, static))
 
-    def forward(inputs: Any) -> Any:
-        values = jax.tree.map(lambda x: x.value, inputs)
+    def forward(inputs: Any, others: Any) -> Any:
+        values, discrete = (jax.tree.map(lambda x: x.value, given) for given in (inputs, others))
         # In shapes, not in the tree: JAX may take the residual of one call apart by the tree of another.
         moves = jax.tree.map(lambda x: jnp.zeros(int(x.perturbed)), inputs)
-        problem = eqx.combine(values, static)
+        problem = eqx.combine(values, discrete, static)
         raw, record = _recorded(problem) if replayed else (integrate(problem), None)
-        return raw, (values, moves, raw, record)
+        return raw, (values, discrete, moves, raw, record)
 
     def backward(residual: Any, cotangents: Raw) -> Any:
-        values, moves, raw, record = residual
+        values, discrete, moves, raw, record = residual
         moving = eqx.filter(values, jax.tree.map(lambda x: x.size > 0, moves))
-        problem = eqx.combine(values, static)
+        problem = eqx.combine(values, discrete, static)
         q, v, y = (_instantiated(x) for x in (cotangents.q, cotangents.v, cotangents.y))
         if replayed:
             found = _pulled(problem, moving, raw, record, jnp.concatenate([q, v], axis=1), y)
         else:
             again = lambda moving: _by_diffrax(eqx.combine(moving, problem))  # noqa: E731
             found = jax.vjp(again, moving)[1]((q, v, y))[0]
-        return (eqx.combine(found, jax.tree.map(jnp.zeros_like, values)),)
+        return eqx.combine(found, jax.tree.map(jnp.zeros_like, values)), None
 
     run.defvjp(forward, backward, symbolic_zeros=True)
-    return run(arrays)
+    return run(arrays, discrete)
 
 
 def _by_diffrax(problem: Problem) -> Any:

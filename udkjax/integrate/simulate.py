@@ -3,6 +3,7 @@
 import gc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.batched import one_by_one
 from udkjax.integrate.lanes import serves, solve
 from udkjax.integrate.outcome import Run, counts, outcome
+from udkjax.integrate.pieces import pieces_of
 from udkjax.integrate.problem import DOUBTED, Problem, Raw
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.reverse import reversible
@@ -155,6 +157,7 @@ def _simulate(
     q, v = start.q.ravel(), start.v.ravel()
     numbers = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v))
     problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, fallback=fallback)
+    problem = replace(problem, breakpoints=mechanism.breakpoints, pieces=pieces_of(mechanism))
     if meter is None and _by_jax(adjoint):
         single = partial(_by_diffrax, adjoint=adjoint, meter=None)
         integrate = solve if serves(problem) else partial(one_by_one, single=single)

@@ -38,7 +38,7 @@ class Task(NamedTuple):
     arrived: Callable[..., tuple[Array, Array, Array]]  # where a step ends: (t, q, v) -> q, v on the manifold, and a
     lasting: Callable[..., Tangential]  # (t, q, v, error of q, error of v) -> the errors as they count
     ended: Callable[..., tuple[Array, Array, Array, Tangential]]  # both: (t, q, v, error of q, error of v) -> q, v, a, errors
-    careful: Callable[..., Trial] | None  # takes a step again, by equations that may branch; None: the lane ends as `DOUBTED`
+    fallback: Callable[..., Trial] | None  # takes a step again, by equations that may branch; None: the lane ends as `DOUBTED`
     doubts: bool  # whether accelerations that are not a number mean that a step wants care
     ts: Array  # (T, *lanes)
     rtol: Array
@@ -50,6 +50,8 @@ class Task(NamedTuple):
     max_steps: int
     method: Method
     recorded: bool = False  # whether the steps are kept, of a run that is not one of several lanes
+    breakpoints: Array | None = None  # (K, *lanes) times where the motion is not smooth
+    piece: Callable[..., Array] | None = None  # of lanes: (t, q, v) -> in which of its smooth pieces each element is (k, *lanes)
 
 
 def attempt(task: Task, here: Point, h: Array, t1: Array, begin: Array) -> Trial:

@@ -24,15 +24,15 @@ class Auto(Dense):
     branch_tol: Float[Array, ""] | None = eqx.field(converter=number, default=BRANCH_TOL)
 
     @property
-    def exact(self) -> SVD:
-        """The method of the careful side."""
+    def rank_revealing(self) -> SVD:
+        """The method that it turns to."""
         return SVD(self.rank_tol, self.relative)
 
     def factor(self, D: Float[Array, "m n"]) -> Factors:
-        return self.exact.factor(D)
+        return self.rank_revealing.factor(D)
 
     def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
-        return self.exact.apply(factors, b)
+        return self.rank_revealing.apply(factors, b)
 
     def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
-        return self.exact.apply_transpose(factors, c)
+        return self.rank_revealing.apply_transpose(factors, c)

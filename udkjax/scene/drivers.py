@@ -1,6 +1,7 @@
 """Drivers prescribe a motion: the constraints that depend on time, and the motion laws that they follow."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import equinox as eqx
@@ -14,11 +15,19 @@ from udkjax.scene.splines import natural
 
 
 class Motion(eqx.Module):
-    """A motion law. Subclass it to write one of your own: `__call__` maps the time (s) to a value (rad, m)."""
+    """A motion law. Subclass it to write one of your own: `__call__` maps the time (s) to a value (rad, m).
+
+    A law that is smooth in pieces names the times where they meet in `breakpoints`; its value and rate are continuous there.
+    """
 
     @abstractmethod
     def __call__(self, t: Any) -> Any:
         """Return the prescribed value at time t; it is differentiated twice."""
+
+    @property
+    def breakpoints(self) -> Float[Array, "k"] | Sequence[Any]:
+        """The times (s) where the law is not smooth: steps end there, and no interpolation reaches across. By default none."""
+        return ()
 
 
 class Polynomial(Motion):
@@ -54,6 +63,10 @@ class Spline(Motion):
     def __call__(self, t):
         return natural(t, self.times, self.values)
 
+    @property
+    def breakpoints(self):
+        return self.times if self.times.size > 2 else ()  # through two points it is one straight line
+
 
 class Driver(Constraint):
     """Prescribe one `coordinate` of body 2 relative to body 1. 1 row: the coordinate minus motion(t).
@@ -74,6 +87,10 @@ class Driver(Constraint):
         if self.coordinate == "distance":
             return [d.norm() - self.motion(t)]
         return [getattr(one.local(d), self.coordinate) - self.motion(t)]
+
+    @property
+    def breakpoints(self):
+        return self.motion.breakpoints
 
     def resolved(self, *frames):
         return self if self.coordinate == "angle" else filled(self, "points", ((0.0, 0.0), (0.0, 0.0)))

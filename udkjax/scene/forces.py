@@ -14,7 +14,10 @@ Load = tuple[Any, Any, Any]  # force x, force y (N), torque about the centre of 
 
 
 class ForceElement(eqx.Module):
-    """A force element. Subclass it and write `potential` or `loads`; the other one stays None, and costs nothing."""
+    """A force element. Subclass it and write `potential` or `loads`; the other one stays None, and costs nothing.
+
+    One that is smooth in pieces of time names the times where they meet in `breakpoints`; its loads may jump there.
+    """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
 
@@ -24,6 +27,18 @@ class ForceElement(eqx.Module):
 
     def loads(self, t: Any, *frames: Frame) -> Sequence[Load] | None:
         """Return (force x, force y, torque about the centre of mass) for each attached body, in ground axes (N, N m), or None."""
+        return None
+
+    @property
+    def breakpoints(self) -> Float[Array, "k"] | Sequence[Any]:
+        """The times (s) where the loads are not smooth: steps end there, and no interpolation reaches across. By default none."""
+        return ()
+
+    def piece(self, t: Any, *frames: Frame) -> Any:
+        """Return which of their smooth pieces the loads are in, as a whole number, or None: they are smooth (the default).
+
+        Where pieces meet, loads are continuous. No interpolation reaches from one piece to another.
+        """
         return None
 
 

@@ -33,6 +33,18 @@ class Constraint(eqx.Module):
         """The bodies whose frames `residual` gets, in that order."""
         return self.bodies
 
+    @property
+    def breakpoints(self) -> Float[Array, "k"] | Sequence[Any]:
+        """The times (s) where Psi is not smooth, though it and its rate are continuous. By default none."""
+        return ()
+
+    def piece(self, t: Any, *frames: Frame) -> Any:
+        """Return which of its smooth pieces Psi is in, as a whole number, or None: it is smooth (the default).
+
+        Where pieces meet, Psi has continuous second derivatives. No interpolation reaches from one piece to another.
+        """
+        return None
+
     def resolved(self, *frames: Frame) -> Self:
         """Return the same with every number that the initial guess decides, given the attached bodies' frames there."""
         return self
@@ -188,6 +200,10 @@ class Profile(eqx.Module):
         """Return the radius (m) at a polar angle (rad)."""
         return periodic(angle, self.angle, self.radius, 2 * jnp.pi)
 
+    def piece(self, angle: Any) -> Any:
+        """Return the number of the cubic at a polar angle (rad)."""
+        return jnp.sum(self.angle[0] + jnp.mod(angle - self.angle[0], 2 * jnp.pi) >= self.angle)
+
 
 def _profile(value) -> Profile:
     return value if isinstance(value, Profile) else Profile(**value)
@@ -203,9 +219,16 @@ class Cam(Joint):
     profile: Profile = eqx.field(converter=_profile)
 
     def residual(self, t, *frames):
-        one, two = frames
-        d = one.local(between(self.points, one, two))
+        d = self._arm(*frames)
         return [d.norm() - self.profile(jnp.arctan2(d.y, d.x))]
+
+    def piece(self, t, *frames):
+        d = self._arm(*frames)
+        return self.profile.piece(jnp.arctan2(d.y, d.x))
+
+    def _arm(self, one, two):
+        """Return the vector from point 1 to point 2 in body 1's frame."""
+        return one.local(between(self.points, one, two))
 
 
 def _beside(axis, points, one, two):

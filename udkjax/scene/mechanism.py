@@ -130,6 +130,12 @@ class Mechanism(eqx.Module):
         return _side_by_side([body.velocity for body in self._bodies], [body.angular_velocity for body in self._bodies])
 
     @property
+    def breakpoints(self) -> Float[Array, "k"] | None:
+        """The times (s) where the motion is not smooth, as the elements name them, in any order; None where none does."""
+        named = [jnp.ravel(number(e.breakpoints)) for e in (*self.constraints.values(), *self._forces) if len(e.breakpoints)]
+        return jnp.concatenate(named) if named else None
+
+    @property
     def bare(self) -> "Mechanism":
         """The same without its `origin`: what is compiled for it serves every origin."""
         if self.origin is None:

@@ -168,7 +168,7 @@ def _counts(run: Run) -> dict[str, Array]:
 def _rank(run: Run) -> dict[str, Array]:
     """By the method's own rule: that of `Auto` is the one of singular values that it turns to."""
     method = Auto() if run.method is None else run.method
-    method = method.exact if isinstance(method, Auto) else method
+    method = method.rank_revealing if isinstance(method, Auto) else method
     if method.rank_tol is None:
         method = type(method)(rank_tolerance(run.mechanism))
     equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))

@@ -1,0 +1,270 @@
+"""Times where the motion is not smooth: outputs there are as exact as elsewhere, and so are their derivatives."""
+
+from itertools import pairwise
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+
+import udkjax as udk
+from udkjax.scene.splines import natural
+
+TS = np.linspace(0.0, 2.0, 401)
+KNOTS, VALUES = np.array([0.0, 0.37, 0.71, 1.13, 1.6]), np.array([0.0, 0.12, -0.1, 0.15, 0.05])
+SWITCH, KICK = 0.9, 4.0
+MASS, INERTIA, ARM, ANGLE, GRAVITY = 1.0, 0.1, 0.5, -0.9, 9.81
+
+
+class Kicked(udk.Motion):
+    """A spline, with a constant acceleration beside it from a time on: one of a user's own, whose acceleration jumps."""
+
+    spline: udk.Spline
+    switch: Any
+    kick: Any
+
+    def __call__(self, t):
+        return self.spline(t) + 0.5 * self.kick * jnp.where(t < self.switch, 0.0, t - self.switch) ** 2
+
+    @property
+    def breakpoints(self):
+        return [*self.spline.breakpoints, self.switch]
+
+
+def pendulum(motion):
+    """A pendulum on a carriage that moves as told."""
+    bodies = {
+        "carriage": udk.Body(2.0, 1.0),
+        "rod": udk.Body(MASS, INERTIA, ARM * np.array([np.cos(ANGLE), np.sin(ANGLE)]), ANGLE),
+    }
+    joints = {
+        "rail": udk.Prismatic(["ground", "carriage"], np.zeros((2, 2)), 0.0),
+        "pin": udk.Revolute(["carriage", "rod"], [[0.0, 0.0], [-ARM, 0.0]]),
+    }
+    return udk.Mechanism(bodies, joints, {"drive": udk.Driver(["ground", "carriage"], "x", motion)})
+
+
+def kicked(x):
+    knots, switch = x
+    return pendulum(Kicked(udk.Spline(knots, VALUES), jnp.asarray(switch), jnp.asarray(KICK)))
+
+
+def start(knots):
+    """The rod at rest above a carriage that moves as the spline does."""
+    x, rate = jax.jvp(lambda t: natural(t, knots, jnp.asarray(VALUES)), (0.0,), (1.0,))
+    q = [[x, 0.0, 0.0], [x + ARM * np.cos(ANGLE), ARM * np.sin(ANGLE), ANGLE]]
+    return udk.State(jnp.array(q), jnp.array([[rate, 0.0, 0.0], [rate, 0.0, 0.0]]))
+
+
+def angles(x, ts=TS, tol=1e-8, **choices):
+    """Angle and rate of the rod (2, T) as a function of the knots and of when the kick begins."""
+    found = udk.simulate(kicked(x), ts, start(x[0]), rtol=tol, atol=tol, method=udk.Elimination(), throw=False, **choices)
+    return jnp.stack([found.q[:, 1, 2], found.v[:, 1, 2]])
+
+
+def reference(knots=KNOTS, switch=SWITCH, kick=KICK, ts=TS):
+    """The same by the pendulum's own equation, from one breakpoint or output to the next."""
+    spline, y, found = CubicSpline(knots, VALUES, bc_type="natural"), np.array([ANGLE, 0.0]), {}
+    stops = np.unique([*ts, *(t for t in (*knots, switch) if ts[0] < t < ts[-1])])
+    found[ts[0]] = y
+    for a, b in pairwise(stops):
+        curvature = (lambda t: spline(t, 2)) if knots[0] < (a + b) / 2 < knots[-1] else (lambda t: 0.0)
+        push = kick * ((a + b) / 2 > switch)
+
+        def rates(t, y, curvature=curvature, push=push):
+            torque = MASS * ARM * (np.sin(y[0]) * (curvature(t) + push) - np.cos(y[0]) * GRAVITY)
+            return [y[1], torque / (INERTIA + MASS * ARM**2)]
+
+        y = found[b] = solve_ivp(rates, (a, b), y, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    return np.array([found[t] for t in ts]).T
+
+
+def assert_within(found, expected, tol, times=10.0):
+    """All angles and rates: so many times what a step may err, which is tol (1 + |y|)."""
+    errors = np.abs(np.asarray(found) - expected) / (tol * (1.0 + np.abs(expected)))
+    assert errors.max() < times, errors.max(axis=-1)
+
+
+# --- outputs
+
+
+@pytest.mark.parametrize("tol", [1e-6, 1e-8])
+def test_outputs_of_a_motion_by_a_spline(tol):
+    """Where the polynomials between states reached across knots, angles were off by 9e-3 and rates by 0.8 at 1e-6."""
+    mech = pendulum(udk.Spline(KNOTS, VALUES))
+    sol = udk.simulate(mech, TS, start(KNOTS), rtol=tol, atol=tol)
+    assert_within([sol.q[:, 1, 2], sol.v[:, 1, 2]], reference(kick=0.0), tol)
+    assert sol.stats["steps"] < 40 and sol.stats["rejected"] <= 4  # 44 and 65 where steps come upon the knots, 27 rejected
+
+
+@pytest.fixture(scope="module")
+def single():
+    return jax.jit(lambda x, tol: angles(x, tol=tol, dt0=0.03))
+
+
+@pytest.mark.parametrize("switch", [SWITCH, 0.71, np.nextafter(0.71, 1.0), 0.71 + 1e-9, 0.0, 2.0], ids=str)
+def test_outputs_of_a_motion_that_names_its_times(single, switch):
+    """Accelerations jump; also at a time that another breakpoint is at, or almost, and at the ends of the run."""
+    found = single((jnp.asarray(KNOTS), jnp.asarray(switch)), 1e-8)
+    assert_within(found, reference(switch=switch), 1e-8)
+
+
+def test_members_of_a_batch_have_breakpoints_of_their_own(single):
+    shifts = np.array([[0.0, 0.0, 0.1], [0.05, 0.02, -0.3], [0.0, 0.3, 0.6], [0.1, -0.1, 2.0]])
+    knots = jnp.asarray(KNOTS + np.stack([np.zeros(4), shifts[:, 0], shifts[:, 1], np.zeros(4), np.zeros(4)], 1))
+    switches = jnp.asarray(SWITCH + shifts[:, 2])
+    found = jax.jit(jax.vmap(lambda *x: angles(x, dt0=0.03)))(knots, switches)
+    for k in range(4):
+        assert_within(found[k], reference(np.asarray(knots[k]), float(switches[k])), 1e-8)
+        assert_allclose(found[k], single((knots[k], switches[k]), 1e-8), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("choices", [{"solver": diffrax.Tsit5()}, {"solver": udk.Adams()}, {"solver": diffrax.Kvaerno5()}])
+def test_other_solvers(choices):
+    """Of this engine, and of diffrax."""
+    ts = TS[::20]
+    found = udk.simulate(kicked((KNOTS, SWITCH)), ts, start(KNOTS), rtol=1e-6, atol=1e-6, method=udk.Elimination(), **choices)
+    assert_within([found.q[:, 1, 2], found.v[:, 1, 2]], reference(ts=ts), 1e-6)
+
+
+# --- derivatives
+
+
+@pytest.fixture(scope="module")
+def by_differences():
+    """Of the reference, along each knot and along the switch, at times that are none of them."""
+    ts, h = np.linspace(0.0, 2.0, 12), 1e-4
+    each = lambda k, sign: (KNOTS + sign * h * (np.arange(5) == k), SWITCH + sign * h * (k == 5))  # noqa: E731
+    ahead, behind = (np.stack([reference(*each(k, s), ts=ts) for k in range(6)], -1) for s in (1, -1))
+    return ts, (ahead - behind) / (2 * h)
+
+
+def test_derivatives_along_breakpoints(by_differences):
+    """Forward, and reverse by a recorded run; a spline's first knot is left out, before which it is another line."""
+    ts, expected = by_differences
+    x, weights = (jnp.asarray(KNOTS), jnp.asarray(SWITCH)), np.cos(np.arange(2.0 * len(ts))).reshape(2, -1)
+    forward = jax.jit(jax.jacfwd(lambda x: angles(x, ts, dt0=0.03, adjoint=diffrax.ForwardMode())))(x)
+    forward = np.concatenate([forward[0], forward[1][..., None]], -1)
+    assert_allclose(forward[..., 1:], expected[..., 1:], rtol=0, atol=1e-5)
+    reverse = jax.jit(jax.grad(lambda x: jnp.sum(weights * angles(x, ts, dt0=0.03))))(x)
+    assert_allclose(np.append(*reverse), np.tensordot(weights, forward, 2), rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_along_breakpoints_by_checkpoints(by_differences):
+    ts, expected = by_differences
+    x, weights = (jnp.asarray(KNOTS), jnp.asarray(SWITCH)), np.cos(np.arange(2.0 * len(ts))).reshape(2, -1)
+    choices = {"adjoint": diffrax.RecursiveCheckpointAdjoint(), "max_steps": 256}
+    reverse = jax.jit(jax.grad(lambda x: jnp.sum(weights * angles(x, ts, **choices))))(x)
+    assert_allclose(np.append(*reverse)[1:], np.tensordot(weights, expected, 2)[1:], rtol=0, atol=1e-4)
+
+
+# --- pieces of the state: a cam, whose profile is a spline in the angle, and a force of a user's own
+
+PHI, RADII = np.array([-1.2, -0.2, 0.7, 1.7, 2.9, 4.0]), np.array([1.0, 1.06, 1.2, 1.1, 1.02, 0.97])
+CAM_TS = TS[::4]
+
+
+def follower(radii, rate, tol=1e-8, phi=PHI, **choices):
+    """Angle and rate (2, T) of a cam that turns freely, by the mass of its follower unevenly."""
+    fixed, profile = np.zeros((2, 2)), udk.Profile(phi, radii)
+    joints = {
+        "pivot": udk.Revolute(["ground", "cam"], fixed),
+        "rail": udk.Prismatic(["ground", "follower"], fixed, np.pi / 2, 0.0),
+        "contact": udk.Cam(["cam", "follower"], fixed, profile),
+    }
+    bodies = {"cam": udk.Body(1.0, INERTIA), "follower": udk.Body(MASS, 1.0, (0.0, 1.1))}
+    mech = udk.Mechanism(bodies, joints)
+    radius, slope = jax.jvp(profile, (np.pi / 2,), (1.0,))
+    q = jnp.stack([jnp.zeros(3), jnp.stack([0.0, radius, 0.0])])
+    v = rate * jnp.stack([jnp.array([0.0, 0.0, 1.0]), jnp.stack([0.0, -slope, 0.0])])
+    run = udk.simulate(mech, CAM_TS, udk.State(q, v), rtol=tol, atol=tol, method=udk.Elimination(), throw=False, **choices)
+    return jnp.stack([run.q[:, 0, 2], run.v[:, 0, 2]])
+
+
+def by_energy(radii, rate):
+    """The same: the rate by the energy, and the time by its integral over the angle, from one knot to the next."""
+    spline = CubicSpline(np.append(PHI, PHI[0] + 2 * np.pi), np.append(radii, radii[0]), bc_type="periodic")
+    inertia = lambda angle: INERTIA + MASS * spline(np.pi / 2 - angle, 1) ** 2  # noqa: E731
+    energy = inertia(0.0) * rate**2 / 2 + MASS * GRAVITY * spline(np.pi / 2)
+    speed = lambda angle: np.sqrt(2 * (energy - MASS * GRAVITY * spline(np.pi / 2 - angle)) / inertia(angle))  # noqa: E731
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    time = lambda a, b: (b - a) / 2 * np.sum(weights / speed((a + b) / 2 + (b - a) / 2 * nodes))  # noqa: E731
+    knots = np.sort(np.ravel(np.pi / 2 - PHI[:, None] + 2 * np.pi * np.arange(-2, 12)))
+    found, start, begin = [], 0.0, 0.0
+    for t in CAM_TS:
+        while begin + time(start, end := knots[knots > start][0]) < t:
+            begin, start = begin + time(start, end), end
+        angle = start + (t - begin) * speed(start)
+        for _ in range(20):
+            angle -= (begin + time(start, angle) - t) * speed(angle)
+        found.append((angle, speed(angle)))
+    return np.array(found).T
+
+
+@pytest.fixture(scope="module")
+def cam():
+    run = jax.jit(follower)
+    return lambda *x: run(*map(jnp.asarray, x))
+
+
+@pytest.mark.parametrize("tol", [1e-6, 1e-8])
+def test_outputs_across_the_knots_of_a_cam(cam, tol):
+    """Where the polynomials between states reached across knots, rates were off by up to 0.7 rad/s."""
+    assert_within(cam(RADII, 4.0, tol, PHI), by_energy(RADII, 4.0), tol)
+
+
+def test_cams_of_a_batch(cam):
+    radii, rates = jnp.asarray(RADII + 0.02 * np.sin(np.arange(18.0)).reshape(3, 6)), jnp.array([4.0, -3.0, 6.0])
+    found = jax.jit(jax.vmap(lambda *x: follower(*x, dt0=0.03)))(radii, rates)
+    for k in (0, 2):
+        assert_within(found[k], by_energy(radii[k], rates[k]), 1e-8)
+    assert_within(found[1], cam(radii[1], rates[1], 1e-12, PHI), 1e-8)
+
+
+@pytest.mark.slow
+def test_derivatives_across_the_knots_of_a_cam():
+    """Up to 80. Where the ends of steps lie in the piece behind, those of outputs before are off by 0.06."""
+    weights, h = np.cos(np.arange(2.0 * len(CAM_TS))).reshape(2, -1), 1e-5
+    x, along = (jnp.asarray(RADII), jnp.asarray(4.0)), (jnp.cos(jnp.arange(6.0)), jnp.asarray(1.0))
+    forward = jax.jit(lambda x, dx: jax.jvp(lambda x: follower(*x, dt0=0.03, adjoint=diffrax.ForwardMode()), (x,), (dx,))[1])
+    found = forward(x, along)
+    ahead, behind = (by_energy(RADII + s * h * along[0], 4.0 + s * h * along[1]) for s in (1, -1))
+    assert_allclose(found, (ahead - behind) / (2 * h), rtol=0, atol=3e-4)
+    reverse = jax.jit(jax.grad(lambda x: jnp.sum(weights * follower(*x, dt0=0.03))))(x)
+    assert_allclose(np.dot(reverse[0], along[0]) + reverse[1], np.sum(weights * found), rtol=1e-9)
+
+
+def test_a_cam_at_rest_on_a_knot(cam):
+    """By rounding it may be in one piece or the other: the run ends all the same."""
+    phi, radii = np.pi / 2 + np.array([-2.0, -1.0, 0.0, 1.0, 2.0, np.pi]), np.array([1.2, 1.1, 1.0, 1.1, 1.2, 1.25])
+    assert_allclose(cam(radii, 1e-15, 1e-8, phi), 0.0, atol=1e-9)
+
+
+class Buffer(udk.ForceElement):
+    """A spring that only pushes: of a user's own, and in two pieces."""
+
+    stiffness: Any
+
+    def loads(self, t, *frames):
+        return [(-self.stiffness * jnp.maximum(frames[0].x, 0.0), 0.0, 0.0)]
+
+    def piece(self, t, *frames):
+        return frames[0].x > 0.0
+
+
+def test_a_force_that_names_its_pieces():
+    """A body runs against it, and back."""
+    stiffness, rate, gap, tol = 400.0, 1.5, 0.6, 1e-8
+    bodies = {"body": udk.Body(1.0, 1.0, (-gap, 0.0), velocity=(rate, 0.0))}
+    mech = udk.Mechanism(bodies, forces={"buffer": Buffer(["body"], stiffness)}, gravity=(0.0, 0.0))
+    sol = udk.simulate(mech, TS, rtol=tol, atol=tol)
+    since, w = TS - gap / rate, np.sqrt(stiffness)
+    x = np.where(since < 0, rate * since, np.where(w * since < np.pi, rate / w * np.sin(w * since), -rate * (since - np.pi / w)))
+    v = np.where(since < 0, rate, np.where(w * since < np.pi, rate * np.cos(w * since), -rate))
+    assert_within([sol.q[:, 0, 0], sol.v[:, 0, 0]], [x, v], tol)
