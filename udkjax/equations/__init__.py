@@ -7,13 +7,20 @@ from udkjax.equations.assembly import Check as Check
 from udkjax.equations.assembly import State as State
 from udkjax.equations.assembly import assemble as assemble
 from udkjax.equations.assembly import check as check
+from udkjax.equations.constraints import gamma as gamma
+from udkjax.equations.constraints import psi as psi
+from udkjax.equations.constraints import psi_dot as psi_dot
+from udkjax.equations.constraints import psi_q as psi_q
 from udkjax.equations.formulations import Augmented as Augmented
 from udkjax.equations.formulations import Formulation as Formulation
 from udkjax.equations.formulations import NullSpaceQR as NullSpaceQR
 from udkjax.equations.formulations import NullSpaceSVD as NullSpaceSVD
 from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
+from udkjax.equations.loads import force as force
+from udkjax.equations.loads import kinetic_energy as kinetic_energy
+from udkjax.equations.loads import mass as mass
+from udkjax.equations.loads import potential_energy as potential_energy
 from udkjax.equations.partitioning import CoordinatePartitioning as CoordinatePartitioning
-from udkjax.equations.programs import Baumgarte as Baumgarte
 from udkjax.equations.programs import Equations as Equations
 from udkjax.equations.programs import prepare as prepare
 from udkjax.equations.quantities import Energy as Energy
@@ -22,3 +29,5 @@ from udkjax.equations.quantities import energy as energy
 from udkjax.equations.quantities import equations_of as equations_of
 from udkjax.equations.quantities import reactions as reactions
 from udkjax.equations.quantities import violation as violation
+from udkjax.equations.textbook import TextbookEquations as TextbookEquations
+from udkjax.equations.udwadia_kalaba import Baumgarte as Baumgarte

@@ -1,7 +1,7 @@
 """The fast form: straight-line programs for elimination, with derivatives by programs of their own (derivative.py).
 
 A first derivative goes by the factors that the value was found with, forward or reverse; where `Auto` may branch, and for every
-derivative beyond the first, it is that of the plain form.
+derivative beyond the first, it is that of the textbook.
 """
 
 from collections.abc import Sequence
@@ -14,10 +14,9 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from udkjax.equations.code import scalars, stacked
-from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, those
+from udkjax.equations.linear import Linear, applied, by_plain_form, moving_of, numbers_moving_of, those, those_numbers
 from udkjax.equations.motion import FAR as NEWTON_FAR
 from udkjax.equations.motion import STEPS, Closed, Tangential, Vector
-from udkjax.equations.plain import plain_accelerations, plain_project, plain_tangential
 from udkjax.pinv import SVD
 from udkjax.straightline import along
 
@@ -32,11 +31,11 @@ FAR = 1e-13
 def accelerations(program: str, equations: "Equations", t: Any, q: Vector, v: Vector) -> Vector:
     """a, by the program of this name."""
     *a, safe = equations.run(program, t, q, v)
-    return _checked(equations, safe, stacked(a), plain_accelerations, t, q, v)
+    return _checked(equations, safe, stacked(a), t, q, v)
 
 
 def project(equations: "Equations", t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """As the plain form, by Newton steps in position and velocity at once."""
+    """By Newton steps in position and velocity at once."""
     q, v, _ = closed(equations, t, q, v, STEPS)
     return q, v
 
@@ -55,8 +54,6 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
     A Newton step takes the given v to where Psi_dot = 0 at the q that it starts from, so the last must not move q. There are at
     most so many `steps`. Derivatives are taken where q and v are then.
     """
-    if not equations.eliminates:
-        return plain_project(equations, t, q, v), (jnp.array(True), jnp.array(False))
     program, far = equations.code.program("nearer"), FAR * equations.scales.length
 
     # On scalars until all is done: vectors that a loop carries have the batch first under vmap, where the programs have it last.
@@ -75,7 +72,8 @@ def _projected(steps: int, equations: "Equations", t: Any, q: Vector, v: Vector)
     _, *found, change, safe = jax.lax.while_loop(more, nearer, start)
     found, moving = [stacked(x) for x in found], ~(change <= far)
     if equations.branches:
-        return _branched(equations, safe, tuple(found), plain_project, t, q, v), (jnp.array(True), moving & safe)
+        found = jax.lax.cond(safe, lambda: tuple(found), lambda: equations.by(SVD).project(t, q, v))
+        return found, (jnp.array(True), moving & safe)
     return tuple(found), (safe if equations.refuses else jnp.array(True), moving)
 
 
@@ -132,21 +130,15 @@ def _largest(numbers: list[Array]) -> Array:
 
 def tangential(equations: "Equations", t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
     """What projection at q leaves of small changes: for estimates of errors, which nobody differentiates, nor do they branch."""
-    if not equations.eliminates:
-        return plain_tangential(equations, t, q, v, dq, dv)
     *changes, distance = equations.call(equations.code.program("tangential"), t, q, v, dq, dv)
     return Tangential(stacked(changes[: len(q)]), stacked(changes[len(q) :]), distance)
 
 
-def _checked(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
+def _checked(equations: "Equations", safe: Bool[Array, ""], a: Vector, t: Any, q: Vector, v: Vector) -> Vector:
     """Take what elimination gave where its pivots are safe, or their rows dropped; else do as the policy says."""
     if equations.branches:
-        return _branched(equations, safe, fast, plain, *state)
-    return jnp.where(safe, fast, jnp.nan) if equations.refuses else fast
-
-
-def _branched(equations: "Equations", safe: Bool[Array, ""], fast: Any, plain: Any, *state: Any) -> Any:
-    return jax.lax.cond(safe, lambda: fast, lambda: plain(equations.by(SVD), *state))
+        return jax.lax.cond(safe, lambda: a, lambda: equations.by(SVD).accelerations(t, q, v))
+    return jnp.where(safe, a, jnp.nan) if equations.refuses else a
 
 
 # --- derivatives
@@ -159,7 +151,7 @@ def _(program, primals, tangents):
         return accelerations(program, *primals), jnp.zeros_like(primals[2])
     if primals[0].branches:
         return accelerations(program, *primals), by_plain_form("accelerations", primals, tangents)[0]
-    (a,), (da,) = _along("accelerations", program, moving, primals, those(tangents, moving))
+    (a,), (da,) = _along("accelerations", program, primals, tangents)
     return a, da
 
 
@@ -180,9 +172,7 @@ def _(primals, tangents):
     dq, dv = _correction(equations, t, q, v, tangents)
     da = jnp.zeros_like(a)
     if any(moving_of(tangents)):
-        changes = (*tangents[:2], dq, dv)
-        moving = moving_of(changes)
-        _, (da,) = _along("accelerations", "accelerations", moving, (equations, t, q, v), those(changes, moving))
+        _, (da,) = _along("accelerations", "accelerations", (equations, t, q, v), (*tangents[:2], dq, dv))
     none = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0) if x.dtype == bool else jnp.zeros_like(x), rest)
     return found, ((dq, dv, da), *none)
 
@@ -203,36 +193,37 @@ def _(primals, tangents):
 
 def _correction(equations: "Equations", t: Any, q: Vector, v: Vector, tangents: Any) -> Sequence[Array]:
     """Where the residuals vanish the tangents of one Newton step are those of the projection."""
-    primals, moving = (equations, t, q, v), moving_of(tangents)
-    if not any(moving):
+    primals = equations, t, q, v
+    if not any(moving_of(tangents)):
         return jnp.zeros_like(q), jnp.zeros_like(v)
-    if equations.branches or not equations.eliminates:
+    if equations.branches:
         return by_plain_form("projection", primals, tangents)
-    _, changes = _along("projection", "projection", moving, primals, those(tangents, moving))
-    return changes
+    return _along("projection", "projection", primals, tangents)[1]
 
 
-def _along(name: str, program: str, moving: tuple[bool, ...], primals: Any, direction: list[Array]) -> tuple[list[Array], ...]:
+def _along(name: str, program: str, primals: Any, tangents: Any) -> tuple[list[Array], ...]:
     """The accelerations by a program, or nothing where `name` is "projection", and the tangents of what has that name."""
+    moving, moved = moving_of(tangents), numbers_moving_of(tangents)
+    direction = those(tangents, moving), those_numbers(tangents, moved)
 
-    def in_parts(primals: Any, *directions: list[Array]) -> tuple[list[Array], ...]:
+    def in_parts(primals: Any, *directions: Any) -> tuple[list[Array], ...]:
         if name == "accelerations":
             a, kept = _evaluated(program, moving, *primals)
             value = [a]
         else:
             equations, *state = jax.lax.stop_gradient(primals)
             value, kept = [], equations.call(equations.code.derivative(name, moving).evaluation(program), *state)
-        linear = Linear.at(name, primals, moving, kept)
-        return value, *(applied(linear, direction) for direction in directions)
+        linear = Linear.at(name, primals, moving, moved, kept)
+        return value, *(applied(linear, *direction) for direction in directions)
 
-    def at_once(primals: Any, *directions: list[Array]) -> tuple[list[Array], ...]:
+    def at_once(primals: Any, *directions: Any) -> tuple[list[Array], ...]:
         equations, *state = primals
         program_along = equations.code.derivative(name, moving).along(program, len(directions))
-        outputs = equations.call(program_along, *state, *(x for direction in directions for x in direction))
+        outputs = equations.call(program_along, *state, *(x for direction, _ in directions for x in direction))
         n, value = len(state[1]), []
         if name == "accelerations":
             *a, safe = outputs[: n + 1]
-            value, outputs = [_checked(equations, safe, stacked(a), plain_accelerations, *state)], outputs[n + 1 :]
+            value, outputs = [_checked(equations, safe, stacked(a), *state)], outputs[n + 1 :]
         changes = [stacked(outputs[k : k + n]) for k in range(0, len(outputs), n)]
         each = len(changes) // len(directions)
         return value, *(changes[k : k + each] for k in range(0, len(changes), each))
@@ -248,7 +239,7 @@ def _evaluated(program: str, moving: tuple[bool, ...], equations: "Equations", t
     """a, and what its derivative needs to know of the state."""
     outputs = equations.call(equations.code.derivative("accelerations", moving).evaluation(program), t, q, v)
     n = len(q)
-    return _checked(equations, outputs[n], stacked(outputs[:n]), plain_accelerations, t, q, v), outputs[n + 1 :]
+    return _checked(equations, outputs[n], stacked(outputs[:n]), t, q, v), outputs[n + 1 :]
 
 
 @_evaluated.defjvp

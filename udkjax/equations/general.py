@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion, Tangential, Vector
-from udkjax.equations.programs import Baumgarte
 from udkjax.equations.scales import RANK_TOL
+from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
 from udkjax.scene.fields import number, optional
 

@@ -1,7 +1,13 @@
 """The derivative of what elimination finds, at one state: a linear map with a transpose, by programs of its own (derivative.py).
 
 It is a primitive, so that reverse mode runs the transposed program instead of transposing one operation after another, and so
-that no derivative is ever taken of what is kept. A derivative of the map itself is that of the plain form.
+that no derivative is ever taken of what is kept.
+
+A derivative of the map itself is that of the textbook. The programs depend on the numbers of the scene by constants, the textbook
+by the numbers themselves. So the map takes the tangents of both, which say the same: the programs use those of the constants, the
+textbook those of the numbers. Transposed, the programs give cotangents of the constants, and none of the numbers, the textbook
+those of the numbers: what JAX adds to the derivatives of the former, because the constants are functions of the numbers, is
+taken off the latter.
 """
 
 import dataclasses
@@ -19,7 +25,6 @@ from jaxtyping import Array
 
 from udkjax.equations.code import stacked
 from udkjax.equations.motion import Vector
-from udkjax.equations.plain import plain_accelerations, plain_correction
 
 if TYPE_CHECKING:
     from udkjax.equations.programs import Equations
@@ -28,7 +33,7 @@ if TYPE_CHECKING:
 class Linear(eqx.Module):
     """The derivative of the accelerations or of the projection at one state, or its transpose: a linear map.
 
-    Of tangents of those inputs that are `moving` to the tangents of what is found, each a list of arrays.
+    Of tangents of those inputs that are `moving` or `moved` to the tangents of what is found, each a list of arrays.
     """
 
     equations: "Equations"
@@ -37,14 +42,15 @@ class Linear(eqx.Module):
     v: Vector
     kept: list[Array]
     name: str = eqx.field(static=True)
-    moving: tuple[bool, ...] = eqx.field(static=True)
+    moving: tuple[bool, ...] = eqx.field(static=True)  # of the constants, t, q, v
+    moved: tuple[bool, ...] = eqx.field(static=True)  # of the numbers of the scene and the gains
     transposed: bool = eqx.field(static=True, default=False)
 
     @classmethod
-    def at(cls, name: str, primals: Any, moving: tuple[bool, ...], kept: list[Array]) -> "Linear":
+    def at(cls, name: str, primals: Any, moving: tuple[bool, ...], moved: tuple[bool, ...], kept: list[Array]) -> "Linear":
         equations, t, q, v = primals
         t = jnp.asarray(t, jnp.result_type(float))
-        return cls(equations, t, q, v, [jax.lax.stop_gradient(jnp.asarray(k)) for k in kept], name, moving)
+        return cls(equations, t, q, v, [jax.lax.stop_gradient(jnp.asarray(k)) for k in kept], name, moving, moved)
 
     @property
     def T(self) -> "Linear":
@@ -57,9 +63,12 @@ class Linear(eqx.Module):
 
 def _linear(linear: Linear, vector: Array) -> Array:
     derivative = linear.equations.code.derivative(linear.name, linear.moving)
-    program = derivative.reverse if linear.transposed else derivative.forward
     equations, *state = linear.primals
-    return stacked(equations.call(program, *state, *linear.kept, vector))
+    numbers = sum(np.size(x) for x in those_numbers(linear.primals, linear.moved))
+    if linear.transposed:
+        found = stacked(equations.call(derivative.reverse, *state, *linear.kept, vector))
+        return jnp.concatenate([found, jnp.zeros(numbers, found.dtype)])
+    return stacked(equations.call(derivative.forward, *state, *linear.kept, vector[: len(vector) - numbers]))
 
 
 @eqxi.filter_primitive_def
@@ -77,7 +86,15 @@ def _derivative(primals, tangents):
     result = _bind(linear, vector)
     if not jax.tree.leaves(at):
         return result, _bind(linear, dot)
-    return result, eqx.filter_jvp(_by_plain_form_of, primals, tangents)[1]
+    if not linear.transposed:
+        return result, eqx.filter_jvp(_by_plain_form_of, primals, tangents)[1]
+    change = eqx.filter_jvp(_by_plain_form_transposed, primals, tangents)[1]
+    constants = [x for x, moves in zip(linear.equations.constants, linear.moving, strict=False) if moves]
+    if not constants:
+        return result, change
+    bars = jax.lax.split(result[: len(constants)], [1] * len(constants))
+    add_on = _through_constants(linear, at, [bar[0] for bar in bars])
+    return result, change.at[len(change) - len(add_on) :].add(-add_on)
 
 
 @eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
@@ -93,47 +110,73 @@ def _bind(linear: Linear, vector: Array) -> Array:
     return eqxi.filter_primitive_bind(_linear_p, linear, vector)
 
 
-def applied(linear: Linear, vectors: list[Array]) -> list[Array]:
+def applied(linear: Linear, vectors: list[Array], numbers: list[Array]) -> list[Array]:
     """Tangents of what is found. In one vector: where vmap batches only some inputs, their cotangents know what to sum over."""
-    found = _bind(linear, _flat(vectors))
+    found = _bind(linear, _flat([*vectors, *numbers]))
     return [found[k : k + len(linear.q)] for k in range(0, len(found), len(linear.q))]
 
 
-# --- the same by the plain form
+# --- the same by the textbook
 
 
 def by_plain_form(name: str, primals: Any, tangents: Any) -> list[Array]:
-    """The tangents of what is found, by the plain form."""
-    moving = moving_of(tangents)
-    function, at = _plain(name, primals, moving)
-    return jax.jvp(function, at, those(tangents, moving))[1]
+    """The tangents of what is found, by the textbook."""
+    state, moved = tuple(not _is_zero(x) for x in tangents[1:]), numbers_moving_of(tangents)
+    function, at = _plain(name, primals, state, moved)
+    along = [*those_numbers(tangents, moved), *(x for x, moves in zip(tangents[1:], state, strict=True) if moves)]
+    return jax.jvp(function, at, along)[1]
 
 
 def _by_plain_form_of(linear: Linear, vector: Array) -> Array:
-    function, at = _plain(linear.name, linear.primals, linear.moving)
-    if linear.transposed:
-        ends = np.cumsum([np.size(x) for x in jax.eval_shape(function, *at)])[:-1]
-        return _flat(jax.vjp(function, *at)[1](jnp.split(vector, ends)))
-    ends = np.cumsum([np.size(x) for x in at])[:-1]
-    parts = [part.reshape(np.shape(x)) for part, x in zip(jnp.split(vector, ends), at, strict=True)]
+    function, at = _plain(linear.name, linear.primals, linear.moving[-3:], linear.moved)
+    constants = sum(linear.moving[:-3])
+    state, numbers = jnp.split(vector[constants:], [_size(those(linear.primals, linear.moving)) - constants])
+    parts, k = [], 0
+    for x in at:  # the numbers, then t, q and v
+        parts.append(jnp.concatenate([numbers, state])[k : k + np.size(x)].reshape(np.shape(x)))
+        k += np.size(x)
     return _flat(jax.jvp(function, at, parts)[1])
 
 
-def _plain(name: str, primals: Any, moving: tuple[bool, ...]) -> tuple[Any, list[Array]]:
-    """The plain form as a function of those inputs that are moving, and their values."""
+def _by_plain_form_transposed(linear: Linear, vector: Array) -> Array:
+    function, at = _plain(linear.name, linear.primals, linear.moving[-3:], linear.moved)
+    found = jax.eval_shape(function, *at)
+    back = jax.vjp(function, *at)[1](jnp.split(vector, np.cumsum([x.size for x in found])[:-1]))
+    numbers = sum(linear.moved)
+    return _flat([*[0.0] * sum(linear.moving[:-3]), *back[numbers:], *back[:numbers]])
+
+
+def _through_constants(linear: Linear, at: Linear, bars: list[Array]) -> Array:
+    """What the cotangents of constants, given as they are, add to the derivative of those of the numbers along `at`."""
+    equations, moved = linear.equations, linear.moved
+    numbers, directions = (those_numbers((e.equations,), moved) for e in (linear, at))
+
+    def constants(*some: Array) -> list[Array]:
+        found = equations.constants_of(*_with(equations, moved, some))
+        return [c for c, moves in zip(found, linear.moving, strict=False) if moves]
+
+    def pulled(*some: Array) -> list[Array]:
+        return list(jax.vjp(constants, *some)[1](bars))
+
+    directions = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(numbers, directions, strict=True)]
+    return _flat(jax.jvp(pulled, numbers, directions)[1]) if numbers else jnp.zeros(0)
+
+
+def _plain(name: str, primals: Any, state: tuple[bool, ...], moved: tuple[bool, ...]) -> tuple[Any, list[Array]]:
+    """The textbook as a function of those of the numbers and of t, q and v that move, and their values."""
+    equations, *here = primals
 
     def function(*some: Array) -> list[Array]:
-        rest = iter(some)
-        *constants, t, q, v = (next(rest) if moves else x for x, moves in zip(_leaves(primals), moving, strict=True))
-        equations = dataclasses.replace(primals[0], constants=constants)
-        if name == "accelerations":
-            return [plain_accelerations(equations, t, q, v)]
-        return list(plain_correction(equations, t, q, v))
+        mechanism, baumgarte = _with(equations, moved, some[: sum(moved)])
+        rest = iter(some[sum(moved) :])
+        t, q, v = (next(rest) if moves else x for x, moves in zip(here, state, strict=True))
+        plain = dataclasses.replace(equations.plain, mechanism=mechanism, baumgarte=baumgarte)
+        return [plain.accelerations(t, q, v)] if name == "accelerations" else list(plain.correct(t, q, v))
 
-    return function, those(primals, moving)
+    return function, [*those_numbers(primals, moved), *(x for x, moves in zip(here, state, strict=True) if moves)]
 
 
-# --- lists of inputs: the constants, t, q, v
+# --- lists of inputs: the constants, t, q, v; and the numbers of the scene and the gains
 
 
 def _leaves(primals: Any) -> list[Any]:
@@ -141,14 +184,44 @@ def _leaves(primals: Any) -> list[Any]:
     return [*equations.constants, t, q, v]
 
 
+def _numbers(primals: Any) -> list[Any]:
+    textbook = primals[0].textbook
+    return jax.tree.leaves((textbook.mechanism, textbook.baumgarte), is_leaf=lambda x: x is None or isinstance(x, SymbolicZero))
+
+
+def _with(equations: "Equations", moved: tuple[bool, ...], some: Sequence[Array]) -> Any:
+    """The mechanism and the gains, some of whose numbers are replaced."""
+    both, rest = (equations.textbook.mechanism, equations.textbook.baumgarte), iter(some)
+    leaves, tree = jax.tree.flatten(both, is_leaf=lambda x: x is None)
+    return tree.unflatten([next(rest) if moves else x for x, moves in zip(leaves, moved, strict=True)])
+
+
+def _is_zero(x: Any) -> bool:
+    return x is None or isinstance(x, SymbolicZero) or x.dtype == jax.dtypes.float0
+
+
 def moving_of(tangents: Any) -> tuple[bool, ...]:
-    """Which inputs have a tangent at all."""
-    return tuple(not isinstance(x, SymbolicZero) and x.dtype != jax.dtypes.float0 for x in _leaves(tangents))
+    """Which of the constants, t, q and v have a tangent at all."""
+    return tuple(not _is_zero(x) for x in _leaves(tangents))
+
+
+def numbers_moving_of(tangents: Any) -> tuple[bool, ...]:
+    """Which numbers of the scene and which gains have a tangent at all."""
+    return tuple(not _is_zero(x) for x in _numbers(tangents))
 
 
 def those(values: Any, moving: tuple[bool, ...]) -> list[Any]:
     """Of constants, t, q and v, or their tangents, those that are moving."""
     return [x for x, moves in zip(_leaves(values), moving, strict=True) if moves]
+
+
+def those_numbers(values: Any, moved: tuple[bool, ...]) -> list[Any]:
+    """Of the numbers of the scene and the gains, or their tangents, those that are moved."""
+    return [x for x, moves in zip(_numbers(values), moved, strict=True) if moves]
+
+
+def _size(values: Sequence[Any]) -> int:
+    return sum(np.size(x) for x in values)
 
 
 def _flat(values: Sequence[Any]) -> Array:

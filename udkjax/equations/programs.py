@@ -1,11 +1,6 @@
-"""The Udwadia-Kalaba equation (de Falco, Pennestri, Vita 2005, section 3).
+"""The Udwadia-Kalaba equation by elimination, as scalar programs of the value and of its first derivative (fast.py).
 
-With D = Psi_q M^(-1/2), a_F = M^(-1) F and b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F,
-
-    a = a_F + M^(-1/2) D^+ b,        lambda = -(D^+)^T D^+ b        (M a + Psi_q^T lambda = F).
-
-It is written twice. The plain form (plain.py) is the equation as it stands, on arrays, for any pseudoinverse. The fast form
-(fast.py) is straight-line programs for elimination, of the value and of its derivatives.
+For every other pseudoinverse, and for all derivatives beyond the first, it is evaluated as it stands in the textbook.
 """
 
 import dataclasses
@@ -17,17 +12,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from udkjax.equations import fast
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.code import Code, code, is_large, scalars, stacked
 from udkjax.equations.motion import Closed, MechanismMotion, Tangential, Vector
-from udkjax.equations.plain import plain_accelerations
 from udkjax.equations.rank_policy import REVEAL, RankPolicy
 from udkjax.equations.scales import Scales, rank_tolerance
+from udkjax.equations.textbook import TextbookEquations
+from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Elimination, Plus, Pseudoinverse, Varga
-from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Loop, Program
 
@@ -42,19 +37,6 @@ FEW = 20  # coordinates: up to so many, `finish` has not too many results for a 
 WITH_CARE = 0.2
 
 
-class Baumgarte(eqx.Module):
-    """Feed the violation back: Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0, alpha and beta in 1/s.
-
-    Gains of 2 to 5 hold what redundancy and rounding excite; the hundreds of the literature only make the problem stiff.
-    """
-
-    alpha: Float[Array, ""]
-    beta: Float[Array, ""]
-
-    def __init__(self, alpha: ArrayLike = 5.0, beta: ArrayLike = 5.0):
-        self.alpha, self.beta = number(alpha), number(beta)
-
-
 class Equations(MechanismMotion):
     """The equations of motion of one mechanism by one method: what an integrator needs, ready to be evaluated.
 
@@ -62,25 +44,18 @@ class Equations(MechanismMotion):
     """
 
     constants: list[Array]  # the subexpressions of parameters alone that the programs use, computed once
-    method: Pseudoinverse
-    scales: Scales
+    textbook: TextbookEquations  # the same as it stands, of the rows kept
     code: Code = eqx.field(static=True)
     policy: RankPolicy = REVEAL  # of `Auto`, which eliminates rows that are known to be independent
     loop: Loop | None = eqx.field(static=True, default=None)  # in which its programs run
 
     def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         """a = a_F + M^(-1/2) D^+ b."""
-        if not self.eliminates:
-            return plain_accelerations(self, t, q, v)
         return fast.accelerations("accelerations_watched" if self.branches else "accelerations", self, t, q, v)
 
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
-        """lambda = -(D^+)^T D^+ b of all rows."""
-        equations = self.by(SVD) if self.code.elimination else self
-        if not self.code.pattern.shape[0]:
-            return jnp.zeros(0)
-        plus, b, _ = equations.linearized("rows", t, q, v)
-        return -self.scales.weights * (plus.T @ (plus @ b))
+        """lambda = -(D^+)^T D^+ b of all rows, by singular values."""
+        return self.by(SVD).multipliers(t, q, v)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric."""
@@ -88,23 +63,19 @@ class Equations(MechanismMotion):
 
     def arrived(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector]:
         """q and v projected, and the accelerations there: by one elimination less."""
-        return fast.arrived(self, t, q, v) if self._by_elimination else super().arrived(t, q, v)
+        return super().arrived(t, q, v) if self.branches else fast.arrived(self, t, q, v)
 
     def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
-        return fast.closed(self, t, q, v, steps) if self._by_elimination else super().closed(t, q, v, steps)
+        return super().closed(t, q, v, steps) if self.branches else fast.closed(self, t, q, v, steps)
 
     @property
     def finishes(self) -> bool:
         few = self.loop is None or not self.loop.batch or self.code.n <= FEW
-        return self._by_elimination and few
+        return few and not self.branches
 
     def finished(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> tuple[Vector, Vector, Vector, Tangential]:
         """q and v projected, the accelerations there, and what projection leaves of changes: by one elimination."""
         return fast.finished(self, t, q, v, dq, dv)
-
-    @property
-    def _by_elimination(self) -> bool:
-        return self.eliminates and not self.branches
 
     def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """A state on the manifold, with the derivatives that `project` has where it returns it."""
@@ -145,6 +116,14 @@ class Equations(MechanismMotion):
         return kinetic, potential
 
     @property
+    def method(self) -> Any:
+        return self.textbook.method
+
+    @property
+    def scales(self) -> Scales:
+        return self.textbook.scales
+
+    @property
     def row_names(self) -> list[tuple[str, int]]:
         return self.code.equations.row_names
 
@@ -162,12 +141,7 @@ class Equations(MechanismMotion):
 
     @property
     def branches(self) -> bool:
-        return self.policy.action == "reveal" and self.eliminates and self.code.elimination == "check"
-
-    @property
-    def eliminates(self) -> bool:
-        """Whether the programs for elimination are those of the method, and not of another that this one was before."""
-        return bool(self.code.elimination) and isinstance(self.method, Auto | Elimination)
+        return self.policy.action == "reveal" and self.code.elimination == "check"
 
     def run(self, name: str, t: Any, q: Any, v: Any) -> list[Any]:
         """Evaluate one of the programs."""
@@ -189,9 +163,7 @@ class Equations(MechanismMotion):
 
     def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Plus, Array, Vector]:
         """D^+ of all rows by a dense method, the right-hand side of the program `name`, and M^(-1/2); rows are weighted."""
-        values, residual, *vectors = self.arrays(name, t, q, v)
-        w = self.scales.weights
-        return self.method.plus(w[:, None] * self.code.pattern.dense(values)), w * residual, vectors[-1]
+        return self._on_all_rows(self.method).linearized(name, t, q, v)
 
     @property
     def refuses(self) -> bool:
@@ -206,18 +178,31 @@ class Equations(MechanismMotion):
             constants = [policy.threshold if k == drop else c for k, c in enumerate(constants)]
         return dataclasses.replace(self, constants=constants, policy=policy)
 
-    def by(self, method: type[Pseudoinverse], share: float = 1.0) -> "Equations":
+    def by(self, method: type[Pseudoinverse], share: float = 1.0) -> TextbookEquations:
         """The same by another method on all rows, with a share of this one's rank threshold."""
-        assert self.method.rank_tol is not None
-        return eqx.tree_at(lambda e: e.method, self, method(share * self.method.rank_tol, self.method.relative))
+        return self._on_all_rows(method(share * self.method.rank_tol, self.method.relative))
 
     @property
-    def rank_revealing(self) -> "Equations":
-        """The same by Varga's method on all rows: without LAPACK it is compiled into one function with what is around it."""
+    def rank_revealing(self) -> TextbookEquations:
+        """The same by Varga's method on all rows, which takes a fraction of the time that singular values take."""
         return self.by(Varga, WITH_CARE)
 
     def within(self, loop: Loop) -> "Equations":
         return dataclasses.replace(self, loop=loop)
+
+    def _on_all_rows(self, method: Pseudoinverse) -> TextbookEquations:
+        return dataclasses.replace(self.textbook, method=method, redundant=(), loop=self.loop)
+
+    @property
+    def plain(self) -> TextbookEquations:
+        """The textbook's form of the same function, which derivatives are taken of where the programs have none."""
+        return self.by(SVD) if self.branches else dataclasses.replace(self.textbook, loop=self.loop)
+
+    def constants_of(self, mechanism: Mechanism, baumgarte: Baumgarte | None) -> list[Array]:
+        """The constants as a function of the numbers of the scene and the gains."""
+        gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
+        numbers = [*scalars(jax.tree.leaves(mechanism)), *gains, jnp.zeros(())]
+        return [jnp.asarray(c) for c in self.code.prologue(numbers)]
 
 
 def prepare(
@@ -230,10 +215,10 @@ def prepare(
 ) -> Any:
     """Prepare a mechanism for a method (default `Auto`). Its numbers may be traced; its structure decides what is compiled.
 
-    Returns `Equations`, straight-line code, or of a scene of more than `LARGE` elements `LargeEquations`, whose program does not
-    grow with the scene. `large` says which, whatever the size. `moving` says of each leaf of the mechanism whether it is traced
-    where all begins: of the others XLA may know the numbers, though they are traced here. Without it none is taken to be.
-    `analysis` is that of `analyse`, by default made here.
+    Returns `Equations`, straight-line code, for elimination, `TextbookEquations` for every other method; or of a scene of more
+    than `LARGE` elements `LargeEquations`, whose program does not grow with the scene. `large` says which, whatever the size.
+    `moving` says of each leaf of the mechanism whether it is traced where all begins: of the others XLA may know the numbers,
+    though they are traced here. Without it none is taken to be. `analysis` is that of `analyse`, by default made here.
 
     A method without a `rank_tol` gets `rank_tolerance`. Without knowledge of which rows are redundant (a mechanism that was built
     from traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
@@ -250,19 +235,20 @@ def prepare(
         from udkjax.equations.large import prepare_large  # and with it SciPy, which small scenes do without
 
         return prepare_large(mechanism, chosen, gains, analysis)
-    left_out, elimination, drop = redundant or (), None, number(0.0)
-    if isinstance(chosen, Elimination):
-        elimination, drop = "drop", tol**2
-    elif isinstance(chosen, Auto) and redundant is None:
-        chosen = chosen.rank_revealing
-    elif isinstance(chosen, Auto):
+    elimination, drop = "drop", tol**2
+    if isinstance(chosen, Auto) and redundant is not None:
         elimination, drop = "check", chosen.branch_tol
-    programs = code(mechanism, left_out if elimination else (), baumgarte is not None, elimination)
+        elimination, drop = "check", chosen.branch_tol
+    elif not isinstance(chosen, Elimination):
+        chosen = chosen.rank_revealing if isinstance(chosen, Auto) else chosen
+        return TextbookEquations(mechanism, chosen, baumgarte, analysis.scales)
+    programs = code(mechanism, redundant or (), baumgarte is not None, elimination)
     leaves = jax.tree.leaves(mechanism)
     numbers = [*scalars(leaves), *gains, drop]
     moves = [move for leaf, move in zip(leaves, moving or [False] * len(leaves), strict=True) for _ in range(np.size(leaf))]
     constants = [jnp.asarray(c) for c in programs.prologue.early(numbers, [*moves, *[False] * (len(numbers) - len(moves))])]
-    return Equations(constants=constants, method=chosen, scales=analysis.scales, code=programs)
+    textbook = TextbookEquations(mechanism, chosen, baumgarte, analysis.scales, redundant or ())
+    return Equations(constants=constants, textbook=textbook, code=programs)
 
 
 def prepare_to_close(mechanism: Mechanism, large: bool | None = None, analysis: Analysis | None = None) -> Any:

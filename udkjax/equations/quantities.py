@@ -12,7 +12,8 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.motion import Motion
-from udkjax.equations.programs import Baumgarte, prepare
+from udkjax.equations.programs import prepare
+from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism

@@ -18,8 +18,8 @@ from udkjax.equations.assembly import Closure, State, close, require_closed
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.partitioning import Partitioned
-from udkjax.equations.programs import Baumgarte
 from udkjax.equations.quantities import equations_of
+from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.batched import one_by_one
 from udkjax.integrate.lanes import serves, solve
 from udkjax.integrate.outcome import Run, counts, outcome

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from udkjax.equations.assembly import State
-from udkjax.equations.programs import Baumgarte
+from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Auto
 from udkjax.scene.checks import SceneError, quoted, shown, suggestion
 from udkjax.scene.mechanism import Mechanism

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int
 
 from udkjax.equations.analysis import analyse
-from udkjax.equations.programs import Baumgarte
+from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import Column, Dimension, structure_of
 from udkjax.study.sweep.designs import Design

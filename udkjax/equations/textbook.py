@@ -1,0 +1,162 @@
+"""The equations of motion of a mechanism by the textbook (udwadia_kalaba.py): any pseudoinverse, derivatives of any order."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from udkjax.equations import constraints, loads
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.motion import MechanismMotion, Tangential, Vector
+from udkjax.equations.scales import Scales
+from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.pinv import Pseudoinverse
+from udkjax.scene.mechanism import Mechanism
+from udkjax.straightline import Loop
+
+
+class TextbookEquations(MechanismMotion):
+    """The equations of motion of one mechanism by one pseudoinverse, of all rows but those that are `redundant`.
+
+    Coordinates and velocities are flat vectors (3 bodies,): x, y, angle of each body in turn. Rows are weighted by
+    `Scales.weights`.
+    """
+
+    mechanism: Mechanism
+    method: Pseudoinverse
+    baumgarte: Baumgarte | None
+    scales: Scales
+    redundant: tuple[int, ...] = eqx.field(static=True, default=())
+    loop: Loop | None = eqx.field(static=True, default=None)  # in which they are evaluated
+
+    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+        """a = a_F + M^(-1/2) D^+ b."""
+        return uk.accelerations(self._here, t, q, v, self.method, self.baumgarte, self.weights)
+
+    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
+        """lambda = -(D^+)^T D^+ b."""
+        return uk.multipliers(self._here, t, q, v, self.method, self.baumgarte, self.weights)
+
+    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric: see `correct`."""
+        return _project(self, t, q, v)
+
+    def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """A state on the manifold, with the derivatives that `project` has where it returns it."""
+        return _as_projected(self, t, q, v)
+
+    def correct(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """One Newton step in position and one in velocity: at a state on the manifold it has the tangents of a projection."""
+        return uk.project(self._here, t, q, v, self.method, self.weights, steps=1)
+
+    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+        """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
+        changes = jnp.stack([dq, dv], axis=1)
+        return Tangential(*uk.tangent_part(self._here, t, q, changes, self.method, self.weights).T)
+
+    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+        """Psi and Psi_dot, of all rows."""
+        return constraints.psi(self.mechanism, t, q), constraints.psi_dot(self.mechanism, t, q, v)
+
+    def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
+        """Whether everything that the equation is made of is a number."""
+        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in self.matrices(t, q, v)]))
+
+    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
+        """M, F, Psi_q and gamma - 2 alpha Psi_dot - beta^2 Psi, of all rows."""
+        mechanism, A = self.mechanism, constraints.psi_q(self.mechanism, t, q)
+        c = uk.b(mechanism, t, q, v, self.baumgarte) + A @ uk.a_F(mechanism, t, q, v)
+        return jnp.diag(loads.mass(mechanism)), loads.force(mechanism, t, q, v), A, c
+
+    def jacobian(self, t: Any, q: Vector) -> Float[Array, "m n"]:
+        """Psi_q of all rows."""
+        return constraints.psi_q(self.mechanism, t, q)
+
+    def weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """D and Psi, their rows weighted, and M^(-1/2), of all rows."""
+        w = self.scales.weights
+        return uk.D(self.mechanism, t, q, w), w * constraints.psi(self.mechanism, t, q), uk.root(self.mechanism)
+
+    def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+        """Kinetic and potential energy (J)."""
+        return loads.kinetic_energy(self.mechanism, v), loads.potential_energy(self.mechanism, t, q, v)
+
+    def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Any, Array, Vector]:
+        """D^+, what it is to be applied to, and M^(-1/2): of "rows" b, of "closure" Psi, of "rate" Psi_dot; rows are weighted."""
+        mechanism, w = self._here, self.weights
+        residual = {
+            "rows": lambda: uk.b(mechanism, t, q, v, self.baumgarte, w),
+            "closure": lambda: uk.weighted(w, constraints.psi(mechanism, t, q)),
+            "rate": lambda: uk.weighted(w, constraints.psi_dot(mechanism, t, q, v)),
+        }
+        return uk.plus(self.method, uk.D(mechanism, t, q, w)), residual[name](), uk.root(mechanism)
+
+    @property
+    def weights(self) -> Float[Array, "m"]:
+        """Those of the rows; zero for those that are left out."""
+        w = self.scales.weights
+        return w.at[np.array(self.redundant)].set(0.0) if self.redundant else w
+
+    @property
+    def row_names(self) -> list[tuple[str, int]]:
+        return constraints.row_names(self.mechanism)
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        return self.redundant
+
+    @property
+    def constrained(self) -> bool:
+        return bool(self.mechanism.constraints)
+
+    @property
+    def stabilized(self) -> bool:
+        return self.baumgarte is not None
+
+    @property
+    def branches(self) -> bool:
+        return False
+
+    @property
+    def quick(self) -> "TextbookEquations":
+        return self
+
+    def within(self, loop: Loop) -> "TextbookEquations":
+        return dataclasses.replace(self, loop=loop)
+
+    @property
+    def _here(self) -> Mechanism:
+        """The mechanism; and the loop around is told that there is more in it than arithmetic."""
+        if self.loop is not None:
+            self.loop.holds(False)
+        return self.mechanism
+
+
+# A projection is differentiated at the state that it returns, where all residuals vanish.
+
+
+@jax.custom_jvp
+def _project(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    return uk.project(equations._here, t, q, v, equations.method, equations.weights)
+
+
+@_project.defjvp
+def _(primals, tangents):
+    equations, t, *_ = primals
+    return jax.jvp(_as_projected, (equations, t, *_project(*primals)), tangents)
+
+
+@jax.custom_jvp
+def _as_projected(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    del equations, t
+    return q, v
+
+
+@_as_projected.defjvp
+def _(primals, tangents):
+    _, _, q, v = primals
+    return (q, v), jax.jvp(TextbookEquations.correct, primals, tangents)[1]

@@ -1,0 +1,146 @@
+"""The Udwadia-Kalaba equation (de Falco, Pennestri, Vita 2005, section 3).
+
+A mechanism's constraints Psi(t, q) = 0, masses M and loads F give, with
+
+    D = Psi_q M^(-1/2),        a_F = M^(-1) F,        b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F,
+
+    a = a_F + M^(-1/2) D^+ b,        lambda = -(D^+)^T D^+ b,        M a + Psi_q^T lambda = F,
+
+whatever the rank of D: the accelerations that satisfy the constraints, or violate them least, and of these the nearest to a_F in
+the metric of M (Gauss's principle), and the multipliers of least norm. Every symbol is a function on arrays, differentiable
+to any order; every faster form is held against these. t, q and v are those of constraints.py; `method` is any pseudoinverse.
+
+Rows of Psi in metres and rows in radians have singular values of different units. Weights w (m,) of the rows make them comparable
+to one another, so that one threshold of the rank serves all (`Scales.weights`: 1 for metres, a length for radians): D and b stand
+for diag(w) D and diag(w) b, which changes no solution of consistent rows, and lambda = -w (D^+)^T D^+ b. A weight of zero leaves
+its row out.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.equations import constraints, loads
+from udkjax.equations.constraints import State, vector
+from udkjax.pinv import Pseudoinverse
+from udkjax.scene.fields import number
+from udkjax.scene.mechanism import Mechanism
+
+Weights = Float[ArrayLike, "m"] | None
+
+
+class Baumgarte(eqx.Module):
+    """Feed the violation back: Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0, alpha and beta in 1/s.
+
+    Gains of 2 to 5 hold what redundancy and rounding excite; the hundreds of the literature only make the problem stiff.
+    """
+
+    alpha: Float[Array, ""]
+    beta: Float[Array, ""]
+
+    def __init__(self, alpha: ArrayLike = 5.0, beta: ArrayLike = 5.0):
+        self.alpha, self.beta = number(alpha), number(beta)
+
+
+def D(mechanism: Mechanism, t: ArrayLike, q: State, w: Weights = None) -> Float[Array, "m n"]:
+    """D = Psi_q M^(-1/2)."""
+    return weighted(w, constraints.psi_q(mechanism, t, q) * root(mechanism))
+
+
+def a_F(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
+    """a_F = M^(-1) F: the accelerations without constraints (m/s^2, rad/s^2)."""
+    return loads.force(mechanism, t, q, v) / loads.mass(mechanism)
+
+
+def b(
+    mechanism: Mechanism, t: ArrayLike, q: State, v: State, baumgarte: Baumgarte | None = None, w: Weights = None
+) -> Float[Array, "m"]:
+    """b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: what the constraints still ask of the accelerations a_F."""
+    b = constraints.gamma(mechanism, t, q, v) - constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v)
+    if baumgarte is not None:
+        b = b - 2 * baumgarte.alpha * constraints.psi_dot(mechanism, t, q, v)
+        b = b - baumgarte.beta**2 * constraints.psi(mechanism, t, q)
+    return weighted(w, b)
+
+
+def accelerations(
+    mechanism: Mechanism,
+    t: ArrayLike,
+    q: State,
+    v: State,
+    method: Pseudoinverse,
+    baumgarte: Baumgarte | None = None,
+    w: Weights = None,
+) -> Float[Array, "n"]:
+    """a = a_F + M^(-1/2) D^+ b (m/s^2, rad/s^2)."""
+    x = plus(method, D(mechanism, t, q, w)) @ b(mechanism, t, q, v, baumgarte, w)
+    return a_F(mechanism, t, q, v) + root(mechanism) * x
+
+
+def multipliers(
+    mechanism: Mechanism,
+    t: ArrayLike,
+    q: State,
+    v: State,
+    method: Pseudoinverse,
+    baumgarte: Baumgarte | None = None,
+    w: Weights = None,
+) -> Float[Array, "m"]:
+    """lambda = -(D^+)^T D^+ b (N, N m): of all that keep M a + Psi_q^T lambda = F those of least norm, where w is None."""
+    D_plus = plus(method, D(mechanism, t, q, w))
+    return weighted(w, -(D_plus.T @ (D_plus @ b(mechanism, t, q, v, baumgarte, w))))
+
+
+def project(
+    mechanism: Mechanism, t: ArrayLike, q: State, v: State, method: Pseudoinverse, w: Weights = None, steps: int = 2
+) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Return a state to the manifold Psi = 0, Psi_dot = 0 by the smallest change in the metric of M.
+
+    By so many Newton steps q - M^(-1/2) D^+ Psi, then v - M^(-1/2) D^+ Psi_dot, in which Psi_dot is linear.
+    """
+
+    def newton(_: Any, q: Array) -> Array:
+        return q - root(mechanism) * (plus(method, D(mechanism, t, q, w)) @ weighted(w, constraints.psi(mechanism, t, q)))
+
+    q = jax.lax.fori_loop(0, steps, newton, vector(q))
+    rate = weighted(w, constraints.psi_dot(mechanism, t, q, v))
+    return q, vector(v) - root(mechanism) * (plus(method, D(mechanism, t, q, w)) @ rate)
+
+
+def tangent_part(
+    mechanism: Mechanism, t: ArrayLike, q: State, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
+) -> Float[Array, "n"]:
+    """(I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: the part of it within the manifold, which projection leaves."""
+    matrix = D(mechanism, t, q, w)
+    return change - root(mechanism) * (plus(method, matrix) @ (matrix @ (change / root(mechanism))))
+
+
+def root(mechanism: Mechanism) -> Float[Array, "n"]:
+    """The diagonal of M^(-1/2)."""
+    return 1 / jnp.sqrt(loads.mass(mechanism))
+
+
+def weighted(w: Weights, rows: Array) -> Array:
+    """Rows, or one number of each, times their weights."""
+    return rows if w is None else (rows.T * jnp.asarray(w)).T
+
+
+def plus(method: Pseudoinverse, D: Float[Array, "m n"]) -> Any:
+    """D^+ as an operator, `D_plus @ b` and `D_plus.T @ x`; of no rows at all it is zero."""
+    return method.plus(D) if len(D) else _Zero(D.shape)
+
+
+class _Zero(eqx.Module):
+    """D^+ of a matrix without rows."""
+
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def T(self) -> "_Zero":
+        return _Zero(self.shape[::-1])
+
+    def __matmul__(self, b: Array) -> Array:
+        return jnp.zeros(self.shape[1])
