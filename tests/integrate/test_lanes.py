@@ -236,7 +236,7 @@ def test_outputs_side_by_side_are_those_one_after_another(placed):
     states += 1e-6 * np.random.default_rng(0).standard_normal(states.shape)
     one, times = lanes.Lanes(prepare(udk.library.parallelogram())), jnp.zeros(len(angles))
     units = lambda shape=(): (jnp.ones((12, *[1] * len(shape))),) * 2  # noqa: E731
-    problem = SimpleNamespace(atol=jnp.asarray(1e-6), rtol=jnp.zeros(()), units=units)
+    problem: Any = SimpleNamespace(atol=jnp.asarray(1e-6), rtol=jnp.zeros(()), units=units)
 
     @partial(jax.jit, static_argnums=1)
     def closed(states, wide):

@@ -1,5 +1,7 @@
 """Fields of a user's class that hold functions and names, and a force law that is a neural network."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,7 +28,7 @@ class Network(udk.ForceElement):
 
 class Named(udk.Joint):
     kind: str
-    shape: object
+    shape: Callable
 
     def residual(self, t, *frames):
         one, two = frames
