@@ -204,7 +204,7 @@ def settled(mechanism: udk.Mechanism, ys: Any) -> np.ndarray:
 def total(mechanism: udk.Mechanism, ys: np.ndarray) -> np.ndarray:
     """Return the energy (J) of states (T, 2n), on the manifold or off it."""
     equations = prepare(mechanism, udk.Elimination())
-    return np.asarray(jax.jit(jax.vmap(lambda y: sum(equations.run("energy", 0.0, *jnp.split(y, 2)))))(ys))
+    return np.asarray(jax.jit(jax.vmap(lambda y: sum(equations.energy(0.0, *jnp.split(y, 2)))))(ys))
 
 
 def again(mechanism: udk.Mechanism, solver: Any, times: np.ndarray, ys: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import assembly, check
+from udkjax.equations import assembly, check, constraints
 
 
 @pytest.fixture(scope="module")
@@ -23,21 +23,21 @@ def motor():
     return udk.Mechanism(rod.bodies, rod.joints, {"motor": turn})
 
 
-def violation(twin, mech, state, t=0.0):
+def violation(mech, state, t=0.0):
     q, v, t = state.q.ravel(), state.v.ravel(), jnp.asarray(t, float)
-    return jnp.abs(twin.psi(mech, t, q)).max(), jnp.abs(twin.psi_dot(mech, t, q, v)).max()
+    return jnp.abs(constraints.psi(mech, t, q)).max(), jnp.abs(constraints.psi_dot(mech, t, q, v)).max()
 
 
 # --- closing
 
 
 @pytest.mark.parametrize("size", [1e-6, 0.1, 0.3])
-def test_closes_from_a_rough_guess(linkage, twin, size):
+def test_closes_from_a_rough_guess(linkage, size):
     for seed in range(5):
         random = np.random.default_rng(seed)
         guess = udk.State(linkage.q0 + size * random.uniform(-1, 1, (4, 3)), random.standard_normal((4, 3)))
         state = udk.assemble(linkage, state=guess)
-        psi, psi_dot = violation(twin, linkage, state)
+        psi, psi_dot = violation(linkage, state)
         assert psi < 1e-14 and psi_dot < 1e-13
         assert jnp.abs(state.q - guess.q).max() < 4 * size + 1e-14
 
@@ -73,14 +73,14 @@ def _end(pose, half):
     return np.array([x + half * np.cos(angle), y + half * np.sin(angle)])
 
 
-def test_velocities_follow_the_drivers(motor, twin):
+def test_velocities_follow_the_drivers(motor):
     """At any time the driver says what the velocities are, whatever the guess was."""
     for t in (0.0, 0.9):
         guess = udk.State(motor.q0 + 0.3, jnp.full((1, 3), 5.0))
         state, angle = udk.assemble(motor, t, guess), 0.3 + 4.0 * t
         assert_allclose(state.q[0], [0.75 * np.cos(angle), 0.75 * np.sin(angle), angle], atol=1e-13)
         assert_allclose(state.v[0], [-3.0 * np.sin(angle), 3.0 * np.cos(angle), 4.0], atol=1e-12)
-        assert max(violation(twin, motor, state, t)) < 1e-12
+        assert max(violation(motor, state, t)) < 1e-12
 
 
 def test_velocities_keep_the_free_motion_of_the_guess(linkage, placed):
@@ -100,13 +100,13 @@ def apart(mech, by):
     return mech.with_parameters({"joint.D.points[0][0]": by})
 
 
-def test_names_what_stays_open_and_makes_nothing_worse(twin):
+def test_names_what_stays_open_and_makes_nothing_worse():
     mech = apart(udk.library.four_bar(), 9.0)
-    before = jnp.linalg.norm(twin.psi(mech, 0.0, mech.q0.ravel()))
+    before = jnp.linalg.norm(constraints.psi(mech, 0.0, mech.q0.ravel()))
     with pytest.raises(udk.AssemblyError, match=r'cannot be closed.*"[ABCD]" \([0-9.]+\).*closer') as caught:
         udk.assemble(mech)
     best = caught.value.state
-    assert jnp.linalg.norm(twin.psi(mech, 0.0, best.q.ravel())) < before
+    assert jnp.linalg.norm(constraints.psi(mech, 0.0, best.q.ravel())) < before
     assert_allclose(udk.assemble(mech, throw=False).q, best.q)
 
 
@@ -131,13 +131,13 @@ def test_a_driver_against_a_joint_leaves_velocities_open():
         udk.assemble(udk.Mechanism(mech.bodies, mech.joints, {"pull": driver}))
 
 
-def test_never_worse(linkage, twin):
+def test_never_worse(linkage):
     """Also from guesses that are hopeless, and for a mechanism that cannot close at all."""
     stuck = linkage.with_parameters({"joint.A3.points[1][0]": -0.4})
     assemble = jax.jit(lambda q: udk.assemble(stuck, state=udk.State(q, jnp.zeros((4, 3)))).q)
     for seed in range(8):
         q = stuck.q0 + np.random.default_rng(seed).uniform(-2, 2, (4, 3))
-        before, after = (jnp.linalg.norm(twin.psi(stuck, 0.0, x.ravel())) for x in (q, assemble(q)))
+        before, after = (jnp.linalg.norm(constraints.psi(stuck, 0.0, x.ravel())) for x in (q, assemble(q)))
         assert after <= before
 
 
@@ -306,12 +306,12 @@ ALONG = {
 
 
 @pytest.mark.parametrize(("make", "start"), ALONG.values(), ids=ALONG)
-def test_what_stays_has_full_rank_elsewhere(twin, make, start):
+def test_what_stays_has_full_rank_elsewhere(make, start):
     """The rows that stay are as many as the rank, and independent, along the motion; also from a singular start."""
     mech = make(start)
     redundant = list(udk.analyse(mech).redundant_rows or ())
     for angle in (start + 0.35, start + 0.7):
-        A = np.asarray(twin.psi_q(mech, jnp.array(0.0), make(angle).q0.ravel()))
+        A = np.asarray(constraints.psi_q(mech, jnp.array(0.0), make(angle).q0.ravel()))
         kept = np.delete(A, redundant, axis=0)
         assert len(kept) == np.linalg.matrix_rank(A, tol=1e-7)
         assert np.linalg.svd(kept, compute_uv=False)[-1] > 1e-3

@@ -1,5 +1,7 @@
 """Derivatives of the fast form: those of the plain form, from the factors at hand, and nothing that is not asked for."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,6 @@ import pytest
 import udkjax as udk
 from udkjax import GROUND
 from udkjax.equations import prepare
-from udkjax.equations.plain import plain_accelerations, plain_correction
 from udkjax.equations.rank_policy import REFUSE, drop_dependent
 from udkjax.straightline import Loop
 
@@ -51,13 +52,14 @@ def test_first_derivatives_are_those_of_the_plain_form(scene, method, baumgarte)
     Reverse mode is the transpose of that: w (J d) = (w J) d.
     """
     mechanism = driven() if scene == "driven" else getattr(udk.library, scene)()
-    random = np.random.default_rng(1)
+    analysis, random = udk.analyse(mechanism), np.random.default_rng(1)
     q, v = (x.ravel() + 0.05 * random.standard_normal(x.size) for x in (mechanism.q0, mechanism.v0))
     inputs = (mechanism, jnp.array(0.3), q, v)
     dots = jax.tree.map(lambda x: jnp.asarray(random.standard_normal(np.shape(x))), inputs)
 
     def of(form):
-        return lambda mechanism, t, q, v: form(prepare(mechanism, method, baumgarte, large=False).with_policy(REFUSE), t, q, v)
+        made = partial(prepare, method=method, baumgarte=baumgarte, large=False, analysis=analysis)
+        return lambda mechanism, t, q, v: form(made(mechanism).with_policy(REFUSE), t, q, v)
 
     def both(fast, plain, at, weights):
         fast, plain = of(fast), of(plain)
@@ -71,8 +73,8 @@ def test_first_derivatives_are_those_of_the_plain_form(scene, method, baumgarte)
         close = lambda _, state: of(project)(mechanism, t, *state)  # noqa: E731
         closed = (mechanism, t, *jax.lax.fori_loop(0, 6, close, (q, v)))
         here, weights = (mechanism, t, q, v), (jnp.cos(jnp.arange(q.size)), jnp.sin(jnp.arange(q.size)))
-        a = both(lambda e, t, q, v: e.accelerations(t, q, v), plain_accelerations, here, weights[0])
-        return (*a, weights[0]), (*both(project, plain_correction, closed, weights), weights)
+        a = both(lambda e, *s: e.accelerations(*s), lambda e, *s: e.plain.accelerations(*s), here, weights[0])
+        return (*a, weights[0]), (*both(project, lambda e, *s: e.plain.correct(*s), closed, weights), weights)
 
     for fast, plain, back, weights in derivatives(*inputs):
         size = max(float(jnp.abs(x).max()) for x in jax.tree.leaves(plain))

@@ -88,14 +88,14 @@ def driven(forces):
 SPRING = {"spring": udk.Spring(["ground", "lower"], [[0.3, 0.5], [0.1, 0.0]], stiffness=40.0, length=0.2, damping=3.0)}
 
 
-def test_a_driver_and_force_elements(twin, closed):
+def test_a_driver_and_force_elements(kkt, closed):
     """Against the KKT equations written down plainly."""
     mech = driven(SPRING)
     q, v = closed(mech)
     reference, found = all_of(mech, T0, q, v, ALL)
     agree(reference, found)
-    assert_allclose(reference, twin.kkt(mech, T0, q, v)[0], atol=1e-9 * np.abs(reference).max())
-    assert np.abs(reference - twin.kkt(driven(None), T0, q, v)[0]).max() > 1.0
+    assert_allclose(reference, kkt(mech, T0, q, v)[0], atol=1e-9 * np.abs(reference).max())
+    assert np.abs(reference - kkt(driven(None), T0, q, v)[0]).max() > 1.0
 
 
 def test_without_constraints():
@@ -143,7 +143,7 @@ def linkage():
     return udk.library.parallelogram(np.deg2rad(-50))
 
 
-def test_plain_LU_divides_by_rounding_errors(linkage, placed, twin):
+def test_plain_LU_divides_by_rounding_errors(linkage, placed):
     """Rank 23 of 24: what LU takes for a pivot is a rounding error, and so is what it makes of the multipliers."""
     q, v = (x.ravel() for x in placed(-0.8, 1.3))
     M, _, A, _ = equations_of(linkage, udk.SVD()).matrices(T0, q, v)

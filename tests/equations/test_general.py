@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
+from udkjax.equations import constraints, loads
 from udkjax.equations.quantities import equations_of
 
 G = 9.81
@@ -249,12 +250,12 @@ def test_mass_redundancy_and_constraints_along_a_motion(stabilization):
 
 
 @pytest.mark.slow
-def test_a_mechanism_written_by_hand_moves_alike(twin):
+def test_a_mechanism_written_by_hand_moves_alike():
     mech = udk.library.parallelogram(np.deg2rad(-50))
     system = udk.ConstrainedSystem(
-        mass=lambda q: jnp.diag(twin.mass(mech)),
-        force=lambda t, q, v: twin.force(mech, t, q, v),
-        constraint=lambda t, q: twin.psi(mech, t, q),
+        mass=lambda q: jnp.diag(loads.mass(mech)),
+        force=lambda t, q, v: loads.force(mech, t, q, v),
+        constraint=lambda t, q: constraints.psi(mech, t, q),
     )
     q, v = mech.q0.ravel(), mech.v0.ravel()
     a, forces = udk.accelerations(system, 0.0, q, v, multipliers=True)

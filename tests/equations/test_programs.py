@@ -11,8 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import prepare
-from udkjax.equations.plain import plain_accelerations, plain_project
+from udkjax.equations import constraints, loads, prepare
 from udkjax.equations.rank_policy import REFUSE
 
 CLASSES = (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)
@@ -128,12 +127,12 @@ def data_null(theta):
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_agrees_with_the_augmented_equations(mechanisms, twin, closed, name):
+def test_agrees_with_the_augmented_equations(mechanisms, kkt, closed, name):
     """One large linear system in a and lambda, by NumPy."""
     mech = mechanisms[name]
     q, v = closed(mech)
     a, multipliers = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3), multipliers=True)
-    expected, forces = twin.kkt(mech, jnp.array(0.0), q, v)
+    expected, forces = kkt(mech, jnp.array(0.0), q, v)
     scale = float(1 + np.abs(expected).max())
     assert_allclose(a.ravel(), expected, atol=1e-10 * scale)
     assert_allclose(multipliers, forces, atol=1e-9 * float(1 + np.abs(forces).max()))
@@ -142,18 +141,18 @@ def test_agrees_with_the_augmented_equations(mechanisms, twin, closed, name):
 
 
 @pytest.mark.parametrize("name", ["double_pendulum", "parallelogram", *LARGE])
-def test_gauss_principle(mechanisms, twin, closed, name):
+def test_gauss_principle(mechanisms, closed, name):
     """Among all accelerations that satisfy the constraints it is nearest to the free ones, in the metric of the masses."""
     mech = mechanisms[name]
     q, v = closed(mech, seed=3)
     a = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3)).ravel()
-    t, mass = jnp.array(0.0), twin.mass(mech)
-    A = twin.psi_q(mech, t, q)
+    t, mass = jnp.array(0.0), loads.mass(mech)
+    A = constraints.psi_q(mech, t, q)
     size = float(1 + jnp.abs(a).max())
-    assert_allclose(A @ a, twin.gamma(mech, t, q, v), atol=1e-10 * size)
+    assert_allclose(A @ a, constraints.gamma(mech, t, q, v), atol=1e-10 * size)
     _, sigma, vt = np.linalg.svd(A)
     allowed = vt[np.sum(sigma > 1e-8 * sigma[0]) :]
-    offset = a - twin.force(mech, t, q, v) / mass
+    offset = a - loads.force(mech, t, q, v) / mass
     assert len(allowed) == 3 * len(mech.bodies) - np.linalg.matrix_rank(A, tol=1e-8)
     assert_allclose(allowed @ (mass * offset), 0.0, atol=1e-10 * size * float(mass.max()))
     effort = offset @ (mass * offset)
@@ -177,15 +176,19 @@ def test_a_constraint_said_many_times_changes_nothing(data):
 
 
 @every_method
-def test_baumgarte_feeds_the_violation_back(mechanisms, twin, method):
+def test_baumgarte_feeds_the_violation_back(mechanisms, method):
     """Psi_q a = gamma - 2 alpha Psi_dot - beta^2 Psi, away from the manifold, where rows are independent."""
     mech, random = mechanisms["four_bar"], np.random.default_rng(5)
     q, v = (x + 0.1 * random.standard_normal(x.shape) for x in (mech.q0, mech.v0))
     t, state = jnp.array(0.0), (q.ravel(), v.ravel())
     gains = udk.Baumgarte(3.0, 7.0)
     a = udk.accelerations(mech, t, q, v, method, gains).ravel()
-    expected = twin.gamma(mech, t, *state) - 6.0 * twin.psi_dot(mech, t, *state) - 49.0 * twin.psi(mech, t, state[0])
-    assert_allclose(twin.psi_q(mech, t, state[0]) @ a, expected, atol=1e-10)
+    expected = (
+        constraints.gamma(mech, t, *state)
+        - 6.0 * constraints.psi_dot(mech, t, *state)
+        - 49.0 * constraints.psi(mech, t, state[0])
+    )
+    assert_allclose(constraints.psi_q(mech, t, state[0]) @ a, expected, atol=1e-10)
     plain = udk.accelerations(mech, t, q, v, method)
     assert_allclose(udk.accelerations(mech, t, q, v, method, udk.Baumgarte(0.0, 0.0)), plain, atol=1e-11)
     assert jnp.abs(a - plain.ravel()).max() > 0.1
@@ -209,14 +212,14 @@ def nearby(mechanisms):
 @pytest.mark.parametrize("method", [udk.Auto(), udk.Elimination()], ids=["Auto", "Elimination"])
 @pytest.mark.parametrize("name", ["parallelogram", "slider_crank"])
 def test_the_fast_form_is_the_plain_form(nearby, method, name):
-    """On rows that are left out they differ by the violation; `quick`, which does not branch, compares like with like."""
+    """On rows that are left out they differ by the violation; the policy, which does not branch, compares like with like."""
     mech, qs, vs = nearby(name)
+    analysis = udk.analyse(mech)
 
     @eqx.filter_jit
     def both(mech, qs, vs):
-        equations = prepare(mech, method, udk.Baumgarte(2.0, 3.0)).with_policy(REFUSE)
-        forms = (equations.accelerations, lambda *s: plain_accelerations(equations, *s), equations.project,
-                 lambda *s: plain_project(equations, *s))  # fmt: skip
+        equations = prepare(mech, method, udk.Baumgarte(2.0, 3.0), analysis=analysis).with_policy(REFUSE)
+        forms = (equations.accelerations, equations.plain.accelerations, equations.project, equations.plain.project)
         return [jax.lax.map(lambda s, form=form: form(0.0, *s), (qs, vs)) for form in forms]
 
     fast, plain, projected, newton = both(mech, qs, vs)
@@ -245,14 +248,14 @@ def test_the_careful_form_is_that_by_singular_values(linkage, placed, angle, sla
 
 
 @pytest.mark.parametrize("name", ["parallelogram", "scissor_lift", "slider_crank"])
-def test_projection_is_the_smallest_change(nearby, twin, name):
+def test_projection_is_the_smallest_change(nearby, name):
     mech, qs, vs = nearby(name)
     equations, t = prepare(mech), jnp.array(0.0)
     q, v = equations.project(t, qs[0], vs[0])
     psi, psi_dot = equations.violation(t, q, v)
     assert_allclose(psi, 0.0, atol=1e-15 * 40)
     assert_allclose(psi_dot, 0.0, atol=1e-14 * 40)
-    A, mass = np.asarray(twin.psi_q(mech, t, q)), np.asarray(twin.mass(mech))
+    A, mass = np.asarray(constraints.psi_q(mech, t, q)), np.asarray(loads.mass(mech))
     _, sigma, vt = np.linalg.svd(A)
     for moved in (q - qs[0], v - vs[0]):
         assert_allclose(vt[np.sum(sigma > 1e-6) :] @ (mass * moved), 0.0, atol=1e-11)
@@ -319,15 +322,15 @@ def test_closing_goes_on_until_nothing_moves(nearby, method, name):
         assert_allclose(jnp.concatenate(violated), 0.0, atol=1e-13)
 
 
-def test_bodies_without_constraints_fall_freely(twin):
+def test_bodies_without_constraints_fall_freely():
     bodies = {"one": udk.Body(2.0, 0.3, [0.1, 0.2], 0.3), "two": udk.Body(1.0, 0.1, [1.0, -0.5], 0.0, [1.0, 2.0], 3.0)}
     forces = [udk.Spring(["one", "two"], [[0.1, 0.0], [0.0, 0.1]], 20.0, 0.5, 0.3), udk.Torque(["ground", "one"], 0.6)]
     mech = udk.Mechanism(bodies, forces=forces)
     assert udk.analyse(mech).redundant_rows == ()
     for method in METHODS.values():
         a, multipliers = udk.accelerations(mech, 0.0, mech.q0, mech.v0, method, multipliers=True)
-        force = twin.force(mech, 0.0, mech.q0.ravel(), mech.v0.ravel())
-        assert_allclose(a.ravel(), force / twin.mass(mech), atol=1e-13)
+        force = loads.force(mech, 0.0, mech.q0.ravel(), mech.v0.ravel())
+        assert_allclose(a.ravel(), force / loads.mass(mech), atol=1e-13)
         assert multipliers.shape == (0,)
     empty = udk.Mechanism(bodies)
     assert_allclose(udk.accelerations(empty, 0.0, empty.q0, empty.v0), [[0.0, -9.81, 0.0]] * 2, atol=1e-15)
@@ -424,11 +427,12 @@ def test_numbers_that_are_traced_are_prepared_for_by_one_function(mechanisms, na
     """As they are without; where XLA knows them after all, and where some do not move, too."""
     mechanism = mechanisms[name]
     leaves, tree = jax.tree.flatten(mechanism)
+    analysis = udk.analyse(mechanism)
     factors = jnp.linspace(0.9, 1.1, 3)
 
     def constants(factor, moving):
         changed = tree.unflatten([factor * x if k % 3 else x for k, x in enumerate(leaves)])
-        return jnp.stack(prepare(changed, large=False, moving=moving).constants)
+        return jnp.stack(prepare(changed, large=False, moving=moving, analysis=analysis).constants)
 
     def all_of(moving):
         f = partial(constants, moving=moving)

@@ -55,8 +55,9 @@ class TextbookEquations(MechanismMotion):
 
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
-        changes = jnp.stack([dq, dv], axis=1)
-        return Tangential(*uk.tangent_part(self._here, t, q, changes, self.method, self.weights).T)
+        mechanism, w = self._here, self.weights
+        of = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
+        return Tangential(*of(jnp.stack([dq, dv])))
 
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows."""

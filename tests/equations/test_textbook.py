@@ -1,0 +1,203 @@
+"""The textbook against what must hold of it, and every faster form against the textbook, in every scene of the library.
+
+Every type of joint, driver and force element is held against it in test_expressions.py.
+"""
+
+import inspect
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations import constraints, loads, prepare
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.rank_policy import REFUSE
+
+SVD = udk.SVD(1e-9)
+T0 = jnp.array(0.3)
+
+
+def scene(name):
+    make = getattr(udk.library, name)
+    required = [p for p in inspect.signature(make).parameters.values() if p.default is p.empty]
+    return make(*(3 for _ in required))
+
+
+@pytest.fixture(scope="module", params=udk.library.__all__)
+def moved(request):
+    """A scene, and a state off its manifold."""
+    mech = scene(request.param)
+    random = np.random.default_rng(3)
+    q, v = (jnp.asarray(np.ravel(x) + 0.03 * random.standard_normal(np.size(x))) for x in (mech.q0, mech.v0))
+    return mech, q, v
+
+
+@eqx.filter_jit
+def textbook(mech, q, v, method, baumgarte=None, w=None):
+    names = {"psi": constraints.psi(mech, T0, q), "psi_q": constraints.psi_q(mech, T0, q)}
+    names |= {"psi_dot": constraints.psi_dot(mech, T0, q, v), "gamma": constraints.gamma(mech, T0, q, v)}
+    names |= {"M": loads.mass(mech), "F": loads.force(mech, T0, q, v)}
+    names |= {"T": loads.kinetic_energy(mech, v), "V": loads.potential_energy(mech, T0, q, v)}
+    names["a"] = uk.accelerations(mech, T0, q, v, method, baumgarte, w)
+    names["lambda"] = uk.multipliers(mech, T0, q, v, method, baumgarte, w)
+    return names
+
+
+def close_to(found, expected, rtol):
+    assert_allclose(found, expected, rtol=0, atol=rtol * (1.0 + np.abs(expected).max(initial=0.0)))
+
+
+# --- the textbook itself
+
+
+def test_accelerations_and_multipliers_solve_the_equations_of_motion(moved):
+    """M a + Psi_q^T lambda = F; and Psi_q a is gamma as far as it can be: what is left is orthogonal to the columns of D."""
+    mech, q, v = moved
+    x = textbook(mech.bare, q, v, SVD)
+    size = 1.0 + np.abs(x["psi_q"]).max(initial=0.0) * np.abs(x["lambda"]).max(initial=0.0)
+    assert_allclose(x["M"] * x["a"] + x["psi_q"].T @ x["lambda"], x["F"], rtol=0, atol=1e-10 * size)
+    left, D = x["psi_q"] @ x["a"] - x["gamma"], x["psi_q"] / np.sqrt(x["M"])
+    assert_allclose(D.T @ left, 0.0, atol=1e-9 * size)
+
+
+def test_rates_are_derivatives_along_a_motion(moved):
+    """Psi_dot and gamma against differences of Psi along q + v s + a s^2 / 2: Psi_ddot = Psi_q a - gamma."""
+    mech, q, v = moved
+    a = jnp.cos(jnp.arange(q.size))
+    psi = jax.jit(lambda s: constraints.psi(mech, T0 + s, q + v * s + a * s**2 / 2))
+    x, h = textbook(mech.bare, q, v, SVD), 1e-3
+    samples = np.array([psi(k * h) for k in range(-3, 4)])
+    close_to(np.array([-1, 9, -45, 0, 45, -9, 1]) @ samples / (60 * h), x["psi_dot"], 1e-9)
+    close_to(np.array([2, -27, 270, -490, 270, -27, 2]) @ samples / (180 * h**2), x["psi_q"] @ a - x["gamma"], 1e-7)
+
+
+def test_the_power_balance(moved):
+    """d(T + V)/dt along a motion that the constraints allow: the power of stated loads, of drivers, and of V itself in time."""
+    mech, q, v = moved
+
+    @jax.jit
+    def balance(q, v):
+        A = constraints.psi_q(mech, T0, q)
+        v = v - uk.plus(SVD, A) @ constraints.psi_dot(mech, T0, q, v)
+        a, multipliers = (f(mech, T0, q, v, SVD) for f in (uk.accelerations, uk.multipliers))
+        energy = lambda t, q, v: loads.kinetic_energy(mech, v) + loads.potential_energy(mech, t, q, v)  # noqa: E731
+        rate = jax.jvp(energy, (T0, q, v), (jnp.ones(()), v, a))[1]
+        psi_t = jax.jvp(lambda t: constraints.psi(mech, t, q), (T0,), (jnp.ones(()),))[1]
+        V_t = jax.grad(lambda t: loads.potential_energy(mech, t, q, v))(T0)
+        terms = [v @ loads.stated_loads(mech, T0, q, v), multipliers @ psi_t, V_t]
+        return (
+            rate,
+            sum(terms),
+            jnp.abs(v) @ jnp.abs(loads.force(mech, T0, q, v)) + jnp.abs(constraints.psi_dot(mech, T0, q, v)).sum(),
+        )
+
+    rate, power, size = balance(q, v)
+    assert_allclose(rate, power, rtol=0, atol=1e-9 * (1.0 + float(size)))
+
+
+@pytest.mark.parametrize("name", ["parallelogram", "slider_crank", "scissor_lift"])
+def test_a_duplicated_constraint_changes_nothing(name):
+    """Neither accelerations, nor what projection does, nor what the joint and its copy do to the bodies together."""
+    mech = scene(name)
+    joint = mech.joint_names[0]
+    twice = udk.Mechanism(
+        mech.bodies, {**mech.joints, "copy": mech.joints[joint]}, mech.drivers, mech.forces, gravity=mech.gravity
+    )
+    q, v = mech.q0.ravel(), 0.1 * jnp.sin(jnp.arange(mech.q0.size))
+    once, again = (textbook(m.bare, q, v, SVD) for m in (mech, twice))
+    close_to(again["a"], once["a"], 1e-11)
+    close_to(again["psi_q"].T @ again["lambda"], once["psi_q"].T @ once["lambda"], 1e-11)
+    off = q + 1e-4 * jnp.cos(jnp.arange(q.size))
+    project = jax.jit(lambda m: jnp.concatenate(uk.project(m, T0, off, v, SVD)))
+    close_to(project(twice.bare), project(mech.bare), 1e-9)
+
+
+def test_the_linkage_of_the_paper(placed):
+    """3.05 theta'' = -3.5 g cos(theta), of rank 11 of 12."""
+    mech = udk.library.parallelogram()
+    for angle in (-0.8, 0.4, 2.0):
+        q, v = (x.ravel() for x in placed(angle, 1.3))
+        assert_allclose(textbook(mech.bare, q, v, SVD)["a"][2], -3.5 * 9.81 * np.cos(angle) / 3.05, rtol=1e-12)
+
+
+def test_weights_change_no_solution_of_consistent_rows_and_zero_leaves_one_out():
+    mech = udk.library.parallelogram(-0.8)
+    q, v = mech.q0.ravel(), mech.v0.ravel()
+    plain = textbook(mech.bare, q, v, SVD)
+    w = jnp.linspace(0.1, 10.0, 12)
+    weighted = textbook(mech.bare, q, v, SVD, w=w)
+    assert_allclose(weighted["a"], plain["a"], atol=1e-12)
+    close_to(weighted["psi_q"].T @ weighted["lambda"], plain["psi_q"].T @ plain["lambda"], 1e-12)
+    without = textbook(mech.bare, q, v, SVD, w=w.at[11].set(0.0))
+    assert_allclose(without["a"], plain["a"], atol=1e-11)
+    assert without["lambda"][11] == 0.0 and np.abs(plain["lambda"][11]) > 1.0
+
+
+@pytest.mark.parametrize("name", ["parallelogram", "slider_crank", "planetary_gear"])
+def test_projection_returns_to_the_manifold_and_leaves_what_is_tangent_to_it(name):
+    mech = scene(name)
+    q, v = (x.ravel() + 1e-4 * jnp.sin(1.0 + jnp.arange(x.size)) for x in (mech.q0, mech.v0))
+    q1, v1 = jax.jit(lambda q, v: uk.project(mech, T0, q, v, SVD, steps=3))(q, v)
+    assert np.abs(constraints.psi(mech, T0, q1)).max() < 1e-13
+    assert np.abs(constraints.psi_dot(mech, T0, q1, v1)).max() < 1e-13
+    part = uk.tangent_part(mech, T0, q1, q, SVD)
+    assert_allclose(constraints.psi_q(mech, T0, q1) @ part, 0.0, atol=1e-12)
+    assert_allclose(uk.tangent_part(mech, T0, q1, part, SVD), part, atol=1e-12)
+    assert_allclose(part @ (loads.mass(mech) * (q - part)), 0.0, atol=1e-12)  # in the metric of M the rest is orthogonal
+
+
+def test_coordinates_may_be_flat_or_by_body():
+    mech = udk.library.slider_crank()
+    q, v = mech.q0 + 0.1, mech.v0 + 0.2
+    for f in (constraints.psi, constraints.psi_q):
+        assert_allclose(f(mech, T0, q), f(mech, T0, q.ravel()), rtol=0)
+    for f in (constraints.psi_dot, constraints.gamma, loads.force, loads.potential_energy):
+        assert_allclose(f(mech, T0, q, v), f(mech, T0, q.ravel(), v.ravel()), rtol=0)
+
+
+def test_row_names_are_those_of_the_analysis(moved):
+    assert tuple(constraints.row_names(moved[0])) == udk.analyse(moved[0]).row_names
+
+
+# --- every faster form against it
+
+
+@pytest.mark.parametrize("large", [False, True], ids=["programs", "blocks"])
+@pytest.mark.parametrize("method", [udk.Auto(), udk.Elimination(1e-7)], ids=["Auto", "Elimination"])
+def test_faster_forms_are_the_textbook(moved, method, large):
+    """Terms, energies, accelerations and multipliers; on the rows that are kept, since off the manifold the others disagree."""
+    mech, q, v = moved
+    if large and isinstance(method, udk.Elimination):
+        pytest.skip("the terms are the same")
+    gains = udk.Baumgarte(2.0, 3.0)
+    analysis = udk.analyse(mech)
+
+    @eqx.filter_jit
+    def fast(mech, q, v):
+        equations = prepare(mech, method, gains, large=large, analysis=analysis).with_policy(REFUSE)
+        M, F, A, c = equations.matrices(T0, q, v)
+        psi, psi_dot = equations.violation(T0, q, v)
+        gamma = c + 2 * gains.alpha * psi_dot + gains.beta**2 * psi
+        T, V = equations.energy(T0, q, v)
+        found = {"psi": psi, "psi_q": A, "psi_dot": psi_dot, "gamma": gamma, "M": jnp.diag(M), "F": F, "T": T, "V": V}
+        return found | {"a": equations.accelerations(T0, q, v)}
+
+    kept = np.ones(len(analysis.row_names))
+    kept[list(analysis.redundant_rows or ())] = 0.0
+    expected = textbook(mech.bare, q, v, udk.SVD(1e-11), gains, analysis.scales.weights * kept)
+    for name, found in fast(mech.bare, q, v).items():
+        close_to(found, expected[name], 1e-8 if name == "a" else 1e-11)
+
+
+def test_multipliers_of_faster_forms_are_those_of_the_textbook(moved):
+    """Of minimum norm, of all rows, weighted."""
+    mech, q, v = moved
+    analysis = udk.analyse(mech)
+    q, v = jax.jit(lambda m, q, v: uk.project(m, T0, q, v, SVD, steps=8))(mech.bare, q, v)
+    expected = textbook(mech.bare, q, v, udk.SVD(1e-6), None, analysis.scales.weights)
+    found = eqx.filter_jit(lambda m, q, v: prepare(m, udk.Auto(1e-6), large=False, analysis=analysis).multipliers(T0, q, v))
+    close_to(found(mech.bare, q, v), expected["lambda"], 1e-9)
