@@ -249,7 +249,7 @@ def prepare(
     textbook = TextbookEquations(
         mechanism=mechanism, method=chosen, baumgarte=baumgarte, scales=analysis.scales, redundant=redundant or ()
     )
-    return Equations(constants=constants, textbook=textbook, code=programs)
+    return Equations(constants=constants, textbook=textbook, code=programs)  # pyright: ignore[reportCallIssue]
 
 
 def prepare_to_close(mechanism: Mechanism, large: bool | None = None, analysis: Analysis | None = None) -> Any:
