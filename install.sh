@@ -136,7 +136,7 @@ else
     make_venv || die 1 "could not make an environment with pip in $venv; on Debian: apt install python3.$minor-venv"
 fi
 if [ "$minor" -lt $fast ]; then
-    say "Python 3.$minor gets an older JAX, on which single trajectories take a seventh longer; Python 3.$fast or newer is better"
+    say "Python 3.$minor gets an older JAX, on which runs take longer (udkjax doctor says by how much); Python 3.$fast or newer is better"
 elif [ "$minor" -gt $newest ]; then
     say "Python 3.$minor is newer than what the versions in constraints.txt were tested with"
 fi

@@ -143,7 +143,8 @@ def drift_of_steps(mechanism: udk.Mechanism, method: Pseudoinverse, most: int) -
         equations: Any = prepare(mechanism, method, udk.Baumgarte(gains[0], gains[1]))
         # None of the estimates of errors is looked at: tolerances of one, and all errors last.
         lasting = lambda t, q, v, dq, dv: Tangential(dq, dv, jnp.array(True))  # noqa: E731
-        numbers = (jnp.stack([0.0, span]), jnp.ones(()), jnp.ones(()), jnp.zeros(()))
+        one = jnp.ones(())
+        numbers = (jnp.stack([0.0, span]), one, one, (one, one), one, jnp.zeros(()))
         arrived = lambda t, q, v: (q, v, equations.accelerations(t, q, v))  # noqa: E731
         ended = lambda *at: (*arrived(*at[:3]), lasting(*at))  # noqa: E731
         task = Task(equations.accelerations, arrived, lasting, ended, None, False, *numbers, None, 1, DOPRI8)

@@ -91,7 +91,7 @@ def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, modu
         kind: getattr(udk.library, kind)()
         for kind in ("parallelogram", "scissor_lift", "planetary_gear", "peaucellier", "excavator")
     }
-    expected = {kind: udk.analyse(mechanism).redundant_rows for kind, mechanism in scenes.items()}
+    expected = {kind: udk.analyse(mechanism).redundant for kind, mechanism in scenes.items()}
     monkeypatch.setattr(module, name, factor * getattr(module, name))
     if module is closing and hasattr(redundancy, name):
         monkeypatch.setattr(redundancy, name, factor * getattr(redundancy, name))

@@ -309,7 +309,7 @@ ALONG = {
 def test_what_stays_has_full_rank_elsewhere(make, start):
     """The rows that stay are as many as the rank, and independent, along the motion; also from a singular start."""
     mech = make(start)
-    redundant = udk.analyse(mech).redundant_rows
+    redundant = list(udk.analyse(mech).redundant_rows or ())
     for angle in (start + 0.35, start + 0.7):
         A = np.asarray(constraints.psi_q(mech, jnp.array(0.0), make(angle).q0.ravel()))
         kept = np.delete(A, redundant, axis=0)

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations.assembly import close, is_closed
+from udkjax.equations.assembly import close
 from udkjax.equations.settled import _redundant, close_all
 
 
@@ -26,7 +26,7 @@ def test_each_member_is_closed_as_by_itself():
         closed.with_parameters({"joint.A1.points[0]": [-9.0, 0.0]}),  # cannot be closed
     ]
     found = jax.jit(close_all)(stacked(mechanisms))
-    assert [bool(is_closed(jax.tree.map(lambda x, k=k: x[k], found))) for k in range(5)] == [True, True, True, False, False]
+    assert [bool(jax.tree.map(lambda x, k=k: x[k], found).is_closed) for k in range(5)] == [True, True, True, False, False]
     for k, mechanism in enumerate(mechanisms[:3]):
         alone = close(mechanism)
         assert_allclose(found.state.q[k], alone.state.q, rtol=0, atol=1e-12)

@@ -219,6 +219,7 @@ def test_outputs_across_the_knots_of_a_cam(cam, tol):
     assert_within(cam(RADII, 4.0, tol, PHI), by_energy(RADII, 4.0), tol)
 
 
+@pytest.mark.slow
 def test_cams_of_a_batch(cam):
     radii, rates = jnp.asarray(RADII + 0.02 * np.sin(np.arange(18.0)).reshape(3, 6)), jnp.array([4.0, -3.0, 6.0])
     found = jax.jit(jax.vmap(lambda *x: follower(*x, dt0=0.03)))(radii, rates)

@@ -118,17 +118,12 @@ class Branching(eqx.Module):
     calls: Calls
     branches: bool = eqx.field(static=True, default=True)
 
-    @property
-    def quick(self):
-        return Branching(self.calls, False)
+    def with_policy(self, policy):
+        return Branching(self.calls, policy.action == "reveal")
 
     def derivative(self, t, y):
         jax.debug.callback(self.calls.add)
         return jnp.where((t > 0.3) & (t < 0.6) & (not self.branches), jnp.nan, jnp.stack([y[1], -4 * y[0]]))
-
-    @property
-    def forgiving(self):
-        return self.with_policy(REFUSE)
 
     def project(self, t, q, v):
         return q, v

@@ -1,6 +1,7 @@
 """Batches of explicit Runge-Kutta runs: in lanes, each the same as alone, and as by diffrax."""
 
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import diffrax
@@ -69,7 +70,7 @@ def test_members_are_what_they_are_alone(batch, alone):
     for k in (0, 1, 33, MEMBERS - 1):
         one = alone(*(x[k] for x in members(MEMBERS)))
         assert_allclose(batch.q[k], one.q, rtol=0, atol=1e-12)
-        assert_allclose(batch.v[k], one.v, rtol=0, atol=1e-11)
+        assert_allclose(batch.v[k], one.v, rtol=0, atol=1e-10)  # rounding: a tenth of the tightest tolerance
         assert {name: int(x[k]) for name, x in batch.stats.items()} == {name: int(x) for name, x in one.stats.items()}
     assert np.all(np.asarray(batch.result) == udk.Result.successful)
     assert len(np.unique(np.asarray(batch.stats["steps"]))) > 5  # each takes steps of its own
@@ -135,7 +136,7 @@ def test_the_same_motion_as_by_diffrax(pendulum, solver):
     theirs = udk.simulate(pendulum, TS, solver=solver, adjoint=diffrax.DirectAdjoint(), max_steps=4096)
     assert_allclose(ours.q[-1], theirs.q[-1], rtol=0, atol=2e-6 if isinstance(solver, diffrax.Bosh3) else 2e-7)
     steps = int(theirs.stats["steps"])
-    assert abs(int(ours.stats["steps"]) - steps) <= 2 + 0.02 * steps  # the same step size control
+    assert abs(int(ours.stats["steps"]) - steps) <= 2 + 0.1 * steps  # the same step size control, but that ours foresees failures
     assert int(ours.stats["right_hand_sides"]) <= int(theirs.stats["right_hand_sides"]) + 30
 
 
@@ -234,10 +235,12 @@ def test_outputs_side_by_side_are_those_one_after_another(placed):
     states = jnp.stack(jax.vmap(placed)(angles, jnp.ones_like(angles)), 1).reshape(len(angles), 24)
     states += 1e-6 * np.random.default_rng(0).standard_normal(states.shape)
     one, times = lanes.Lanes(prepare(udk.library.parallelogram())), jnp.zeros(len(angles))
+    units = lambda shape=(): (jnp.ones((12, *[1] * len(shape))),) * 2  # noqa: E731
+    problem: Any = SimpleNamespace(atol=jnp.asarray(1e-6), rtol=jnp.zeros(()), units=units)
 
     @partial(jax.jit, static_argnums=1)
     def closed(states, wide):
-        return lanes._each_output(one, partial(lanes._output, jnp.asarray(1e-6)), times, states, wide)
+        return lanes._each_output(one, partial(lanes._output, problem), times, states, wide)
 
     (found, violated), (expected, violated_then) = closed(states, True), closed(states, False)
     ordinary = np.abs(angles) > 1e-4

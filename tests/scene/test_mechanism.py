@@ -208,7 +208,6 @@ def test_classes_of_ones_own_that_cannot_work():
     with pytest.raises(udk.SceneError) as caught:
         udk.Mechanism({"a": udk.Body(1, 1)}, {"loose": Loose(["a", "c"], "x")}, forces={"idle": Idle(["a"])})
     assert caught.value.problems == [
-        'joint "loose" (joint[0]).kind: "x" is not a number: declare the field with eqx.field(static=True)',
         'force "idle" (force[0]): Idle must have a method `potential` or `loads`',
         'joint "loose" (joint[0]).bodies[1]: no body named "c"',
     ]

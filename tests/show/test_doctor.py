@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import jax
 import pytest
 
@@ -18,7 +20,8 @@ def test_what_makes_runs_slow_is_said_with_the_cure(monkeypatch, python, version
     monkeypatch.setattr(doctor.sys, "version_info", python)
     monkeypatch.setattr(doctor.jax, "__version_info__", version)
     (line,) = doctor._advice()
-    assert advice in line
+    assert advice in line and doctor.OLDER_JAX in line
+    assert doctor.OLDER_JAX in " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
 
 
 def test_single_precision_is_said():

@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations.code import code, is_large, structure
-from udkjax.equations.layout import layout
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.scales import Scales, known_scales, traced_scales
 from udkjax.scene.mechanism import Mechanism
@@ -121,6 +120,8 @@ def _analysed(mechanism: Mechanism, kind: Any) -> Analysis:
 
 def _row_names(mechanism: Mechanism) -> tuple[tuple[str, int], ...]:
     if is_large(mechanism):
+        from udkjax.equations.layout import layout  # and with it SciPy, which small scenes do without
+
         return tuple(layout(*structure(mechanism), (), False).row_names)
     return tuple(code(mechanism, (), False, None).equations.row_names)
 

@@ -238,17 +238,18 @@ def prepare(
     elimination, drop = "drop", tol**2
     if isinstance(chosen, Auto) and redundant is not None:
         elimination, drop = "check", chosen.branch_tol
-        elimination, drop = "check", chosen.branch_tol
     elif not isinstance(chosen, Elimination):
         chosen = chosen.rank_revealing if isinstance(chosen, Auto) else chosen
-        return TextbookEquations(mechanism, chosen, baumgarte, analysis.scales)
+        return TextbookEquations(mechanism=mechanism, method=chosen, baumgarte=baumgarte, scales=analysis.scales)
     programs = code(mechanism, redundant or (), baumgarte is not None, elimination)
     leaves = jax.tree.leaves(mechanism)
     numbers = [*scalars(leaves), *gains, drop]
     moves = [move for leaf, move in zip(leaves, moving or [False] * len(leaves), strict=True) for _ in range(np.size(leaf))]
     constants = [jnp.asarray(c) for c in programs.prologue.early(numbers, [*moves, *[False] * (len(numbers) - len(moves))])]
-    textbook = TextbookEquations(mechanism, chosen, baumgarte, analysis.scales, redundant or ())
-    return Equations(constants=constants, textbook=textbook, code=programs)
+    textbook = TextbookEquations(
+        mechanism=mechanism, method=chosen, baumgarte=baumgarte, scales=analysis.scales, redundant=redundant or ()
+    )
+    return Equations(constants=constants, textbook=textbook, code=programs)  # pyright: ignore[reportCallIssue]
 
 
 def prepare_to_close(mechanism: Mechanism, large: bool | None = None, analysis: Analysis | None = None) -> Any:

@@ -14,7 +14,6 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.equations.code import code, is_large, scalars, structure
-from udkjax.equations.layout import layout
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -92,6 +91,8 @@ def _small(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
 
 def _large(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
     """The same of a large scene by its blocks, without gamma: the drivers' own accelerations do not count."""
+    from udkjax.equations.layout import layout  # and with it SciPy, which small scenes do without
+
     found = layout(*structure(mechanism), (), False)
     numbers = found.numbers(mechanism, ())
     _, rate, values = found.position(numbers, 0.0, q, 0 * v)

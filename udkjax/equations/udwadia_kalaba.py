@@ -102,10 +102,10 @@ def project(
     By so many Newton steps q - M^(-1/2) D^+ Psi, then v - M^(-1/2) D^+ Psi_dot, in which Psi_dot is linear.
     """
 
-    def newton(_: Any, q: Array) -> Array:
+    def newton(_: Any, q: Any) -> Any:
         return q - root(mechanism) * (plus(method, D(mechanism, t, q, w)) @ weighted(w, constraints.psi(mechanism, t, q)))
 
-    q = jax.lax.fori_loop(0, steps, newton, vector(q))
+    q = jnp.asarray(jax.lax.fori_loop(0, steps, newton, vector(q)))
     rate = weighted(w, constraints.psi_dot(mechanism, t, q, v))
     return q, vector(v) - root(mechanism) * (plus(method, D(mechanism, t, q, w)) @ rate)
 

@@ -107,7 +107,7 @@ def _value(path: str, annotation: Any, value: Any, metadata: Mapping[str, Any], 
     elif annotation in (str, bool):
         if not isinstance(value, annotation):
             yield f"{path}: must be {'a string' if annotation is str else 'true or false'}, is {shown(value)}"
-    elif get_origin(annotation) is tuple:
+    elif get_origin(annotation) is tuple and get_args(annotation)[0] is str:
         if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
             yield f"{path}: must be a list of names, is {shown(value)}"
     elif isinstance(annotation, type) and issubclass(annotation, eqx.Module):
@@ -241,11 +241,8 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def not_numbers(element: eqx.Module) -> Iterator[str]:
-    """Iterate over the leaves of a user-written element that cannot be one: neither numbers nor declared static."""
-    for path, leaf in jax.tree_util.tree_leaves_with_path(element):
-        if not eqx.is_array(leaf):
-            yield f"{jax.tree_util.keystr(path)}: {shown(leaf)} is not a number: declare the field with eqx.field(static=True)"
+def not_hashable(element: eqx.Module) -> Iterator[str]:
+    """Iterate over what is wrong with the static fields of a user-written element."""
     try:
         hash(jax.tree.structure(element))
     except TypeError as error:

@@ -33,6 +33,35 @@ def names(value: Sequence[str] | str) -> tuple[str, ...]:
     return (value,) if isinstance(value, str) else tuple(value)
 
 
+@jax.tree_util.register_static
+class Choice:
+    """What a field of a user's class holds that is neither an array nor a number: a function, a name. Static by itself.
+
+    It is called, compared, looked up and asked for attributes as the `value` that it stands for.
+    """
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return self.value(*arguments, **named)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "value":  # not yet set, while it is copied
+            raise AttributeError(name)
+        return getattr(self.value, name)
+
+    def __eq__(self, other: object) -> bool:
+        other = other.value if isinstance(other, Choice) else other
+        return self.value is other or bool(self.value == other)
+
+    def __hash__(self) -> int:
+        return hash(self.value)
+
+    def __repr__(self) -> str:
+        return repr(self.value)
+
+
 class Requirement(NamedTuple):
     """What each entry of a number must satisfy: `holds` maps the array to a boolean array of the same shape."""
 

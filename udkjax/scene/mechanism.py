@@ -12,9 +12,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND, Body, Frame
-from udkjax.scene.checks import Entry, SceneError, not_numbers, problems_of
+from udkjax.scene.checks import Entry, SceneError, not_hashable, problems_of
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import Choice, Numbers, number
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.parameters import parameters_of, replaced
@@ -192,7 +192,8 @@ def _checked(given: Mapping[str, list], gravity: Any, name: str) -> dict[str, li
                 continue
             element = jax.tree.map(_as_number, element)
             entries.append(entry := Entry(section, index, key, type(element), table_of(element)))
-            problems.extend(f"{entry.where}{problem}" for problem in not_numbers(element))
+            element = jax.tree.map(_as_choice, element)
+            problems.extend(f"{entry.where}{problem}" for problem in not_hashable(element))
             if section == "force" and not _acts(type(element)):
                 problems.append(f"{entry.where}: {type(element).__name__} must have a method `potential` or `loads`")
             found[section].append((key, element))
@@ -225,6 +226,11 @@ def _acts(cls: type) -> bool:
 def _as_number(leaf):
     """Convert the plain numbers of user-written elements, which would be static."""
     return number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
+
+
+def _as_choice(leaf):
+    """Make what is no number static by itself."""
+    return leaf if eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct) else Choice(leaf)
 
 
 def _side_by_side(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:

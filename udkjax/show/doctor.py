@@ -14,6 +14,9 @@ from udkjax.study.machine import cores
 
 FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 FAST_PYTHON = (3, 12)
+OLDER_JAX = (
+    "single runs take a seventh longer"  # as `python -m benchmarks trajectory` measures it with jax 0.10; README says it too
+)
 
 
 def doctor() -> str:
@@ -43,10 +46,10 @@ def _cache() -> str:
 def _advice():
     if sys.version_info < FAST_PYTHON:
         yield (
-            f"Python {platform.python_version()} cannot have jax 0.12, on which single trajectories run several times faster: "
+            f"Python {platform.python_version()} cannot have jax 0.12; with an older one {OLDER_JAX}: "
             "install Python 3.12 or newer, remove .venv and run install.sh again"
         )
     elif jax.__version_info__ < (0, 12):
-        yield f"jax {jax.__version__} runs single trajectories several times slower than jax 0.12: pip install --upgrade jax"
+        yield f"with jax {jax.__version__}, older than 0.12, {OLDER_JAX}: pip install --upgrade jax"
     if jnp.result_type(float) != jnp.float64:
         yield "float64 is off, so that loops close to single precision only: unset JAX_ENABLE_X64, or set it to 1"
