@@ -89,12 +89,12 @@ def _derivative(primals, tangents):
     if not linear.transposed:
         return result, eqx.filter_jvp(_by_plain_form_of, primals, tangents)[1]
     change = eqx.filter_jvp(_by_plain_form_transposed, primals, tangents)[1]
-    constants = [x for x, moves in zip(linear.equations.constants, linear.moving, strict=False) if moves]
-    if not constants:
+    constants = linear.moving[:-3]
+    if not any(constants) or not any(linear.moved):
         return result, change
-    bars = jax.lax.split(result[: len(constants)], [1] * len(constants))
-    add_on = _through_constants(linear, at, [bar[0] for bar in bars])
-    return result, change.at[len(change) - len(add_on) :].add(-add_on)
+    bars = [bar[0] for bar in jax.lax.split(result[: sum(constants)], [1] * sum(constants))]
+    twice = _flat(through_constants(linear.equations, at.equations, constants, linear.moved, bars))
+    return result, change.at[len(change) - len(twice) :].add(-twice)
 
 
 @eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
@@ -146,20 +146,30 @@ def _by_plain_form_transposed(linear: Linear, vector: Array) -> Array:
     return _flat([*[0.0] * sum(linear.moving[:-3]), *back[numbers:], *back[:numbers]])
 
 
-def _through_constants(linear: Linear, at: Linear, bars: list[Array]) -> Array:
-    """What the cotangents of constants, given as they are, add to the derivative of those of the numbers along `at`."""
-    equations, moved = linear.equations, linear.moved
-    numbers, directions = (those_numbers((e.equations,), moved) for e in (linear, at))
-
-    def constants(*some: Array) -> list[Array]:
-        found = equations.constants_of(*_with(equations, moved, some))
-        return [c for c, moves in zip(found, linear.moving, strict=False) if moves]
+def through_constants(
+    equations: "Equations", along: Any, constants: tuple[bool, ...], moved: tuple[bool, ...], bars: list[Array]
+) -> list[Array]:
+    """What cotangents of some constants, given as they are, add to the change of those of the numbers that are moved, `along` a
+    change of any numbers: None where they have none."""
+    numbers, changes = _numbers((equations,)), _numbers((along,))
+    turned = tuple(not _is_zero(dx) for dx in changes)
 
     def pulled(*some: Array) -> list[Array]:
-        return list(jax.vjp(constants, *some)[1](bars))
+        here = _replaced(numbers, turned, some)
 
-    directions = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(numbers, directions, strict=True)]
-    return _flat(jax.jvp(pulled, numbers, directions)[1]) if numbers else jnp.zeros(0)
+        def function(*some: Array) -> list[Array]:
+            found = equations.constants_of(*_with(equations, (True,) * len(here), _replaced(here, moved, some)))
+            return [c for c, moves in zip(found, constants, strict=True) if moves]
+
+        return list(jax.vjp(function, *(x for x, m in zip(here, moved, strict=True) if m))[1](bars))
+
+    at, direction = ([x for x, turns in zip(xs, turned, strict=True) if turns] for xs in (numbers, changes))
+    return jax.jvp(pulled, at, direction)[1]
+
+
+def _replaced(values: Sequence[Any], which: tuple[bool, ...], some: Sequence[Any]) -> list[Any]:
+    rest = iter(some)
+    return [next(rest) if m else x for x, m in zip(values, which, strict=True)]
 
 
 def _plain(name: str, primals: Any, state: tuple[bool, ...], moved: tuple[bool, ...]) -> tuple[Any, list[Array]]:
@@ -191,9 +201,9 @@ def _numbers(primals: Any) -> list[Any]:
 
 def _with(equations: "Equations", moved: tuple[bool, ...], some: Sequence[Array]) -> Any:
     """The mechanism and the gains, some of whose numbers are replaced."""
-    both, rest = (equations.textbook.mechanism, equations.textbook.baumgarte), iter(some)
+    both = equations.textbook.mechanism, equations.textbook.baumgarte
     leaves, tree = jax.tree.flatten(both, is_leaf=lambda x: x is None)
-    return tree.unflatten([next(rest) if moves else x for x, moves in zip(leaves, moved, strict=True)])
+    return tree.unflatten(_replaced(leaves, moved, some))
 
 
 def _is_zero(x: Any) -> bool:

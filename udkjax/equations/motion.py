@@ -67,6 +67,11 @@ class Motion(eqx.Module):
         """The same by a rank-revealing method on all rows, for states that `refuse` says nothing of. By default, as they are."""
         return self
 
+    @property
+    def plain(self) -> "Motion":
+        """The same in the form that is differentiated more than once. By default, as they are."""
+        return self
+
     def within(self, loop: Loop) -> "Motion":
         """The same, to be evaluated in that loop, which XLA compiles into one function."""
         del loop

@@ -21,12 +21,12 @@ from udkjax.equations.partitioning import Partitioned
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.batched import one_by_one
+from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.lanes import serves, solve
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.pieces import pieces_of
 from udkjax.integrate.problem import DOUBTED, Problem, Raw
 from udkjax.integrate.projection import Projection
-from udkjax.integrate.reverse import reversible
 from udkjax.integrate.solution import Result, SimulationError, Solution
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.kept import Kept
@@ -161,7 +161,7 @@ def _simulate(
     if meter is None and _by_jax(adjoint):
         single = partial(_by_diffrax, adjoint=adjoint, meter=None)
         integrate = solve if serves(problem) else partial(one_by_one, single=single)
-        raw = integrate(problem) if adjoint else reversible(problem, integrate)
+        raw = integrate(problem) if adjoint else differentiable(problem)
     else:
         raw = _by_diffrax(problem, adjoint, meter)
     later = (raw.reached & (jnp.arange(len(ts)) > 0))[:, None]

@@ -6,6 +6,7 @@ finds both at once need not hand on what it knows.
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import cached_property, partial
 from typing import Any
 
@@ -21,10 +22,13 @@ from udkjax.straightline.fusion import differentiated
 Parts = Callable[..., tuple[list[Any], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
 
 
-def along(seen: Parts, run: Parts, at: Any, direction: Any, few: int = 1) -> tuple[list[Any], ...]:
+def along(
+    seen: Parts, run: Parts, at: Any, direction: Any, few: int | None = 1, shapes: tuple[list[Any], list[Any]] | None = None
+) -> tuple[list[Any], ...]:
     """The value at `at` and its change along `direction`, trees of arrays: by `run`; transformations see what `seen` does.
 
-    A batch of up to `few` directions at one place is so many directions for `run`.
+    A batch of up to `few` directions at one place is so many directions for `run`, and of any other `seen` is mapped; where it is
+    None, both are mapped over any batch. `shapes` are those of the value and of the change, where they are known.
     """
     (place, way), static = eqx.partition((at, direction), eqx.is_array)
     (start, places), (ways, form) = jax.tree.flatten(place), jax.tree.flatten(way)
@@ -34,16 +38,20 @@ def along(seen: Parts, run: Parts, at: Any, direction: Any, few: int = 1) -> tup
             eqx.combine(places.unflatten(at), static[0]), *(eqx.combine(form.unflatten(d), static[1]) for d in directions)
         )
 
-    both = Both(function(seen), function(run), start, ways, few)
+    both = Both(function(seen), function(run), start, ways, few, shapes)
     return both.split(along_p.bind(*start, *ways, both=both))
 
 
 class Both:
     """The two forms as functions of lists of arrays: those of the place, then those of one direction after another."""
 
-    def __init__(self, seen: Parts, run: Parts, start: Sequence[Any], way: Sequence[Any], few: int):
+    def __init__(
+        self, seen: Parts, run: Parts, start: Sequence[Any], way: Sequence[Any], few: int | None, shapes: Any | None = None
+    ):
         self.seen, self.run = partial(self._flat, seen), partial(self._flat, run)
         self.start, self.way, self.few = len(start), len(way), few
+        if shapes is not None:
+            self.shapes = shapes
         self._parts, self._examples = seen, [[jax.ShapeDtypeStruct(x.shape, x.dtype) for x in xs] for xs in (start, way)]
 
     def _flat(self, parts: Parts, *xs: Any) -> list[Any]:
@@ -64,6 +72,13 @@ class Both:
     def values(self) -> int:
         return len(self.shapes[0])
 
+    def mapped(self, axes: Sequence[int | None], size: int) -> "Both":
+        """Both forms of a batch."""
+        other = copy(self)
+        other.seen, other.run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
+        other.shapes = tuple([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
+        return other
+
 
 def _avals(*xs: Any, both: Both) -> list[Any]:
     value, change = both.shapes
@@ -74,6 +89,12 @@ def _avals(*xs: Any, both: Both) -> list[Any]:
 def _batched(xs: Sequence[Any], axes: Sequence[int | None], both: Both) -> tuple[list[Any], list[int | None]]:
     size = next(x.shape[axis] for x, axis in zip(xs, axes, strict=True) if axis is not None)
     directions, moved = (len(xs) - both.start) // both.way, any(axis is not None for axis in axes[: both.start])
+    if both.few is None:
+        found = along_p.bind(*xs, both=both.mapped(axes, size))
+        if moved:
+            return found, [0] * len(found)
+        value, changes = found[: both.values], found[both.values :]
+        return [*(x[0] for x in value), *changes], [*[None] * len(value), *[0] * len(changes)]
     if moved or size * directions > both.few:
         changes = [0] * (len(both.shapes[1]) * directions)
         out = [*[0 if moved else None] * both.values, *changes]
