@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.integrate import record, reverse
+from udkjax.integrate import derivatives, record
 from udkjax.integrate.replay import walked_back
 
 PENDULUM = udk.library.compound_pendulum()
@@ -132,7 +132,7 @@ def test_only_what_depends_on_the_parameters_is_differentiated(monkeypatch):
         seen.append((len(jax.tree.leaves(problem.equations)), moving))
         return walked_back(problem, moving, *rest)
 
-    monkeypatch.setattr(reverse, "walked_back", spy)
+    monkeypatch.setattr(derivatives, "walked_back", spy)
     inertia = lambda x: total(((x, X[0][1]), *X[1:]), max_steps=997)  # noqa: E731
     jax.make_jaxpr(jax.grad(inertia))(0.1)
     ((numbers, moving),) = seen

@@ -69,7 +69,7 @@ def _(primals, tangents):
     def in_parts(at: Any, *directions: list[Array]) -> tuple[list[Any], ...]:
         """The run with its record, and linear maps of the directions."""
         raw, record = at[0].recorded(undifferentiated(at[1]))
-        linear = Linear(*at, (raw, record), moving)
+        linear = Linear(function=at[0], xs=at[1], run=(raw, record), moving=moving)
         return list(_as_run(*at, raw)), *(linear.applied(direction) for direction in directions)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
@@ -198,7 +198,8 @@ class Run(Function):
             leaves, tree = jax.tree.flatten((which.textbook.mechanism, which.textbook.baumgarte), is_leaf=lambda x: x is None)
             moved, constants = tuple(map(bool, leaves)), tuple(which.constants)
             bars = [bar for bar, m in zip(given.constants, constants, strict=True) if m]
-            found = iter(through_constants(eqx.combine(at, self.rest.equations), along, constants, moved, bars))
+            equations: Any = eqx.combine(at, self.rest.equations)
+            found = iter(through_constants(equations, along, constants, moved, bars))
             mechanism, baumgarte = tree.unflatten([next(found) if m else None for m in moved])
             textbook = replace(none.equations.textbook, mechanism=mechanism, baumgarte=baumgarte)
             none = replace(none, equations=replace(none.equations, textbook=textbook))

@@ -79,9 +79,10 @@ def simulate(
     by default made here; a mechanism all of whose numbers are traced needs one to be fast.
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
-    vmap as well. For forward mode give `adjoint=diffrax.ForwardMode()`; reverse mode works as it is. Explicit Runge-Kutta methods
-    are integrated by an engine of our own, under vmap in lanes that step each on its own; every other solver, an adjoint other
-    than these two and a progress meter by `diffrax.diffeqsolve`.
+    vmap as well. It has derivatives of any order, forward and reverse; those beyond the first take the time of a hundred runs and
+    minutes to compile. Explicit Runge-Kutta methods are integrated by an engine of our own, under vmap in lanes that step each on
+    its own; every other solver, an `adjoint` of diffrax other than `ForwardMode` and a progress meter by `diffrax.diffeqsolve`,
+    with the derivatives of that.
 
     A run that does not reach its end raises `SimulationError`, which carries the solution; with `throw=False`, or when numbers
     are traced, `Solution.result` tells instead. A violation of Psi above `drift_tol` (of L, or rad) at an output time ends the

@@ -76,7 +76,8 @@ class Both:
         """Both forms of a batch."""
         other = copy(self)
         other.seen, other.run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
-        other.shapes = tuple([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
+        value, change = ([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
+        other.shapes = value, change
         return other
 
 

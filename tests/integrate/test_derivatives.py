@@ -1,0 +1,134 @@
+"""Derivatives of runs and of assembly as JAX's users expect them: forward, reverse and further, with no extra argument."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+
+TS = np.array([0.0, 1.0, 2.0])
+PENDULUM = udk.library.double_pendulum()
+LINKAGE = udk.library.parallelogram(np.deg2rad(-50.0))
+SECOND = {
+    "hessian": jax.hessian,
+    "forward over forward": lambda f: jax.jacfwd(jax.jacfwd(f)),
+    "reverse over reverse": lambda f: jax.jacrev(jax.grad(f)),
+    "reverse over forward": lambda f: jax.jacrev(jax.jacfwd(f)),
+}
+
+
+@pytest.fixture(scope="module")
+def exact(data):
+    return {name: float(x) for name, x in data("seed_fivebar_parallelogram")["sensitivities_rest_minus50"]["2"].items()}
+
+
+def linkage_at(angle):
+    """q and v of the paper's linkage at rest."""
+    e = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    links = [jnp.append(jnp.array([x, 0.0]) + e / 2, angle) for x in (0.0, 1.0, 2.0)]
+    q = jnp.stack([*links, jnp.append(jnp.array([1.0, 0.0]) + e, 0.0)])
+    return udk.State(q, jnp.zeros_like(q))
+
+
+def of_linkage(x, **choices):
+    """Its angle after 2 s, of the initial angle and the mass of a link; redundant, of rank 11."""
+    mechanism = LINKAGE.with_parameters({"body.link1.mass": x[1]})
+    choices = {"rtol": 1e-10, "atol": 1e-10, "max_steps": 2048, "throw": False} | choices
+    return udk.simulate(mechanism, TS, linkage_at(x[0]), **choices).q[-1, 0, 2]
+
+
+def of_pendulum(x, **choices):
+    """The angle of the second rod after 2 s, of the initial angle of the first, which assembly closes, and its mass."""
+    one = PENDULUM.body_names[0]
+    mechanism = PENDULUM.with_parameters({f"body.{one}.mass": x[1], f"body.{one}.angle": x[0]})
+    choices = {"rtol": 1e-10, "atol": 1e-10, "max_steps": 2048, "throw": False} | choices
+    return udk.simulate(mechanism, TS, **choices).q[-1, 1, 2]
+
+
+AT = {of_linkage: jnp.array([np.deg2rad(-50.0), 1.0]), of_pendulum: jnp.array([-0.3, 1.2])}
+BOTH = pytest.mark.parametrize("f", AT, ids=lambda f: f.__name__)
+
+
+def differences(f, x, h):
+    """First derivatives of eighth order, second by differences of these."""
+    weights = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280]) / h
+    found = [
+        sum(w * np.asarray(f(x + k * h * d)) for k, w in zip(range(-4, 5), weights, strict=True) if w) for d in np.eye(len(x))
+    ]
+    return np.stack(found, axis=-1)
+
+
+@pytest.fixture(scope="module")
+def slopes():
+    return {f: jax.jit(jax.jacfwd(f)) for f in AT}
+
+
+@BOTH
+def test_first_derivatives(f, slopes):
+    """Forward and reverse mode, and a direction: the same, and that of differences."""
+    x = AT[f]
+    forward = slopes[f](x)
+    assert_allclose(forward, differences(jax.jit(partial(f, rtol=1e-12, atol=1e-12)), x, 2e-3), rtol=1e-6)
+    for mode in (jax.grad, jax.jacrev):
+        assert_allclose(jax.jit(mode(f))(x), forward, rtol=1e-9)
+    direction = jnp.array([0.3, -1.0])
+    assert_allclose(jax.jit(lambda x: jax.jvp(f, (x,), (direction,))[1])(x), forward @ direction, rtol=1e-9)
+
+
+def test_first_derivatives_are_those_of_the_exact_solution(exact, slopes):
+    assert_allclose(slopes[of_linkage](AT[of_linkage])[0], exact["dtheta_dtheta0"], rtol=1e-8)
+
+
+@pytest.mark.slow
+@BOTH
+@pytest.mark.parametrize("second", SECOND.values(), ids=SECOND)
+def test_second_derivatives(f, second, slopes):
+    """In any order of modes: symmetric, and those of differences of first ones."""
+    x = AT[f]
+    found = jax.jit(second(f))(x)
+    assert_allclose(found, differences(slopes[f], x, 2e-3), rtol=1e-5)
+    assert_allclose(found, found.T, rtol=1e-8)
+
+
+@pytest.mark.slow
+@BOTH
+def test_batches_of_derivatives(f, slopes):
+    """Mapped, and of what is mapped, forward and reverse."""
+    xs = AT[f] + jnp.array([[0.0, 0.0], [0.1, 0.2], [-0.1, 0.1]])
+    one_by_one = np.stack([slopes[f](x) for x in xs])
+    for mode in (jax.jacfwd, jax.grad):
+        assert_allclose(jax.jit(jax.vmap(mode(f)))(xs), one_by_one, rtol=1e-7)
+    total = lambda xs: jnp.sum(jax.vmap(f)(xs))  # noqa: E731
+    for mode in (jax.jacfwd, jax.grad):
+        assert_allclose(jax.jit(mode(total))(xs), one_by_one, rtol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [udk.BDF(), udk.Verner65()], ids=["BDF", "Verner65"])
+def test_other_solvers_have_both_modes(solver, slopes):
+    f, x = partial(of_pendulum, solver=solver, rtol=1e-8, atol=1e-8), AT[of_pendulum]
+    for mode in (jax.jacfwd, jax.grad):
+        assert_allclose(jax.jit(mode(f))(x), slopes[of_pendulum](x), rtol=1e-4)
+
+
+def assembled(x):
+    """What assembly makes of a rough guess of a redundant linkage: of the first link's angle, and the second link's length."""
+    mechanism = LINKAGE.with_parameters({"body.link1.angle": x[0], "body.coupler.mass": x[1]})
+    state = udk.assemble(mechanism, throw=False)
+    return jnp.sum(jnp.cos(jnp.arange(12.0)) * (state.q.ravel() + 0.1 * state.v.ravel()))
+
+
+@pytest.mark.parametrize("second", [None, *(pytest.param(f, marks=pytest.mark.slow, id=n) for n, f in SECOND.items())])
+def test_derivatives_of_assembly(second):
+    x = jnp.array([np.deg2rad(-50.0) + 0.05, 2.0])
+    slope = jax.jit(jax.jacfwd(assembled))
+    if second is None:
+        expected = differences(jax.jit(assembled), x, 1e-3)
+        for mode in (jax.jacfwd, jax.grad, jax.jacrev):
+            assert_allclose(jax.jit(mode(assembled))(x), expected, rtol=1e-7, atol=1e-9)
+        return
+    assert_allclose(jax.jit(second(assembled))(x), differences(slope, x, 1e-3), rtol=1e-5, atol=1e-7)
