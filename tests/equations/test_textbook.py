@@ -37,13 +37,13 @@ def moved(request):
 
 
 @eqx.filter_jit
-def textbook(mech, q, v, method, baumgarte=None, w=None):
-    names = {"psi": constraints.psi(mech, T0, q), "psi_q": constraints.psi_q(mech, T0, q)}
-    names |= {"psi_dot": constraints.psi_dot(mech, T0, q, v), "gamma": constraints.gamma(mech, T0, q, v)}
-    names |= {"M": loads.mass(mech), "F": loads.force(mech, T0, q, v)}
-    names |= {"T": loads.kinetic_energy(mech, v), "V": loads.potential_energy(mech, T0, q, v)}
-    names["a"] = uk.accelerations(mech, T0, q, v, method, baumgarte, w)
-    names["lambda"] = uk.multipliers(mech, T0, q, v, method, baumgarte, w)
+def textbook(mech, q, v, method, baumgarte=None, w=None, t=T0):
+    names = {"psi": constraints.psi(mech, t, q), "psi_q": constraints.psi_q(mech, t, q)}
+    names |= {"psi_dot": constraints.psi_dot(mech, t, q, v), "gamma": constraints.gamma(mech, t, q, v)}
+    names |= {"M": loads.mass(mech), "F": loads.force(mech, t, q, v)}
+    names |= {"T": loads.kinetic_energy(mech, v), "V": loads.potential_energy(mech, t, q, v)}
+    names["a"] = uk.accelerations(mech, t, q, v, method, baumgarte, w)
+    names["lambda"] = uk.multipliers(mech, t, q, v, method, baumgarte, w)
     return names
 
 
@@ -100,20 +100,20 @@ def test_the_power_balance(moved):
 
 
 @pytest.mark.parametrize("name", ["parallelogram", "slider_crank", "scissor_lift"])
-def test_a_duplicated_constraint_changes_nothing(name):
+def test_a_duplicated_constraint_changes_nothing(name, closed):
     """Neither accelerations, nor what projection does, nor what the joint and its copy do to the bodies together."""
     mech = scene(name)
     joint = mech.joint_names[0]
     twice = udk.Mechanism(
         mech.bodies, {**mech.joints, "copy": mech.joints[joint]}, mech.drivers, mech.forces, gravity=mech.gravity
     )
-    q, v = mech.q0.ravel(), 0.1 * jnp.sin(jnp.arange(mech.q0.size))
-    once, again = (textbook(m.bare, q, v, SVD) for m in (mech, twice))
+    q, v = closed(mech)
+    once, again = (textbook(m.bare, q, v, SVD, t=jnp.array(0.0)) for m in (mech, twice))
     close_to(again["a"], once["a"], 1e-11)
     close_to(again["psi_q"].T @ again["lambda"], once["psi_q"].T @ once["lambda"], 1e-11)
     off = q + 1e-4 * jnp.cos(jnp.arange(q.size))
-    project = jax.jit(lambda m: jnp.concatenate(uk.project(m, T0, off, v, SVD)))
-    close_to(project(twice.bare), project(mech.bare), 1e-9)
+    project = jax.jit(lambda m: jnp.concatenate(uk.project(m, 0.0, off, v, SVD, steps=4)))
+    close_to(project(twice.bare), project(mech.bare), 1e-7)  # where redundant rows disagree, copies count twice
 
 
 def test_the_linkage_of_the_paper(placed):
@@ -141,7 +141,7 @@ def test_weights_change_no_solution_of_consistent_rows_and_zero_leaves_one_out()
 def test_projection_returns_to_the_manifold_and_leaves_what_is_tangent_to_it(name):
     mech = scene(name)
     q, v = (x.ravel() + 1e-4 * jnp.sin(1.0 + jnp.arange(x.size)) for x in (mech.q0, mech.v0))
-    q1, v1 = jax.jit(lambda q, v: uk.project(mech, T0, q, v, SVD, steps=3))(q, v)
+    q1, v1 = jax.jit(lambda q, v: uk.project(mech, T0, q, v, SVD, steps=8))(q, v)
     assert np.abs(constraints.psi(mech, T0, q1)).max() < 1e-13
     assert np.abs(constraints.psi_dot(mech, T0, q1, v1)).max() < 1e-13
     part = uk.tangent_part(mech, T0, q1, q, SVD)

@@ -26,14 +26,11 @@ CONSISTENT = 1e-6
 class Code:
     """Named programs over one graph. Each takes the constants, t, q and, where it needs them, v.
 
-    On all rows of Psi (D as the values of `pattern`) and, with the suffix `_kept`, on the rows not left out (`kept_pattern`):
-
-    rows       D, b, a_F, M^(-1/2)        closure    D, Psi, M^(-1/2)        rate    D, Psi_dot, M^(-1/2)
-
-    and for elimination: `accelerations` (a, whether all pivots are safe), `nearer` (q and v after a Newton step to Psi = 0 and to
-    Psi_dot = 0, whether safe), `closer` (the same of q alone), `arrival` (the same of v alone, and the accelerations with it),
-    `tangential` (of changes of q and v what projection leaves; their `Factors.distance`), `finish` (`arrival` and
-    `tangential`, with its pivots; whether safe).
+    On all rows of Psi (D as the values of `pattern`): `rows` (D, b, a_F, M^(-1/2)), `closure` (D, Psi, M^(-1/2)), `psi`,
+    `psi_dot`; `energy`; and for elimination, on those not left out: `accelerations` (a, whether all pivots are safe), `nearer` (q
+    and v after a Newton step to Psi = 0 and to Psi_dot = 0, whether safe), `closer` (the same of q alone), `arrival` (the same of
+    v alone, and the accelerations with it), `tangential` (of changes of q and v what projection leaves; their
+    `Factors.distance`), `finish` (`arrival` and `tangential`, with its pivots; whether safe).
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
 
@@ -44,31 +41,25 @@ class Code:
         self.drop = graph.input("drop", "parameter")
         self.n = len(equations.q)
         self.root = [graph.constant(1.0) / graph.sqrt(m) for m in equations.mass]
-        everything = list(range(len(equations.psi)))
-        self.kept = [i for i in everything if i not in left_out]
+        self.kept = [i for i in range(len(equations.psi)) if i not in left_out]
         self.left_out = left_out
         self.D: list[Row] = [{k: entry * self.root[k] for k, entry in row.items()} for row in equations.psi_q]
-        self.pattern, self.values = pattern(self.D, self.n)
-        self.kept_pattern, self.kept_values = pattern([self.D[i] for i in self.kept], self.n)
+        self.pattern, values = pattern(self.D, self.n)
 
-        self.outputs: dict[str, list[Scalar]] = {"energy": [equations.kinetic_energy, equations.potential_energy]}
-        self._describe("", everything, self.values)
+        self.outputs: dict[str, list[Scalar]] = {
+            "rows": [*values, *(self.b(i) for i in range(len(self.D))), *equations.free, *self.root],
+            "closure": [*values, *equations.psi, *self.root],
+            "psi": equations.psi,
+            "psi_dot": equations.psi_dot,
+            "energy": [equations.kinetic_energy, equations.potential_energy],
+        }
         if elimination:
-            self._describe("_kept", self.kept, self.kept_values)
             self._eliminate()
         self._programs: dict[str, Program] = {}
         self._derivatives: dict[tuple[str, tuple[bool, ...]], Derivative] = {}
         wanted = [s for name, outputs in self.outputs.items() for s in outputs]
         self.constants = frontier(graph, wanted, lambda node: node.depends <= {"parameter"})
         self.prologue = Program(graph, [*equations.inputs, *self.gains, self.drop], self.constants)
-
-    def _describe(self, suffix: str, rows: Sequence[int], values: list[Scalar]):
-        e = self.equations
-        self.outputs["rows" + suffix] = [*values, *(self.b(i) for i in rows), *e.free, *self.root]
-        self.outputs["closure" + suffix] = [*values, *(e.psi[i] for i in rows), *self.root]
-        self.outputs["rate" + suffix] = [*values, *(e.psi_dot[i] for i in rows), *self.root]
-        self.outputs["psi" + suffix] = [e.psi[i] for i in rows]
-        self.outputs["psi_dot" + suffix] = [e.psi_dot[i] for i in rows]
 
     def _eliminate(self):
         """The equation for rows that are independent: a = a_F + M^(-1) Psi_q^T y with D D^T y = b."""

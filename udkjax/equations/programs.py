@@ -156,8 +156,8 @@ class Equations(MechanismMotion):
     def arrays(self, name: str, t: Any, q: Any, v: Any) -> list[Array]:
         """What a program returns, as arrays: the values of D, the right-hand side, and vectors over the coordinates."""
         outputs = self.run(name, t, q, v)
-        n, kept = len(q), self.code.kept_pattern if name.endswith("_kept") else self.code.pattern
-        bounds = [0, kept.slots, kept.slots + kept.shape[0]]
+        n, pattern = len(q), self.code.pattern
+        bounds = [0, pattern.slots, pattern.slots + pattern.shape[0]]
         bounds += list(range(bounds[-1] + n, len(outputs) + 1, n))
         return [stacked(outputs[i:j]) for i, j in pairwise(bounds)]
 
