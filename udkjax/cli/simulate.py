@@ -46,7 +46,7 @@ def simulate(
         dt: time between two instants that are kept (s); the steps of the solver are its own.
         t0: start of the run (s).
         rtol: relative tolerance of a step.
-        atol: absolute tolerance of a step.
+        atol: tolerance of a step beside it, in the scene's own length and time, which `udkjax check` prints.
         method: pseudoinverse of the weighted constraint Jacobian.
         rank_tol: what this method counts as rank deficient; by default, what suits the method.
         formulation: how accelerations are found; partitioning integrates independent coordinates only, without Baumgarte.

@@ -5,8 +5,9 @@ of a micrometre and one of a kilometre behave alike.
 
 The length L is the longest arm by which a constraint turns a body at the initial guess, which Psi_q tells by itself,
 |dPsi/dangle| / |dPsi/d(x, y)|, or a radius of gyration sqrt(I/m), if one is longer. It does not depend on where the origin is.
-The rate 1/T is the fastest at which anything changes there: velocities over L, roots of free accelerations a_F over L, and the
-same of the drivers. A row's scale is what a displacement of L, or a turn of one radian, changes in it.
+T is the shortest time in which anything changes there: that in which a velocity moves a body by L, that of a swing of a pendulum
+of length L under a free acceleration a_F, pi sqrt(L / a_F), and the same of the drivers. A row's scale is what a displacement of
+L, or a turn of one radian, changes in it.
 """
 
 from collections import OrderedDict

@@ -138,7 +138,9 @@ def _scales(mechanism: Mechanism, guess: tuple[Any, ...], xp: Any) -> Scales:
 
     unit = xp.tile(xp.stack([length, length, xp.ones_like(length)]), len(mass))
     v = xp.asarray(mechanism.v0).ravel()
-    rates = [fastest(v / unit), xp.sqrt(fastest(free / unit)), fastest(psi_t / scale), xp.sqrt(fastest(gamma / scale))]
+    # An acceleration a lets a pendulum of length L swing to and fro in pi sqrt(L / a) each.
+    swings = (xp.sqrt(fastest(x)) / np.pi for x in (free / unit, gamma / scale))
+    rates = [fastest(v / unit), fastest(psi_t / scale), *swings]
     return Scales(length, arm, reduce(xp.maximum, rates), xp.max(mass), scale)
 
 

@@ -16,7 +16,7 @@ SHORTEST, LONGEST = 0.2, 0.95  # of a step, one that is taken in its place
 # A step's velocity has a small part of them, which must be less than the tolerance. Where the configuration is still ahead of the
 # end of a step, seven times as far away: close to it are many nodes of the next one, and outputs in a next one that is ten times
 # as long, as after a step that was made shorter, have a hundred times as much of them.
-PAST, BEFORE = 3e-17, 1e-14
+PAST, BEFORE = 1e-16, 3e-14
 # Elimination trusts no pivot that is closer than 1e-3 (`BRANCH_TOL`), and shorter steps that begin so close would get shorter and
 # shorter: they have no stage where it does.
 NEAREST = 1.5e-3

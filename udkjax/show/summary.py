@@ -3,6 +3,7 @@
 import numpy as np
 
 from udkjax.equations import energy, violation
+from udkjax.equations.analysis import analyse
 from udkjax.integrate import Solution
 from udkjax.scene import Mechanism
 from udkjax.show.plots import largest
@@ -21,6 +22,8 @@ def check_summary(mech: Mechanism, check) -> str:
     }
     if check.dependent:
         lines["depend on each other"] = ", ".join(check.dependent)
+    found = analyse(mech)
+    lines["length, time, mass"] = f"{float(found.length):.3g} m, {float(found.time):.3g} s, {float(found.mass):.3g} kg"
     lines["closure, as given"] = f"{float(check.residual_before):.2e}"
     lines["closure, assembled"] = f"{float(check.residual_after):.2e}" + ("" if check.closed else ": it does not close")
     return table(mech.name or "mechanism", lines)
