@@ -25,11 +25,13 @@ UNITS = [
     (1.0, 1.0, 1e6),
     (1e-6, 1e-3, 1e-9),
 ]
+# A change of units by powers of two changes no digit of any number.
+BINARY = [(2.0**-20, 1.0, 1.0), (2.0**10, 2.0**-10, 2.0**20), (1.0, 2.0**8, 2.0**-30)]
 TS = np.linspace(0.0, 2.0, 21)
 TOL = 1e-9
-# Rounding errors of the first, tiny steps and of interpolation, over what they are divided by: far below the tolerance. Of rates
-# there are more: second differences of positions are among what they are interpolated from.
-POSITION, RATE = 1e-10, 2e-9
+# Rounding errors, which a change of units makes others: of positions, far below the tolerance; of rates there are more, since
+# first steps are tiny and second differences of positions over their squares are among what rates are interpolated from.
+POSITION, RATE = 1e-10, 10 * TOL
 
 
 def deviation(mechanism, units, method=None):
@@ -46,6 +48,12 @@ def test_the_motion_is_the_same_in_all_units(name):
     for units in UNITS:
         dq, dv = deviation(SCENES[name](), units)
         assert dq < POSITION and dv < RATE, units
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_to_the_last_digit_where_the_units_are_powers_of_two(name):
+    for units in BINARY:
+        assert deviation(SCENES[name](), units) == (0.0, 0.0), units
 
 
 @pytest.mark.parametrize("method", [udk.SVD(), udk.Varga()], ids=["SVD", "Varga"])

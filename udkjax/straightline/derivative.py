@@ -172,7 +172,7 @@ def _slope(detail: Details, dtypes: tuple, k: int) -> Any:
 
     def slope(*scalars):
         f = lambda x: detail.primitive.bind(*scalars[:k], x, *scalars[k + 1 :], **detail.parameters)  # noqa: E731
-        return jax.jvp(f, (scalars[k],), (jax.numpy.ones((), dtypes[k]),))[1]
+        return jax.jvp(f, (scalars[k],), (np.ones((), dtypes[k]),))[1]
 
     return jax.make_jaxpr(slope)(*(jax.ShapeDtypeStruct((), d) for d in dtypes))
 
