@@ -28,8 +28,8 @@ class Code:
 
     On all rows of Psi (D as the values of `pattern`): `rows` (D, b, a_F, M^(-1/2)), `closure` (D, Psi, M^(-1/2)), `psi`,
     `psi_dot`; `energy`; and for elimination, on those not left out: `accelerations` (a, whether all pivots are safe), `nearer` (q
-    and v after a Newton step to Psi = 0 and to Psi_dot = 0, whether safe), `closer` (the same of q alone), `arrival` (the same of
-    v alone, and the accelerations with it), `tangential` (of changes of q and v what projection leaves; their
+    and v after a Newton step to Psi = 0 and to Psi_dot = 0, whether safe), `closer` (the same of q alone), `output` (the same of v
+    alone, and Psi of all rows), `arrival` (the same of v alone, and the accelerations with it), `tangential` (of changes of q and v what projection leaves; their
     `Factors.distance`), `finish` (`arrival` and `tangential`, with its pivots; whether safe).
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
@@ -78,6 +78,7 @@ class Code:
         closer, with_doubt = self._without(e.q, psi), self._safe(self._dropping)
         self.outputs["nearer"] = [*closer, *self._without(e.v, psi_dot), with_doubt]
         self.outputs["closer"] = [*closer, with_doubt]
+        self.outputs["output"] = [*self._without(e.v, psi_dot), *e.psi]
         v = self._without(e.v, psi_dot, dropping=False)
         moved = dict(zip((x.index for x in e.v), v, strict=True))
         n, loads = self.n, graph.replaced([*e.free, *(self.b(i) for i in self.kept)], moved)

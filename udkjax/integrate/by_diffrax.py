@@ -14,6 +14,7 @@ from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.explicit import GROW, SAFETY, SHRINK
 from udkjax.integrate.first_step import first_step
+from udkjax.integrate.outcome import stopped
 from udkjax.integrate.problem import DONE, STEP_LIMIT, STEP_TOO_SMALL, Problem, Raw
 from udkjax.integrate.projection import project_all, violation
 from udkjax.integrate.tableau import is_explicit
@@ -49,6 +50,7 @@ def by_diffrax(
     violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, STEP_LIMIT, STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, DONE, status)
+    status = stopped(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
     found = evaluations(run.controller_state)
     right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (problem.h is None))  # one chooses the first step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]

@@ -38,6 +38,7 @@ from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.record import Record
 from udkjax.integrate.replay import walked_back
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.native import engine
 from udkjax.straightline import along
 
 Mask = tuple[bool, ...]  # of a list of arrays: those that have tangents
@@ -56,7 +57,7 @@ def differentiable(problem: Problem) -> Raw:
 
 @eqx.filter_custom_jvp
 def _run(function: "Run", xs: list[Array]) -> Raw:
-    return function.raw(xs)
+    return function.fast(xs)
 
 
 @_run.def_jvp
@@ -135,6 +136,11 @@ class Run(Function):
     @property
     def plain(self) -> "Run":
         return replace(self, is_plain=True)
+
+    def fast(self, xs: list[Array]) -> Raw:
+        """By machine code, which has no derivatives, if that serves."""
+        problem = self.problem(xs)
+        return engine.solve(problem) if engine.serves(problem) else self.raw(xs)
 
     def raw(self, xs: list[Array]) -> Raw:
         """By the engine that serves; under vmap in lanes, or one after another."""

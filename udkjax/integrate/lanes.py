@@ -20,6 +20,7 @@ from udkjax.integrate.batched import CHUNKED, batched
 from udkjax.integrate.explicit import March, march
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.norms import largest
+from udkjax.integrate.outcome import stopped
 from udkjax.integrate.pieces import Pieces
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.projection import ended, lasting, violation
@@ -209,7 +210,9 @@ def raw_of(problem: Problem, lanes: Lanes, m: March) -> Raw:
     number = jnp.arange(inner + 2).reshape(-1, *[1] * len(lanes.shape))
     reached = (number <= m.written) & (number <= inner) | (m.code == DONE)
     q, v = jnp.split(ys, 2, axis=1)
-    return Raw(q, v, violated, reached, m.code, m.here.t, end, m.tried, m.accepted, m.evaluations)
+    span = jnp.broadcast_to(problem.ts[-1] - problem.ts[0], lanes.shape)
+    status = lanes.over(stopped, span, m.code, m.here.t, end)
+    return Raw(q, v, violated, reached, status, m.here.t, end, m.tried, m.accepted, m.evaluations)
 
 
 # --- with care

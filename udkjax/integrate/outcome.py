@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from udkjax.integrate.problem import DONE, STEP_LIMIT, Raw
+from udkjax.equations.motion import Motion
+from udkjax.integrate.problem import DONE, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL, Raw
 from udkjax.integrate.solution import Result
 from udkjax.straightline import when
 
@@ -27,7 +28,8 @@ class Run(eqx.Module):
 
 def outcome(run: Run) -> tuple[Array, Array, Bool[Array, "T"]]:
     """Return the `Result`, the time (s) that belongs to it, and which of the output times count."""
-    code = jnp.where(run.raw.status == STEP_LIMIT, Result.step_limit, _stopped(run))
+    code = jnp.where(run.raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
+    code = jnp.where(run.raw.status == NOT_FINITE, Result.not_finite, code)
     code = jnp.where(run.raw.status == DONE, Result.successful, code)
     code, time, reached = _drift(run, code)
     first = jnp.arange(len(run.ts)) == 0
@@ -37,15 +39,19 @@ def outcome(run: Run) -> tuple[Array, Array, Bool[Array, "T"]]:
     return code, jnp.where(started, time, run.ts[0]), reached & (started | first)
 
 
-def _stopped(run: Run) -> Array:
-    """Why the step size fell to nothing: a number that is not finite, at the end or right ahead, or something else."""
-    q, v = jnp.split(run.raw.y, 2)
-    times = run.raw.t + jnp.array([0.0, AHEAD]) * (run.ts[-1] - run.ts[0])
+def stopped(equations: Motion, span: Array, status: Array, t: Array, y: Array) -> Array:
+    """The status of a run that ended in (t, y), and whether its step became too small because of what is not finite there.
+
+    Or right ahead.
+    """
+    q, v = jnp.split(y, 2)
+    times = t + jnp.array([0.0, AHEAD]) * span
 
     def finite(_: Array) -> Array:
-        return jnp.all(jax.lax.map(lambda t: run.equations.is_finite(t, q + (t - run.raw.t) * v, v), times))
+        return jnp.all(jax.lax.map(lambda later: equations.is_finite(later, q + (later - t) * v, v), times))
 
-    return jnp.where(when(run.raw.status != DONE, finite, jnp.array(True)), Result.step_too_small, Result.not_finite)
+    is_finite = when(status != DONE, finite, jnp.array(True))
+    return jnp.where((status == STEP_TOO_SMALL) & ~is_finite, NOT_FINITE, status)
 
 
 def _drift(run: Run, code: Array) -> tuple[Array, Array, Bool[Array, "T"]]:

@@ -11,7 +11,8 @@ from udkjax.equations.motion import Motion
 from udkjax.integrate.pieces import Pieces
 from udkjax.integrate.undifferentiated import undifferentiated
 
-RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, DOUBTED = range(5)  # what a run may be
+# What a run may be. `NOT_FINITE`: its step became too small because of a number that is not finite.
+RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, DOUBTED, NOT_FINITE = range(6)
 
 
 class Problem(eqx.Module):

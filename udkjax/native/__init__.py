@@ -1,0 +1,1 @@
+"""Machine code from the expressions of a scene: the fast engine."""

@@ -1,0 +1,346 @@
+"""A thin layer over LLVM's text, in which an algorithm reads like one: values with operators, variables, loops, branches.
+
+A `Function` is written once for one state, or for W of them side by side: wide values are vectors of W lanes, and plain numbers
+where W is one. Numbers meet wide values by being repeated. Of W lanes no branch is taken by one alone: what differs between them
+is chosen (`select`), and a condition of all of them is `any_of`.
+"""
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Union
+
+DOUBLE, INT, BOOL, POINTER = "double", "i64", "i1", "ptr"
+_COMPARE = {
+    "lt": ("olt", "slt"),
+    "le": ("ole", "sle"),
+    "gt": ("ogt", "sgt"),
+    "ge": ("oge", "sge"),
+    "eq": ("oeq", "eq"),
+    "ne": ("une", "ne"),
+}
+Operand = Union["Value", float, int, bool]
+
+
+def literal(number: Any, base: str) -> str:
+    """A number as LLVM writes it."""
+    if base == DOUBLE:
+        return "0x%016X" % struct.unpack("<Q", struct.pack("<d", float(number)))[0]
+    return str(int(number)) if base != BOOL else str(bool(number)).lower()
+
+
+class Value:
+    """One value of a function: its name there, and what it is a vector of."""
+
+    __slots__ = ("base", "f", "name", "width")
+
+    def __init__(self, f: "Function", name: str, base: str, width: int = 1):
+        self.f, self.name, self.base, self.width = f, name, base, width
+
+    @property
+    def type(self) -> str:
+        return typed(self.base, self.width)
+
+    def __add__(self, other):
+        return self.f.arithmetic("add", self, other)
+
+    def __radd__(self, other):
+        return self.f.arithmetic("add", other, self)
+
+    def __sub__(self, other):
+        return self.f.arithmetic("sub", self, other)
+
+    def __rsub__(self, other):
+        return self.f.arithmetic("sub", other, self)
+
+    def __mul__(self, other):
+        return self.f.arithmetic("mul", self, other)
+
+    def __rmul__(self, other):
+        return self.f.arithmetic("mul", other, self)
+
+    def __truediv__(self, other):
+        return self.f.arithmetic("div", self, other)
+
+    def __rtruediv__(self, other):
+        return self.f.arithmetic("div", other, self)
+
+    def __neg__(self):
+        return self.f.op(f"fneg {self.type} {self.name}", self.base, self.width)
+
+    def __lt__(self, other):
+        return self.f.compare("lt", self, other)
+
+    def __le__(self, other):
+        return self.f.compare("le", self, other)
+
+    def __gt__(self, other):
+        return self.f.compare("gt", self, other)
+
+    def __ge__(self, other):
+        return self.f.compare("ge", self, other)
+
+    def is_(self, other: Operand) -> "Value":
+        """Equality; `==` is Python's own."""
+        return self.f.compare("eq", self, other)
+
+    def is_not(self, other: Operand) -> "Value":
+        """Inequality; true of what is not a number."""
+        return self.f.compare("ne", self, other)
+
+    def __and__(self, other):
+        return self.f.logic("and", self, other)
+
+    __rand__ = __and__
+
+    def __or__(self, other):
+        return self.f.logic("or", self, other)
+
+    __ror__ = __or__
+
+    def __invert__(self):
+        return self.f.logic("xor", self, True)
+
+
+class Variable:
+    """A place that holds a value; LLVM keeps it in a register where it can."""
+
+    def __init__(self, f: "Function", base: str, width: int):
+        self.f, self.base, self.width = f, base, width
+        self.place = f.reserve(typed(base, width))
+
+    @property
+    def value(self) -> Value:
+        return self.f.op(f"load {typed(self.base, self.width)}, ptr {self.place}", self.base, self.width)
+
+    @value.setter
+    def value(self, new: Operand):
+        new = self.f.like(new, self.base, self.width)
+        self.f.line(f"store {new.type} {new.name}, ptr {self.place}")
+
+    def where(self, mask: Value, new: Operand):
+        """Set it in some lanes."""
+        self.value = self.f.select(mask, self.f.like(new, self.base, self.width), self.value)
+
+
+class Function:
+    """A function that returns nothing. `name` and `arguments` (pairs of base type and name) are those of its definition."""
+
+    def __init__(self, name: str, arguments: Sequence[tuple[str, str]], width: int = 1, returns: str = "void"):
+        self.name, self.width, self.returns = name, width, returns
+        self._arguments, self._lines, self._reserved = list(arguments), [], []
+        self._count, self.declared = 0, set()
+        self.given = {n: Value(self, f"%{n}", base) for base, n in arguments}
+
+    # --- text
+
+    def line(self, text: str):
+        self._lines.append(text)
+
+    def op(self, text: str, base: str, width: int = 1) -> Value:
+        self._count += 1
+        name = f"%t{self._count}"
+        self._lines.append(f"{name} = {text}")
+        return Value(self, name, base, width)
+
+    def reserve(self, type_: str, count: int = 1) -> str:
+        """Memory of the function's own, for as long as it runs."""
+        self._count += 1
+        name = f"%m{self._count}"
+        self._reserved.append(f"{name} = alloca {type_}, i64 {count}, align 64")
+        return name
+
+    def text(self) -> str:
+        """The definition; what it calls of LLVM's own is in `declared`."""
+        arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{n}" for base, n in self._arguments)
+        end = "ret void" if self.returns == "void" else None
+        body = "\n  ".join([*self._reserved, *self._lines, *([end] if end else [])])
+        return f"define {self.returns} @{self.name}({arguments}) {{\n  {body}\n}}\n"
+
+    # --- values
+
+    def const(self, number: Any, base: str = DOUBLE, width: int = 1) -> Value:
+        one = literal(number, base)
+        return Value(self, one if width == 1 else f"<{', '.join([f'{base} {one}'] * width)}>", base, width)
+
+    def like(self, x: Operand, base: str, width: int) -> Value:
+        """A value or a number as so many lanes of a type."""
+        if not isinstance(x, Value):
+            return self.const(x, base, width)
+        if x.base == INT and base == DOUBLE:
+            x = self.op(f"sitofp {x.type} {x.name} to {typed(DOUBLE, x.width)}", DOUBLE, x.width)
+        if x.base == BOOL and base != BOOL:
+            to = "uitofp" if base == DOUBLE else "zext"
+            x = self.op(f"{to} {x.type} {x.name} to {typed(base, x.width)}", base, x.width)
+        if x.base != base:
+            raise TypeError(f"{x.base} for {base}")
+        return x if x.width == width else self.repeat(x, width)
+
+    def repeat(self, x: Value, width: int) -> Value:
+        """The same number in all lanes."""
+        if x.width != 1:
+            raise TypeError(f"{x.width} lanes for {width}")
+        kind = typed(x.base, width)
+        one = self.op(f"insertelement {kind} poison, {x.base} {x.name}, i64 0", x.base, width)
+        return self.op(f"shufflevector {kind} {one.name}, {kind} poison, <{width} x i32> zeroinitializer", x.base, width)
+
+    def both(self, a: Operand, b: Operand) -> tuple[Value, Value]:
+        width = max(x.width for x in (a, b) if isinstance(x, Value))
+        bases = [x.base for x in (a, b) if isinstance(x, Value)]
+        base = DOUBLE if DOUBLE in bases else bases[0]
+        return self.like(a, base, width), self.like(b, base, width)
+
+    def arithmetic(self, kind: str, a: Operand, b: Operand) -> Value:
+        x, y = self.both(a, b)
+        name = f"f{kind} contract" if x.base == DOUBLE else {"div": "sdiv"}.get(kind, kind)
+        return self.op(f"{name} {x.type} {x.name}, {y.name}", x.base, x.width)
+
+    def compare(self, kind: str, a: Operand, b: Operand) -> Value:
+        x, y = self.both(a, b)
+        real, whole = _COMPARE[kind]
+        name = f"fcmp {real}" if x.base == DOUBLE else f"icmp {whole}"
+        return self.op(f"{name} {x.type} {x.name}, {y.name}", BOOL, x.width)
+
+    def logic(self, kind: str, a: Operand, b: Operand) -> Value:
+        x, y = self.both(a, b)
+        return self.op(f"{kind} {x.type} {x.name}, {y.name}", x.base, x.width)
+
+    def select(self, mask: Value, yes: Operand, no: Operand) -> Value:
+        given = [x for x in (yes, no) if isinstance(x, Value)]
+        base = given[0].base if given else DOUBLE
+        width = max(mask.width, *(x.width for x in given)) if given else mask.width
+        a, b = self.like(yes, base, width), self.like(no, base, width)
+        mask = mask if mask.width in (width, 1) else self.repeat(mask, width)
+        return self.op(f"select {mask.type} {mask.name}, {a.type} {a.name}, {b.type} {b.name}", base, width)
+
+    def intrinsic(self, name: str, *arguments: Operand) -> Value:
+        """An intrinsic function of LLVM on numbers, lane by lane: fma, sqrt, fabs, maximum, minimum, floor, exp, log, pow, ..."""
+        width = max((x.width for x in arguments if isinstance(x, Value)), default=1)
+        values = [self.like(x, DOUBLE, width) for x in arguments]
+        kind = typed(DOUBLE, width)
+        full = f"llvm.{name}.{'f64' if width == 1 else f'v{width}f64'}"
+        self.declared.add(f"declare {kind} @{full}({', '.join([kind] * len(values))})")
+        return self.op(f"call {kind} @{full}({', '.join(f'{kind} {v.name}' for v in values)})", DOUBLE, width)
+
+    def fma(self, a: Operand, b: Operand, c: Operand) -> Value:
+        return self.intrinsic("fma", a, b, c)
+
+    def abs(self, a: Value) -> Value:
+        return self.intrinsic("fabs", a)
+
+    def max(self, a: Operand, b: Operand) -> Value:
+        """The larger of two numbers; b where one is none: one instruction."""
+        x, y = self.both(a, b)
+        return self.select(x > y, x, y)
+
+    def min(self, a: Operand, b: Operand) -> Value:
+        """The smaller of two numbers; b where one is none."""
+        x, y = self.both(a, b)
+        return self.select(x < y, x, y)
+
+    def is_finite(self, a: Value) -> Value:
+        return self.abs(a) < float("inf")
+
+    def reduced(self, name: str, x: Value) -> Value:
+        """All lanes together: `or` and `and` of conditions, `fmax` of numbers."""
+        if x.width == 1:
+            return x
+        full = f"llvm.vector.reduce.{name}.v{x.width}{'f64' if x.base == DOUBLE else x.base}"
+        self.declared.add(f"declare {x.base} @{full}({x.type})")
+        return self.op(f"call {x.base} @{full}({x.type} {x.name})", x.base)
+
+    def any_of(self, mask: Value) -> Value:
+        return self.reduced("or", mask)
+
+    def all_of(self, mask: Value) -> Value:
+        return self.reduced("and", mask)
+
+    def lane(self, x: Value, k: Value) -> Value:
+        """The number in one lane."""
+        if x.width == 1:
+            return x
+        return self.op(f"extractelement {x.type} {x.name}, i64 {k.name}", x.base)
+
+    def only(self, k: Value) -> Value:
+        """The mask of one lane alone."""
+        if self.width == 1:
+            return self.const(True, BOOL)
+        lanes = Value(self, f"<{', '.join(f'i64 {j}' for j in range(self.width))}>", INT, self.width)
+        return lanes.is_(k)
+
+    # --- memory
+
+    def at(self, pointer: Value | str, k: Operand, base: str = DOUBLE) -> Value:
+        """The address of the k-th number from a pointer."""
+        name = pointer.name if isinstance(pointer, Value) else pointer
+        index = self.like(k, INT, 1)
+        return self.op(f"getelementptr {base}, ptr {name}, i64 {index.name}", POINTER)
+
+    def load(self, pointer: Value, k: Operand = 0, width: int = 1, base: str = DOUBLE) -> Value:
+        place = self.at(pointer, k, base)
+        return self.op(f"load {typed(base, width)}, ptr {place.name}, align 8", base, width)
+
+    def store(self, x: Operand, pointer: Value, k: Operand = 0, width: int = 1, base: str = DOUBLE):
+        x = self.like(x, base, width)
+        place = self.at(pointer, k, base)
+        self.line(f"store {x.type} {x.name}, ptr {place.name}, align 8")
+
+    def variable(self, start: Operand, base: str = DOUBLE, width: int | None = None) -> Variable:
+        found = Variable(self, base, self.width if width is None else width)
+        found.value = start
+        return found
+
+    def call(self, name: str, *arguments: Value):
+        self.line(f"call void @{name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
+
+    # --- control
+
+    def _label(self, name: str) -> str:
+        self._count += 1
+        return f"{name}{self._count}"
+
+    @contextmanager
+    def if_(self, condition: Value) -> Iterator[None]:
+        """What is done where a condition of all lanes holds."""
+        then, end = self._label("then"), self._label("end")
+        self.line(f"br i1 {condition.name}, label %{then}, label %{end}")
+        self.line(f"{then}:")
+        yield
+        self.line(f"br label %{end}")
+        self.line(f"{end}:")
+
+    def choose(self, condition: Value, then: Callable[[], None], otherwise: Callable[[], None]):
+        """One of two things to do."""
+        yes, no, end = self._label("then"), self._label("else"), self._label("end")
+        self.line(f"br i1 {condition.name}, label %{yes}, label %{no}")
+        for label, do in ((yes, then), (no, otherwise)):
+            self.line(f"{label}:")
+            do()
+            self.line(f"br label %{end}")
+        self.line(f"{end}:")
+
+    @contextmanager
+    def while_(self, condition: Callable[[], Value]) -> Iterator[None]:
+        """What is done again while a condition holds, which is looked at before."""
+        head, body, end = self._label("while"), self._label("do"), self._label("end")
+        self.line(f"br label %{head}")
+        self.line(f"{head}:")
+        self.line(f"br i1 {condition().name}, label %{body}, label %{end}")
+        self.line(f"{body}:")
+        yield
+        self.line(f"br label %{head}")
+        self.line(f"{end}:")
+
+    @contextmanager
+    def each(self, end: Operand, start: Operand = 0) -> Iterator[Value]:
+        """What is done for every whole number from `start` to before `end`."""
+        k = self.variable(start, INT, 1)
+        last = self.like(end, INT, 1)
+        with self.while_(lambda: k.value < last):
+            yield k.value
+            k.value = k.value + 1
+
+
+def typed(base: str, width: int) -> str:
+    """The type of so many lanes."""
+    return base if width == 1 else f"<{width} x {base}>"

@@ -1,0 +1,60 @@
+"""The least-norm solution of equations whose rank is in question: D^+ b by one-sided Jacobi rotations.
+
+Pairs of rows of [D b] are turned until all rows of D are orthogonal to one another (Hestenes 1958). Their lengths are then the
+singular values of D, to high relative accuracy, and
+
+    D^+ b = sum_i r_i b_i / |r_i|^2    of all rows r_i that are longer than `tol` times the longest.
+"""
+
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+
+LEAST_NORM = "least_norm"
+SWEEPS = 30  # at most; some six or eight do
+ROUNDING = 1e-15  # cosines of angles between rows that are orthogonal but for rounding
+
+
+def least_norm() -> Function:
+    """`least_norm(D (m, n), b (m), x (n), m, n, tol)`: x = D^+ b. D and b are turned."""
+    arguments = [(POINTER, "D"), (POINTER, "b"), (POINTER, "x"), (INT, "m"), (INT, "n"), (DOUBLE, "tol")]
+    f = Function(LEAST_NORM, arguments)
+    D, b, x, m, n, tol = (f.given[name] for _, name in arguments)
+
+    def dot(i: Value, j: Value) -> Value:
+        total = f.variable(0.0)
+        with f.each(n) as k:
+            total.value = f.fma(f.load(D, i * n + k), f.load(D, j * n + k), total.value)
+        return total.value
+
+    def turn(place: Value, one: Value, two: Value, c: Value, s: Value):
+        p, q = f.load(place, one), f.load(place, two)
+        f.store(f.fma(c, p, -(s * q)), place, one)
+        f.store(f.fma(s, p, c * q), place, two)
+
+    turned, sweep = f.variable(1, INT), f.variable(0, INT)
+    with f.while_(lambda: (turned.value > 0) & (sweep.value < SWEEPS)):
+        turned.value = f.const(0, INT)
+        sweep.value = sweep.value + 1
+        with f.each(m) as i, f.each(m, i + 1) as j:
+            a, c, g = dot(i, i), dot(j, j), dot(i, j)
+            with f.if_(f.abs(g) > f.intrinsic("sqrt", a * c) * ROUNDING):
+                turned.value = f.const(1, INT)
+                zeta = (c - a) / (g * 2.0)
+                root = f.intrinsic("sqrt", f.fma(zeta, zeta, 1.0))
+                t = f.select(zeta < 0.0, f.const(-1.0), 1.0) / (f.abs(zeta) + root)
+                cosine = 1.0 / f.intrinsic("sqrt", f.fma(t, t, 1.0))
+                sine = cosine * t
+                with f.each(n) as k:
+                    turn(D, i * n + k, j * n + k, cosine, sine)
+                turn(b, i, j, cosine, sine)
+    longest = f.variable(0.0)
+    with f.each(m) as i:
+        longest.value = f.max(dot(i, i), longest.value)
+    with f.each(n) as k:
+        f.store(0.0, x, k)
+    with f.each(m) as i:
+        square = dot(i, i)
+        with f.if_(square > tol * tol * longest.value):
+            share = f.load(b, i) / square
+            with f.each(n) as k:
+                f.store(f.fma(share, f.load(D, i * n + k), f.load(x, k)), x, k)
+    return f

@@ -1,0 +1,140 @@
+"""Machine code for this processor from LLVM's text, and where it is kept on disk.
+
+What is kept is object code as the compiler leaves it, under a digest of the text, the processor and the compiler: plain bytes. A
+file that is not whole is made again; the oldest go when there are too many.
+"""
+
+import ctypes
+import hashlib
+import os
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+LEVEL = 2  # of optimization: 3 takes longer to compile and gains nothing
+KEPT_FILES = 2_000  # object files: some 100 MB
+_MAGIC = b"udkjax object 1\n"
+
+
+@cache
+def _llvm() -> Any:
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm
+
+
+@cache
+def target_machine() -> Any:
+    """The compiler for the processor that runs this."""
+    llvm = _llvm()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=_features(), opt=LEVEL, reloc="pic", codemodel="small", jit=True
+    )
+
+
+@cache
+def _features() -> str:
+    return _llvm().get_host_cpu_features().flatten()
+
+
+@cache
+def lanes() -> int:
+    """How many float64 numbers a vector register holds."""
+    features = _llvm().get_host_cpu_features()
+    if features.get("avx512f") and features.get("avx512dq") and features.get("avx512vl"):
+        return 8
+    return 4 if features.get("avx2") and features.get("fma") else 2
+
+
+def digest(text: str) -> str:
+    """What tells one program from another, on this processor, with this compiler."""
+    import llvmlite
+
+    llvm = _llvm()
+    parts = [text, llvm.get_host_cpu_name(), _features(), llvm.get_default_triple(), llvmlite.__version__, str(LEVEL)]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+
+
+class Library:
+    """The machine code of one module, in memory for as long as this object lives: addresses of its functions by name."""
+
+    def __init__(self, code: bytes):
+        llvm = _llvm()
+        empty = llvm.parse_assembly("")
+        # The engine owns its target machine and takes it along when it goes.
+        machine = llvm.Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
+        self._engine = llvm.create_mcjit_compiler(empty, machine)
+        self._engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(code))
+        self._engine.finalize_object()
+
+    def __getitem__(self, name: str) -> int:
+        address = self._engine.get_function_address(name)
+        if not address:
+            raise KeyError(name)
+        return address
+
+
+def library(text: str) -> Library:
+    """The code of a module: from disk, or compiled and put there."""
+    name = digest(text)
+    folder = cache_folder()
+    code = _read(folder / name) if folder else None
+    if code is None:
+        code = compiled(text)
+        if folder:
+            _write(folder / name, code)
+    return Library(code)
+
+
+def compiled(text: str) -> bytes:
+    """Object code of a module."""
+    llvm, machine = _llvm(), target_machine()
+    module = llvm.parse_assembly(text)
+    module.triple = llvm.get_default_triple()
+    module.data_layout = str(machine.target_data)
+    builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=LEVEL))
+    builder.getModulePassManager().run(module, builder)
+    return machine.emit_object(module)
+
+
+def cache_folder() -> Path | None:
+    """Where code is kept: `native` in the cache of compiled programs, or None where nothing is."""
+    from udkjax.environment import cache_folder as of_programs
+
+    base = of_programs()
+    return None if base is None else Path(base) / "native"
+
+
+def _read(path: Path) -> bytes | None:
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    head, code = data[: len(_MAGIC) + 32], data[len(_MAGIC) + 32 :]
+    if not head.startswith(_MAGIC) or hashlib.sha256(code).digest() != head[len(_MAGIC) :]:
+        return None
+    return code
+
+
+def _write(path: Path, code: bytes):
+    """As a whole, or not at all: other processes may read it meanwhile."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(_MAGIC + hashlib.sha256(code).digest() + code)
+        os.replace(temporary, path)
+        files = [p for p in path.parent.iterdir() if p.is_file()]
+        if len(files) > KEPT_FILES:
+            for old in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) - KEPT_FILES]:
+                old.unlink(missing_ok=True)
+    except OSError:  # nowhere to write: it runs all the same
+        return
+
+
+def function(address: int, *arguments: Any) -> Any:
+    """A function at an address, to be called without Python's lock."""
+    return ctypes.CFUNCTYPE(None, *arguments)(address)
