@@ -1,7 +1,7 @@
 """The programs of one structure: what has to be computed for a method and a stabilization, and nothing else."""
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import jax
@@ -29,8 +29,8 @@ class Code:
     On all rows of Psi (D as the values of `pattern`): `rows` (D, b, a_F, M^(-1/2)), `closure` (D, Psi, M^(-1/2)), `psi`,
     `psi_dot`; `energy`; and for elimination, on those not left out: `accelerations` (a, whether all pivots are safe), `nearer` (q
     and v after a Newton step to Psi = 0 and to Psi_dot = 0, whether safe), `closer` (the same of q alone), `output` (the same of v
-    alone, and Psi of all rows), `arrival` (the same of v alone, and the accelerations with it), `tangential` (of changes of q and v what projection leaves; their
-    `Factors.distance`), `finish` (`arrival` and `tangential`, with its pivots; whether safe).
+    alone, and Psi of all rows), `arrival` (the same of v alone, and the accelerations with it), `tangential` (of changes of q and
+    v what projection leaves; their `Factors.distance`), `finish` (`arrival` and `tangential`, with its pivots; whether safe).
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
 
@@ -39,6 +39,7 @@ class Code:
         graph = self.graph = equations.graph
         self.gains = [graph.input(name, "parameter") for name in ("alpha", "beta")] if baumgarte else []
         self.drop = graph.input("drop", "parameter")
+        self.least = graph.input("least", "parameter") if elimination == "watch" else self.drop
         self.n = len(equations.q)
         self.root = [graph.constant(1.0) / graph.sqrt(m) for m in equations.mass]
         self.kept = [i for i in range(len(equations.psi)) if i not in left_out]
@@ -59,7 +60,8 @@ class Code:
         self._derivatives: dict[tuple[str, tuple[bool, ...]], Derivative] = {}
         wanted = [s for name, outputs in self.outputs.items() for s in outputs]
         self.constants = frontier(graph, wanted, lambda node: node.depends <= {"parameter"})
-        self.prologue = Program(graph, [*equations.inputs, *self.gains, self.drop], self.constants)
+        thresholds = [self.drop, *([self.least] if elimination == "watch" else [])]
+        self.prologue = Program(graph, [*equations.inputs, *self.gains, *thresholds], self.constants)
 
     def _eliminate(self):
         """The equation for rows that are independent: a = a_F + M^(-1) Psi_q^T y with D D^T y = b."""
@@ -90,7 +92,7 @@ class Code:
 
     def _safe(self, factors: Factors) -> Scalar:
         """Whether no pivot is too small to be trusted; a method that drops such rows does not ask."""
-        return all_of(factors.above(self.drop) if self.elimination == "check" else [], self.graph)
+        return all_of(factors.above(self.least) if self.elimination in ("check", "watch") else [], self.graph)
 
     def solved(self, b: Sequence[Scalar], dropping: bool = False) -> list[Scalar]:
         """y with D D^T y = b, of the rows kept; zero where a row was dropped, if `dropping` is asked for or the method drops."""
@@ -140,6 +142,11 @@ class Code:
             self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name])
         return self._programs[name]
 
+    @cached_property
+    def watching(self) -> "Code":
+        """The same, that watches instead of checking."""
+        return Code(self.equations, self.left_out, bool(self.gains), "watch")
+
     def derivative(self, name: str, moving: tuple[bool, ...]) -> Derivative:
         """The derivative of "accelerations" or "projection" along some of constants, t, q and v: those that are `moving`."""
         if (name, moving) not in self._derivatives:
@@ -158,7 +165,12 @@ def is_large(mechanism: Mechanism) -> bool:
 
 
 def code(mechanism: Mechanism, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None) -> Code:
-    """Return the code for a mechanism's structure; `elimination` is None, "drop" or "check"."""
+    """Return the code for a mechanism's structure; `elimination` is None, or what it does with small pivots.
+
+    "drop": it leaves out rows whose pivots are below `drop`; "check": it says where there are any; "watch": it does both, with a
+    threshold `least` of what it says that is larger than that of what it leaves out. (Derivatives of steps that are taken with care
+    are those of the rows that are left.)
+    """
     return _code(*structure(mechanism), left_out, baumgarte, elimination)
 
 

@@ -69,15 +69,15 @@ def _(primals, tangents):
 
     def in_parts(at: Any, *directions: list[Array]) -> tuple[list[Any], ...]:
         """The run with its record, and linear maps of the directions."""
-        raw, record = at[0].recorded(undifferentiated(at[1]))
+        raw, record = at[0].recorded(undifferentiated(at[1]), moving)
         linear = Linear(function=at[0], xs=at[1], run=(raw, record), moving=moving)
         return list(_as_run(*at, raw)), *(linear.applied(direction) for direction in directions)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
         """Both by forward mode."""
         function, xs = at
-        raw, change = _change(lambda xs: function.raw(xs), xs, moving, direction)
-        return list(raw), [change[k] for k in SMOOTH]
+        raw, change = function.pushed(xs, moving, direction)
+        return list(raw), change
 
     known = list(shapes), [shapes[k] for k in SMOOTH]
     raw, change = along(in_parts, at_once, primals, _those(tangents[1], moving), None, known)
@@ -142,14 +142,27 @@ class Run(Function):
         problem = self.problem(xs)
         return engine.solve(problem) if engine.serves(problem) else self.raw(xs)
 
+    def pushed(self, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[Raw, list[Array]]:
+        """The run, and the change of its states along v, of those of x that are moving: by machine code, if that serves."""
+        problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
+        if not self.is_plain and engine.serves_derivatives(problem, which):
+            rest = iter(vs)
+            change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in moving])
+            raw, found = engine.pushed(problem, which, change)
+            return raw, list(found)
+        raw, change = _change(lambda xs: self.raw(xs), xs, moving, vs)
+        return raw, [change[k] for k in SMOOTH]
+
     def raw(self, xs: list[Array]) -> Raw:
         """By the engine that serves; under vmap in lanes, or one after another."""
         problem = self.problem(xs)
         return solve(problem) if serves(problem) else one_by_one(problem, partial(_by_diffrax, adjoint="ForwardMode"))
 
-    def recorded(self, xs: list[Array]) -> tuple[Raw, Any]:
+    def recorded(self, xs: list[Array], moving: Mask) -> tuple[Raw, Any]:
         """The run, and its record if it is made for one."""
-        problem = self.problem(xs)
+        problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
+        if not self.is_plain and engine.serves_derivatives(problem, which):
+            return engine.solve(problem), None
         return _recorded(problem) if serves(problem) else (self.raw(xs), None)
 
     def __call__(self, xs: list[Array]) -> list[Array]:
@@ -297,8 +310,13 @@ def _apply(linear: Linear, vector: Array) -> Array:
     assert isinstance(function, Run)
     raw, record = linear.run
     if not linear.transposed:
-        change = _change(function.raw, xs, moving, vs)[1]
-        return _flat([change[k] for k in SMOOTH])
+        return _flat(function.pushed(xs, moving, vs)[1])
+    problem, which = function.problem(xs), jax.tree.unflatten(function.tree, moving)
+    if not function.is_plain and engine.serves_derivatives(problem, which):
+        q, v, y = vs
+        found = engine.pulled(problem, which, jnp.concatenate([q, v], axis=1), y)
+        pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
+        return _flat([bar for m, bar in pairs if m is True])
     if record is None:
         return _flat(function.through_diffrax("RecursiveCheckpointAdjoint", xs, moving, vs))
     return _flat(function.walk(_pulled, xs, moving, raw, record, vs))

@@ -7,7 +7,7 @@ generated along with the code that it calls: it reads the buffers of the frame a
 from typing import Any
 
 from udkjax.native.ir import INT, POINTER, Function, Value
-from udkjax.native.trajectory import CALL, INPUTS, OUTPUTS
+from udkjax.native.trajectory import INPUTS, OUTPUTS, Trajectory
 
 # Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, and in it the arguments and results, 40 bytes each:
 # size, extensions, count, types, buffers.
@@ -19,9 +19,10 @@ METADATA, MAJOR, MINOR = 24, 24, 28
 VERSION = (0, 1)
 
 
-def handler(name: str) -> Function:
-    """`name(frame)`: every input is (1 or members, length), of float64; outputs have all members."""
-    f = Function(name, [(POINTER, "frame")], returns="ptr")
+def handler(trajectory: Trajectory, name: str) -> Function:
+    """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions."""
+    f, fields = Function(name, [(POINTER, "frame")], returns="ptr"), trajectory.call
+    inputs, outputs = (*INPUTS, *trajectory.inputs), (*OUTPUTS, *trajectory.outputs)
     frame = f.given["frame"]
 
     def word(pointer: Value, offset: int, base: str = INT) -> Value:
@@ -34,14 +35,14 @@ def handler(name: str) -> Function:
             f.line(f"store i32 {number}, ptr {f.at(metadata, offset, 'i8').name}, align 4")
         f.line("ret ptr null")
         f.line(f"{f._label('after')}:")
-    call = Value(f, f.reserve(INT, len(CALL)), POINTER)
+    call = Value(f, f.reserve(INT, len(fields)), POINTER)
 
     def put(field: str, value: Any, base: str = INT):
-        f.store(value, call, CALL.index(field), base=base)
+        f.store(value, call, fields.index(field), base=base)
 
     buffers = [word(f.at(frame, start, "i8"), BUFFERS, POINTER) for start in (ARGUMENTS, RESULTS)]
     found = {}
-    for pointers, names in zip(buffers, (INPUTS, OUTPUTS), strict=True):
+    for pointers, names in zip(buffers, (inputs, outputs), strict=True):
         for k, field in enumerate(names):
             found[field] = f.load(pointers, k, base=POINTER)
             put(field, word(found[field], DATA, POINTER), POINTER)
@@ -52,8 +53,12 @@ def handler(name: str) -> Function:
     put("members", dimension("ys", 0))
     put("times", dimension("ys", 1))
     put("knots", dimension("breaks", 1))
-    for field in INPUTS:
-        put(f"{field} stride", f.select(dimension(field, 0) > 1, dimension(field, 1), f.const(0, INT)))
+    put("directions", dimension(inputs[-1], 1) if trajectory.along_directions else 0)
+    for field in inputs:
+        length = f.variable(1, INT, 1)
+        with f.each(word(found[field], RANK), 1) as k:
+            length.value = length.value * f.load(word(found[field], DIMS, POINTER), k, base=INT)
+        put(f"{field} stride", f.select(dimension(field, 0) > 1, length.value, f.const(0, INT)))
     following = Value(f, f.reserve(INT), POINTER)
     f.store(0, following, base=INT)
     put("next", following, POINTER)

@@ -1,6 +1,6 @@
 """A straight-line program as an LLVM function: one state, or W lanes of them.
 
-The program finds its inputs and leaves its outputs at places of memory that `Places` tell: all are numbers side by side, W of each.
+It finds its inputs and leaves its outputs in memory: all are numbers side by side, W of each.
 """
 
 import math
@@ -28,20 +28,20 @@ class UnsupportedError(ValueError):
     """Something in a scene that machine code has no instruction for."""
 
 
-def write(program: Program, name: str, width: int, inputs: Sequence[int], outputs: Sequence[tuple[int, int]]) -> Function:
-    """The function `name(ptr work, ptr out)`.
+Place = tuple[str, int]  # which pointer, and the how manieth number from there
 
-    Input k is the number at place `inputs[k]` of `work`; output k goes to a place of `out` or, where the first of the pair is 0,
-    of `work`: conditions as one or zero.
-    """
-    f = Function(name, [(POINTER, "work"), (POINTER, "out")], width)
+
+def write(
+    program: Program, name: str, width: int, pointers: Sequence[str], inputs: Sequence[Place], outputs: Sequence[Place]
+) -> Function:
+    """A function of some pointers that takes the inputs from their places and puts the outputs, conditions as one or zero, there."""
+    f = Function(name, [(POINTER, x) for x in pointers], width)
     writer = Writer(f, program)
-    for k, s in enumerate(program.inputs):
+    for s, (pointer, place) in zip(program.inputs, inputs, strict=True):
         if program.uses(s):
-            writer.known[s.index] = _typed(f, f.load(f.given["work"], inputs[k] * width, width), s.node.dtype)
-    found = writer.run()
-    for value, (which, place) in zip(found, outputs, strict=True):
-        f.store(value, f.given["out" if which else "work"], place * width, width)
+            writer.known[s.index] = _typed(f, f.load(f.given[pointer], place * width, width), s.node.dtype)
+    for value, (pointer, place) in zip(writer.run(), outputs, strict=True):
+        f.store(value, f.given[pointer], place * width, width)
     return f
 
 

@@ -16,7 +16,7 @@ The functions of one module, all of them on one piece of memory (`Places`): `run
 `decide` (whether it counts, and the next), `outputs` (states between steps).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,7 +37,8 @@ from udkjax.integrate.tableau import Method
 from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM, least_norm
 from udkjax.native.power import power
-from udkjax.native.program import write
+from udkjax.native.program import Place, write
+from udkjax.straightline import Program
 
 OUTPUT_STEPS = 7  # of Newton's method to an output: where two branches of the manifold meet, it halves the distance in each
 
@@ -45,9 +46,6 @@ SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "care", "max
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("ys", "violation", "info")
 INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the last q and v
-# What `run` is told, 8 bytes each: how many members, output times and breakpoints; the addresses of inputs, their strides from
-# member to member (numbers), the addresses of outputs, and that of the number of the next member, which threads share.
-CALL = ("members", "times", "knots", *INPUTS, *(f"{x} stride" for x in INPUTS), *OUTPUTS, "next")
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,8 @@ class Places:
         return self.places[name]
 
 
-_LANE = (  # numbers of each lane
+_LANE = (  # numbers of each lane; `call` and `ways` are addresses
+    *("call", "ways"),
     *(
         "t1",
         "step",
@@ -127,8 +126,27 @@ class Lane:
             setattr(self, name, self._f.select(mask, self._f.like(value, DOUBLE, self._f.width), getattr(self, name)))
 
 
+def _numbered(pointer: str, count: int) -> list[Place]:
+    return [(pointer, k) for k in range(count)]
+
+
 class Trajectory:
-    """The text of one module."""
+    """The text of one module.
+
+    `run` is told, 8 bytes each (`call`): how many members, output times, breakpoints and directions there are; the addresses of
+    inputs, their strides from member to member (numbers), the addresses of outputs, and that of the number of the next member,
+    which threads share.
+    """
+
+    inputs: tuple[str, ...] = ()  # besides those of every run
+    outputs: tuple[str, ...] = ()
+    along_directions = False  # whether the last inputs and outputs have directions, after the members
+
+    @property
+    def call(self) -> tuple[str, ...]:
+        inputs = (*INPUTS, *self.inputs)
+        strides = (f"{x} stride" for x in inputs)
+        return "members", "times", "knots", "directions", *inputs, *strides, *OUTPUTS, *self.outputs, "next"
 
     def __init__(self, plan: Plan):
         self.plan, self.code, self.method = plan, plan.code, plan.method
@@ -152,6 +170,7 @@ class Trajectory:
         p.add("rows", m)
         p.add("psi", m)
         p.add("R", len(code.outputs["rows"]))
+        self.ways = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
         self.globals: list[str] = []
         self.stage_accelerations = ["P3 a", *(f"A{i}" for i in range(1, plan.method.stages))]
@@ -164,53 +183,76 @@ class Trajectory:
         self._programs()
         self._attempt()
         self._decide()
-        self._interpolation()
+        self._differences()
+        self._between()
         self._outputs()
         if self.cares:
             self.functions.append(least_norm())
             self._care()
         self._begin()
         self._finish()
+        self._derivatives()
         self._run()
         declared = sorted(
             set().union(*(f.declared for f in self.functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
         )
         return "\n".join([*declared, *self.globals, *(f.text() for f in self.functions)])
 
+    # What a trajectory with derivatives does besides (tangents.py, walk.py).
+
+    def _derivatives(self):
+        """Its functions."""
+
+    def _accepted(self, f: Function, s: Lane, accept: Value):
+        """What it does with a step once its end is in P3."""
+
+    def _interpolated(self, f: Function, s: Lane):
+        """What it does with a state between steps, in X t, X q and O v, of lanes that are `due`."""
+
+    def _begun(self, f: Function, lane: Value, member: Value):
+        """What it does with a member that is taken into a lane."""
+
+    def _ended(self, f: Function, s: Lane):
+        """What it does with members that are done, in lanes that are `due`."""
+
+    def _next(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """Which members come next, into lanes whose members are done."""
+        fill()
+
+    def _stage(self, f: Function, i: int):
+        """The accelerations of stage i, of the state in X."""
+        self._call(f, "accelerations", f"A{i}")
+
+    @property
+    def doubts(self) -> bool:
+        """Whether pivots may be too small to be trusted."""
+        return self.code.elimination in ("check", "watch")
+
     @property
     def cares(self) -> bool:
         """Whether steps may be taken again with care."""
-        return self.code.elimination == "check" and self.m > 0
+        return self.doubts and self.m > 0
 
     # --- the scene's programs
 
     def _programs(self):
-        code, p, n = self.code, self.places, self.n
-        state = [p["constants"] + k for k in range(self.constants)] + [p["X t"]]
-        state += [p["X q"] + k for k in range(n)] + [p["X v"] + k for k in range(n)]
-        changes = [p["X dq"] + k for k in range(n)] + [p["X dv"] + k for k in range(n)]
-
-        def work(name: str, count: int) -> list[tuple[int, int]]:
-            return [(0, p[name] + k) for k in range(count)]
-
-        def out(count: int) -> list[tuple[int, int]]:
-            return [(1, k) for k in range(count)]
-
-        safe = [(0, p["safe"])]
+        code, n = self.code, self.n
+        state, changes = self._state(), [*self._work("X dq", n), *self._work("X dv", n)]
+        safe = self._work("safe", 1)
         outputs = {
-            "accelerations": [*out(n), *safe],
-            "closer": [*work("C", n), *safe],
-            "arrival": [*work("O v", n), *work("O a", n), *safe],
+            "accelerations": [*_numbered("out", n), *safe],
+            "closer": [*self._work("C", n), *safe],
+            "arrival": [*self._work("O v", n), *self._work("O a", n), *safe],
             "finish": [
-                *(x for name in ("O v", "O a", "O dq", "O dv") for x in work(name, n)),
-                (0, p["distance"]),
+                *(x for name in ("O v", "O a", "O dq", "O dv") for x in self._work(name, n)),
+                *self._work("distance", 1),
                 *safe,
             ],
-            "tangential": [*work("O dq", n), *work("O dv", n), (0, p["distance"])],
-            "output": [*work("O v", n), *work("psi", self.m)],
-            "psi": work("psi", self.m),
-            "rows": work("R", len(code.outputs["rows"])),
-            "psi_dot": work("psi", self.m),
+            "tangential": [*self._work("O dq", n), *self._work("O dv", n), *self._work("distance", 1)],
+            "output": [*self._work("O v", n), *self._work("psi", self.m)],
+            "psi": self._work("psi", self.m),
+            "rows": self._work("R", len(code.outputs["rows"])),
+            "psi_dot": self._work("psi", self.m),
         }
         wanted = ["accelerations", "rows", "psi"]
         if self.plan.projected:
@@ -220,9 +262,20 @@ class Trajectory:
             wanted += ["psi_dot"]
         for name in dict.fromkeys(wanted):
             inputs = [*state, *changes] if name in ("tangential", "finish") else state
-            self.functions.append(write(code.program(name), name, self.plan.width, inputs, outputs[name]))
-        inputs = list(range(len(code.prologue.inputs)))
-        self.functions.append(write(code.prologue, "prologue", 1, inputs, out(self.constants)))
+            self._write(code.program(name), name, ("work", "out"), inputs, outputs[name])
+        inputs = _numbered("work", len(code.prologue.inputs))
+        self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, _numbered("out", self.constants)))
+
+    def _write(self, program: Program, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]):
+        self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs))
+
+    def _work(self, name: str, count: int) -> list[Place]:
+        return [("work", self.places[name] + k) for k in range(count)]
+
+    def _state(self) -> list[Place]:
+        """The constants, and t, q and v in X."""
+        counts = {"constants": self.constants, "X t": 1, "X q": self.n, "X v": self.n}
+        return [place for name, count in counts.items() for place in self._work(name, count)]
 
     # --- helpers to write functions with
 
@@ -231,12 +284,16 @@ class Trajectory:
         self.functions.append(f)
         return f, Lane(f, self.places)
 
-    def _vector(self, f: Function, name: str, r: Value) -> Value:
-        """One register of an array of coordinates."""
-        return f.load(f.given["work"], r * self.plan.vector + self.places[name] * self.plan.width, self.plan.vector)
+    def _start(self, name: str, pointer: str) -> int:
+        """Where an array is, in numbers from a pointer."""
+        return (self.places if pointer == "work" else self.ways)[name] * self.plan.width
 
-    def _put(self, f: Function, name: str, r: Value, x: Value):
-        f.store(x, f.given["work"], r * self.plan.vector + self.places[name] * self.plan.width, self.plan.vector)
+    def _vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
+        """One register of an array of coordinates."""
+        return f.load(f.given[pointer], r * self.plan.vector + self._start(name, pointer), self.plan.vector)
+
+    def _put(self, f: Function, name: str, r: Value, x: Value, pointer: str = "work"):
+        f.store(x, f.given[pointer], r * self.plan.vector + self._start(name, pointer), self.plan.vector)
 
     def _over(self, f: Function, x: Value) -> Value:
         """A number of each lane, to go with registers of coordinates."""
@@ -257,12 +314,14 @@ class Trajectory:
     def _call(self, f: Function, name: str, out: str | None = None):
         f.call(name, f.given["work"], self._address(f, out) if out else f.given["work"])
 
-    def _weighted(self, f: Function, row: np.ndarray, r: Value) -> Value | None:
+    def _weighted(
+        self, f: Function, row: np.ndarray, r: Value, names: Sequence[str] | None = None, pointer: str = "work"
+    ) -> Value | None:
         """sum_j row_j a_j of one register of coordinates; None where all are zero."""
         total = None
-        for weight, name in zip(row, self.stage_accelerations, strict=False):
+        for weight, name in zip(row, names or self.stage_accelerations, strict=False):
             if weight != 0:
-                a = self._vector(f, name, r)
+                a = self._vector(f, name, r, pointer)
                 total = a * float(weight) if total is None else f.fma(a, float(weight), total)
         return total
 
@@ -279,7 +338,7 @@ class Trajectory:
         with f.if_(~begins):
             for i in range(1, stages):
                 self._stage_state(f, s, i)
-                self._call(f, "accelerations", f"A{i}")
+                self._stage(f, i)
                 self._checked(f, s, f"A{i}")
         self._stage_state(f, s, stages)
         setattr(s, "X t", s.t1)
@@ -337,20 +396,21 @@ class Trajectory:
         f.declared.add(f"declare double @{name}(double, {x.type})")
         return f.op(f"call double @{name}(double {f.const(0.0).name}, {x.type} {x.name})", DOUBLE)
 
-    def _stage_state(self, f: Function, s: Lane, i: int):
-        """t, q and v of stage i in X."""
-        method, h = self.method, self._over(f, s.step)
-        setattr(s, "X t", f.fma(s.step, float(method.nodes[i]), s.T3))
+    def _stage_state(self, f: Function, s: Lane, i: int, start: str = "P3", step: Value | None = None):
+        """t, q and v of stage i in X, of the step from a point."""
+        step = s.step if step is None else step
+        method, h, names = self.method, self._over(f, step), [f"{start} a", *self.stage_accelerations[1:]]
+        setattr(s, "X t", f.fma(step, float(method.nodes[i]), getattr(s, f"T{start[1:]}")))
         with f.each(self.rowcount) as r:
-            q, v = self._vector(f, "P3 q", r), self._vector(f, "P3 v", r)
-            sum_q, sum_v = self._weighted(f, method.q[i], r), self._weighted(f, method.v[i], r)
+            q, v = self._vector(f, f"{start} q", r), self._vector(f, f"{start} v", r)
+            sum_q, sum_v = self._weighted(f, method.q[i], r, names), self._weighted(f, method.v[i], r, names)
             slope = v * float(method.nodes[i]) if sum_q is None else f.fma(h, sum_q, v * float(method.nodes[i]))
             self._put(f, "X q", r, f.fma(h, slope, q))
             self._put(f, "X v", r, v if sum_v is None else f.fma(h, sum_v, v))
 
     def _checked(self, f: Function, s: Lane, name: str):
         """What becomes of accelerations whose pivots are too small to be trusted."""
-        if self.code.elimination != "check":
+        if not self.doubts:
             return
         unsafe = (s.judged > 0.5) & (s.safe < 0.5)
         with f.if_(f.any_of(unsafe)):
@@ -421,7 +481,7 @@ class Trajectory:
         begin = s.begin > 0.5
         bad = judged & ~(error < np.inf)
         # --- doubt, and steps a little shorter instead
-        if self.code.elimination == "check":
+        if self.doubts:
             doubt = bad & ~careful
             far_from_here = self._far(f, s, s.distance2)
             beside = judged & ~careful & (error < 1.0) & ~self._far(f, s, s.distance) & (s.last < 0.5)
@@ -451,7 +511,7 @@ class Trajectory:
         factor = f.min(factor, where(accept, f.const(GROW, DOUBLE, f.width), SAFETY))
         h = where(judged, step * where(dodge, f.const(DODGE, DOUBLE, f.width), factor), s.h)
         failed = judged & ~accept & stepped
-        if self.code.elimination == "check":
+        if self.doubts:
             h = where(failed, self._around(f, s, left, step, h), h)
         s.behind = h
         with f.if_(f.any_of(begun)):
@@ -473,6 +533,7 @@ class Trajectory:
             s.where(accept, distance2=s.distance)
             if self.m:
                 s.where(accept, tolerance=self._tolerance(f, s, "P3 v"))
+            self._accepted(f, s, accept)
         s.where(accept & stepped, rate=rate)
         first = s.tried < 0.0
         if self.plan.breaks:
@@ -576,14 +637,14 @@ class Trajectory:
             s.lands = where(reaches, yes, 0.0)
         t1 = where(begin, s.behind if self.plan.breaks else s.T3, t1)
         s.t1 = t1
-        s.step = where(s.judged > 0.5, t1 - s.T3, 0.0)
+        s.step = where((s.judged > 0.5) & ~begin, t1 - s.T3, 0.0)
         s.begin = where(begin, yes, 0.0)
         s.last = where(last, yes, 0.0)
 
     def _each_break(self, f: Function, s: Lane, here: Value):
         """t1: just before the next breakpoint; behind: just behind all of those that are here."""
         call = f.given["call"]
-        knots, width = f.load(call, CALL.index("knots"), base=INT), f.width
+        knots, width = f.load(call, self.call.index("knots"), base=INT), f.width
         with f.each(knots) as k:
             if width == 1:
                 at = self._input(f, call, "breaks", s.member, k)
@@ -601,16 +662,17 @@ class Trajectory:
 
     def _of_member(self, f: Function, call: Value, name: str, member: Value) -> Value:
         """The address of what an input holds of a member (one lane)."""
-        number = member if member.base == INT else f.op(f"fptosi double {member.name} to i64", INT)
-        stride = f.load(call, CALL.index(f"{name} stride"), base=INT)
-        pointer = f.load(call, CALL.index(name), base=POINTER)
+        number = member if member.base == INT else self._whole(f, member)
+        stride = f.load(call, self.call.index(f"{name} stride"), base=INT)
+        pointer = f.load(call, self.call.index(name), base=POINTER)
         return f.at(pointer, number * stride)
 
     # --- states between steps
 
-    def _interpolation(self):
-        """`differences`: Newton's divided differences of the last points, the latest first; `between`: the polynomial at `next`."""
-        f, s = self._function("differences")
+    def _differences(self, name: str = "differences", to: tuple[str, Places] | None = None):
+        """Newton's divided differences of the last points, the latest first: of their states, or of changes of these."""
+        pointer = to[0] if to else "work"
+        f, s = self._function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
         times = [getattr(s, f"T{POINTS - 1 - k}") for k in range(POINTS)]
         step = times[0] - times[1]
         inverse: dict[tuple[int, int], Value] = {}
@@ -625,10 +687,10 @@ class Trajectory:
             sofar = near if sofar is None else sofar & near
             used.append(sofar)
         with f.each(self.rowcount) as r:
-            known = {x: [self._vector(f, f"P{POINTS - 1 - k} {x}", r) for k in range(POINTS)] for x in "qva"}
+            known = {x: [self._vector(f, f"P{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
             column = [x for x in known["q"] for _ in range(3)]
             given = {1: known["v"], 2: [a * 0.5 for a in known["a"]]}
-            self._put(f, "N0", r, column[0])
+            self._put(f, "N0", r, column[0], pointer)
             for degree in range(1, 3 * POINTS):
                 following = []
                 for i in range(3 * POINTS - degree):
@@ -636,24 +698,29 @@ class Trajectory:
                     following.append(given[degree][one] if one == two else (column[i + 1] - column[i]) * inverse[one, two])
                 column = following
                 mask = used[degree // 3]
-                self._put(f, f"N{degree}", r, column[0] if mask is None else f.select(mask, column[0], 0.0))
-        f, s = self._function("between")
+                self._put(f, f"N{degree}", r, column[0] if mask is None else f.select(mask, column[0], 0.0), pointer)
+
+    def _between(self, name: str = "between", to: tuple[str, Places] | None = None):
+        """The polynomial at the time `next`."""
+        pointer = to[0] if to else "work"
+        f, s = self._function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
         ahead = [self._over(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
-        setattr(s, "X t", s.next)
+        if not to:
+            setattr(s, "X t", s.next)
         with f.each(self.rowcount) as r:
-            q, v = self._vector(f, f"N{3 * POINTS - 1}", r), f.const(0.0, DOUBLE, self.plan.vector)
+            q, v = self._vector(f, f"N{3 * POINTS - 1}", r, pointer), f.const(0.0, DOUBLE, self.plan.vector)
             for k in reversed(range(3 * POINTS - 1)):
                 d = ahead[k // 3]
                 v = f.fma(v, d, q)
-                q = f.fma(q, d, self._vector(f, f"N{k}", r))
-            self._put(f, "X q", r, q)
-            self._put(f, "X v", r, v)
+                q = f.fma(q, d, self._vector(f, f"N{k}", r, pointer))
+            self._put(f, "X q", r, q, pointer)
+            self._put(f, "X v", r, v, pointer)
 
     def _outputs(self):
         """Write the states at output times up to `until`."""
         f, s = self._function("outputs", [(POINTER, "work"), (POINTER, "call")])
         call = f.given["call"]
-        inner = f.load(call, CALL.index("times"), base=INT) - 1
+        inner = f.load(call, self.call.index("times"), base=INT) - 1
 
         def due() -> Value:
             s.due = f.select((s.next <= s.until) & (s.written + 1.0 < inner), f.const(1.0, DOUBLE, f.width), 0.0)
@@ -664,8 +731,9 @@ class Trajectory:
             with f.while_(due):
                 f.call("between", f.given["work"])
                 self._settle(f, s, "due")
+                self._interpolated(f, s)
                 with f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
-                    number = f.op(f"fptosi double {f.lane(s.written, k).name} to i64", INT) + 1
+                    number = self._whole(f, f.lane(s.written, k)) + 1
                     self._write_state(f, s, call, k, number, "X q", "O v")
                     f.store(
                         self._input(f, call, "ts", f.lane(s.member, k), number + 1),
@@ -679,7 +747,7 @@ class Trajectory:
         if self.plan.projected:
             tolerance = self._tolerance(f, s, "X v")
             threshold = f.min(f.max(TURNED / tolerance, NOTHING_LEFT), USELESS)
-            if self.code.elimination != "check":
+            if self.code.elimination == "drop":
                 threshold = None
 
             def close():
@@ -703,18 +771,25 @@ class Trajectory:
 
     def _write_state(self, f: Function, s: Lane, call: Value, k: Value, number: Value, q: str, v: str):
         """State number `number` of lane k into the outputs."""
-        member = f.op(f"fptosi double {f.lane(s.member, k).name} to i64", INT)
-        times = f.load(call, CALL.index("times"), base=INT)
+        member = self._whole(f, f.lane(s.member, k))
+        times = f.load(call, self.call.index("times"), base=INT)
         row = member * times + number
-        ys = f.at(f.load(call, CALL.index("ys"), base=POINTER), row * (2 * self.n))
+        ys = f.at(f.load(call, self.call.index("ys"), base=POINTER), row * (2 * self.n))
         self._copied(f, ys, 0, q, k)
         self._copied(f, ys, self.n, v, k)
-        f.store(f.lane(s.violated, k), f.load(call, CALL.index("violation"), base=POINTER), row)
+        f.store(f.lane(s.violated, k), f.load(call, self.call.index("violation"), base=POINTER), row)
 
-    def _copied(self, f: Function, to: Value, start: int, name: str, k: Value):
+    def _copied(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work"):
         """The coordinates of lane k to an address."""
         with f.each(self.n) as i:
-            f.store(f.load(f.given["work"], (i + self.places[name]) * f.width + k), to, i + start)
+            f.store(f.load(f.given[pointer], i * f.width + k + self._start(name, pointer)), to, i + start)
+
+    def _whole(self, f: Function, x: Value) -> Value:
+        return f.op(f"fptosi double {x.name} to i64", INT)
+
+    def _call_of(self, f: Function) -> Value:
+        """What `run` was told."""
+        return f.load(f.given["work"], self.places["call"] * f.width, base=POINTER)
 
     # --- with care
 
@@ -831,7 +906,7 @@ class Trajectory:
             f.store(value, work, f.like(i, INT, 1) * width + p[name] * width + k)
 
         for name in _LANE:
-            if name not in SETTINGS and name != "judged":
+            if name not in SETTINGS and name not in ("judged", "call", "ways"):
                 put(name, 0.0)
         given = self._of_member(f, call, "settings", member)
         settings = {name: f.load(given, j) for j, name in enumerate(SETTINGS)}
@@ -857,7 +932,7 @@ class Trajectory:
             with f.each(self.m) as i:
                 put("rows", f.load(rows, i), i)
         ts = self._of_member(f, call, "ts", member)
-        times = f.load(call, CALL.index("times"), base=INT)
+        times = f.load(call, self.call.index("times"), base=INT)
         start, end = f.load(ts), f.load(ts, times - 1)
         for name, value in (("start", start), ("end", end), ("next", f.load(ts, 1)), ("rate", np.inf)):
             put(name, value)
@@ -870,12 +945,13 @@ class Trajectory:
         put("active", 1.0)
         put("tolerance", settings["atol"])
         put("member", f.op(f"sitofp i64 {member.name} to double", DOUBLE))
+        self._begun(f, k, member)
 
     def _finish(self):
         """Write what is left of the members whose lanes are marked in `due`: their first and last states, and how they ended."""
         f, s = self._function("finish_members", [(POINTER, "work"), (POINTER, "call")])
         p, width, call, work = self.places, self.plan.width, f.given["call"], f.given["work"]
-        times = f.load(call, CALL.index("times"), base=INT)
+        times = f.load(call, self.call.index("times"), base=INT)
         # Why the step size fell to nothing: a number that is not finite, at the end or right ahead, or something else.
         stopped = s.due.is_(1.0) & s.code.is_not(float(DONE)) & s.code.is_not(float(STEP_LIMIT))
         with f.if_(f.any_of(stopped)):
@@ -899,10 +975,10 @@ class Trajectory:
         setattr(s, "X t", s.T3)
         self._settle(f, s, "due")
         with f.each(width) as k, f.if_(f.lane(s.due, k) > 0.5):
-            member = f.op(f"fptosi double {f.lane(s.member, k).name} to i64", INT)
+            member = self._whole(f, f.lane(s.member, k))
             with f.if_(f.lane(s.code, k).is_(float(DONE))):
                 self._write_state(f, s, call, k, times - 1, "X q", "O v")
-            info = f.at(f.load(call, CALL.index("info"), base=POINTER), member * (len(INFO) + 2 * self.n))
+            info = f.at(f.load(call, self.call.index("info"), base=POINTER), member * (len(INFO) + 2 * self.n))
             values = {"t": s.T3}
             for j, name in enumerate(INFO):
                 f.store(f.lane(values.get(name, getattr(s, name) if name != "t" else s.T3), k), info, j)
@@ -925,6 +1001,7 @@ class Trajectory:
         s.violated = worst.value
         with f.each(width) as k, f.if_(f.lane(s.due, k) > 0.5):
             self._write_state(f, s, call, k, f.const(0, INT), "X q", "O v")
+        self._ended(f, s)
 
     def _run(self):
         """`run(call)`: members one after another, until there are none left."""
@@ -936,21 +1013,20 @@ class Trajectory:
         f = Function("run", [(POINTER, "call")], self.plan.width)
         self.functions.append(f)
         call, width = f.given["call"], self.plan.width
-        size = (self.places.size * width + 2 * self.plan.vector) * 8
-        block = f.op(f"call ptr @malloc(i64 {size + 64})", POINTER)
-        address = f.op(f"ptrtoint ptr {block.name} to i64", INT)
-        aligned = f.logic("and", address + 63, -64)
-        f.given["work"] = f.op(f"inttoptr i64 {aligned.name} to ptr", POINTER)
-        work, s = f.given["work"], Lane(f, self.places)
-        with f.each(self.places.size * width + self.plan.vector) as i:
+        size = self.places.size * width + 2 * self.plan.vector
+        block, work = self._allocated(f, f.const(size, INT))
+        f.given["work"], s = work, Lane(f, self.places)
+        with f.each(size) as i:
             f.store(0.0, work, i)
+        f.store(call, work, self.places["call"] * width, base=POINTER)
+        blocks = [block, *self._memory(f, call)]
         for name in ("length", "omega", "rtol", "atol", "smallest"):  # of lanes that stay empty
             setattr(s, name, f.const(1.0, DOUBLE, width))
         with f.each(-(-self.n // max(self.plan.vector // width, 1)) * max(self.plan.vector // width, 1)) as i:
             for name in ("scale q", "scale v"):
                 f.store(f.const(1.0, DOUBLE, width), work, (i + self.places[name]) * width, width)
-        members = f.load(call, CALL.index("members"), base=INT)
-        following = f.load(call, CALL.index("next"), base=POINTER)
+        members = f.load(call, self.call.index("members"), base=INT)
+        following = f.load(call, self.call.index("next"), base=POINTER)
         yes = f.const(1.0, DOUBLE, width)
 
         def fill():
@@ -972,7 +1048,7 @@ class Trajectory:
             self._aim(f, s)
             f.call("attempt", work)
             f.call("decide", work)
-            if not self.cares and self.code.elimination == "check":
+            if not self.cares and self.doubts:
                 s.where(s.doubt > 0.5, code=DOUBTED)
             f.call("outputs", work, call)
             ended = (s.active > 0.5) & s.code.is_not(float(RUNNING))
@@ -980,5 +1056,19 @@ class Trajectory:
                 s.due = f.select(ended, yes, 0.0)
                 f.call("finish_members", work, call)
                 s.where(ended, active=0.0, doubt=0.0)
-                fill()
-        f.line(f"call void @free(ptr {block.name})")
+                self._next(f, s, fill)
+        for block in blocks:
+            f.line(f"call void @free(ptr {block.name})")
+
+    def _allocated(self, f: Function, count: Value) -> tuple[Value, Value]:
+        """So many numbers: what to free, and where they begin, at a register's boundary."""
+        size = count * 8 + 64
+        block = f.op(f"call ptr @malloc(i64 {size.name})", POINTER)
+        address = f.op(f"ptrtoint ptr {block.name} to i64", INT)
+        aligned = f.logic("and", address + 63, -64)
+        return block, f.op(f"inttoptr i64 {aligned.name} to ptr", POINTER)
+
+    def _memory(self, f: Function, call: Value) -> list[Value]:
+        """Further memory of a run, in `work` already: what to free."""
+        del f, call
+        return []

@@ -1,0 +1,347 @@
+"""Derivatives of a trajectory in reverse mode: the steps are recorded, and walked back.
+
+A point is an accepted state (q, v, a) at its time; each step leads from one to the next. Cotangents of the points are collected from
+the last to the first: those of an output go through its projection and through the interpolation to the four points that it lies
+on; those of a point through its accelerations and its projection to the end of the step that led there, and through the sums
+
+    q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
+
+of its stages, the last first, to the point before. The stages are evaluated again on the way, with what the derivatives need to
+know of them; the transposed programs are those of equations/derivative.py.
+
+Members run side by side in lanes and walk back side by side; the next ones follow when all are back.
+"""
+
+from collections.abc import Sequence
+
+from udkjax.integrate.problem import DONE
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.tangents import Differentiated
+from udkjax.native.trajectory import POINTS, STRETCH, Lane, Plan, _numbered
+
+FIRST = 512  # points that a record has room for, before it grows
+HEAD = 3  # numbers of a point before its state: its time, how many outputs were written before its step, whether it begins anew
+
+
+class Reverse(Differentiated):
+    """A trajectory that is walked back, with cotangents of its outputs and its end."""
+
+    inputs = ("ysbar", "endbar")
+    outputs = ("cbar", "qbar", "vbar")
+
+    def __init__(self, plan: Plan, moving: tuple[bool, ...]):
+        super().__init__(plan, moving)
+        p, n = self.places, self.n
+        for name in ("record", "capacity", "points", "at", "before", "ready", "any"):
+            p.add(name)
+        p.add("cbar", self.count)
+        p.add("G c", self.count)
+        for name in ("G q", "G v", "Y q", "Y v"):
+            p.add(name, n)
+        for k in range(POINTS):
+            for x in "qva":
+                p.add(f"B{k} {x}", n)
+        for j in range(plan.method.stages):
+            p.add(f"S{j}", n)
+        for k in range(3 * POINTS):
+            p.add(f"M{k}", n)
+        self.row = HEAD + 3 * n
+
+    def _derivatives(self):
+        self._evaluations()
+        n = self.n
+        found = [*self._work("G c", self.count), *self._work("G q", n), *self._work("G v", n)]
+        kept = _numbered("kept", len(self.of_accelerations.kept))
+        inputs = [*self._state(), *kept, *_numbered("bar", n)]
+        self._write(self.of_accelerations.reverse, "reverse", ("work", "kept", "bar"), inputs, found)
+        if self.of_projection:
+            kept = _numbered("kept", len(self.of_projection.kept))
+            inputs = [*self._state(), *kept, *self._work("Y q", n), *self._work("Y v", n)]
+            self._write(self.of_projection.reverse, "reverse_projection", ("work", "kept"), inputs, found)
+        self._transposed_differences()
+        self._step_back()
+        self._walk()
+
+    # --- the record
+
+    def _accepted(self, f: Function, s: Lane, accept: Value):
+        marked = f.select(accept, f.const(1.0, DOUBLE, f.width), 0.0)
+        with f.each(f.width) as k, f.if_(f.lane(marked, k) > 0.5):
+            self._note(f, s, k)
+
+    def _begun(self, f: Function, lane: Value, member: Value):
+        del member
+        s = Lane(f, self.places)
+        record = f.op(f"call ptr @malloc(i64 {FIRST * self.row * 8})", POINTER)
+        self._put_lane(f, "record", lane, record, POINTER)
+        self._put_lane(f, "capacity", lane, f.const(float(FIRST)))
+        self._put_lane(f, "points", lane, f.const(0.0))
+        self._note(f, s, lane)
+
+    def _put_lane(self, f: Function, name: str, k: Value, x: Value, base: str = DOUBLE):
+        f.store(x, f.given["work"], k + self.places[name] * f.width, base=base)
+
+    def _lane(self, f: Function, name: str, k: Value, base: str = DOUBLE) -> Value:
+        return f.load(f.given["work"], k + self.places[name] * f.width, base=base)
+
+    def _note(self, f: Function, s: Lane, k: Value):
+        """One more point, that of P3."""
+        points, capacity = self._lane(f, "points", k), self._lane(f, "capacity", k)
+        with f.if_(points >= capacity):
+            self._put_lane(f, "capacity", k, capacity * 2.0)
+            size = self._whole(f, capacity * 2.0) * (self.row * 8)
+            old = self._lane(f, "record", k, POINTER)
+            new = f.op(f"call ptr @realloc(ptr {old.name}, i64 {size.name})", POINTER)
+            f.declared.add("declare ptr @realloc(ptr, i64)")
+            self._put_lane(f, "record", k, new, POINTER)
+        row = f.at(self._lane(f, "record", k, POINTER), self._whole(f, points) * self.row)
+        for j, name in enumerate(("T3", "written", "begin")):
+            f.store(self._lane(f, name, k), row, j)
+        for j, x in enumerate("qva"):
+            self._copied(f, row, HEAD + j * self.n, f"P3 {x}", k)
+        self._put_lane(f, "points", k, points + 1.0)
+
+    def _recalled(self, f: Function, k: Value, number: Value, point: str):
+        """A point of lane k from its record; before the first one there is the first."""
+        row = f.at(self._lane(f, "record", k, POINTER), self._whole(f, f.max(number, 0.0)) * self.row)
+        self._put_lane(f, f"T{point[1:]}", k, f.load(row, 0))
+        for j, x in enumerate("qva"):
+            with f.each(self.n) as i:
+                place = i * f.width + k + self._start(f"{point} {x}", "work")
+                f.store(f.load(row, i + (HEAD + j * self.n)), f.given["work"], place)
+
+    # --- the way back
+
+    def _each_marked(self, f: Function, mask: Value):
+        marked = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+        with f.each(f.width) as k, f.if_(f.lane(marked, k) > 0.5):
+            yield k
+
+    def _added(self, f: Function, mask: Value):
+        """The cotangents of the constants that a program has found, to those of lanes in question."""
+        with f.each(self.count) as i:
+            total = f.load(f.given["work"], i * f.width + self._start("cbar", "work"), f.width)
+            more = f.load(f.given["work"], i * f.width + self._start("G c", "work"), f.width)
+            f.store(f.select(mask, total + more, total), f.given["work"], i * f.width + self._start("cbar", "work"), f.width)
+
+    def _projected_back(self, f: Function, mask: Value):
+        """Y through the projection that led to the state in X: G q and G v."""
+        if self.of_projection:
+            self._evaluate_end(f)
+            f.call("reverse_projection", f.given["work"], self._address(f, "KP"))
+            self._added(f, mask)
+        else:
+            with f.each(self.rowcount) as r:
+                for x in "qv":
+                    self._put(f, f"G {x}", r, self._vector(f, f"Y {x}", r))
+
+    def _accelerated_back(self, f: Function, kept: str, bar: str, mask: Value):
+        """The cotangents of accelerations, through the equations at the state in X: G q and G v."""
+        f.call("reverse", f.given["work"], self._address(f, kept), self._address(f, bar))
+        self._added(f, mask)
+
+    def _transposed_differences(self):
+        """From cotangents of divided differences (M) to those of the points (B): `differences`, transposed; M is cleared."""
+        f, s = self._function("differences_back")
+        active = s.at > 0.5
+        times = [getattr(s, f"T{POINTS - 1 - k}") for k in range(POINTS)]
+        step = times[0] - times[1]
+        inverse, used = {}, [None, None]
+        for i in range(POINTS):
+            for j in range(i + 1, POINTS):
+                d = times[j] - times[i]
+                inverse[i, j] = self._over(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
+        sofar = None
+        for k in range(1, POINTS - 1):
+            near = (times[k] - times[k + 1]) * STRETCH >= step
+            sofar = near if sofar is None else sofar & near
+            used.append(sofar)
+        zero, count = f.const(0.0, DOUBLE, self.plan.vector), 3 * POINTS
+        with f.each(self.rowcount) as r:
+            bars: dict[str, list[Value]] = {x: [zero] * POINTS for x in "qva"}
+            column: list[Value] = []
+            for degree in reversed(range(count)):
+                length = count - degree
+                mask = used[degree // 3]
+                mine = self._vector(f, f"M{degree}", r)
+                mine = mine if mask is None else f.select(mask, mine, 0.0)
+                here = [zero] * length
+                for i, bar in enumerate(column):  # of the column after this one
+                    one, two = i // 3, (i + degree + 1) // 3
+                    if one == two:
+                        x, share = ("v", bar) if degree == 0 else ("a", bar * 0.5)
+                        bars[x][one] = bars[x][one] + share
+                    else:
+                        part = bar * inverse[one, two]
+                        here[i + 1] = here[i + 1] + part
+                        here[i] = here[i] - part
+                here[0] = here[0] + mine
+                column = here
+                self._put(f, f"M{degree}", r, zero)
+            for i, bar in enumerate(column):
+                bars["q"][i // 3] = bars["q"][i // 3] + bar
+            for k in range(POINTS):
+                for x in "qva":
+                    name = f"B{POINTS - 1 - k} {x}"
+                    old = self._vector(f, name, r)
+                    self._put(f, name, r, f.select(active, old + bars[x][k], old))
+
+    def _step_back(self):
+        """From the cotangents of P3 to those of P2, of lanes that are not yet back (`at`)."""
+        f, s = self._function("step_back")
+        active = s.at > 0.5
+        step = f.select((s.begin > 0.5) | ~active, 0.0, s.T3 - s.T2)
+        h, last = self._over(f, step), self.last
+        stages = range(1, last)
+        for i in stages:
+            self._stage_state(f, s, i, "P2", step)
+            self._stage(f, i)
+        setattr(s, "X t", s.T3)
+        with f.each(self.rowcount) as r:
+            for x in "qv":
+                self._put(f, f"X {x}", r, self._vector(f, f"P3 {x}", r))
+        f.call("evaluation", f.given["work"], self._address(f, "C"), self._address(f, f"K{last}"))
+        self._accelerated_back(f, f"K{last}", "B3 a", active)
+        with f.each(self.rowcount) as r:
+            for x in "qv":
+                self._put(f, f"Y {x}", r, self._vector(f, f"B3 {x}", r) + self._vector(f, f"G {x}", r))
+        self._projected_back(f, active)
+        self._collected(f, h, last, range(last), active, first=True)
+        for i in reversed(stages):
+            self._stage_state(f, s, i, "P2", step)
+            self._accelerated_back(f, f"K{i}", f"S{i}", active)
+            self._collected(f, h, i, range(i), active)
+        with f.each(self.rowcount) as r:
+            old = self._vector(f, "B2 a", r)
+            self._put(f, "B2 a", r, f.select(active, old + self._vector(f, "S0", r), old))
+
+    def _collected(self, f: Function, h: Value, i: int, stages: Sequence[int], active: Value, first: bool = False):
+        """The cotangents G of the state of stage i, to those of the point before and of the stages that it is made of."""
+        method, zero = self.method, f.const(0.0, DOUBLE, self.plan.vector)
+        with f.each(self.rowcount) as r:
+            of_q, of_v = (self._vector(f, f"G {x}", r) for x in "qv")
+            hq = h * of_q
+            for x, more in (("q", of_q), ("v", f.fma(hq, float(method.nodes[i]), of_v))):
+                old = self._vector(f, f"B2 {x}", r)
+                self._put(f, f"B2 {x}", r, f.select(active, old + more, old))
+            hhq, hv = h * hq, h * of_v
+            for j in stages:
+                a2, a = float(method.q[i][j]), float(method.v[i][j])
+                total = zero if first else self._vector(f, f"S{j}", r)
+                total = f.fma(hhq, a2, total) if a2 else total
+                total = f.fma(hv, a, total) if a else total
+                if first or a2 or a:
+                    self._put(f, f"S{j}", r, total)
+
+    def _walk(self):
+        """Walk back all members that are `ready`, and write the cotangents of what they began with."""
+        f, s = self._function("walk", [(POINTER, "work"), (POINTER, "call")])
+        n, call, yes = self.n, f.given["call"], f.const(1.0, DOUBLE, f.width)
+        times = f.load(call, self.call.index("times"), base=INT)
+        s.at = f.select(s.ready > 0.5, s.points - 1.0, 0.0)
+        zeros = [f"B{k} {x}" for k in range(POINTS) for x in "qva"] + [f"M{k}" for k in range(3 * POINTS)]
+        for names, length in ((zeros, n), (["cbar"], self.count)):
+            with f.each(length) as i:
+                for name in names:
+                    f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], i * f.width + self._start(name, "work"), f.width)
+
+        def given(k: Value, number: Value, to: str):
+            """The cotangents of an output of lane k are added to arrays of coordinates."""
+            member = self._lane(f, "member", k)
+            bars = f.at(self._of_member(f, call, "ysbar", member), number * (2 * n))
+            more(k, bars, to)
+
+        def more(k: Value, bars: Value, to: str):
+            for x, offset in (("q", 0), ("v", n)):
+                with f.each(n) as i:
+                    place = i * f.width + k + self._start(f"{to} {x}", "work")
+                    total = f.load(f.given["work"], place) + f.load(bars, i + offset)
+                    f.store(total, f.given["work"], place)
+
+        for k in self._each_marked(f, s.ready > 0.5):
+            more(k, self._of_member(f, call, "endbar", self._lane(f, "member", k)), "B3")
+            with f.if_(self._lane(f, "code", k).is_(float(DONE))):
+                given(k, times - 1, "B3")
+            for j in range(POINTS):
+                self._recalled(f, k, self._lane(f, "at", k) - float(POINTS - 1 - j), f"P{j}")
+            self._head(f, k)
+
+        def due() -> Value:
+            s.due = f.select((s.at > 0.5) & (s.written > s.before), yes, 0.0)
+            return f.any_of(s.due > 0.5)
+
+        with f.while_(lambda: f.any_of(s.at > 0.5)):
+            s.any = f.const(0.0, DOUBLE, f.width)
+            with f.while_(due):
+                s.any = yes
+                with f.each(n) as i:
+                    for x in "qv":
+                        place = i * f.width + self._start(f"Y {x}", "work")
+                        f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], place, f.width)
+                for k in self._each_marked(f, s.due > 0.5):
+                    number, member = self._whole(f, self._lane(f, "written", k)), self._lane(f, "member", k)
+                    self._put_lane(f, "next", k, self._input(f, call, "ts", member, number))
+                    given(k, number, "Y")
+                    rows = (self._whole(f, member) * times + number) * (2 * n)
+                    state = f.at(f.load(call, self.call.index("ys"), base=POINTER), rows)
+                    for x, offset in (("q", 0), ("v", n)):
+                        with f.each(n) as i:
+                            place = i * f.width + k + self._start(f"X {x}", "work")
+                            f.store(f.load(state, i + offset), f.given["work"], place)
+                setattr(s, "X t", s.next)
+                mask = s.due > 0.5
+                self._projected_back(f, mask)
+                ahead = [self._over(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
+                with f.each(self.rowcount) as r:
+                    of_q, of_v = (self._vector(f, f"G {x}", r) for x in "qv")
+                    # q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the products pi_k of differences of times.
+                    one, slope = f.const(1.0, DOUBLE, self.plan.vector), f.const(0.0, DOUBLE, self.plan.vector)
+                    for k in range(3 * POINTS):
+                        old = self._vector(f, f"M{k}", r)
+                        self._put(f, f"M{k}", r, f.select(mask, f.fma(one, of_q, f.fma(slope, of_v, old)), old))
+                        slope = f.fma(slope, ahead[k // 3], one)
+                        one = one * ahead[k // 3]
+                s.where(mask, written=s.written - 1.0)
+            with f.if_(f.any_of(s.any > 0.5)):
+                f.call("differences_back", f.given["work"])
+            f.call("step_back", f.given["work"])
+            active = s.at > 0.5
+            with f.each(self.rowcount) as r:
+                for name in "BP":
+                    for k in reversed(range(POINTS)):
+                        for x in "qva":
+                            old = self._vector(f, f"{name}{k} {x}", r)
+                            if k or name == "B":
+                                zero = f.const(0.0, DOUBLE, self.plan.vector)
+                                new = self._vector(f, f"{name}{k - 1} {x}", r) if k else zero
+                                self._put(f, f"{name}{k} {x}", r, f.select(active, new, old))
+            for k in reversed(range(1, POINTS)):
+                s.where(active, **{f"T{k}": getattr(s, f"T{k - 1}")})
+            s.where(active, at=s.at - 1.0)
+            for k in self._each_marked(f, active):
+                self._recalled(f, k, self._lane(f, "at", k) - float(POINTS - 1), "P0")
+                self._head(f, k)
+        # What is left is that of the first state as it was given, which is the first output, too.
+        for k in self._each_marked(f, s.ready > 0.5):
+            given(k, f.const(0, INT), "B3")
+            number = self._whole(f, self._lane(f, "member", k))
+            for name, place, length in (("cbar", "cbar", self.count), ("qbar", "B3 q", n), ("vbar", "B3 v", n)):
+                to = f.at(f.load(call, self.call.index(name), base=POINTER), number * length)
+                with f.each(length) as i:
+                    f.store(f.load(f.given["work"], i * f.width + k + self._start(place, "work")), to, i)
+            f.line(f"call void @free(ptr {self._lane(f, 'record', k, POINTER).name})")
+        s.ready = f.const(0.0, DOUBLE, f.width)
+
+    def _head(self, f: Function, k: Value):
+        """What is noted of the step that led to the point where lane k is."""
+        row = f.at(self._lane(f, "record", k, POINTER), self._whole(f, self._lane(f, "at", k)) * self.row)
+        self._put_lane(f, "before", k, f.load(row, 1))
+        self._put_lane(f, "begin", k, f.load(row, 2))
+
+    def _ended(self, f: Function, s: Lane):
+        s.where(s.due > 0.5, ready=1.0)
+
+    def _next(self, f: Function, s: Lane, fill):
+        with f.if_(~f.any_of(s.active > 0.5)):
+            f.call("walk", f.given["work"], f.given["call"])
+            fill()
