@@ -29,11 +29,9 @@ from udkjax.straightline import Loop, Program
 FEW = 20  # coordinates: up to so many, `finish` has not too many results for a fusion of lanes (straightline/fusion.py)
 # Steps with care begin on the constraint manifold, unless states are not projected, and only those beside singular configurations
 # take it. Rows that count as redundant there and are not leave what they hold back in velocities, as large as the threshold, and
-# rounding errors are as large as a unit over its square: both are least at the third root of a unit, 6e-6. With this many times
-# the `rank_tol` the threshold of Varga's method is about that: it compares diagonal entries of R, which are larger than singular
-# values, with the largest norm of a column, which is less than the largest of them. With 3, linkages that turn back in singular
-# configurations take up to a quarter less steps, but Peaucellier's may cross with errors of 1e-5 in its energy, at any tolerance;
-# with 0.03 they take up to two fifths more.
+# rounding errors are as large as a unit over its square: both are least at some third root of a unit. With three times more,
+# linkages that turn back in singular configurations take up to a quarter less steps, but Peaucellier's may cross with errors of
+# 1e-5 in its energy, at any tolerance; with three times less they take up to two fifths more.
 WITH_CARE = 0.2
 
 

@@ -17,8 +17,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
 from udkjax.equations.code import Code
-from udkjax.equations.programs import Equations
-from udkjax.equations.scales import RANK_TOL
+from udkjax.equations.programs import WITH_CARE, Equations
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.tableau import Method, is_explicit, method_of
 from udkjax.native import machine
@@ -30,9 +29,6 @@ from udkjax.native.walk import Reverse
 from udkjax.pinv import Auto
 
 FEW = 2  # members up to which one follows another: eight lanes take as long as two members
-# Rows that count as redundant where a step is taken with care, and are not, leave what they hold back in velocities, as large as
-# the threshold, and rounding errors are as large as a unit over its square: both are least at the third root of a unit.
-CARE_TOL = np.finfo(float).eps ** (1 / 3)
 
 
 class Kind(NamedTuple):
@@ -274,11 +270,11 @@ def _inputs(problem: Problem, code: Code | None = None) -> list[Array]:
     textbook = problem.equations.textbook
     method, baumgarte = textbook.method, textbook.baumgarte
     gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
-    care = method.rank_tol * (CARE_TOL / RANK_TOL)
     thresholds = [method.branch_tol] if isinstance(method, Auto) else [method.rank_tol**2]
     if code is not None and code.elimination == "watch":
-        thresholds = [care**2, *thresholds]
+        thresholds = [(WITH_CARE * method.rank_tol) ** 2, *thresholds]
     first = 0.0 if problem.h is None else problem.h
+    care = WITH_CARE * method.rank_tol
     settings = [problem.rtol, problem.atol, problem.smallest, first, problem.length, problem.rate, care, problem.max_steps]
     given = {
         "numbers": _vector([*jax.tree.leaves(textbook.mechanism), *gains, *thresholds]),

@@ -812,7 +812,8 @@ class Trajectory:
                 yield tuple(f.load(table, e * 4 + j, base=INT) for j in range(4))
 
         # x = D^+ right of one lane, with the rows weighted.
-        f, s = self._function("solve", [(POINTER, "work"), (INT, "lane"), (POINTER, "right"), (POINTER, "x")])
+        arguments = [(POINTER, "work"), (INT, "lane"), (POINTER, "right"), (POINTER, "x"), (DOUBLE, "tol")]
+        f, s = self._function("solve", arguments)
         k, right = f.given["lane"], f.given["right"]
         D, b = (Value(f, f.reserve(DOUBLE, c), POINTER) for c in (m * n, m))
         with f.each(m * n) as i:
@@ -823,7 +824,7 @@ class Trajectory:
         for row, column, slot, sign in entries(f):
             weight = length / number(f, "rows", k, row)
             f.store(number(f, "R", k, slot) * weight * sign, D, row * n + column)
-        f.call(LEAST_NORM, D, b, f.given["x"], *(f.const(c, INT) for c in (m, n)), f.lane(s.care, k))
+        f.call(LEAST_NORM, D, b, f.given["x"], *(f.const(c, INT) for c in (m, n)), f.given["tol"])
 
         def each_lane(f: Function, mask: Value) -> Any:
             marked = f.select(mask, one(f), 0.0)
@@ -835,7 +836,7 @@ class Trajectory:
             """`x` of a lane, with D and what else is in R of the state in X."""
             with f.each(m) as i:
                 f.store(values(i), right, i)
-            f.call("solve", f.given["work"], k, right, x)
+            f.call("solve", f.given["work"], k, right, x, number(f, "care", k, 0))
 
         def root(f: Function, k: Value, i: Value) -> Value:
             return number(f, "R", k, i + (slots + m + n))
@@ -889,7 +890,7 @@ class Trajectory:
                 for row, column, slot, sign in entries(f):
                     part = number(f, "R", k, slot) * sign * number(f, f"X {d}", k, column) / root(f, k, column)
                     f.store(f.load(right, row) + part, right, row)
-                f.call("solve", f.given["work"], k, right, x)
+                f.call("solve", f.given["work"], k, right, x, f.const(np.sqrt(NOTHING_LEFT)))
                 with f.each(n) as i:
                     put(f, f"O {d}", k, i, number(f, f"X {d}", k, i) - root(f, k, i) * f.load(x, i))
 
