@@ -210,13 +210,15 @@ def prepare(
     large: bool | None = None,
     moving: Sequence[bool] = (),
     analysis: Analysis | None = None,
+    evaluated: bool = True,
 ) -> Any:
     """Prepare a mechanism for a method (default `Auto`). Its numbers may be traced; its structure decides what is compiled.
 
     Returns `Equations`, straight-line code, for elimination, `TextbookEquations` for every other method; or of a scene of more
     than `LARGE` elements `LargeEquations`, whose program does not grow with the scene. `large` says which, whatever the size.
     `moving` says of each leaf of the mechanism whether it is traced where all begins: of the others XLA may know the numbers,
-    though they are traced here. Without it none is taken to be. `analysis` is that of `analyse`, by default made here.
+    though they are traced here. Without it none is taken to be. `analysis` is that of `analyse`, by default made here. What is not
+    `evaluated` lacks its constants: it is for whoever has code that computes them.
 
     A method without a `rank_tol` gets `rank_tolerance`. Without knowledge of which rows are redundant (a mechanism that was built
     from traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.
@@ -240,10 +242,13 @@ def prepare(
         chosen = chosen.rank_revealing if isinstance(chosen, Auto) else chosen
         return TextbookEquations(mechanism=mechanism, method=chosen, baumgarte=baumgarte, scales=analysis.scales)
     programs = code(mechanism, redundant or (), baumgarte is not None, elimination)
-    leaves = jax.tree.leaves(mechanism)
-    numbers = [*scalars(leaves), *gains, drop]
-    moves = [move for leaf, move in zip(leaves, moving or [False] * len(leaves), strict=True) for _ in range(np.size(leaf))]
-    constants = [jnp.asarray(c) for c in programs.prologue.early(numbers, [*moves, *[False] * (len(numbers) - len(moves))])]
+    constants = []
+    if evaluated:
+        leaves = jax.tree.leaves(mechanism)
+        numbers = [*scalars(leaves), *gains, drop]
+        moves = [move for leaf, move in zip(leaves, moving or [False] * len(leaves), strict=True) for _ in range(np.size(leaf))]
+        found = programs.prologue.early(numbers, [*moves, *[False] * (len(numbers) - len(moves))])
+        constants = [jnp.asarray(c) for c in found]
     textbook = TextbookEquations(
         mechanism=mechanism, method=chosen, baumgarte=baumgarte, scales=analysis.scales, redundant=redundant or ()
     )

@@ -37,15 +37,16 @@ def equations_of(
     formulation: Formulation | None = None,
     moving: Sequence[bool] = (),
     analysis: Analysis | None = None,
+    evaluated: bool = True,
 ) -> Motion:
     """Prepare the equations of motion of whatever has some, by the Udwadia-Kalaba equation or another formulation.
 
-    `moving` and `analysis` are those of `prepare`.
+    `moving`, `analysis` and `evaluated` are those of `prepare`.
     """
     if isinstance(system, ConstrainedSystem):
         equations = prepare_general(system, method, baumgarte)
     else:
-        equations = prepare(system, method, baumgarte, moving=moving, analysis=analysis)
+        equations = prepare(system, method, baumgarte, moving=moving, analysis=analysis, evaluated=evaluated)
     return equations if formulation is None else formulation.of(equations)
 
 

@@ -18,7 +18,6 @@ AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one lo
 class Run(eqx.Module):
     """A run as the integrator leaves it."""
 
-    equations: Any
     raw: Raw
     ts: Float[Array, "T"]
     closed: Bool[Array, ""]
@@ -26,17 +25,17 @@ class Run(eqx.Module):
     drift_tol: Float[Array, ""]
 
 
-def outcome(run: Run) -> tuple[Array, Array, Bool[Array, "T"]]:
+def outcome(run: Run, xp: Any = jnp) -> tuple[Array, Array, Bool[Array, "T"]]:
     """Return the `Result`, the time (s) that belongs to it, and which of the output times count."""
-    code = jnp.where(run.raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
-    code = jnp.where(run.raw.status == NOT_FINITE, Result.not_finite, code)
-    code = jnp.where(run.raw.status == DONE, Result.successful, code)
-    code, time, reached = _drift(run, code)
-    first = jnp.arange(len(run.ts)) == 0
-    code = jnp.where(run.missed, Result.drift, code)
-    code = jnp.where(run.closed, code, Result.could_not_assemble)
+    code = xp.where(run.raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
+    code = xp.where(run.raw.status == NOT_FINITE, Result.not_finite, code)
+    code = xp.where(run.raw.status == DONE, Result.successful, code)
+    code, time, reached = _drift(run, code, xp)
+    first = xp.arange(len(run.ts)) == 0
+    code = xp.where(run.missed, Result.drift, code)
+    code = xp.where(run.closed, code, Result.could_not_assemble)
     started = run.closed & ~run.missed
-    return code, jnp.where(started, time, run.ts[0]), reached & (started | first)
+    return code, xp.where(started, time, run.ts[0]), reached & (started | first)
 
 
 def stopped(equations: Motion, span: Array, status: Array, t: Array, y: Array) -> Array:
@@ -54,20 +53,20 @@ def stopped(equations: Motion, span: Array, status: Array, t: Array, y: Array) -
     return jnp.where((status == STEP_TOO_SMALL) & ~is_finite, NOT_FINITE, status)
 
 
-def _drift(run: Run, code: Array) -> tuple[Array, Array, Bool[Array, "T"]]:
+def _drift(run: Run, code: Array, xp: Any) -> tuple[Array, Array, Bool[Array, "T"]]:
     """The first output time at which a row of Psi is violated, also one that the method leaves out, ends the solution."""
     lost = run.raw.reached & ~(run.raw.violation <= run.drift_tol)
-    drifted, first = jnp.any(lost), jnp.argmax(lost)
-    reached = run.raw.reached & (~drifted | (jnp.arange(len(run.ts)) <= first))
-    return jnp.where(drifted, Result.drift, code), jnp.where(drifted, run.ts[first], run.raw.t), reached
+    drifted, first = xp.any(lost), xp.argmax(lost)
+    reached = run.raw.reached & (~drifted | (xp.arange(len(run.ts)) <= first))
+    return xp.where(drifted, Result.drift, code), xp.where(drifted, run.ts[first], run.raw.t), reached
 
 
-def counts(raw: Raw, projected: bool, outputs: int) -> dict[str, Any]:
+def counts(raw: Raw, projected: bool, outputs: int, xp: Any = jnp) -> dict[str, Any]:
     """Count steps and what follows from them; right-hand sides are -1 where they are not known."""
     return {
         "steps": raw.tried,
         "accepted": raw.accepted,
         "rejected": raw.tried - raw.accepted,
         "right_hand_sides": raw.evaluations,
-        "projections": raw.tried + 2 * (outputs - 1) if projected else jnp.zeros_like(raw.tried),
+        "projections": raw.tried + 2 * (outputs - 1) if projected else xp.zeros_like(raw.tried),
     }

@@ -1,12 +1,11 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
-import gc
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,16 +19,14 @@ from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.partitioning import Partitioned
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.batched import one_by_one
 from udkjax.integrate.derivatives import differentiable
-from udkjax.integrate.lanes import serves, solve
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.pieces import pieces_of
-from udkjax.integrate.problem import DOUBTED, Problem, Raw
+from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import Result, SimulationError, Solution
 from udkjax.integrate.undifferentiated import undifferentiated
-from udkjax.kept import Kept
+from udkjax.native.engine import known, unserved
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -62,6 +59,7 @@ def simulate(
     throw: bool = True,
     progress: Any = None,
     analysis: Analysis | None = None,
+    engine: Literal["auto", "native", "diffrax"] = "auto",
 ) -> Solution:
     """Integrate the motion of a mechanism; return its states at the times `ts` (T,), in s. The motion starts at ts[0].
 
@@ -80,9 +78,10 @@ def simulate(
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. It has derivatives of any order, forward and reverse; those beyond the first take the time of a hundred runs and
-    minutes to compile. Explicit Runge-Kutta methods are integrated by an engine of our own, under vmap in lanes that step each on
-    its own; every other solver, an `adjoint` of diffrax other than `ForwardMode` and a progress meter by `diffrax.diffeqsolve`,
-    with the derivatives of that.
+    minutes to compile. There are two engines. "native" is machine code made of the scene's expressions, on the CPU: explicit
+    Runge-Kutta methods with elimination, under vmap in lanes that step each on its own. "diffrax" is `diffrax.diffeqsolve`: every
+    solver, adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` says which it was,
+    and why.
 
     A run that does not reach its end raises `SimulationError`, which carries the solution; with `throw=False`, or when numbers
     are traced, `Solution.result` tells instead. A violation of Psi above `drift_tol` (of L, or rad) at an output time ends the
@@ -96,29 +95,24 @@ def simulate(
     settings = (number(rtol), number(atol), method, stabilization, drift, _step(dt0), formulation)
     choices = (solver, adjoint, max_steps, _meter(progress))
 
-    def run(analysis: Analysis | None, fallback: bool) -> tuple[Solution, Any, Any]:
-        with _uncollected():
-            return _simulate(bare, analysis, ts, state, closure, *settings, *choices, fallback, moving)
-
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
     bare: Any = mechanism
     if isinstance(mechanism, Mechanism):
         analysis, bare = analyse(mechanism) if analysis is None else analysis, mechanism.bare
         if state is None and closure is None:
-            closure = close(mechanism, start, forward=adjoint is not None and _by_jax(adjoint), analysis=analysis)
+            closure = close(mechanism, start, analysis=analysis)
     moves = [isinstance(x, Tracer) for x in jax.tree.leaves(mechanism)]
     moving = tuple(moves) if any(moves) else ()
-    traced = bool(moving) or any(isinstance(x, Tracer) for x in jax.tree.leaves((ts, state, closure, settings)))
-    solution, missed, doubted = run(analysis, fallback=traced)
-    if isinstance(solution.code, Tracer):  # the times, or something around, are traced after all
-        return solution if traced else run(analysis, fallback=True)[0]
-    if doubted:  # few runs meet what elimination cannot solve: only these compile what can
-        solution, missed, _ = run(analysis, fallback=True)
-    if (
-        isinstance(mechanism, Mechanism) and missed and mechanism.is_known
-    ):  # an analysis of other numbers, in which a row depended
-        solution, *_ = run(analyse(mechanism), fallback=True)
+
+    def run(analysis: Analysis | None) -> tuple[Solution, Any]:
+        return _run(bare, analysis, ts, state, closure, *settings, *choices, moving, engine)
+
+    solution, missed = run(analysis)
+    if isinstance(solution.code, Tracer):
+        return solution
+    if isinstance(mechanism, Mechanism) and missed and mechanism.is_known:
+        solution, _ = run(analyse(mechanism))  # the analysis was of other numbers, in which a row depended
     if throw and isinstance(mechanism, Mechanism) and closure is not None:
         require_closed(mechanism, closure)
     if throw and solution.result != Result.successful:
@@ -126,8 +120,21 @@ def simulate(
     return solution
 
 
-@Kept
+def _run(mechanism, analysis, ts, state, closure, *settings):
+    """Return the solution, and whether it takes rows that the method leaves out.
+
+    Machine code is called at once where all numbers are known, by NumPy; everything else is traced.
+    """
+    given = (mechanism, analysis, ts, state, closure, *settings)
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(given)):
+        return _simulate(jnp, *given)
+    with jax.ensure_compile_time_eval():  # while something else is traced
+        known = _simulate(np, *given)
+    return _compiled(*given) if known is None else known
+
+
 def _simulate(
+    xp,
     mechanism,
     analysis,
     ts,
@@ -144,60 +151,72 @@ def _simulate(
     adjoint,
     max_steps,
     meter,
-    fallback,
     moving,
+    engine,
 ):
-    """Return the solution, whether it takes rows that the method leaves out, and whether it wants a fallback not there."""
+    """As `_run`; by NumPy, None where the numbers are known, but not to machine code."""
+    if xp is np:
+        ts, rtol, atol, drift_tol = (np.asarray(x) for x in (ts, rtol, atol, drift_tol))
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
-    equations = equations_of(mechanism, method, baumgarte, formulation, moving, analysis)
+    equations = equations_of(mechanism, method, baumgarte, formulation, moving, analysis, evaluated=xp is jnp)
     projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, Partitioned))
-    start, closed, missed = _start(equations, state, closure)
+    start, closed, missed = _start(equations, state, closure, xp)
     # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
-    loose_rtol, loose_atol = (jnp.where(closed, tol, 1e3) for tol in (rtol, atol))
-    ulp = jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    q, v = start.q.ravel(), start.v.ravel()
-    numbers = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v))
-    problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, fallback=fallback)
+    loose_rtol, loose_atol = (xp.where(closed, tol, 1e3) for tol in (rtol, atol))
+    ulp = np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1]))
+    q, v = xp.ravel(xp.asarray(start.q)), xp.ravel(xp.asarray(start.v))
+    numbers = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v, xp))
+    problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps)
     problem = replace(problem, breakpoints=mechanism.breakpoints, pieces=pieces_of(mechanism))
-    if meter is None and _by_jax(adjoint):
-        single = partial(_by_diffrax, adjoint=adjoint, meter=None)
-        integrate = solve if serves(problem) else partial(one_by_one, single=single)
-        raw = integrate(problem) if adjoint else differentiable(problem)
+    why = unserved(problem, adjoint, meter)
+    if engine == "native" and why:
+        raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
+    native = engine != "diffrax" and not why
+    if xp is np and not native:
+        return None
+    if not native:
+        why = why if engine != "diffrax" else "it was asked for"
+        raw = by_diffrax(problem, adjoint, meter)
     else:
-        raw = _by_diffrax(problem, adjoint, meter)
-    later = (raw.reached & (jnp.arange(len(ts)) > 0))[:, None]
-    q, v = jnp.where(later, raw.q, q), jnp.where(later, raw.v, v)
-    seen = undifferentiated(Run(equations, raw, ts, closed, missed, drift_tol))
-    code, time, reached = outcome(seen)
-    q, v = (jnp.where(reached[:, None], y, jnp.nan).reshape(-1, *start.q.shape) for y in (q, v))
-    stats = counts(raw, projected, len(ts))
-    settings = (
+        raw = known(problem) if xp is np else differentiable(problem)
+    later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
+    q, v = xp.where(later, raw.q, q), xp.where(later, raw.v, v)
+    seen = Run(raw, ts, closed, missed, drift_tol)
+    code, time, reached = outcome(seen if xp is np else undifferentiated(seen), xp)
+    q, v = (xp.where(reached[:, None], y, xp.nan).reshape(-1, *np.shape(start.q)) for y in (q, v))
+    stats = counts(raw, projected, len(ts), xp)
+    chosen = (
         ("method", type(method).__name__),
         ("formulation", "UdwadiaKalaba" if formulation is None else type(formulation).__name__),
         ("stabilization", type(stabilization).__name__),
         ("solver", "Dopri8" if solver is None else type(solver).__name__),
         ("max_steps", str(max_steps)),
         ("first_step", "chosen" if dt0 is None else "given"),
+        ("engine", "native" if native else f"diffrax: {why}"),
     )
-    names = getattr(mechanism, "body_names", ())
-    return Solution(ts, q, v, code, time, stats, rtol, atol, names, settings), missed, raw.status == DOUBTED
+    arrays = jax.tree.map(jnp.asarray, (ts, q, v, code, time, stats, rtol, atol))
+    return Solution(*arrays, getattr(mechanism, "body_names", ()), chosen), missed
 
 
-def _start(equations: Any, state: State | None, closure: Closure | None) -> tuple[State, Any, Any]:
+_compiled = eqx.filter_jit(partial(_simulate, jnp))
+
+
+def _start(equations: Any, state: State | None, closure: Closure | None, xp: Any) -> tuple[State, Any, Any]:
     """The initial state; whether it is closed; whether that takes rows left out as redundant."""
     if state is not None:
-        return state, jnp.array(True), jnp.array(False)
+        return state, xp.array(True), xp.array(False)
     assert closure is not None
-    closed, kept = jnp.asarray(closure.is_closed), len(closure.psi) - len(equations.left_out)
+    closed, kept = xp.asarray(closure.is_closed), len(closure.psi) - len(equations.left_out)
     return closure.state, closed, closed & (closure.rank > kept)
 
 
-def _units(analysis: Analysis | None, ts: Array, v: Array) -> tuple[Array | None, Array]:
+def _units(analysis: Analysis | None, ts: Array, v: Array, xp: Any) -> tuple[Array | None, Array]:
     """The length and the rate that `atol` is relative to."""
     if analysis is None:
-        return None, jnp.ones(())
-    scales = analysis.scales
-    return undifferentiated((scales.length, jnp.maximum(jnp.maximum(scales.rate, scales.size(v)), 1 / (ts[-1] - ts[0]))))
+        return None, xp.ones(())
+    scales = analysis.scales if xp is jnp else jax.tree.map(np.asarray, analysis.scales)
+    units = scales.length, xp.maximum(xp.maximum(scales.rate, scales.size(v, xp)), 1 / (ts[-1] - ts[0]))
+    return units if xp is np else undifferentiated(units)
 
 
 def _times(ts: ArrayLike | Sequence[float]) -> Float[Array, "T"]:
@@ -220,38 +239,11 @@ def _step(dt0: ArrayLike | None) -> Array | None:
     return dt0
 
 
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """Keep Python from looking for garbage meanwhile.
-
-    What is traced and compiled makes a hundred thousand objects that stay: each collection would look at them, and at all of JAX,
-    again, which takes a tenth of the time of a first run.
-    """
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collecting:
-            gc.enable()
-
-
-# diffrax is imported where it is asked for: it takes as long as all of JAX.
-
-
-def _by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Raw:
+def by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
+    """As in by_diffrax.py: diffrax is imported where it is asked for, since that takes as long as all of JAX."""
     from udkjax.integrate.by_diffrax import by_diffrax
 
     return by_diffrax(problem, adjoint, meter)
-
-
-def _by_jax(adjoint: Any) -> bool:
-    """Whether derivatives are taken by JAX, through any integrator, and not by an adjoint of diffrax, through its own."""
-    if adjoint is None:
-        return True
-    import diffrax
-
-    return type(adjoint) is diffrax.ForwardMode
 
 
 def _meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":

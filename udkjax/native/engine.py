@@ -20,6 +20,7 @@ from udkjax.equations.code import Code
 from udkjax.equations.programs import WITH_CARE, Equations
 from udkjax.integrate.problem import DONE, Problem, Raw
 from udkjax.integrate.tableau import Method, is_explicit, method_of
+from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.native import machine
 from udkjax.native.ffi import handler
 from udkjax.native.program import UnsupportedError
@@ -176,18 +177,39 @@ mlir.register_lowering(native_p, mlir.lower_fun(_compiled_into), platform="cpu")
 # --- problems
 
 
-def serves(problem: Problem) -> bool:
-    """Whether machine code can integrate a problem: one of scalar expressions, by an explicit Runge-Kutta method, on the CPU."""
+def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
+    """Why machine code cannot integrate a problem; empty where it can."""
     equations = problem.equations
-    if type(equations) is not Equations or problem.pieces is not None or problem.length is None:
-        return False
-    if not is_explicit(problem.solver) or jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
-        return False
+    if adjoint is not None:
+        return f"{type(adjoint).__name__} is an adjoint of diffrax"
+    if meter is not None:
+        return "a progress meter is diffrax's"
+    if type(equations) is not Equations or problem.length is None:
+        return f"it knows the Udwadia-Kalaba equation of a mechanism by elimination, not {type(equations).__name__}"
+    if not is_explicit(problem.solver):
+        return f"{type(problem.solver).__name__} is no explicit Runge-Kutta method"
+    if problem.pieces is not None:
+        return "an element is smooth in pieces of the state"
+    if jax.default_backend() != "cpu":
+        return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
+    if not jax.config.jax_enable_x64:
+        return "it computes in float64, which JAX is told not to"
     try:
         compiled(_kind(problem), 1)
-    except UnsupportedError:
-        return False
-    return True
+    except UnsupportedError as error:
+        return f"the scene takes {error}, which is no arithmetic on numbers"
+    return ""
+
+
+def serves(problem: Problem) -> bool:
+    """Whether machine code can integrate a problem: one of scalar expressions, by an explicit Runge-Kutta method, on the CPU."""
+    return not unserved(problem)
+
+
+def known(problem: Problem) -> Raw:
+    """Integrate a problem whose numbers are all known, without tracing anything: `Raw` of NumPy's arrays."""
+    kind, inputs = _kind(problem), _inputs(problem, xp=np)
+    return _raw(compiled(kind, 1)(inputs, _shapes(inputs, kind, len(problem.ts))))
 
 
 def solve(problem: Problem) -> Raw:
@@ -265,7 +287,7 @@ def _kind(problem: Problem, moving: tuple[bool, ...] | None = None, mode: str = 
     )
 
 
-def _inputs(problem: Problem, code: Code | None = None) -> list[Array]:
+def _inputs(problem: Problem, code: Code | None = None, xp: Any = jnp) -> list[Any]:
     """Those of a run, of one member."""
     textbook = problem.equations.textbook
     method, baumgarte = textbook.method, textbook.baumgarte
@@ -277,26 +299,27 @@ def _inputs(problem: Problem, code: Code | None = None) -> list[Array]:
     care = WITH_CARE * method.rank_tol
     settings = [problem.rtol, problem.atol, problem.smallest, first, problem.length, problem.rate, care, problem.max_steps]
     given = {
-        "numbers": _vector([*jax.tree.leaves(textbook.mechanism), *gains, *thresholds]),
+        "numbers": _vector([*jax.tree.leaves(textbook.mechanism), *gains, *thresholds], xp),
         "ts": problem.ts,
         "q": problem.q,
         "v": problem.v,
-        "settings": _vector(settings),
+        "settings": _vector(settings, xp),
         "rows": textbook.scales.rows,
-        "breaks": jnp.zeros(0) if problem.breakpoints is None else problem.breakpoints,
+        "breaks": xp.zeros(0) if problem.breakpoints is None else problem.breakpoints,
     }
-    return [jax.lax.stop_gradient(jnp.asarray(given[name], float))[None] for name in INPUTS]
+    arrays = [xp.asarray(given[name], float)[None] for name in INPUTS]
+    return arrays if xp is np else undifferentiated(arrays)
 
 
-def _vector(parts: Sequence[Any]) -> Array:
-    return jnp.concatenate([jnp.ravel(jnp.asarray(x, float)) for x in parts])
+def _vector(parts: Sequence[Any], xp: Any) -> Any:
+    return xp.concatenate([xp.ravel(xp.asarray(x, float)) for x in parts])
 
 
-def _raw(found: Sequence[Array]) -> Raw:
+def _raw(found: Sequence[Any]) -> Raw:
     ys, violation, info = (x[0] for x in found)
-    q, v = jnp.split(ys, 2, axis=1)
+    q, v = ys[:, : ys.shape[1] // 2], ys[:, ys.shape[1] // 2 :]
     code, t, tried, accepted, evaluations, written = (info[k] for k in range(len(INFO)))
-    number = jnp.arange(len(ys))
+    number = np.arange(len(ys))
     reached = (number <= written) & (number < len(ys) - 1) | (code == DONE)
     counts = (x.astype(int) for x in (tried, accepted, evaluations))
     return Raw(q, v, violation, reached, code.astype(int), t, info[len(INFO) :], *counts)
