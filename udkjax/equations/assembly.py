@@ -33,7 +33,7 @@ from udkjax.equations.closing import (
 from udkjax.equations.code import is_large
 from udkjax.equations.programs import prepare_to_close
 from udkjax.equations.redundancy import dependent_constraints
-from udkjax.equations.scales import Scales
+from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -97,17 +97,15 @@ def close(
     mechanism: Mechanism,
     t: ArrayLike = 0.0,
     state: State | None = None,
-    forward: bool = False,
     analysis: Analysis | None = None,
 ) -> Closure:
     """As `assemble`, with the residuals instead of an error.
 
-    Where all numbers are known the closure is, too, also while something else is traced. With `forward` it has derivatives by
-    forward mode only, which take no more steps than closing does.
+    Where all numbers are known the closure is, too, also while something else is traced.
     """
     if not _known((mechanism, t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
-        return _close(mechanism.bare, analysis, t, state, forward)
+        return _close(mechanism.bare, analysis, t, state)
     of, when, found = _latest.get(id(mechanism), (None, 0.0, None))
     if found is not None and state is None and of is not None and of() is mechanism and when == np.asarray(t).item():
         return found
@@ -138,13 +136,32 @@ _latest: dict[int, tuple[Any, float, Closure | None]] = {}
 
 
 @eqx.filter_jit
-def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State | None, forward: bool) -> Closure:
+def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State | None) -> Closure:
+    from udkjax.native import engine
+
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
-    closed = _closed_forward if forward else _closed
-    rows = TracedRows(prepare_to_close(mechanism, analysis=analysis))
-    q, v, psi, psi_dot, rank = rows.assembled(closed, number(t), q, v)
+    close = _by_machine_code if engine.closes(mechanism) else _assembled
+    q, v, psi, psi_dot, rank = close(mechanism, analysis, number(t), q, v)
     return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales)
+
+
+def _assembled(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
+    return TracedRows(prepare_to_close(mechanism, analysis=analysis)).assembled(_closed, t, q, v)
+
+
+@eqx.filter_custom_jvp
+def _by_machine_code(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
+    from udkjax.native import engine
+
+    return engine.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
+
+
+@_by_machine_code.def_jvp
+def _(primals, tangents):
+    found = _by_machine_code(*primals)
+    change = eqx.filter_jvp(_assembled, primals, tangents)[1]
+    return found, (*change[:-1], None)
 
 
 def _known(tree: Any) -> bool:
@@ -215,12 +232,6 @@ def check(mechanism: Mechanism) -> Check:
 @jax.custom_jvp
 def _closed(rows: TracedRows, t: Any, q: Any) -> Any:
     return close_position(rows, t, q)
-
-
-def _closed_forward(rows: TracedRows, t: Any, q: Any) -> Any:
-    """The same; forward mode follows the steps as they are, and one more, which projects the tangent: see `_closed_plain`."""
-    q = close_position(rows, t, q)
-    return q + rows.correction(t, q)
 
 
 def _closed_plain(rows: TracedRows, t: Any, q: Any) -> Any:

@@ -41,7 +41,7 @@ def close_all(
 
     def one(k: Any) -> Closure:
         mechanism, t, state, analysis = jax.tree.map(lambda leaf: leaf[k], (mechanisms, ts, states, analyses))
-        return close(mechanism, t, state, forward=True, analysis=analysis)
+        return close(mechanism, t, state, analysis=analysis)
 
     if analysis.redundant_rows is None or is_large(mechanisms) or not mechanisms.constraints:
         return jax.lax.map(one, jnp.arange(size))

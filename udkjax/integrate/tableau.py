@@ -119,3 +119,5 @@ DOPRI8 = _method(
     _ORDER_8 - _ORDER_7,
     order=8,
 )
+
+EULER = _method(row("0"), (), row("1"), row("1"), order=1)

@@ -16,18 +16,21 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from udkjax.equations.code import Code
+from udkjax.equations.code import Code, code, is_large
 from udkjax.equations.programs import WITH_CARE, Equations
+from udkjax.equations.scales import Scales
 from udkjax.integrate.problem import DONE, Problem, Raw
-from udkjax.integrate.tableau import Method, is_explicit, method_of
+from udkjax.integrate.tableau import EULER, Method, is_explicit, method_of
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.native import machine
+from udkjax.native.closing import Closing
 from udkjax.native.ffi import handler
 from udkjax.native.program import UnsupportedError
 from udkjax.native.tangents import Forward
-from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, Plan, Trajectory
+from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, SETTINGS, Plan, Trajectory
 from udkjax.native.walk import Reverse
 from udkjax.pinv import Auto
+from udkjax.scene.mechanism import Mechanism
 
 FEW = 2  # members up to which one follows another: eight lanes take as long as two members
 
@@ -61,8 +64,12 @@ class Compiled:
     """The machine code of one kind of trajectory, in so many lanes."""
 
     def __init__(self, kind: Kind, width: int):
-        plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
-        self.trajectory = trajectory = MODES[kind.mode](plan, kind.moving) if kind.moving is not None else Trajectory(plan)  # pyright: ignore
+        if kind.mode == "closing":
+            trajectory: Trajectory = Closing(kind.code, machine.lanes())
+        else:
+            plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
+            trajectory = MODES[kind.mode](plan, kind.moving) if kind.moving is not None else Trajectory(plan)  # pyright: ignore
+        self.trajectory = trajectory
         main = handler(trajectory, "call_frame")
         text = "\n".join([trajectory.text(), *sorted(main.declared), main.text()])
         self.name = f"udkjax_{machine.digest(text)}"
@@ -79,8 +86,8 @@ class Compiled:
         for name, x in zip((*INPUTS, *names.inputs), inputs, strict=True):
             fields[name] = x.ctypes.data
             fields[f"{name} stride"] = math.prod(x.shape[1:]) if len(x) > 1 else 0
-        fields |= {name: x.ctypes.data for name, x in zip((*OUTPUTS, *names.outputs), found, strict=True)}
-        members, times = shapes[0][:2]
+        fields |= {name: x.ctypes.data for name, x in zip((*names.results, *names.outputs), found, strict=True)}
+        members, times = shapes[0][0], inputs[INPUTS.index("ts")].shape[1]
         following = ctypes.c_int64(0)
         fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
         fields |= {"directions": inputs[-1].shape[1] if names.along_directions else 0, "next": ctypes.addressof(following)}
@@ -109,6 +116,8 @@ def compiled(kind: Kind, width: int) -> Compiled:
 def _shapes(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, ...]]:
     n = inputs[INPUTS.index("q")].shape[1]
     members = max(x.shape[0] for x in inputs)
+    if kind.mode == "closing":
+        return [(members, 2 * n), (members, 2 * inputs[INPUTS.index("rows")].shape[1]), (members, 1)]
     shapes: list[tuple[int, ...]] = [(members, times, 2 * n), (members, times), (members, len(INFO) + 2 * n)]
     if kind.mode == "forward":
         directions = inputs[-1].shape[1]
@@ -120,7 +129,8 @@ def _shapes(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, ..
 
 
 def _code(inputs: Sequence[Any], kind: Kind) -> Compiled:
-    return compiled(kind, machine.lanes() if max(x.shape[0] for x in inputs) > FEW else 1)
+    few = kind.mode == "closing" or max(x.shape[0] for x in inputs) <= FEW
+    return compiled(kind, 1 if few else machine.lanes())
 
 
 def _at_once(*inputs: Any, kind: Kind, times: int) -> list[Array]:
@@ -172,6 +182,43 @@ native_p.def_impl(_at_once)
 native_p.def_abstract_eval(_abstract)
 batching.primitive_batchers[native_p] = _batched
 mlir.register_lowering(native_p, mlir.lower_fun(_compiled_into), platform="cpu")
+
+
+# --- closing
+
+
+def closes(mechanism: Mechanism) -> bool:
+    """Whether machine code can close a mechanism."""
+    if is_large(mechanism) or jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
+        return False
+    try:
+        compiled(_closing(mechanism), 1)
+    except UnsupportedError:
+        return False
+    return True
+
+
+def closed(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D, from a guess at time t."""
+    kind = _closing(mechanism)
+    settings = {"length": scales.length, "care": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
+    given = {
+        "numbers": _vector([*jax.tree.leaves(mechanism), 0.0], jnp),
+        "ts": _vector([t, t], jnp),
+        "q": q,
+        "v": v,
+        "settings": _vector([settings.get(name, 0.0) for name in SETTINGS], jnp),
+        "rows": scales.rows,
+        "breaks": jnp.zeros(0),
+    }
+    inputs = [jnp.asarray(given[name], float)[None] for name in INPUTS]
+    state, residuals, rank = (x[0] for x in native_p.bind(*undifferentiated(inputs), kind=kind, times=2))
+    n, m = len(q), len(residuals) // 2
+    return state[:n], state[n:], residuals[:m], residuals[m:], rank[0].astype(int)
+
+
+def _closing(mechanism: Mechanism) -> Kind:
+    return Kind(code(mechanism, (), False, None), Tableau(EULER), projected=False, breaks=False, mode="closing")
 
 
 # --- problems

@@ -7,7 +7,7 @@ generated along with the code that it calls: it reads the buffers of the frame a
 from typing import Any
 
 from udkjax.native.ir import INT, POINTER, Function, Value
-from udkjax.native.trajectory import INPUTS, OUTPUTS, Trajectory
+from udkjax.native.trajectory import INPUTS, Trajectory
 
 # Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, and in it the arguments and results, 40 bytes each:
 # size, extensions, count, types, buffers.
@@ -22,7 +22,7 @@ VERSION = (0, 1)
 def handler(trajectory: Trajectory, name: str) -> Function:
     """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions."""
     f, fields = Function(name, [(POINTER, "frame")], returns="ptr"), trajectory.call
-    inputs, outputs = (*INPUTS, *trajectory.inputs), (*OUTPUTS, *trajectory.outputs)
+    inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
     frame = f.given["frame"]
 
     def word(pointer: Value, offset: int, base: str = INT) -> Value:
@@ -50,8 +50,8 @@ def handler(trajectory: Trajectory, name: str) -> Function:
     def dimension(field: str, k: int) -> Value:
         return f.load(word(found[field], DIMS, POINTER), k, base=INT)
 
-    put("members", dimension("ys", 0))
-    put("times", dimension("ys", 1))
+    put("members", dimension(outputs[0], 0))
+    put("times", dimension("ts", 1))
     put("knots", dimension("breaks", 1))
     put("directions", dimension(inputs[-1], 1) if trajectory.along_directions else 0)
     for field in inputs:

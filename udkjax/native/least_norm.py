@@ -14,10 +14,10 @@ ROUNDING = 1e-15  # cosines of angles between rows that are orthogonal but for r
 
 
 def least_norm() -> Function:
-    """`least_norm(D (m, n), b (m), x (n), m, n, tol)`: x = D^+ b. D and b are turned."""
-    arguments = [(POINTER, "D"), (POINTER, "b"), (POINTER, "x"), (INT, "m"), (INT, "n"), (DOUBLE, "tol")]
+    """`least_norm(D (m, n), b (m), x (n), m, n, tol, rank)`: x = D^+ b, and the rank of D. D and b are turned."""
+    arguments = [(POINTER, "D"), (POINTER, "b"), (POINTER, "x"), (INT, "m"), (INT, "n"), (DOUBLE, "tol"), (POINTER, "rank")]
     f = Function(LEAST_NORM, arguments)
-    D, b, x, m, n, tol = (f.given[name] for _, name in arguments)
+    D, b, x, m, n, tol, rank = (f.given[name] for _, name in arguments)
 
     def dot(i: Value, j: Value) -> Value:
         total = f.variable(0.0)
@@ -51,9 +51,11 @@ def least_norm() -> Function:
         longest.value = f.max(dot(i, i), longest.value)
     with f.each(n) as k:
         f.store(0.0, x, k)
+    f.store(0.0, rank)
     with f.each(m) as i:
         square = dot(i, i)
         with f.if_(square > tol * tol * longest.value):
+            f.store(f.load(rank) + 1.0, rank)
             share = f.load(b, i) / square
             with f.each(n) as k:
                 f.store(f.fma(share, f.load(D, i * n + k), f.load(x, k)), x, k)

@@ -102,7 +102,7 @@ _LANE = (  # numbers of each lane; `call` and `ways` are addresses
     *(f"T{k}" for k in range(POINTS)),
     *(f"distance{k}" for k in range(POINTS - 1)),
     *SETTINGS,
-    *("start", "end", "safe", "behind", "violated"),
+    *("start", "end", "safe", "behind", "violated", "rank"),
 )
 
 
@@ -139,6 +139,7 @@ class Trajectory:
     """
 
     inputs: tuple[str, ...] = ()  # besides those of every run
+    results: tuple[str, ...] = OUTPUTS
     outputs: tuple[str, ...] = ()
     along_directions = False  # whether the last inputs and outputs have directions, after the members
 
@@ -146,7 +147,7 @@ class Trajectory:
     def call(self) -> tuple[str, ...]:
         inputs = (*INPUTS, *self.inputs)
         strides = (f"{x} stride" for x in inputs)
-        return "members", "times", "knots", "directions", *inputs, *strides, *OUTPUTS, *self.outputs, "next"
+        return "members", "times", "knots", "directions", *inputs, *strides, *self.results, *self.outputs, "next"
 
     def __init__(self, plan: Plan):
         self.plan, self.code, self.method = plan, plan.code, plan.method
@@ -188,11 +189,15 @@ class Trajectory:
         self._outputs()
         if self.cares:
             self.functions.append(least_norm())
+            self._solve()
             self._care()
         self._begin()
         self._finish()
         self._derivatives()
         self._run()
+        return self._joined()
+
+    def _joined(self) -> str:
         declared = sorted(
             set().union(*(f.declared for f in self.functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
         )
@@ -254,17 +259,19 @@ class Trajectory:
             "rows": self._work("R", len(code.outputs["rows"])),
             "psi_dot": self._work("psi", self.m),
         }
-        wanted = ["accelerations", "rows", "psi"]
-        if self.plan.projected:
-            wanted += ["closer", "arrival", "tangential"] if self.method.ends else ["closer", "finish"]
-            wanted += ["output"]
-        if self.cares:
-            wanted += ["psi_dot"]
-        for name in dict.fromkeys(wanted):
+        for name in self._wanted():
             inputs = [*state, *changes] if name in ("tangential", "finish") else state
             self._write(code.program(name), name, ("work", "out"), inputs, outputs[name])
         inputs = _numbered("work", len(code.prologue.inputs))
         self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, _numbered("out", self.constants)))
+
+    def _wanted(self) -> list[str]:
+        """The programs that it calls."""
+        wanted = ["accelerations", "rows", "psi"]
+        if self.plan.projected:
+            wanted += ["closer", "arrival", "tangential"] if self.method.ends else ["closer", "finish"]
+            wanted += ["output"]
+        return wanted + (["psi_dot"] if self.cares else [])
 
     def _write(self, program: Program, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]):
         self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs))
@@ -793,38 +800,43 @@ class Trajectory:
 
     # --- with care
 
-    def _care(self):
-        """What a rank-revealing method on all rows finds, of lanes that want care, one after the other."""
-        code, p, n, m, width = self.code, self.places, self.n, self.m, self.plan.width
-        slots, one = code.pattern.slots, lambda f: f.const(1.0, DOUBLE, width)
-        table = [x for e in code.pattern.entries for x in (e.row, e.column, e.slot, e.sign)]
+    def _number(self, f: Function, name: str, k: Value, i: Any) -> Value:
+        """The i-th number of an array, of lane k."""
+        return f.load(f.given["work"], f.like(i, INT, 1) * f.width + self.places[name] * f.width + k)
+
+    def _entries(self, f: Function) -> Any:
+        """What is done for every entry of D: its row, column, place among the values, and sign."""
+        table = Value(f, "@entries", POINTER)
+        with f.each(len(self.code.pattern.entries)) as e:
+            yield tuple(f.load(table, e * 4 + j, base=INT) for j in range(4))
+
+    def _solve(self):
+        """`solve`: x = D^+ right of one lane, with the rows weighted; D is that of R."""
+        n, m = self.n, self.m
+        table = [x for e in self.code.pattern.entries for x in (e.row, e.column, e.slot, e.sign)]
         self.globals.append(f"@entries = private constant [{len(table)} x i64] [{', '.join(f'i64 {x}' for x in table)}]")
-
-        def number(f: Function, name: str, k: Value, i: Any) -> Value:
-            return f.load(f.given["work"], f.like(i, INT, 1) * width + p[name] * width + k)
-
-        def put(f: Function, name: str, k: Value, i: Value, x: Value):
-            f.store(x, f.given["work"], (i + p[name]) * width + k)
-
-        def entries(f: Function) -> Any:
-            table = Value(f, "@entries", POINTER)
-            with f.each(len(code.pattern.entries)) as e:
-                yield tuple(f.load(table, e * 4 + j, base=INT) for j in range(4))
-
-        # x = D^+ right of one lane, with the rows weighted.
         arguments = [(POINTER, "work"), (INT, "lane"), (POINTER, "right"), (POINTER, "x"), (DOUBLE, "tol")]
         f, s = self._function("solve", arguments)
         k, right = f.given["lane"], f.given["right"]
-        D, b = (Value(f, f.reserve(DOUBLE, c), POINTER) for c in (m * n, m))
+        D, b = (Value(f, f.reserve(DOUBLE, max(c, 1)), POINTER) for c in (m * n, m))
         with f.each(m * n) as i:
             f.store(0.0, D, i)
         length = f.lane(s.length, k)
         with f.each(m) as i:
-            f.store(f.load(right, i) * length / number(f, "rows", k, i), b, i)
-        for row, column, slot, sign in entries(f):
-            weight = length / number(f, "rows", k, row)
-            f.store(number(f, "R", k, slot) * weight * sign, D, row * n + column)
-        f.call(LEAST_NORM, D, b, f.given["x"], *(f.const(c, INT) for c in (m, n)), f.given["tol"])
+            f.store(f.load(right, i) * length / self._number(f, "rows", k, i), b, i)
+        for row, column, slot, sign in self._entries(f):
+            weight = length / self._number(f, "rows", k, row)
+            f.store(self._number(f, "R", k, slot) * weight * sign, D, row * n + column)
+        rank = f.at(f.given["work"], k + self.places["rank"] * f.width)
+        f.call(LEAST_NORM, D, b, f.given["x"], *(f.const(c, INT) for c in (m, n)), f.given["tol"], rank)
+
+    def _care(self):
+        """What a rank-revealing method on all rows finds, of lanes that want care, one after the other."""
+        code, p, n, m, width = self.code, self.places, self.n, self.m, self.plan.width
+        slots, number, one = code.pattern.slots, self._number, lambda f: f.const(1.0, DOUBLE, width)
+
+        def put(f: Function, name: str, k: Value, i: Value, x: Value):
+            f.store(x, f.given["work"], (i + p[name]) * width + k)
 
         def each_lane(f: Function, mask: Value) -> Any:
             marked = f.select(mask, one(f), 0.0)
@@ -887,7 +899,7 @@ class Trajectory:
             for d in ("dq", "dv"):
                 with f.each(m) as i:
                     f.store(0.0, right, i)
-                for row, column, slot, sign in entries(f):
+                for row, column, slot, sign in self._entries(f):
                     part = number(f, "R", k, slot) * sign * number(f, f"X {d}", k, column) / root(f, k, column)
                     f.store(f.load(right, row) + part, right, row)
                 f.call("solve", f.given["work"], k, right, x, f.const(np.sqrt(NOTHING_LEFT)))
@@ -1039,27 +1051,33 @@ class Trajectory:
 
         fill()
         with f.while_(lambda: f.any_of(s.active > 0.5)):
-            doubtful = s.doubt > 0.5
-            careful = f.any_of(doubtful)
-            if self.cares:
-                s.careful = f.select(careful, f.const(1.0, DOUBLE, width), 0.0)
-                s.judged = f.select(careful, f.select(doubtful, yes, 0.0), s.active)
-            else:
-                s.judged = s.active
-            self._aim(f, s)
-            f.call("attempt", work)
-            f.call("decide", work)
-            if not self.cares and self.doubts:
-                s.where(s.doubt > 0.5, code=DOUBTED)
-            f.call("outputs", work, call)
-            ended = (s.active > 0.5) & s.code.is_not(float(RUNNING))
-            with f.if_(f.any_of(ended)):
-                s.due = f.select(ended, yes, 0.0)
-                f.call("finish_members", work, call)
-                s.where(ended, active=0.0, doubt=0.0)
-                self._next(f, s, fill)
+            self._round(f, s, fill)
         for block in blocks:
             f.line(f"call void @free(ptr {block.name})")
+
+    def _round(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """One step of all lanes, and what becomes of those that are done."""
+        work, call, width = f.given["work"], f.given["call"], self.plan.width
+        yes = f.const(1.0, DOUBLE, width)
+        doubtful = s.doubt > 0.5
+        careful = f.any_of(doubtful)
+        if self.cares:
+            s.careful = f.select(careful, f.const(1.0, DOUBLE, width), 0.0)
+            s.judged = f.select(careful, f.select(doubtful, yes, 0.0), s.active)
+        else:
+            s.judged = s.active
+        self._aim(f, s)
+        f.call("attempt", work)
+        f.call("decide", work)
+        if not self.cares and self.doubts:
+            s.where(s.doubt > 0.5, code=DOUBTED)
+        f.call("outputs", work, call)
+        ended = (s.active > 0.5) & s.code.is_not(float(RUNNING))
+        with f.if_(f.any_of(ended)):
+            s.due = f.select(ended, yes, 0.0)
+            f.call("finish_members", work, call)
+            s.where(ended, active=0.0, doubt=0.0)
+            self._next(f, s, fill)
 
     def _allocated(self, f: Function, count: Value) -> tuple[Value, Value]:
         """So many numbers: what to free, and where they begin, at a register's boundary."""

@@ -155,7 +155,7 @@ def _computed(static, arrays, members, tol):
     def one(members, x, shift):
         member = jax.tree.map(lambda leaf: leaf[0], members._replace(x=x, shift=shift))
         mech, state = _member(mechanism, member, targets)
-        closure = close(mech, member.ts[0], state, forward=True, analysis=settings["analysis"])
+        closure = close(mech, member.ts[0], state, analysis=settings["analysis"])
         return jax.tree.map(lambda leaf: leaf[None], _run(mech, member.ts, closure, tol, settings, channels, ends))
 
     def every(members):

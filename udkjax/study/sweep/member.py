@@ -143,7 +143,7 @@ class Recipe:
     def _closure(self, shared: Any, own: Any, mechanism: Mechanism) -> Closure | None:
         if shared[1] is not None or not self.assembled:
             return shared[1]
-        return close(mechanism, self.plan.ts[0], forward=True, analysis=self._setting("analysis", shared, own))
+        return close(mechanism, self.plan.ts[0], analysis=self._setting("analysis", shared, own))
 
     def _run(self, shared: Any, shift: Any, own: Any, mechanism: Mechanism, closure: Closure | None) -> Kept:
         settings = self.settings(shared, own, shift)

@@ -1,0 +1,127 @@
+"""Machine code that closes a mechanism: the loop of equations/closing.py, for numbers that are known when it runs.
+
+    q <- q - s M^(-1/2) D^+ Psi
+
+by steps that are limited, and halved until the residual falls; then the velocities that the constraints allow. D^+ is that of all
+rows, weighted, by rotations (least_norm.py).
+"""
+
+import numpy as np
+
+from udkjax.equations.closing import HALVINGS, ITERATIONS, ROUNDING, STRIDE
+from udkjax.equations.code import Code
+from udkjax.integrate.tableau import EULER
+from udkjax.native.ir import INT, POINTER, Function, Value
+from udkjax.native.least_norm import least_norm
+from udkjax.native.trajectory import Lane, Plan, Trajectory
+
+VELOCITIES = 2  # corrections: the second removes the rounding errors of the first
+
+
+class Closing(Trajectory):
+    """The text of a module whose `run` closes members, from their guesses q and v at the time ts[0]."""
+
+    results = ("state", "residuals", "rank")
+
+    def __init__(self, code: Code, vector: int):
+        super().__init__(Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector))
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        self._programs()
+        self.functions.append(least_norm())
+        self._solve()
+        self._begin()
+        self._close()
+        self._run()
+        return self._joined()
+
+    def _wanted(self) -> list[str]:
+        return ["rows", "psi", "psi_dot"]
+
+    def _close(self):
+        """`close(work, call)`: the member in the one lane."""
+        f, s = self._function("close", [(POINTER, "work"), (POINTER, "call")])
+        work, n, m, p = f.given["work"], self.n, self.m, self.places
+        right, x = (Value(f, f.reserve("double", max(c, 1)), POINTER) for c in (m, n))
+        lane, slots = f.const(0, INT), self.code.pattern.slots
+
+        def size() -> Value:
+            """|Psi|, each row over its scale; not a number where a row is none."""
+            self._call(f, "psi")
+            total = f.variable(0.0)
+            with f.each(m) as i:
+                part = f.load(work, i + p["psi"]) / f.load(work, i + p["rows"])
+                total.value = f.fma(part, part, total.value)
+            return f.intrinsic("sqrt", total.value)
+
+        def solve(to: str):
+            """-M^(-1/2) D^+ of what is in `psi`, as coordinates."""
+            self._call(f, "rows")
+            with f.each(m) as i:
+                f.store(f.load(work, i + p["psi"]), right, i)
+            f.call("solve", work, lane, right, x, s.care)
+            with f.each(n) as i:
+                root = f.load(work, i + (p["R"] + slots + m + n))
+                f.store(-(root * f.load(x, i)), work, i + p[to])
+
+        def moved(scale: Value):
+            with f.each(n) as i:
+                q = f.fma(scale, f.load(work, i + p["X dq"]), f.load(work, i + p["C"]))
+                f.store(q, work, i + p["X q"])
+
+        setattr(s, "X t", s.start)
+        with f.each(n) as i:
+            for name in "qv":
+                f.store(f.load(work, i + p[f"P3 {name}"]), work, i + p[f"X {name}"])
+        better, steps = f.variable(1.0), f.variable(0, INT)
+        with f.while_(lambda: (better.value > 0.5) & (steps.value < ITERATIONS)):
+            steps.value = steps.value + 1
+            before = size()
+            largest, longest = f.variable(1.0), f.variable(0.0)
+            with f.each(n) as i:
+                q = f.load(work, i + p["X q"])
+                largest.value = f.max(f.abs(q) * f.load(work, i + p["inverse unit"]), largest.value)
+                f.store(q, work, i + p["C"])
+            better.value = f.select(before > largest.value * (ROUNDING * np.finfo(float).eps), f.const(1.0), 0.0)
+            with f.if_(better.value > 0.5):
+                solve("X dq")
+                with f.each(n) as i:
+                    step = f.abs(f.load(work, i + p["X dq"])) * f.load(work, i + p["inverse unit"])
+                    longest.value = f.max(step, longest.value)
+                scale = f.variable(f.select(longest.value > STRIDE, STRIDE / longest.value, f.const(1.0)))
+                halvings, better.value = f.variable(0, INT), 0.0
+                with f.while_(lambda: (better.value < 0.5) & (halvings.value < HALVINGS)):
+                    moved(scale.value)
+                    better.value = f.select(size() < before, f.const(1.0), 0.0)
+                    scale.value = scale.value * 0.5
+                    halvings.value = halvings.value + 1
+                with f.if_(better.value < 0.5):
+                    moved(f.const(0.0))
+        for _ in range(VELOCITIES):
+            self._call(f, "psi_dot")
+            solve("X dv")
+            with f.each(n) as i:
+                f.store(f.load(work, i + p["X v"]) + f.load(work, i + p["X dv"]), work, i + p["X v"])
+        self._written(f, s)
+
+    def _written(self, f: Function, s: Lane):
+        """The state, Psi and Psi_dot there, and the rank of D."""
+        member, work = self._whole(f, s.member), f.given["work"]
+
+        def address(name: str, length: int) -> Value:
+            return f.at(f.load(f.given["call"], self.call.index(name), base=POINTER), member * length)
+
+        state, residuals = address("state", 2 * self.n), address("residuals", 2 * self.m)
+        self._copied(f, state, 0, "X q", f.const(0, INT))
+        self._copied(f, state, self.n, "X v", f.const(0, INT))
+        for name, offset in (("psi", 0), ("psi_dot", self.m)):
+            self._call(f, name)
+            with f.each(self.m) as i:
+                f.store(f.load(work, i + self.places["psi"]), residuals, i + offset)
+        f.store(s.rank, address("rank", 1))
+
+    def _round(self, f: Function, s: Lane, fill):
+        f.call("close", f.given["work"], f.given["call"])
+        s.active = f.const(0.0)
+        fill()
