@@ -16,16 +16,17 @@ ROOT = Path(udkjax.__file__).parent
 BELOW = {
     "environment": set(),
     "straightline": set(),
-    "kept": {"environment", "straightline"},
     "pinv": {"straightline"},
     "scene": set(),
     "equations": {"scene", "pinv", "straightline"},
-    "integrate": {"equations", "scene", "pinv", "straightline", "kept"},
+    "native": {"environment", "equations", "scene", "pinv", "straightline"},
+    "integrate": {"native", "equations", "scene", "pinv", "straightline"},
     "study": {"integrate", "equations", "scene", "pinv", "straightline"},
     "show": {"environment", "study", "integrate", "equations", "scene", "pinv", "straightline"},
 }
 ONLY_IN = {
     "diffrax": {"integrate", "cli"},
+    "llvmlite": {"native"},
     "matplotlib": {"show"},
     "tyro": {"cli"},
     "msgspec": {"scene"},
@@ -74,10 +75,10 @@ def test_a_floor_imports_only_from_below():
 @pytest.mark.parametrize(
     ("place", "line"),
     [
-        ("scene/joints.py", "from udkjax.equations import assembly"),
+        ("scene/joints.py", "from udkjax.equations import loads"),
         ("scene/joints.py", "from udkjax import equations"),
         ("scene/joints.py", "import udkjax.pinv.svd as svd"),
-        ("scene/joints.py", "from ..equations import assembly"),
+        ("scene/joints.py", "from ..equations import loads"),
         ("scene/library/pendulums.py", "from ...show import plots"),
         ("scene/library/pendulums.py", "from .. import __init__, study\nfrom ... import study"),
         ("pinv/rule.py", "def late():\n    from udkjax.scene import Body"),

@@ -32,13 +32,9 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.equations import NullSpaceSVD as NullSpaceSVD
     from udkjax.equations import accelerations as accelerations
     from udkjax.equations import analyse as analyse
-    from udkjax.equations import check as check
     from udkjax.equations import energy as energy
     from udkjax.equations import reactions as reactions
     from udkjax.equations import violation as violation
-    from udkjax.equations.assembly import AssemblyError as AssemblyError
-    from udkjax.equations.assembly import State as State
-    from udkjax.equations.assembly import assemble as assemble
     from udkjax.integrate import BDF as BDF
     from udkjax.integrate import Adams as Adams
     from udkjax.integrate import Projection as Projection
@@ -47,6 +43,10 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.integrate import Solution as Solution
     from udkjax.integrate import Verner65 as Verner65
     from udkjax.integrate import simulate as simulate
+    from udkjax.integrate.assembly import AssemblyError as AssemblyError
+    from udkjax.integrate.assembly import State as State
+    from udkjax.integrate.assembly import assemble as assemble
+    from udkjax.integrate.assembly import check as check
     from udkjax.pinv import SVD as SVD
     from udkjax.pinv import Auto as Auto
     from udkjax.pinv import Elimination as Elimination
@@ -120,9 +120,9 @@ _NAMES = {
         Polynomial Sine Spline Profile
         Spring TorsionSpring Force Torque Friction""",
     "udkjax.pinv": "SVD Varga Greville Householder GramSchmidt Elimination Auto",
-    "udkjax.equations.assembly": "AssemblyError State assemble",
+    "udkjax.integrate.assembly": "AssemblyError State assemble check",
     "udkjax.equations": """
-        ConstrainedSystem Baumgarte Analysis analyse accelerations check violation energy reactions
+        ConstrainedSystem Baumgarte Analysis analyse accelerations violation energy reactions
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
     "udkjax.study.identify": """
         identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck

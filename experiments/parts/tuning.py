@@ -16,7 +16,7 @@ from udkjax.equations.motion import Tangential
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.solution import Result
 from udkjax.integrate.step import Task, attempt
-from udkjax.integrate.tableau import DOPRI8
+from udkjax.native.tableau import DOPRI8
 from udkjax.pinv import Pseudoinverse
 from udkjax.study.identify.fitting import Fit, descend
 from udkjax.study.identify.problem import Evaluated

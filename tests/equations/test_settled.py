@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations.assembly import close
-from udkjax.equations.settled import _redundant, close_all
+from udkjax.integrate.assembly import close
+from udkjax.integrate.settled import _redundant, close_all
 
 
 def stacked(mechanisms):

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from udkjax.integrate.crossing import LONGEST, SHORTEST, ahead, around, far, passed
+from udkjax.integrate.crossing import ahead, around, far, passed
 from udkjax.integrate.tableau import method_of
+from udkjax.native.steps import LONGEST, SHORTEST
 
 METHODS = {"Dopri8": None, "Tsit5": diffrax.Tsit5(), "Dopri5": diffrax.Dopri5(), "Bosh3": diffrax.Bosh3(), "Heun": diffrax.Heun()}
 

@@ -12,7 +12,7 @@ def check(scene: Scene, /) -> None:
         scene: the mechanism.
     """
     mech, _ = load(scene)
-    from udkjax.equations.assembly import check as checked
+    from udkjax.integrate.assembly import check as checked
     from udkjax.show.summary import check_summary
 
     found = checked(mech)

@@ -2,11 +2,6 @@
 
 from udkjax.equations.analysis import Analysis as Analysis
 from udkjax.equations.analysis import analyse as analyse
-from udkjax.equations.assembly import AssemblyError as AssemblyError
-from udkjax.equations.assembly import Check as Check
-from udkjax.equations.assembly import State as State
-from udkjax.equations.assembly import assemble as assemble
-from udkjax.equations.assembly import check as check
 from udkjax.equations.constraints import gamma as gamma
 from udkjax.equations.constraints import psi as psi
 from udkjax.equations.constraints import psi_dot as psi_dot

@@ -28,9 +28,9 @@ class Code:
 
     On all rows of Psi (D as the values of `pattern`): `rows` (D, b, a_F, M^(-1/2)), `closure` (D, Psi, M^(-1/2)), `psi`,
     `psi_dot`; `energy`; and for elimination, on those not left out: `accelerations` (a, whether all pivots are safe), `nearer` (q
-    and v after a Newton step to Psi = 0 and to Psi_dot = 0, whether safe), `closer` (the same of q alone), `output` (the same of v
-    alone, and Psi of all rows), `arrival` (the same of v alone, and the accelerations with it), `tangential` (of changes of q and
-    v what projection leaves; their `Factors.distance`), `finish` (`arrival` and `tangential`, with its pivots; whether safe).
+    and v after a Newton step to Psi = 0 and to Psi_dot = 0, whether safe), `closer` (the same of q alone), `output` (the same of
+    v alone, and Psi of all rows), `arrival` (the same of v alone, and the accelerations with it), `tangential` (of changes of q
+    and v what projection leaves; their `Factors.distance`), `finish` (`arrival` and `tangential`, with its pivots; whether safe).
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
 
@@ -168,8 +168,8 @@ def code(mechanism: Mechanism, left_out: tuple[int, ...], baumgarte: bool, elimi
     """Return the code for a mechanism's structure; `elimination` is None, or what it does with small pivots.
 
     "drop": it leaves out rows whose pivots are below `drop`; "check": it says where there are any; "watch": it does both, with a
-    threshold `least` of what it says that is larger than that of what it leaves out. (Derivatives of steps that are taken with care
-    are those of the rows that are left.)
+    threshold `least` of what it says that is larger than that of what it leaves out. (Derivatives of steps that are taken with
+    care are those of the rows that are left.)
     """
     return _code(*structure(mechanism), left_out, baumgarte, elimination)
 

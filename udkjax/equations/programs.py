@@ -217,8 +217,8 @@ def prepare(
     Returns `Equations`, straight-line code, for elimination, `TextbookEquations` for every other method; or of a scene of more
     than `LARGE` elements `LargeEquations`, whose program does not grow with the scene. `large` says which, whatever the size.
     `moving` says of each leaf of the mechanism whether it is traced where all begins: of the others XLA may know the numbers,
-    though they are traced here. Without it none is taken to be. `analysis` is that of `analyse`, by default made here. What is not
-    `evaluated` lacks its constants: it is for whoever has code that computes them.
+    though they are traced here. Without it none is taken to be. `analysis` is that of `analyse`, by default made here. What is
+    not `evaluated` lacks its constants: it is for whoever has code that computes them.
 
     A method without a `rank_tol` gets `rank_tolerance`. Without knowledge of which rows are redundant (a mechanism that was built
     from traced numbers) `Auto` takes singular values throughout, and `Elimination` drops what it finds dependent on the way.

@@ -3,6 +3,11 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from udkjax.integrate.assembly import AssemblyError as AssemblyError
+from udkjax.integrate.assembly import Check as Check
+from udkjax.integrate.assembly import State as State
+from udkjax.integrate.assembly import assemble as assemble
+from udkjax.integrate.assembly import check as check
 from udkjax.integrate.projection import Projection as Projection
 from udkjax.integrate.simulate import simulate as simulate
 from udkjax.integrate.solution import Result as Result

@@ -12,13 +12,13 @@ from udkjax.equations.motion import Motion
 from udkjax.equations.rank_policy import REFUSE
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
-from udkjax.integrate.explicit import GROW, SAFETY, SHRINK
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.outcome import stopped
-from udkjax.integrate.problem import DONE, STEP_LIMIT, STEP_TOO_SMALL, Problem, Raw
+from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.projection import project_all, violation
 from udkjax.integrate.tableau import is_explicit
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.native.steps import DONE, GROW, SAFETY, SHRINK, STEP_LIMIT, STEP_TOO_SMALL
 
 
 def by_diffrax(

@@ -7,23 +7,8 @@ constraint manifold. Another step misses it, and costs less than care: one whose
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from udkjax.integrate.tableau import Method
-
-# What a step that failed is shortened to, where it is not known when the configuration is reached; how often in a row.
-DODGE, DODGES = 0.8, 3
-SHORTEST, LONGEST = 0.2, 0.95  # of a step, one that is taken in its place
-# Rounding errors of accelerations are about a unit of rounding over the third power of the distance, in the scene's own units.
-# A step's velocity has a small part of them, which must be less than the tolerance. Where the configuration is still ahead of the
-# end of a step, seven times as far away: close to it are many nodes of the next one, and outputs in a next one that is ten times
-# as long, as after a step that was made shorter, have a hundred times as much of them.
-PAST, BEFORE = 1e-16, 3e-14
-# Elimination trusts no pivot that is closer than 1e-3 (`BRANCH_TOL`), and shorter steps that begin so close would get shorter and
-# shorter: they have no stage where it does.
-NEAREST = 1.5e-3
-# Of a step: a configuration that is expected by then lies behind its end, though it is expected a little too early, by up to a
-# tenth of a step. More than the larger of `Method.clearings`. Where it is far away, it may be expected by three tenths too early,
-# and just be ahead of the end: less than this much of the distance that the end should have by then.
-SURE, EXPECTED = 0.85, 0.3
+from udkjax.native.steps import BEFORE, EXPECTED, LONGEST, NEAREST, SHORTEST, SURE
+from udkjax.native.tableau import Method
 
 
 def far(distance: Array, step: Array, tolerance: Array, rounding: float = BEFORE) -> Array:

@@ -31,6 +31,7 @@ from jaxtyping import Array
 
 from udkjax.equations.linear import through_constants
 from udkjax.equations.programs import Equations
+from udkjax.integrate import by_native
 from udkjax.integrate.batched import one_by_one
 from udkjax.integrate.explicit import march
 from udkjax.integrate.lanes import Lanes, number_of, raw_of, serves, solve, task_of
@@ -38,7 +39,6 @@ from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.record import Record
 from udkjax.integrate.replay import walked_back
 from udkjax.integrate.undifferentiated import undifferentiated
-from udkjax.native import engine
 from udkjax.straightline import along
 
 Mask = tuple[bool, ...]  # of a list of arrays: those that have tangents
@@ -140,15 +140,15 @@ class Run(Function):
     def fast(self, xs: list[Array]) -> Raw:
         """By machine code, which has no derivatives, if that serves."""
         problem = self.problem(xs)
-        return engine.solve(problem) if engine.serves(problem) else self.raw(xs)
+        return by_native.solve(problem) if by_native.serves(problem) else self.raw(xs)
 
     def pushed(self, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[Raw, list[Array]]:
         """The run, and the change of its states along v, of those of x that are moving: by machine code, if that serves."""
         problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
-        if not self.is_plain and engine.serves_derivatives(problem, which):
+        if not self.is_plain and by_native.serves_derivatives(problem, which):
             rest = iter(vs)
             change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in moving])
-            raw, found = engine.pushed(problem, which, change)
+            raw, found = by_native.pushed(problem, which, change)
             return raw, list(found)
         raw, change = _change(lambda xs: self.raw(xs), xs, moving, vs)
         return raw, [change[k] for k in SMOOTH]
@@ -161,8 +161,8 @@ class Run(Function):
     def recorded(self, xs: list[Array], moving: Mask) -> tuple[Raw, Any]:
         """The run, and its record if it is made for one."""
         problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
-        if not self.is_plain and engine.serves_derivatives(problem, which):
-            return engine.solve(problem), None
+        if not self.is_plain and by_native.serves_derivatives(problem, which):
+            return by_native.solve(problem), None
         return _recorded(problem) if serves(problem) else (self.raw(xs), None)
 
     def __call__(self, xs: list[Array]) -> list[Array]:
@@ -312,9 +312,9 @@ def _apply(linear: Linear, vector: Array) -> Array:
     if not linear.transposed:
         return _flat(function.pushed(xs, moving, vs)[1])
     problem, which = function.problem(xs), jax.tree.unflatten(function.tree, moving)
-    if not function.is_plain and engine.serves_derivatives(problem, which):
+    if not function.is_plain and by_native.serves_derivatives(problem, which):
         q, v, y = vs
-        found = engine.pulled(problem, which, jnp.concatenate([q, v], axis=1), y)
+        found = by_native.pulled(problem, which, jnp.concatenate([q, v], axis=1), y)
         pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
         return _flat([bar for m, bar in pairs if m is True])
     if record is None:

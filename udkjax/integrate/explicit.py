@@ -22,27 +22,37 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from udkjax.integrate.breakpoints import GAP, last_end, new_start
-from udkjax.integrate.crossing import BEFORE, DODGE, DODGES, PAST, ahead, around, far, passed
+from udkjax.integrate.breakpoints import last_end, new_start
+from udkjax.integrate.crossing import ahead, around, far, passed
 from udkjax.integrate.first_step import first_step
-from udkjax.integrate.interpolation import POINTS, Point, interpolated
+from udkjax.integrate.interpolation import Point, interpolated
 from udkjax.integrate.packing import Packing
 from udkjax.integrate.pieces import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, EXACT, TRIES, share_before
-from udkjax.integrate.problem import DONE, DOUBTED, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
 from udkjax.integrate.record import Record, blank, noted
 from udkjax.integrate.step import Task, Trial, attempt, tolerance
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.native.steps import (
+    BEFORE,
+    CAUTIOUS,
+    CUT,
+    DODGE,
+    DODGES,
+    DONE,
+    DOUBTED,
+    FORESEEN,
+    GAP,
+    GROW,
+    PAST,
+    POINTS,
+    RUNNING,
+    SAFETY,
+    SHRINK,
+    STEEPEST,
+    STEP_LIMIT,
+    STEP_TOO_SMALL,
+)
 from udkjax.straightline import after, apart, when
 
-# Of the step's size. With 0.9 every tenth step of an ordinary run is rejected, and most runs take 4 to 15 % more at equal error.
-SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
-# Where errors grow, a step as long as the one before may be foreseen to fail. It is made so short that its error should be
-# this much of the tolerance, errors growing by this factor at most. At equal error most runs take up to 8 % fewer right-hand
-# sides, those of linkages that swing to and fro 15 %.
-FORESEEN, STEEPEST = 0.5, 100.0
-# Of the step before a breakpoint: the first behind it. The outputs in it have states on one side alone, and so larger errors.
-CAUTIOUS = 0.5
-CUT = 0.9  # of the step that was planned: one less long was cut short
 BLOCK = 4  # output times that are interpolated together
 
 

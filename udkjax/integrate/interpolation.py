@@ -6,13 +6,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from udkjax.native.steps import STRETCH
 from udkjax.straightline import cut
 
-POINTS = 4  # states that an interpolating polynomial goes through: with three, velocities between steps are worse than at steps
 # Columns of differences between two barriers: with none XLA computes each coefficient with all that it is made of. Each barrier
 # sends what passes through memory, of which lanes have much.
 CUT_EVERY = 3
-STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 
 
 class Point(NamedTuple):

@@ -22,11 +22,12 @@ from udkjax.integrate.interpolation import Point
 from udkjax.integrate.norms import largest
 from udkjax.integrate.outcome import stopped
 from udkjax.integrate.pieces import Pieces
-from udkjax.integrate.problem import DONE, Problem, Raw
+from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.projection import ended, lasting, violation
 from udkjax.integrate.step import Task, Trial, errors, judged, stage_state
 from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.native.steps import DONE
 from udkjax.straightline import Loop, apart, cut, when
 
 ROUND = 8  # lanes: what the widest vector units hold

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.motion import Motion
-from udkjax.integrate.problem import DONE, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL, Raw
+from udkjax.integrate.problem import Raw
 from udkjax.integrate.solution import Result
+from udkjax.native.steps import AHEAD, DONE, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
 from udkjax.straightline import when
-
-AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one looks for what is not finite
 
 
 class Run(eqx.Module):

@@ -11,9 +11,6 @@ from udkjax.equations.motion import Motion
 from udkjax.integrate.pieces import Pieces
 from udkjax.integrate.undifferentiated import undifferentiated
 
-# What a run may be. `NOT_FINITE`: its step became too small because of a number that is not finite.
-RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, DOUBTED, NOT_FINITE = range(6)
-
 
 class Problem(eqx.Module):
     """What to integrate: q'' = a(t, q, v) of some equations from ts[0] to ts[-1]. Its arrays may be batched."""

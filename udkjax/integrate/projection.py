@@ -11,12 +11,7 @@ from jaxtyping import Array, Float
 from udkjax.equations.motion import Motion, Tangential
 from udkjax.equations.rank_policy import REFUSE, drop_dependent
 from udkjax.integrate.undifferentiated import undifferentiated
-
-# How much of an error counts that projection takes back. What lasts of it is what it does to the rest while the step is taken.
-# Close to singular configurations it is the stages' distance from the manifold over a small singular value: for its sake alone,
-# steps were up to six times as many at tolerances of 1e-11. A hundredth keeps some of these; with none of it, runs that cross are
-# less exact than their tolerance says.
-TAKEN_BACK = 1e-3
+from udkjax.native.steps import TAKEN_BACK
 
 
 class Projection(eqx.Module):

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from udkjax.integrate.interpolation import POINTS, Point
+from udkjax.integrate.interpolation import Point
+from udkjax.native.steps import POINTS
 
 KEPT = 512  # steps of which everything is kept: most runs take no more, and of a hundred coordinates they fill 7 MB
 BEHIND = POINTS - 1  # points that an output takes besides the one that its step leads to

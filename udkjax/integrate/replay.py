@@ -25,12 +25,13 @@ from jaxtyping import Array
 from udkjax.equations.rank_policy import REFUSE
 from udkjax.integrate.breakpoints import breakpoint_at, is_new_start
 from udkjax.integrate.explicit import BLOCK
-from udkjax.integrate.interpolation import POINTS, Point
+from udkjax.integrate.interpolation import Point
 from udkjax.integrate.lanes import Lanes, task_of
-from udkjax.integrate.problem import DONE, Problem, Raw
+from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.record import BEHIND, Record, as_point, noted
 from udkjax.integrate.replay_outputs import Equations, Sums, Walk, of_outputs, of_points
 from udkjax.integrate.step import Task, attempt, stage_state
+from udkjax.native.steps import DONE, POINTS
 from udkjax.straightline import when
 
 

@@ -11,10 +11,11 @@ from jaxtyping import Array, Float, Int
 from udkjax.equations.motion import Motion
 from udkjax.equations.rank_policy import drop_within
 from udkjax.integrate.explicit import BLOCK
-from udkjax.integrate.interpolation import POINTS, Point, interpolated
+from udkjax.integrate.interpolation import Point, interpolated
 from udkjax.integrate.lanes import output_tolerance
 from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.record import as_array, as_point
+from udkjax.native.steps import POINTS
 
 
 class Sums(NamedTuple):

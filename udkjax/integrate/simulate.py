@@ -13,12 +13,13 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.assembly import Closure, State, close, require_closed
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.partitioning import Partitioned
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.integrate.assembly import Closure, State, close, require_closed
+from udkjax.integrate.by_native import known, unserved
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.pieces import pieces_of
@@ -26,7 +27,6 @@ from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import Result, SimulationError, Solution
 from udkjax.integrate.undifferentiated import undifferentiated
-from udkjax.native.engine import known, unserved
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -80,8 +80,8 @@ def simulate(
     vmap as well. It has derivatives of any order, forward and reverse; those beyond the first take the time of a hundred runs and
     minutes to compile. There are two engines. "native" is machine code made of the scene's expressions, on the CPU: explicit
     Runge-Kutta methods with elimination, under vmap in lanes that step each on its own. "diffrax" is `diffrax.diffeqsolve`: every
-    solver, adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` says which it was,
-    and why.
+    solver, adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` says which it
+    was, and why.
 
     A run that does not reach its end raises `SimulationError`, which carries the solution; with `throw=False`, or when numbers
     are traced, `Solution.result` tells instead. A violation of Psi above `drift_tol` (of L, or rad) at an output time ends the
@@ -120,7 +120,7 @@ def simulate(
     return solution
 
 
-def _run(mechanism, analysis, ts, state, closure, *settings):
+def _run(mechanism, analysis, ts, state, closure, *settings) -> Any:
     """Return the solution, and whether it takes rows that the method leaves out.
 
     Machine code is called at once where all numbers are known, by NumPy; everything else is traced.
@@ -153,8 +153,8 @@ def _simulate(
     meter,
     moving,
     engine,
-):
-    """As `_run`; by NumPy, None where the numbers are known, but not to machine code."""
+) -> Any:
+    """As `_run`; by NumPy, None where machine code cannot."""
     if xp is np:
         ts, rtol, atol, drift_tol = (np.asarray(x) for x in (ts, rtol, atol, drift_tol))
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
@@ -165,7 +165,7 @@ def _simulate(
     loose_rtol, loose_atol = (xp.where(closed, tol, 1e3) for tol in (rtol, atol))
     ulp = np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1]))
     q, v = xp.ravel(xp.asarray(start.q)), xp.ravel(xp.asarray(start.v))
-    numbers = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v, xp))
+    numbers: Any = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v, xp))
     problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps)
     problem = replace(problem, breakpoints=mechanism.breakpoints, pieces=pieces_of(mechanism))
     why = unserved(problem, adjoint, meter)
@@ -181,7 +181,8 @@ def _simulate(
         raw = known(problem) if xp is np else differentiable(problem)
     later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
     q, v = xp.where(later, raw.q, q), xp.where(later, raw.v, v)
-    seen = Run(raw, ts, closed, missed, drift_tol)
+    ends: Any = (raw, ts, closed, missed, drift_tol)
+    seen = Run(*ends)
     code, time, reached = outcome(seen if xp is np else undifferentiated(seen), xp)
     q, v = (xp.where(reached[:, None], y, xp.nan).reshape(-1, *np.shape(start.q)) for y in (q, v))
     stats = counts(raw, projected, len(ts), xp)
@@ -195,7 +196,8 @@ def _simulate(
         ("engine", "native" if native else f"diffrax: {why}"),
     )
     arrays = jax.tree.map(jnp.asarray, (ts, q, v, code, time, stats, rtol, atol))
-    return Solution(*arrays, getattr(mechanism, "body_names", ()), chosen), missed
+    fields: Any = (*arrays, getattr(mechanism, "body_names", ()), chosen)
+    return Solution(*fields), missed
 
 
 _compiled = eqx.filter_jit(partial(_simulate, jnp))
@@ -210,7 +212,7 @@ def _start(equations: Any, state: State | None, closure: Closure | None, xp: Any
     return closure.state, closed, closed & (closure.rank > kept)
 
 
-def _units(analysis: Analysis | None, ts: Array, v: Array, xp: Any) -> tuple[Array | None, Array]:
+def _units(analysis: Analysis | None, ts: Any, v: Any, xp: Any) -> tuple[Any, Any]:
     """The length and the rate that `atol` is relative to."""
     if analysis is None:
         return None, xp.ones(())

@@ -14,8 +14,8 @@ from jaxtyping import Array
 from udkjax.equations.motion import Tangential
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.norms import all_finite, largest
-from udkjax.integrate.tableau import Method
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.native.tableau import Method
 from udkjax.straightline import cut, when
 
 CHAINS = 4  # sums that a sum over stages is made of, none of which waits for another

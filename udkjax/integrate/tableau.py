@@ -1,46 +1,16 @@
-"""What an explicit Runge-Kutta method needs of its tableau for q'' = a(t, q, v).
+"""The tableaus of diffrax's explicit Runge-Kutta methods.
 
-Methods are those of diffrax, but for the default's tableau, which stands here: a run by it need not import diffrax, which takes
-as long as all of JAX.
+diffrax is imported where one is given: that takes as long as all of JAX.
 """
 
-from collections.abc import Sequence
-from fractions import Fraction
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from udkjax.native.tableau import DOPRI8, Method, method
+
 if TYPE_CHECKING:
     import diffrax
-
-
-class Method(NamedTuple):
-    """A tableau as q'' = a needs it, without stages that serve interpolation alone."""
-
-    nodes: np.ndarray  # c, and below it 1: the end of the step is one state more
-    v: np.ndarray  # A, and below it b
-    q: np.ndarray  # A A, and below it b A
-    error_v: np.ndarray  # (stages,)
-    error_q: np.ndarray
-    order: float
-    ends: bool  # whether the last stage is the next step's first
-
-    @property
-    def stages(self) -> int:
-        return len(self.error_v)
-
-    @property
-    def clearings(self) -> tuple[float, float]:
-        """Fractions of a step far from all nodes: the middles of the widest gap between two and of the widest before it."""
-        nodes = np.unique(self.nodes)
-        middles, gaps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
-        widest = np.argmax(gaps)
-        return middles[np.argmax(gaps[: max(widest, 1)])], middles[widest]
-
-
-def row(text: str) -> np.ndarray:
-    """Coefficients written as fractions."""
-    return np.array([float(Fraction(x)) for x in text.split()])
 
 
 def is_explicit(solver: "diffrax.AbstractSolver | None") -> bool:
@@ -64,60 +34,4 @@ def method_of(solver: "diffrax.AbstractERK | None") -> Method:
     ends = bool(tableau.fsal and error[-1] != 0)
     if tableau.fsal and not ends:  # the last stage is there for interpolation, or for the next step
         c, stages, b, error = c[:-1], stages[:-1], b[:-1], error[:-1]
-    return _method(c, stages, b, error, order, ends)
-
-
-def _method(c: np.ndarray, stages: Sequence[Any], b: np.ndarray, error: np.ndarray, order: float, ends: bool = False) -> Method:
-    A = np.zeros((len(c), len(c)))
-    for i, coefficients in enumerate(stages):
-        A[i + 1, : i + 1] = coefficients
-    return Method(np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error @ A, float(order), ends)
-
-
-# The pair of orders 8 and 7 with 13 stages: P. J. Prince, J. R. Dormand, High order embedded Runge-Kutta formulae, J. Comp. Appl.
-# Math. 7 (1981) 67-75; `diffrax.Dopri8` without the stage that serves its interpolation.
-_ORDER_8 = row(
-    """14005451/335480064 0 0 0 0 -59238493/1068277825 181606767/758867731 561292985/797845732 -1041891430/1371343529
-    760417239/1151165299 118820643/751138087 -528747749/2220607170 1/4"""
-)
-_ORDER_7 = row(
-    """13451932/455176623 0 0 0 0 -808719846/976000145 1757004468/5645159321 656045339/265891186 -3867574721/1518517206
-    465885868/322736535 53011238/667516719 2/45 0"""
-)
-DOPRI8 = _method(
-    row("0 1/18 1/12 1/8 5/16 3/8 59/400 93/200 5490023248/9719169821 13/20 1201146811/1299019798 1 1"),
-    (
-        row("1/18"),
-        row("1/48 1/16"),
-        row("1/32 0 3/32"),
-        row("5/16 0 -75/64 75/64"),
-        row("3/80 0 0 3/16 3/20"),
-        row("29443841/614563906 0 0 77736538/692538347 -28693883/1125000000 23124283/1800000000"),
-        row("16016141/946692911 0 0 61564180/158732637 22789713/633445777 545815736/2771057229 -180193667/1043307555"),
-        row(
-            """39632708/573591083 0 0 -433636366/683701615 -421739975/2616292301 100302831/723423059 790204164/839813087
-            800635310/3783071287"""
-        ),
-        row(
-            """246121993/1340847787 0 0 -37695042795/15268766246 -309121744/1061227803 -12992083/490766935
-            6005943493/2108947869 393006217/1396673457 123872331/1001029789"""
-        ),
-        row(
-            """-1028468189/846180014 0 0 8478235783/508512852 1311729495/1432422823 -10304129995/1701304382
-            -48777925059/3047939560 15336726248/1032824649 -45442868181/3398467696 3065993473/597172653"""
-        ),
-        row(
-            """185892177/718116043 0 0 -3185094517/667107341 -477755414/1098053517 -703635378/230739211
-            5731566787/1027545527 5232866602/850066563 -4093664535/808688257 3962137247/1805957418 65686358/487910083"""
-        ),
-        row(
-            """403863854/491063109 0 0 -5068492393/434740067 -411421997/543043805 652783627/914296604 11173962825/925320556
-            -13158990841/6184727034 3936647629/1978049680 -160528059/685178525 248638103/1413531060 0"""
-        ),
-    ),
-    _ORDER_8,
-    _ORDER_8 - _ORDER_7,
-    order=8,
-)
-
-EULER = _method(row("0"), (), row("1"), row("1"), order=1)
+    return method(c, stages, b, error, order, ends)

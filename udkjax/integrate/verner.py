@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.integrate.tableau import row
+from udkjax.native.tableau import row
 
 TABLEAU = diffrax.ButcherTableau(
     c=row("1/6 4/15 2/3 5/6 1 1/15 1"),

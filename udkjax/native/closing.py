@@ -10,9 +10,9 @@ import numpy as np
 
 from udkjax.equations.closing import HALVINGS, ITERATIONS, ROUNDING, STRIDE
 from udkjax.equations.code import Code
-from udkjax.integrate.tableau import EULER
 from udkjax.native.ir import INT, POINTER, Function, Value
 from udkjax.native.least_norm import least_norm
+from udkjax.native.tableau import EULER
 from udkjax.native.trajectory import Lane, Plan, Trajectory
 
 VELOCITIES = 2  # corrections: the second removes the rounding errors of the first

@@ -25,7 +25,7 @@ Operand = Union["Value", float, int, bool]
 def literal(number: Any, base: str) -> str:
     """A number as LLVM writes it."""
     if base == DOUBLE:
-        return "0x%016X" % struct.unpack("<Q", struct.pack("<d", float(number)))[0]
+        return f"0x{struct.unpack('<Q', struct.pack('<d', float(number)))[0]:016X}"
     return str(int(number)) if base != BOOL else str(bool(number)).lower()
 
 

@@ -34,7 +34,7 @@ Place = tuple[str, int]  # which pointer, and the how manieth number from there
 def write(
     program: Program, name: str, width: int, pointers: Sequence[str], inputs: Sequence[Place], outputs: Sequence[Place]
 ) -> Function:
-    """A function of some pointers that takes the inputs from their places and puts the outputs, conditions as one or zero, there."""
+    """A function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs."""
     f = Function(name, [(POINTER, x) for x in pointers], width)
     writer = Writer(f, program)
     for s, (pointer, place) in zip(program.inputs, inputs, strict=True):

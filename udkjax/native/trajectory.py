@@ -25,19 +25,43 @@ import numpy as np
 from udkjax.equations.code import Code
 from udkjax.equations.motion import FAR, STEPS
 from udkjax.equations.rank_policy import NOTHING_LEFT, TURNED, USELESS
-from udkjax.integrate.breakpoints import BEFORE as END_BEFORE
-from udkjax.integrate.breakpoints import BEHIND, GAP, SAME
-from udkjax.integrate.crossing import BEFORE, DODGE, DODGES, EXPECTED, LONGEST, NEAREST, PAST, SHORTEST, SURE
-from udkjax.integrate.explicit import CAUTIOUS, CUT, FORESEEN, GROW, SAFETY, SHRINK, STEEPEST
-from udkjax.integrate.interpolation import POINTS, STRETCH
-from udkjax.integrate.outcome import AHEAD
-from udkjax.integrate.problem import DONE, DOUBTED, NOT_FINITE, RUNNING, STEP_LIMIT, STEP_TOO_SMALL
-from udkjax.integrate.projection import TAKEN_BACK
-from udkjax.integrate.tableau import Method
 from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM, least_norm
 from udkjax.native.power import power
 from udkjax.native.program import Place, write
+from udkjax.native.steps import (
+    AHEAD,
+    BEFORE,
+    BEGINS_BEHIND,
+    CAUTIOUS,
+    CUT,
+    DODGE,
+    DODGES,
+    DONE,
+    DOUBTED,
+    ENDS_BEFORE,
+    EXPECTED,
+    FORESEEN,
+    GAP,
+    GROW,
+    LONGEST,
+    NEAREST,
+    NOT_FINITE,
+    PAST,
+    POINTS,
+    RUNNING,
+    SAFETY,
+    SAME,
+    SHORTEST,
+    SHRINK,
+    STEEPEST,
+    STEP_LIMIT,
+    STEP_TOO_SMALL,
+    STRETCH,
+    SURE,
+    TAKEN_BACK,
+)
+from udkjax.native.tableau import Method
 from udkjax.straightline import Program
 
 OUTPUT_STEPS = 7  # of Newton's method to an output: where two branches of the manifold meet, it halves the distance in each
@@ -110,20 +134,20 @@ class Lane:
     """The numbers of each lane, as attributes: read, and written for all lanes (or by `where` for some)."""
 
     def __init__(self, f: Function, places: Places):
-        object.__setattr__(self, "_f", f)
-        object.__setattr__(self, "_places", places)
+        self.__dict__.update(_f=f, _places=places)
 
     def __getattr__(self, name: str) -> Value:
-        f: Function = self._f
-        return f.load(f.given["work"], self._places[name] * f.width, f.width)
+        f: Any = self.__dict__["_f"]
+        return f.load(f.given["work"], self.__dict__["_places"][name] * f.width, f.width)
 
     def __setattr__(self, name: str, value: Any):
-        f: Function = self._f
-        f.store(value, f.given["work"], self._places[name] * f.width, f.width)
+        f: Any = self.__dict__["_f"]
+        f.store(value, f.given["work"], self.__dict__["_places"][name] * f.width, f.width)
 
     def where(self, mask: Value, **named: Any):
+        f: Any = self.__dict__["_f"]
         for name, value in named.items():
-            setattr(self, name, self._f.select(mask, self._f.like(value, DOUBLE, self._f.width), getattr(self, name)))
+            setattr(self, name, f.select(mask, f.like(value, DOUBLE, f.width), getattr(self, name)))
 
 
 def _numbered(pointer: str, count: int) -> list[Place]:
@@ -335,7 +359,7 @@ class Trajectory:
     # --- one step
 
     def _attempt(self):
-        """From P3 by `step` to `t1`: the state there in X q, O v, O a; `error`, `distance`, and `doubt` of lanes that are `judged`."""
+        """From P3 by `step` to `t1`: the state there in X q, O v, O a; its `error` and `distance`, of lanes that are `judged`."""
         f, s = self._function("attempt")
         method, stages = self.method, self.method.stages
         one = lambda: f.const(1.0, DOUBLE, f.width)  # noqa: E731
@@ -659,9 +683,9 @@ class Trajectory:
                 f.call("gather", f.given["work"], call, k)
                 at = s.due
             ahead = at > here + s.smallest
-            s.t1 = f.select(ahead, f.min(at - s.smallest * END_BEFORE, s.t1), s.t1)
+            s.t1 = f.select(ahead, f.min(at - s.smallest * ENDS_BEFORE, s.t1), s.t1)
             passed = at <= here + s.smallest * SAME
-            s.behind = f.select(passed, f.max(at + s.smallest * BEHIND, s.behind), s.behind)
+            s.behind = f.select(passed, f.max(at + s.smallest * BEGINS_BEHIND, s.behind), s.behind)
 
     def _input(self, f: Function, call: Value, name: str, member: Value, k: Value) -> Value:
         """The k-th number of an input of a member (one lane)."""
@@ -844,10 +868,10 @@ class Trajectory:
             with f.each(width) as k, f.if_(f.lane(marked, k) > 0.5):
                 yield k, right, x
 
-        def solved(f: Function, k: Value, right: Value, x: Value, values: Any):
+        def solved(f: Function, k: Value, right: Value, x: Value, name: str, start: int = 0):
             """`x` of a lane, with D and what else is in R of the state in X."""
             with f.each(m) as i:
-                f.store(values(i), right, i)
+                f.store(number(f, name, k, i + start), right, i)
             f.call("solve", f.given["work"], k, right, x, number(f, "care", k, 0))
 
         def root(f: Function, k: Value, i: Value) -> Value:
@@ -857,7 +881,7 @@ class Trajectory:
         f, s = self._function("accelerate_carefully", [(POINTER, "work"), (POINTER, "out")])
         self._call(f, "rows")
         for k, right, x in each_lane(f, (s.judged > 0.5) & (s.careful > 0.5) & (s.safe < 0.5)):
-            solved(f, k, right, x, lambda i: number(f, "R", k, i + slots))
+            solved(f, k, right, x, "R", slots)
             with f.each(n) as i:
                 a = f.fma(root(f, k, i), f.load(x, i), number(f, "R", k, i + (slots + m)))
                 f.store(a, f.given["out"], i * width + k)
@@ -873,7 +897,7 @@ class Trajectory:
             with f.each(self.rowcount) as r:
                 self._put(f, "C", r, self._vector(f, "X q", r))
             for k, right, x in each_lane(f, s.moving > 0.5):
-                solved(f, k, right, x, lambda i: number(f, "psi", k, i))
+                solved(f, k, right, x, "psi")
                 with f.each(n) as i:
                     put(f, "C", k, i, number(f, "X q", k, i) - root(f, k, i) * f.load(x, i))
             moving = s.moving > 0.5
@@ -885,7 +909,7 @@ class Trajectory:
         with f.if_(f.any_of(doubtful)):
             self._call(f, "psi_dot")
             for k, right, x in each_lane(f, doubtful):
-                solved(f, k, right, x, lambda i: number(f, "psi", k, i))
+                solved(f, k, right, x, "psi")
                 with f.each(n) as i:
                     put(f, "O v", k, i, number(f, "X v", k, i) - root(f, k, i) * f.load(x, i))
             with f.each(self.rowcount) as r:
@@ -911,7 +935,7 @@ class Trajectory:
     def _begin(self):
         """Take a member into a lane."""
         arguments = [(POINTER, "work"), (POINTER, "call"), (INT, "lane"), (INT, "member")]
-        f, s = self._function("begin", arguments)
+        f, _ = self._function("begin", arguments)
         p, width, call, k, member = self.places, self.plan.width, f.given["call"], f.given["lane"], f.given["member"]
         work = f.given["work"]
 
@@ -1040,7 +1064,6 @@ class Trajectory:
                 f.store(f.const(1.0, DOUBLE, width), work, (i + self.places[name]) * width, width)
         members = f.load(call, self.call.index("members"), base=INT)
         following = f.load(call, self.call.index("next"), base=POINTER)
-        yes = f.const(1.0, DOUBLE, width)
 
         def fill():
             with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):

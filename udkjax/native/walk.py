@@ -1,8 +1,8 @@
 """Derivatives of a trajectory in reverse mode: the steps are recorded, and walked back.
 
-A point is an accepted state (q, v, a) at its time; each step leads from one to the next. Cotangents of the points are collected from
-the last to the first: those of an output go through its projection and through the interpolation to the four points that it lies
-on; those of a point through its accelerations and its projection to the end of the step that led there, and through the sums
+A point is an accepted state (q, v, a) at its time; each step leads from one to the next. Cotangents of the points are collected
+from the last to the first: those of an output go through its projection and through the interpolation to the four points that it
+lies on; those of a point through its accelerations and its projection to the end of the step that led there, and through the sums
 
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
 
@@ -14,8 +14,8 @@ Members run side by side in lanes and walk back side by side; the next ones foll
 
 from collections.abc import Sequence
 
-from udkjax.integrate.problem import DONE
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.steps import DONE
 from udkjax.native.tangents import Differentiated
 from udkjax.native.trajectory import POINTS, STRETCH, Lane, Plan, _numbered
 

@@ -11,7 +11,7 @@ from udkjax.study import exact_coordinates
 
 
 def check_summary(mech: Mechanism, check) -> str:
-    """Describe what `udkjax.equations.assembly.check` found in a mechanism."""
+    """Describe what `udkjax.integrate.assembly.check` found in a mechanism."""
     lines = {
         "bodies": f"{check.bodies}",
         "coordinates": f"{check.coordinates}",

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations import Baumgarte, energy
-from udkjax.equations.assembly import State, assemble
 from udkjax.equations.programs import prepare
 from udkjax.integrate import Projection, Result, simulate
+from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.solvers import solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
 from udkjax.scene import Mechanism

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.equations.assembly import State
+from udkjax.integrate.assembly import State
 from udkjax.integrate.solution import versions
 from udkjax.scene import Mechanism, dumps
 from udkjax.study.cases import FIRST_STEP, GAINS, METHODS, RANK_HELD, SMALL_GAINS, Case

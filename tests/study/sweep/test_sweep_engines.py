@@ -12,7 +12,7 @@ import scipy.stats
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations.assembly import close
+from udkjax.integrate.assembly import close
 from udkjax.study.exact import exact_coordinates
 from udkjax.study.sweep.chunk import program, run
 from udkjax.study.sweep.plan import planned

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.equations.assembly import State, assemble
+from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.solution import versions
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.agreement import GradientCheck

@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.equations.assembly import State
+from udkjax.integrate.assembly import State
 from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.errors import IdentificationError

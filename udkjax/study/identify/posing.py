@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.assembly import AssemblyError, close, require_closed
+from udkjax.integrate.assembly import AssemblyError, close, require_closed
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result
 from udkjax.scene.checks import SceneError, suggestion

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.assembly import State, close
-from udkjax.equations.settled import close_all
+from udkjax.integrate.assembly import State, close
 from udkjax.integrate.batched import CHUNKED
 from udkjax.integrate.lanes import LANES
+from udkjax.integrate.settled import close_all
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Solution
 from udkjax.integrate.solvers import forward_mode

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.equations.assembly import State
+from udkjax.integrate.assembly import State
 from udkjax.scene.checks import quoted
 from udkjax.study.identify.channels import Quantity
 from udkjax.study.identify.errors import IdentificationError

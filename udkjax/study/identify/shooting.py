@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.equations.assembly import State
+from udkjax.integrate.assembly import State
 from udkjax.study.identify.fitting import Fit, descend
 from udkjax.study.identify.problem import Evaluated, Problem
 from udkjax.study.identify.program import Members, Predicted, Program

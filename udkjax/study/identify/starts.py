@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.equations.assembly import assemble
 from udkjax.equations.redundancy import rows_of
+from udkjax.integrate.assembly import assemble
 from udkjax.scene.checks import SceneError, quoted
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.errors import IdentificationError

@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from udkjax.equations.assembly import State
 from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.integrate.assembly import State
 from udkjax.pinv import Auto
 from udkjax.scene.checks import SceneError, quoted, shown, suggestion
 from udkjax.scene.mechanism import Mechanism

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from udkjax.equations.analysis import analyse
-from udkjax.equations.assembly import Closure, State, close
-from udkjax.equations.settled import close_all
+from udkjax.integrate.assembly import Closure, State, close
+from udkjax.integrate.settled import close_all
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solvers import forward_mode
 from udkjax.integrate.tableau import is_explicit

@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.assembly import Closure, State, close
 from udkjax.equations.closing import rounding
 from udkjax.equations.code import is_large
 from udkjax.equations.programs import prepare
 from udkjax.equations.rank_policy import REFUSE
 from udkjax.equations.scales import rank_tolerance
+from udkjax.integrate.assembly import Closure, State, close
 from udkjax.pinv import Auto
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism

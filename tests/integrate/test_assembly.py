@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import assembly, check, constraints
+from udkjax.equations import constraints
+from udkjax.integrate import assembly, check
 
 
 @pytest.fixture(scope="module")

@@ -34,6 +34,7 @@ from udkjax.equations.code import is_large
 from udkjax.equations.programs import prepare_to_close
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
+from udkjax.integrate import by_native
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -137,11 +138,9 @@ _latest: dict[int, tuple[Any, float, Closure | None]] = {}
 
 @eqx.filter_jit
 def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State | None) -> Closure:
-    from udkjax.native import engine
-
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
-    close = _by_machine_code if engine.closes(mechanism) else _assembled
+    close = _by_machine_code if by_native.closes(mechanism) else _assembled
     q, v, psi, psi_dot, rank = close(mechanism, analysis, number(t), q, v)
     return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales)
 
@@ -152,9 +151,7 @@ def _assembled(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any)
 
 @eqx.filter_custom_jvp
 def _by_machine_code(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
-    from udkjax.native import engine
-
-    return engine.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
+    return by_native.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
 
 
 @_by_machine_code.def_jvp

@@ -1,0 +1,211 @@
+"""Machine code for problems: which ones it serves, and how their numbers go in and come out (native/)."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.equations.code import Code, code, is_large
+from udkjax.equations.programs import WITH_CARE, Equations
+from udkjax.equations.scales import Scales
+from udkjax.integrate.problem import Problem, Raw
+from udkjax.integrate.tableau import is_explicit, method_of
+from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.native.operation import Kind, Tableau, compiled, native_p, shapes_of
+from udkjax.native.program import UnsupportedError
+from udkjax.native.steps import DONE
+from udkjax.native.tableau import EULER
+from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, SETTINGS
+from udkjax.pinv import Auto
+from udkjax.scene.mechanism import Mechanism
+
+# --- closing
+
+
+def closes(mechanism: Mechanism) -> bool:
+    """Whether machine code can close a mechanism."""
+    if is_large(mechanism) or jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
+        return False
+    try:
+        compiled(_closing(mechanism), 1)
+    except UnsupportedError:
+        return False
+    return True
+
+
+def closed(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D, from a guess at time t."""
+    kind = _closing(mechanism)
+    settings = {"length": scales.length, "care": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
+    given = {
+        "numbers": _vector([*jax.tree.leaves(mechanism), 0.0], jnp),
+        "ts": _vector([t, t], jnp),
+        "q": q,
+        "v": v,
+        "settings": _vector([settings.get(name, 0.0) for name in SETTINGS], jnp),
+        "rows": scales.rows,
+        "breaks": jnp.zeros(0),
+    }
+    inputs = [jnp.asarray(given[name], float)[None] for name in INPUTS]
+    state, residuals, rank = (x[0] for x in native_p.bind(*undifferentiated(inputs), kind=kind, times=2))
+    n, m = len(q), len(residuals) // 2
+    return state[:n], state[n:], residuals[:m], residuals[m:], rank[0].astype(int)
+
+
+def _closing(mechanism: Mechanism) -> Kind:
+    return Kind(code(mechanism, (), False, None), Tableau(EULER), projected=False, breaks=False, mode="closing")
+
+
+# --- problems
+
+
+def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
+    """Why machine code cannot integrate a problem; empty where it can."""
+    equations = problem.equations
+    if adjoint is not None:
+        return f"{type(adjoint).__name__} is an adjoint of diffrax"
+    if meter is not None:
+        return "a progress meter is diffrax's"
+    if type(equations) is not Equations or problem.length is None:
+        return f"it knows the Udwadia-Kalaba equation of a mechanism by elimination, not {type(equations).__name__}"
+    if not is_explicit(problem.solver):
+        return f"{type(problem.solver).__name__} is no explicit Runge-Kutta method"
+    if problem.pieces is not None:
+        return "an element is smooth in pieces of the state"
+    if jax.default_backend() != "cpu":
+        return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
+    if not jax.config.jax_enable_x64:
+        return "it computes in float64, which JAX is told not to"
+    try:
+        compiled(_kind(problem), 1)
+    except UnsupportedError as error:
+        return f"the scene takes {error}, which is no arithmetic on numbers"
+    return ""
+
+
+def serves(problem: Problem) -> bool:
+    """Whether machine code can integrate a problem: one of scalar expressions, by an explicit Runge-Kutta method, on the CPU."""
+    return not unserved(problem)
+
+
+def known(problem: Problem) -> Raw:
+    """Integrate a problem whose numbers are all known, without tracing anything: `Raw` of NumPy's arrays."""
+    kind, inputs = _kind(problem), _inputs(problem, xp=np)
+    return _raw(compiled(kind, 1)(inputs, shapes_of(inputs, kind, len(problem.ts))))
+
+
+def solve(problem: Problem) -> Raw:
+    """Integrate one problem; under vmap, as many as there are, in lanes."""
+    return _raw(native_p.bind(*_inputs(problem), kind=_kind(problem), times=len(problem.ts)))
+
+
+def serves_derivatives(problem: Problem, moving: Any) -> bool:
+    """Whether there is machine code for the derivatives along what is `moving`: numbers of the scene, and initial states."""
+    if not serves(problem):
+        return False
+    moved = eqx.tree_at(lambda p: (p.q, p.v, p.equations), moving, (False, False, None), is_leaf=lambda x: x is None)
+    equations = eqx.tree_at(
+        lambda e: (e.constants, e.textbook.mechanism, e.textbook.baumgarte),
+        moving.equations,
+        (None, None, None),
+        is_leaf=lambda x: x is None,
+    )
+    return not any(x is True for x in jax.tree.leaves((moved, equations)))
+
+
+def pushed(problem: Any, moving: Any, change: Any) -> tuple[Raw, tuple[Array, Array, Array]]:
+    """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is moving."""
+    kind = _kind(problem, _moving(problem, moving), "forward")
+    constants = [dx for dx, m in zip(change.equations.constants, moving.equations.constants, strict=True) if m is True]
+    n = len(problem.q)
+    dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
+    along = [jnp.stack(constants) if constants else jnp.zeros(0), dq, dv]
+    *found, dys, dend = native_p.bind(
+        *_inputs(problem, kind.code), *(x[None, None] for x in along), kind=kind, times=len(problem.ts)
+    )
+    return _raw(found), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
+
+
+def pulled(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
+    """The cotangents of what is `moving`, from those of the states at the output times (T, 2n) and of the end (2n,)."""
+    kind = _kind(problem, _moving(problem, moving), "reverse")
+    bars = [ys[None], end[None]]
+    cbar, qbar, vbar = native_p.bind(*_inputs(problem, kind.code), *bars, kind=kind, times=len(problem.ts))[len(OUTPUTS) :]
+    found = iter(cbar[0])
+    assert kind.moving is not None
+    by_node = {s.index: next(found) for s, m in zip(kind.code.constants, kind.moving, strict=True) if m}
+    pairs = zip(problem.equations.code.constants, moving.equations.constants, strict=True)
+    constants = [by_node[s.index] if m is True else None for s, m in pairs]
+    none = jax.tree.map(lambda m: None, moving, is_leaf=lambda x: x is None)
+    zeros = jax.tree.map(
+        lambda m, x: jnp.zeros_like(x) if m is True else None, moving.equations, problem.equations, is_leaf=lambda x: x is None
+    )
+    equations = eqx.tree_at(lambda e: e.constants, zeros, constants, is_leaf=lambda x: x is None)
+    return eqx.tree_at(
+        lambda p: (p.equations, p.q, p.v),
+        none,
+        (equations, qbar[0] if moving.q is True else None, vbar[0] if moving.v is True else None),
+        is_leaf=lambda x: x is None,
+    )
+
+
+def _moving(problem: Any, moving: Any) -> tuple[bool, ...]:
+    """Of the constants of the code that watches: which have derivatives."""
+    code = problem.equations.code
+    moves = {s.index for s, m in zip(code.constants, moving.equations.constants, strict=True) if m is True}
+    return tuple(s.index in moves for s in _watching(code).constants)
+
+
+def _watching(code: Code) -> Code:
+    """The code of derivatives: it leaves out what depends on other rows, where a step is taken with care."""
+    return code.watching if code.elimination == "check" else code
+
+
+def _kind(problem: Any, moving: tuple[bool, ...] | None = None, mode: str = "run") -> Kind:
+    code = problem.equations.code
+    method = Tableau(method_of(problem.solver))
+    return Kind(
+        code if moving is None else _watching(code), method, problem.projected, problem.breakpoints is not None, moving, mode
+    )
+
+
+def _inputs(problem: Any, code: Code | None = None, xp: Any = jnp) -> list[Any]:
+    """Those of a run, of one member."""
+    textbook = problem.equations.textbook
+    method, rank_tol, baumgarte = textbook.method, textbook.method.rank_tol, textbook.baumgarte
+    gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
+    thresholds = [method.branch_tol] if isinstance(method, Auto) else [rank_tol**2]
+    if code is not None and code.elimination == "watch":
+        thresholds = [(WITH_CARE * rank_tol) ** 2, *thresholds]
+    first = 0.0 if problem.h is None else problem.h
+    care = WITH_CARE * rank_tol
+    settings = [problem.rtol, problem.atol, problem.smallest, first, problem.length, problem.rate, care, problem.max_steps]
+    given = {
+        "numbers": _vector([*jax.tree.leaves(textbook.mechanism), *gains, *thresholds], xp),
+        "ts": problem.ts,
+        "q": problem.q,
+        "v": problem.v,
+        "settings": _vector(settings, xp),
+        "rows": textbook.scales.rows,
+        "breaks": xp.zeros(0) if problem.breakpoints is None else problem.breakpoints,
+    }
+    arrays = [xp.asarray(given[name], float)[None] for name in INPUTS]
+    return arrays if xp is np else undifferentiated(arrays)
+
+
+def _vector(parts: Sequence[Any], xp: Any) -> Any:
+    return xp.concatenate([xp.ravel(xp.asarray(x, float)) for x in parts])
+
+
+def _raw(found: Sequence[Any]) -> Raw:
+    ys, violation, info = (x[0] for x in found)
+    q, v = ys[:, : ys.shape[1] // 2], ys[:, ys.shape[1] // 2 :]
+    code, t, tried, accepted, evaluations, written = (info[k] for k in range(len(INFO)))
+    number = np.arange(len(ys))
+    reached = (number <= written) & (number < len(ys) - 1) | (code == DONE)
+    counts = (x.astype(int) for x in (tried, accepted, evaluations))
+    return Raw(q, v, violation, reached, code.astype(int), t, info[len(INFO) :], *counts)

@@ -1,0 +1,178 @@
+"""Machine code as an operation of JAX: what is compiled once for each kind, called at once or from compiled programs."""
+
+import ctypes
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+from jaxtyping import Array
+
+from udkjax.equations.code import Code
+from udkjax.native import machine
+from udkjax.native.closing import Closing
+from udkjax.native.ffi import handler
+from udkjax.native.tableau import Method
+from udkjax.native.tangents import Forward
+from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, Plan, Trajectory
+from udkjax.native.walk import Reverse
+
+FEW = 2  # members up to which one follows another: eight lanes take as long as two members
+
+
+class Kind(NamedTuple):
+    """Which trajectory: all that its code depends on but the number of lanes."""
+
+    code: Code
+    method: "Tableau"
+    projected: bool
+    breaks: bool
+    moving: tuple[bool, ...] | None = None  # of a run with derivatives: of which constants
+    mode: str = "run"  # or "forward", or "reverse"
+
+
+class Tableau:
+    """A method, to be looked up by its numbers."""
+
+    def __init__(self, method: Method):
+        self.method = method
+        self._key = tuple(np.asarray(x).tobytes() for x in method)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tableau) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+class Compiled:
+    """The machine code of one kind of trajectory, in so many lanes."""
+
+    def __init__(self, kind: Kind, width: int):
+        if kind.mode == "closing":
+            trajectory: Trajectory = Closing(kind.code, machine.lanes())
+        else:
+            plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
+            trajectory = MODES[kind.mode](plan, kind.moving) if kind.moving is not None else Trajectory(plan)  # pyright: ignore
+        self.trajectory = trajectory
+        main = handler(trajectory, "call_frame")
+        text = "\n".join([trajectory.text(), *sorted(main.declared), main.text()])
+        self.name = f"udkjax_{machine.digest(text)}"
+        self.library = machine.library(text)
+        self._run = machine.function(self.library["run"], ctypes.c_void_p)
+        capsule = jax.ffi.pycapsule(ctypes.c_void_p(self.library["call_frame"]))
+        jax.ffi.register_ffi_target(self.name, capsule, platform="cpu")
+
+    def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
+        """Outputs of these shapes, on as many threads as there are cores."""
+        names, fields = self.trajectory, {}
+        inputs = [np.ascontiguousarray(x, np.float64) for x in inputs]
+        found = [np.full(shape, np.nan) for shape in shapes]
+        for name, x in zip((*INPUTS, *names.inputs), inputs, strict=True):
+            fields[name] = x.ctypes.data
+            fields[f"{name} stride"] = math.prod(x.shape[1:]) if len(x) > 1 else 0
+        fields |= {name: x.ctypes.data for name, x in zip((*names.results, *names.outputs), found, strict=True)}
+        members, times = shapes[0][0], inputs[INPUTS.index("ts")].shape[1]
+        following = ctypes.c_int64(0)
+        fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
+        fields |= {"directions": inputs[-1].shape[1] if names.along_directions else 0, "next": ctypes.addressof(following)}
+        call = (ctypes.c_int64 * len(names.call))(*(fields[name] for name in names.call))
+        threads = min(os.cpu_count() or 1, members)
+        if threads == 1:
+            self._run(ctypes.addressof(call))
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(lambda _: self._run(ctypes.addressof(call)), range(threads)))
+        return found
+
+
+MODES: dict[str, type[Trajectory]] = {"forward": Forward, "reverse": Reverse}
+
+
+@lru_cache(maxsize=256)
+def compiled(kind: Kind, width: int) -> Compiled:
+    """The machine code of a kind of trajectory."""
+    return Compiled(kind, width)
+
+
+# --- as an operation of JAX: inputs and outputs have the members first, of an input that all share only one
+
+
+def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, ...]]:
+    """The shapes of the outputs."""
+    n = inputs[INPUTS.index("q")].shape[1]
+    members = max(x.shape[0] for x in inputs)
+    if kind.mode == "closing":
+        return [(members, 2 * n), (members, 2 * inputs[INPUTS.index("rows")].shape[1]), (members, 1)]
+    shapes: list[tuple[int, ...]] = [(members, times, 2 * n), (members, times), (members, len(INFO) + 2 * n)]
+    if kind.mode == "forward":
+        directions = inputs[-1].shape[1]
+        shapes += [(members, directions, times, 2 * n), (members, directions, 2 * n)]
+    if kind.mode == "reverse":
+        assert kind.moving is not None
+        shapes += [(members, sum(kind.moving)), (members, n), (members, n)]
+    return shapes
+
+
+def _code(inputs: Sequence[Any], kind: Kind) -> Compiled:
+    few = kind.mode == "closing" or max(x.shape[0] for x in inputs) <= FEW
+    return compiled(kind, 1 if few else machine.lanes())
+
+
+def _at_once(*inputs: Any, kind: Kind, times: int) -> list[Array]:
+    found = _code(inputs, kind)([np.asarray(x) for x in inputs], shapes_of(inputs, kind, times))
+    return [jnp.asarray(x) for x in found]
+
+
+def _compiled_into(*inputs: Any, kind: Kind, times: int) -> Sequence[Array]:
+    results = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes_of(inputs, kind, times)]
+    return jax.ffi.ffi_call(_code(inputs, kind).name, results)(*inputs)
+
+
+def _abstract(*inputs: Any, kind: Kind, times: int) -> list[Any]:
+    return [ShapedArray(shape, np.dtype(float)) for shape in shapes_of(inputs, kind, times)]
+
+
+def _batched(inputs: Sequence[Any], axes: Sequence[int | None], kind: Kind, times: int) -> tuple[list[Any], list[int | None]]:
+    """A batch is more members; but one of directions alone, more directions."""
+    size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
+    first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
+    ways = len(MODES["forward"].inputs) if kind.mode == "forward" else 0
+    shared = len(inputs) - ways
+    if ways and all(axis is None for axis in axes[:shared]):
+
+        def directions(x: Any, axis: int | None) -> Any:
+            x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else x
+            x = jnp.moveaxis(x, 0, 1)
+            return x.reshape(x.shape[0], x.shape[1] * x.shape[2], *x.shape[3:])
+
+        given = [directions(x, axis) for x, axis in zip(first[shared:], axes[shared:], strict=True)]
+        found = native_p.bind(*first[:shared], *given, kind=kind, times=times)
+        changes = [x.reshape(x.shape[0], size, x.shape[1] // size, *x.shape[2:]) for x in found[len(OUTPUTS) :]]
+        return [*found[: len(OUTPUTS)], *changes], [*[None] * len(OUTPUTS), *[1] * len(changes)]
+    members = max(x.shape[0 if axis is None else 1] for x, axis in zip(first, axes, strict=True))
+
+    def each(x: Any, axis: int | None) -> Any:
+        if axis is None and x.shape[0] == 1:
+            return x
+        x = x[None] if axis is None else x
+        return jnp.broadcast_to(x, (size, members, *x.shape[2:])).reshape(size * members, *x.shape[2:])
+
+    found = native_p.bind(*(each(x, axis) for x, axis in zip(first, axes, strict=True)), kind=kind, times=times)
+    return [x.reshape(size, members, *x.shape[1:]) for x in found], [0] * len(found)
+
+
+native_p = Primitive("native_trajectory")
+native_p.multiple_results = True
+native_p.def_impl(_at_once)
+native_p.def_abstract_eval(_abstract)
+batching.primitive_batchers[native_p] = _batched
+mlir.register_lowering(native_p, mlir.lower_fun(_compiled_into), platform="cpu")

@@ -1,0 +1,50 @@
+"""The numbers that steps are chosen by, for machine code and whatever steps as it does."""
+
+# Of the step's size. With 0.9 every tenth step of an ordinary run is rejected, and most runs take 4 to 15 % more at equal error.
+SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
+# Where errors grow, a step as long as the one before may be foreseen to fail. It is made so short that its error should be
+# this much of the tolerance, errors growing by this factor at most. At equal error most runs take up to 8 % fewer right-hand
+# sides, those of linkages that swing to and fro 15 %.
+FORESEEN, STEEPEST = 0.5, 100.0
+# Of the step before a breakpoint: the first behind it. The outputs in it have states on one side alone, and so larger errors.
+CAUTIOUS = 0.5
+CUT = 0.9  # of the step that was planned: one less long was cut short
+
+# What a step that failed is shortened to, where it is not known when the configuration is reached; how often in a row.
+DODGE, DODGES = 0.8, 3
+SHORTEST, LONGEST = 0.2, 0.95  # of a step, one that is taken in its place
+# Rounding errors of accelerations are about a unit of rounding over the third power of the distance, in the scene's own units.
+# A step's velocity has a small part of them, which must be less than the tolerance. Where the configuration is still ahead of the
+# end of a step, seven times as far away: close to it are many nodes of the next one, and outputs in a next one that is ten times
+# as long, as after a step that was made shorter, have a hundred times as much of them.
+PAST, BEFORE = 1e-16, 3e-14
+# Elimination trusts no pivot that is closer than 1e-3 (`BRANCH_TOL`), and shorter steps that begin so close would get shorter and
+# shorter: they have no stage where it does.
+NEAREST = 1.5e-3
+# Of a step: a configuration that is expected by then lies behind its end, though it is expected a little too early, by up to a
+# tenth of a step. More than the larger of `Method.clearings`. Where it is far away, it may be expected by three tenths too early,
+# and just be ahead of the end: less than this much of the distance that the end should have by then.
+SURE, EXPECTED = 0.85, 0.3
+
+# Breakpoints.
+UNIT = 0.01  # of the smallest step: what times are rounded by
+ENDS_BEFORE, BEGINS_BEHIND = (
+    2 * UNIT,
+    UNIT,
+)  # of the smallest step: how far away from a breakpoint a step ends, and the next one begins
+GAP = ENDS_BEFORE + BEGINS_BEHIND
+SAME = 0.5  # of the smallest step: breakpoints that are so close count as one
+
+POINTS = 4  # states that an interpolating polynomial goes through: with three, velocities between steps are worse than at steps
+STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
+
+# What a run may be. `NOT_FINITE`: its step became too small because of a number that is not finite.
+RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, DOUBTED, NOT_FINITE = range(6)
+
+AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one looks for what is not finite
+
+# How much of an error counts that projection takes back. What lasts of it is what it does to the rest while the step is taken.
+# Close to singular configurations it is the stages' distance from the manifold over a small singular value: for its sake alone,
+# steps were up to six times as many at tolerances of 1e-11. A hundredth keeps some of these; with none of it, runs that cross are
+# less exact than their tolerance says.
+TAKEN_BACK = 1e-3
