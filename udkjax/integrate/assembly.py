@@ -11,6 +11,7 @@ one that all pseudoinverses share: gradients of the assembled state are right wh
 """
 
 import weakref
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -35,6 +36,7 @@ from udkjax.equations.programs import prepare_to_close
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.integrate import by_native
+from udkjax.integrate.derivatives import Function, Linear, Mask, replaced, those
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -149,16 +151,82 @@ def _assembled(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any)
     return TracedRows(prepare_to_close(mechanism, analysis=analysis)).assembled(_closed, t, q, v)
 
 
-@eqx.filter_custom_jvp
+class Assembly(Function):
+    """q and v of a closed state, of the numbers of a mechanism and a guess. `rest` is what else they depend on."""
+
+    rest: Any
+    tree: Any = eqx.field(static=True)
+    is_plain: bool = eqx.field(static=True, default=False)
+
+    @property
+    def plain(self) -> "Assembly":
+        return replace(self, is_plain=True)
+
+    def guess(self, xs: list[Array]) -> tuple[Any, ...]:
+        """The mechanism, its analysis, and t, q and v."""
+        return eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
+
+    def __call__(self, xs: list[Array]) -> list[Array]:
+        return list(_assembled(*self.guess(xs))[:2])
+
+    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
+        *_, q, v = self.guess(xs)
+        return [q.shape, v.shape]
+
+    def pull(self, xs: list[Array], moving: Mask, ws: list[Array]) -> list[Array]:
+        return jax.vjp(lambda some: self(replaced(xs, moving, some)), those(xs, moving))[1](ws)[0]
+
+    def forward(self, xs: list[Array], moving: Mask, vs: list[Array], run: Any) -> list[Array]:
+        guess, which = self._native(xs, moving)
+        if guess is None:
+            return super().forward(xs, moving, vs, run)
+        rest = iter(vs)
+        change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in moving])
+        return list(by_native.closed_along(guess, _those_of(which), _those_of(change)))
+
+    def backward(self, xs: list[Array], moving: Mask, ws: list[Array], run: Any) -> list[Array]:
+        guess, which = self._native(xs, moving)
+        if guess is None:
+            return super().backward(xs, moving, ws, run)
+        found = by_native.closed_back(guess, _those_of(which), *ws)
+        pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_those_of(which), found)), strict=True)
+        return [bar for m, bar in pairs if m is True]
+
+    def _native(self, xs: list[Array], moving: Mask) -> tuple[Any, Any]:
+        """What machine code takes, if it closes the mechanism and has derivatives along what is moving."""
+        which = jax.tree.unflatten(self.tree, moving)
+        mechanism, analysis, t, q, v = self.guess(xs)
+        others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
+        if self.is_plain or others or not by_native.closes(mechanism):
+            return None, None
+        return (mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v), which
+
+
+def _those_of(tree: Any) -> tuple[Any, Any, Any]:
+    """Of a mechanism, an analysis, t, q and v: what machine code has derivatives along."""
+    mechanism, _, _, q, v = tree
+    return mechanism, q, v
+
+
 def _by_machine_code(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
+    arrays, rest = eqx.partition((mechanism, analysis, t, q, v), eqx.is_inexact_array)
+    xs, tree = jax.tree.flatten(arrays)
+    return _closed_by_code(Assembly(rest, tree), xs)
+
+
+@eqx.filter_custom_jvp
+def _closed_by_code(function: Assembly, xs: list[Array]) -> tuple[Any, Any, Any, Any, Any]:
+    mechanism, analysis, t, q, v = function.guess(xs)
     return by_native.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
 
 
-@_by_machine_code.def_jvp
+@_closed_by_code.def_jvp
 def _(primals, tangents):
-    found = _by_machine_code(*primals)
-    change = eqx.filter_jvp(_assembled, primals, tangents)[1]
-    return found, (*change[:-1], None)
+    function, xs = primals
+    found = _closed_by_code(function, xs)
+    moving = tuple(dx is not None for dx in tangents[1])
+    linear = Linear(function=function, xs=xs, run=(), moving=moving)
+    return found, (*linear.applied(those(tangents[1], moving)), None, None, None)
 
 
 def _known(tree: Any) -> bool:

@@ -39,7 +39,52 @@ def closes(mechanism: Mechanism) -> bool:
 
 def closed(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
     """q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D, from a guess at time t."""
-    kind = _closing(mechanism)
+    inputs = _guess(mechanism, scales, tol, t, q, v)
+    state, residuals, rank = (x[0] for x in native_p.bind(*inputs, kind=_closing(mechanism), times=2))
+    n, m = len(q), len(residuals) // 2
+    return state[:n], state[n:], residuals[:m], residuals[m:], rank[0].astype(int)
+
+
+def closed_along(guess: Any, moving: Any, change: Any) -> tuple[Array, Array]:
+    """The changes of q and v along a `change` of what is moving of (mechanism, scales, tol, t, q, v)."""
+    (mechanism, *_, q, v), (_, *_, dq, dv) = guess, change
+    n, kind = len(q), _closing(guess[0], _numbers_moving(mechanism, moving[0]), "closing forward")
+    numbers = _vector(_moved(moving[0], change[0]), jnp)
+    along = [numbers, *(jnp.zeros(n) if dx is None else dx for dx in (dq, dv))]
+    dstate = native_p.bind(*_guess(*guess), *(x[None, None] for x in along), kind=kind, times=2)[-1][0, 0]
+    return dstate[:n], dstate[n:]
+
+
+def closed_back(guess: Any, moving: Any, qbar: Array, vbar: Array) -> Any:
+    """The cotangents of what is moving, from those of q and v."""
+    mechanism, n = guess[0], len(qbar)
+    kind = _closing(mechanism, _numbers_moving(mechanism, moving[0]), "closing reverse")
+    bars = jnp.concatenate([qbar, vbar])[None]
+    numbers, *states = (x[0] for x in native_p.bind(*_guess(*guess), bars, kind=kind, times=2)[-3:])
+    found, parts = 0, []
+    leaves, tree = jax.tree.flatten(mechanism)
+    for x, m in zip(leaves, jax.tree.leaves(moving[0], is_leaf=lambda x: x is None), strict=True):
+        if m is True:
+            parts.append(numbers[found : found + np.size(x)].reshape(np.shape(x)))
+            found += np.size(x)
+        else:
+            parts.append(None)
+    assert len(states[0]) == n
+    return jax.tree.unflatten(tree, parts), *(x if m is True else None for x, m in zip(states, moving[-2:], strict=True))
+
+
+def _moved(moving: Any, change: Any) -> list[Any]:
+    """The changes of the numbers that are moving, in order."""
+    pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (moving, change)), strict=True)
+    return [dx for m, dx in pairs if m is True]
+
+
+def _numbers_moving(mechanism: Mechanism, moving: Any) -> tuple[bool, ...]:
+    leaves = zip(jax.tree.leaves(mechanism), jax.tree.leaves(moving, is_leaf=lambda x: x is None), strict=True)
+    return (*(m is True for x, m in leaves for _ in range(np.size(x))), False)
+
+
+def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> list[Any]:
     settings = {"length": scales.length, "care": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
     given = {
         "numbers": _vector([*jax.tree.leaves(mechanism), 0.0], jnp),
@@ -50,14 +95,11 @@ def closed(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: An
         "rows": scales.rows,
         "breaks": jnp.zeros(0),
     }
-    inputs = [jnp.asarray(given[name], float)[None] for name in INPUTS]
-    state, residuals, rank = (x[0] for x in native_p.bind(*undifferentiated(inputs), kind=kind, times=2))
-    n, m = len(q), len(residuals) // 2
-    return state[:n], state[n:], residuals[:m], residuals[m:], rank[0].astype(int)
+    return undifferentiated([jnp.asarray(given[name], float)[None] for name in INPUTS])
 
 
-def _closing(mechanism: Mechanism) -> Kind:
-    return Kind(code(mechanism, (), False, None), Tableau(EULER), projected=False, breaks=False, mode="closing")
+def _closing(mechanism: Mechanism, moving: tuple[bool, ...] | None = None, mode: str = "closing") -> Kind:
+    return Kind(code(mechanism, (), False, None), Tableau(EULER), projected=False, breaks=False, moving=moving, mode=mode)
 
 
 # --- problems

@@ -80,7 +80,7 @@ def _(primals, tangents):
         return list(raw), change
 
     known = list(shapes), [shapes[k] for k in SMOOTH]
-    raw, change = along(in_parts, at_once, primals, _those(tangents[1], moving), None, known)
+    raw, change = along(in_parts, at_once, primals, those(tangents[1], moving), None, known)
     return Raw(*raw), Raw(*[change[SMOOTH.index(k)] if k in SMOOTH else None for k in range(len(raw))])
 
 
@@ -117,6 +117,25 @@ class Function(eqx.Module):
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
         """Those of f(x)."""
 
+    def forward(self, xs: list[Array], moving: Mask, vs: list[Array], run: Any) -> list[Array]:
+        """J v. `run` is what evaluating f at x has left for its first derivatives, if anything."""
+        del run
+        return _change(self, xs, moving, vs)[1]
+
+    def backward(self, xs: list[Array], moving: Mask, ws: list[Array], run: Any) -> list[Array]:
+        """J^T w, of those of x that are moving, in the same way."""
+        del run
+        return self.pull(xs, moving, ws)
+
+    @property
+    def plain(self) -> "Function":
+        """The same in the form that is differentiated more than once."""
+        return self
+
+    def counted_twice(self, xs: list[Array], dxs: list[Any], moving: Mask, bars: list[Array]) -> list[Array] | None:
+        """Of a change of cotangents, what JAX adds itself."""
+        return None
+
 
 class Run(Function):
     """Positions and velocities at the output times, and at the end, of the numbers of a problem. `rest` is what else it has.
@@ -141,6 +160,23 @@ class Run(Function):
         """By machine code, which has no derivatives, if that serves."""
         problem = self.problem(xs)
         return by_native.solve(problem) if by_native.serves(problem) else self.raw(xs)
+
+    def forward(self, xs: list[Array], moving: Mask, vs: list[Array], run: Any) -> list[Array]:
+        return super().forward(xs, moving, vs, run) if run is None else self.pushed(xs, moving, vs)[1]
+
+    def backward(self, xs: list[Array], moving: Mask, ws: list[Array], run: Any) -> list[Array]:
+        if run is None:
+            return self.pull(xs, moving, ws)
+        problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
+        if not self.is_plain and by_native.serves_derivatives(problem, which):
+            q, v, y = ws
+            found = by_native.pulled(problem, which, jnp.concatenate([q, v], axis=1), y)
+            pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
+            return [bar for m, bar in pairs if m is True]
+        raw, record = run
+        if record is None:
+            return self.through_diffrax("RecursiveCheckpointAdjoint", xs, moving, ws)
+        return self.walk(_pulled, xs, moving, raw, record, ws)
 
     def pushed(self, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[Raw, list[Array]]:
         """The run, and the change of its states along v, of those of x that are moving: by machine code, if that serves."""
@@ -181,9 +217,9 @@ class Run(Function):
         """The way back of a recorded run."""
 
         def arrays(some: list[Array]) -> Problem:
-            return eqx.filter(self.problem(_replaced(xs, moving, some)), eqx.is_inexact_array)
+            return eqx.filter(self.problem(replaced(xs, moving, some)), eqx.is_inexact_array)
 
-        numbers, to_xs = jax.vjp(arrays, _those(xs, moving))
+        numbers, to_xs = jax.vjp(arrays, those(xs, moving))
         which = replace(jax.tree.unflatten(self.tree, moving), fallback=numbers.fallback)
         if self.is_plain and isinstance(which.equations, Equations):
             textbook, none = which.equations.textbook, jax.tree.map(lambda _: False, numbers.equations)
@@ -197,10 +233,10 @@ class Run(Function):
         """Reverse mode by an adjoint of diffrax."""
 
         def function(some: list[Array]) -> list[Array]:
-            raw = _by_diffrax(self.problem(_replaced(xs, moving, some)), adjoint)
+            raw = _by_diffrax(self.problem(replaced(xs, moving, some)), adjoint)
             return [raw[k] for k in SMOOTH]
 
-        return jax.vjp(function, _those(xs, moving))[1](ws)[0]
+        return jax.vjp(function, those(xs, moving))[1](ws)[0]
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
         problem = eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
@@ -240,9 +276,9 @@ class Along(Function):
         of_x, of_v = moving[: len(xs)], moving[len(xs) :]
         either = tuple(a or b for a, b in zip(of_x, self.moving, strict=True))
         found, change = _change(lambda xs: self.of.pull(xs, either, ws), xs, self.moving, vs)
-        change = _those(change, tuple(x for x, e in zip(of_x, either, strict=True) if e))
-        found = _those(found, tuple(m for m, e in zip(self.moving, either, strict=True) if e))
-        return [*change, *_those(found, of_v)]
+        change = those(change, tuple(x for x, e in zip(of_x, either, strict=True) if e))
+        found = those(found, tuple(m for m, e in zip(self.moving, either, strict=True) if e))
+        return [*change, *those(found, of_v)]
 
     def parts(self, xs: list[Array]) -> tuple[list[Array], list[Array]]:
         return xs[: len(self.moving)], xs[len(self.moving) :]
@@ -265,16 +301,16 @@ class Back(Along):
         if any(of_x):
             found += _change(lambda xs: self.of.pull(xs, of_x, bars), xs, self.moving, directions)[1]
         if any(of_w):
-            found += _those(_change(self.of, xs, self.moving, directions)[1], of_w)
+            found += those(_change(self.of, xs, self.moving, directions)[1], of_w)
         return found
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        return [x.shape for x in _those(self.parts(xs)[0], self.moving)]
+        return [x.shape for x in those(self.parts(xs)[0], self.moving)]
 
 
 def _change(function: Callable, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[Any, Any]:
     """f(x), and its change along v, of those of x that are moving, by forward mode."""
-    return jax.jvp(lambda *some: function(_replaced(xs, moving, some)), _those(xs, moving), vs)
+    return jax.jvp(lambda *some: function(replaced(xs, moving, some)), those(xs, moving), vs)
 
 
 # --- the linear map
@@ -285,7 +321,7 @@ class Linear(eqx.Module):
 
     function: Function
     xs: list[Array]
-    run: Any  # of a `Run`: what it left, and its record, if it is known
+    run: Any  # what evaluating it has left for its first derivatives; None: nothing
     moving: Mask = eqx.field(static=True)
     transposed: bool = eqx.field(static=True, default=False)
 
@@ -296,30 +332,16 @@ class Linear(eqx.Module):
     @property
     def inputs(self) -> list[tuple[int, ...]]:
         """The shapes of what it is applied to."""
-        return self.function.shapes(self.xs) if self.transposed else [x.shape for x in _those(self.xs, self.moving)]
+        return self.function.shapes(self.xs) if self.transposed else [x.shape for x in those(self.xs, self.moving)]
 
     def applied(self, vs: list[Array]) -> list[Array]:
         return _split(_bind(self, _flat(vs)), self.T.inputs)
 
 
 def _apply(linear: Linear, vector: Array) -> Array:
-    function, xs, moving = linear.function, linear.xs, linear.moving
-    vs = _split(vector, linear.inputs)
-    if linear.run is None:
-        return _flat(function.pull(xs, moving, vs) if linear.transposed else _change(function, xs, moving, vs)[1])
-    assert isinstance(function, Run)
-    raw, record = linear.run
-    if not linear.transposed:
-        return _flat(function.pushed(xs, moving, vs)[1])
-    problem, which = function.problem(xs), jax.tree.unflatten(function.tree, moving)
-    if not function.is_plain and by_native.serves_derivatives(problem, which):
-        q, v, y = vs
-        found = by_native.pulled(problem, which, jnp.concatenate([q, v], axis=1), y)
-        pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
-        return _flat([bar for m, bar in pairs if m is True])
-    if record is None:
-        return _flat(function.through_diffrax("RecursiveCheckpointAdjoint", xs, moving, vs))
-    return _flat(function.walk(_pulled, xs, moving, raw, record, vs))
+    function, vs = linear.function, _split(vector, linear.inputs)
+    apply = function.backward if linear.transposed else function.forward
+    return _flat(apply(linear.xs, linear.moving, vs, linear.run))
 
 
 @eqxi.filter_primitive_def
@@ -338,12 +360,11 @@ def _derivative(primals, tangents):
     parts = [None] * len(linear.inputs) if change is None else _split(change, linear.inputs)
     dxs = [*at.xs, *parts]
     moving = tuple(dx is not None for dx in dxs)
-    of = function.plain if isinstance(function, Run) else function
-    further = Linear(kind(of, linear.moving), [*linear.xs, *_split(vector, linear.inputs)], None, moving)
-    slope = _bind(further, _flat(_those(dxs, moving)))
-    if linear.transposed and isinstance(function, Run):
-        bars = _split(found, linear.T.inputs)
-        slope = slope - _flat(function.counted_twice(linear.xs, at.xs, linear.moving, bars))
+    further = Linear(kind(function.plain, linear.moving), [*linear.xs, *_split(vector, linear.inputs)], None, moving)
+    slope = _bind(further, _flat(those(dxs, moving)))
+    if linear.transposed:
+        twice = function.counted_twice(linear.xs, at.xs, linear.moving, _split(found, linear.T.inputs))
+        slope = slope if twice is None else slope - _flat(twice)
     return found, slope
 
 
@@ -360,11 +381,13 @@ def _bind(linear: Linear, vector: Array) -> Array:
     return eqxi.filter_primitive_bind(_linear_p, linear, vector)
 
 
-def _those(xs: Sequence[Any], which: Mask) -> list[Any]:
+def those(xs: Sequence[Any], which: Mask) -> list[Any]:
+    """Those that are marked."""
     return [x for x, m in zip(xs, which, strict=True) if m]
 
 
-def _replaced(xs: Sequence[Array], moving: Mask, some: Sequence[Array]) -> list[Array]:
+def replaced(xs: Sequence[Array], moving: Mask, some: Sequence[Array]) -> list[Array]:
+    """The same, with others in place of those that are moving."""
     rest = iter(some)
     return [next(rest) if m else x for x, m in zip(xs, moving, strict=True)]
 

@@ -6,6 +6,8 @@ by steps that are limited, and halved until the residual falls; then the velocit
 rows, weighted, by rotations (least_norm.py).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from udkjax.equations.closing import HALVINGS, ITERATIONS, ROUNDING, STRIDE
@@ -15,6 +17,7 @@ from udkjax.native.least_norm import least_norm
 from udkjax.native.tableau import EULER
 from udkjax.native.trajectory import Lane, Plan, Trajectory
 
+POSITION, VELOCITY = 0, 1  # what a correction is of
 VELOCITIES = 2  # corrections: the second removes the rounding errors of the first
 
 
@@ -98,7 +101,13 @@ class Closing(Trajectory):
                     halvings.value = halvings.value + 1
                 with f.if_(better.value < 0.5):
                     moved(f.const(0.0))
+                with f.if_(better.value > 0.5):
+                    taken = scale.value * 2.0
+                    limited = f.select(longest.value > STRIDE, f.const(1.0), 0.0)
+                    self._before(f, "q", lambda: self._taken(f, POSITION, taken, limited))
+        self._taken(f, POSITION, f.const(1.0), f.const(0.0))
         for _ in range(VELOCITIES):
+            self._taken(f, VELOCITY, f.const(1.0), f.const(0.0))
             self._call(f, "psi_dot")
             solve("X dv")
             with f.each(n) as i:
@@ -120,6 +129,26 @@ class Closing(Trajectory):
             with f.each(self.m) as i:
                 f.store(f.load(work, i + self.places["psi"]), residuals, i + offset)
         f.store(s.rank, address("rank", 1))
+        self._ended_closing(f, member)
+
+    # What closing with derivatives does besides (closing_derivatives.py).
+
+    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
+        """What it does with a correction of the state in X: so much of it was taken, less where it was limited."""
+
+    def _ended_closing(self, f: Function, member: Value):
+        """What it does with a member that is closed."""
+
+    def _before(self, f: Function, x: str, do: Callable[[], None]):
+        """What is done with the state before a step, in C, instead of that in X."""
+        p, work = self.places, f.given["work"]
+        with f.each(self.n) as i:
+            here, before = f.load(work, i + p[f"X {x}"]), f.load(work, i + p["C"])
+            f.store(here, work, i + p["C"])
+            f.store(before, work, i + p[f"X {x}"])
+        do()
+        with f.each(self.n) as i:
+            f.store(f.load(work, i + p["C"]), work, i + p[f"X {x}"])
 
     def _round(self, f: Function, s: Lane, fill):
         f.call("close", f.given["work"], f.given["call"])

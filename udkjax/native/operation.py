@@ -19,6 +19,7 @@ from jaxtyping import Array
 from udkjax.equations.code import Code
 from udkjax.native import machine
 from udkjax.native.closing import Closing
+from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
 from udkjax.native.ffi import handler
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
@@ -59,6 +60,8 @@ class Compiled:
     def __init__(self, kind: Kind, width: int):
         if kind.mode == "closing":
             trajectory: Trajectory = Closing(kind.code, machine.lanes())
+        elif kind.mode in CLOSING:
+            trajectory = CLOSING[kind.mode](kind.code, kind.moving, machine.lanes())
         else:
             plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
             trajectory = MODES[kind.mode](plan, kind.moving) if kind.moving is not None else Trajectory(plan)  # pyright: ignore
@@ -97,6 +100,9 @@ class Compiled:
 MODES: dict[str, type[Trajectory]] = {"forward": Forward, "reverse": Reverse}
 
 
+CLOSING: dict[str, Any] = {"closing forward": ClosingForward, "closing reverse": ClosingReverse}
+
+
 @lru_cache(maxsize=256)
 def compiled(kind: Kind, width: int) -> Compiled:
     """The machine code of a kind of trajectory."""
@@ -110,9 +116,16 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
     """The shapes of the outputs."""
     n = inputs[INPUTS.index("q")].shape[1]
     members = max(x.shape[0] for x in inputs)
-    if kind.mode == "closing":
-        return [(members, 2 * n), (members, 2 * inputs[INPUTS.index("rows")].shape[1]), (members, 1)]
-    shapes: list[tuple[int, ...]] = [(members, times, 2 * n), (members, times), (members, len(INFO) + 2 * n)]
+    shapes: list[tuple[int, ...]]
+    if kind.mode.startswith("closing"):
+        shapes = [(members, 2 * n), (members, 2 * inputs[INPUTS.index("rows")].shape[1]), (members, 1)]
+        if kind.mode == "closing forward":
+            shapes += [(members, inputs[-1].shape[1], 2 * n)]
+        if kind.mode == "closing reverse":
+            assert kind.moving is not None
+            shapes += [(members, sum(kind.moving)), (members, n), (members, n)]
+        return shapes
+    shapes = [(members, times, 2 * n), (members, times), (members, len(INFO) + 2 * n)]
     if kind.mode == "forward":
         directions = inputs[-1].shape[1]
         shapes += [(members, directions, times, 2 * n), (members, directions, 2 * n)]
@@ -123,7 +136,7 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
 
 
 def _code(inputs: Sequence[Any], kind: Kind) -> Compiled:
-    few = kind.mode == "closing" or max(x.shape[0] for x in inputs) <= FEW
+    few = kind.mode.startswith("closing") or max(x.shape[0] for x in inputs) <= FEW
     return compiled(kind, 1 if few else machine.lanes())
 
 
@@ -145,7 +158,8 @@ def _batched(inputs: Sequence[Any], axes: Sequence[int | None], kind: Kind, time
     """A batch is more members; but one of directions alone, more directions."""
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
-    ways = len(MODES["forward"].inputs) if kind.mode == "forward" else 0
+    ways = 3 if kind.mode.endswith("forward") else 0  # the last inputs, which have directions
+    results = 3  # the first outputs, which have none
     shared = len(inputs) - ways
     if ways and all(axis is None for axis in axes[:shared]):
 
@@ -156,8 +170,8 @@ def _batched(inputs: Sequence[Any], axes: Sequence[int | None], kind: Kind, time
 
         given = [directions(x, axis) for x, axis in zip(first[shared:], axes[shared:], strict=True)]
         found = native_p.bind(*first[:shared], *given, kind=kind, times=times)
-        changes = [x.reshape(x.shape[0], size, x.shape[1] // size, *x.shape[2:]) for x in found[len(OUTPUTS) :]]
-        return [*found[: len(OUTPUTS)], *changes], [*[None] * len(OUTPUTS), *[1] * len(changes)]
+        changes = [x.reshape(x.shape[0], size, x.shape[1] // size, *x.shape[2:]) for x in found[results:]]
+        return [*found[:results], *changes], [*[None] * results, *[1] * len(changes)]
     members = max(x.shape[0 if axis is None else 1] for x, axis in zip(first, axes, strict=True))
 
     def each(x: Any, axis: int | None) -> Any:

@@ -1,0 +1,329 @@
+"""Derivatives of closing a mechanism: of its steps as they are, forward along directions and backward.
+
+A correction is x = A^+ r, of least norm, with A = Psi_q M^(-1/2) and r = Psi (or Psi_dot), both with their rows weighted. Along a
+change of the state and of the numbers, where the rank is constant (Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413),
+
+    dx = A^+ (dr - dA x - A g) + g,        g = dA^T y,        y = (A^+)^T x,
+
+and transposed, from a cotangent w of x,
+
+    u = (A^+)^T w,    h = w - A^T u:    u is the cotangent of r, and -u x^T + y h^T that of A.
+
+The coordinates change by -s M^(-1/2) x; s, where it limits the step, is a function of it, too. Behind the last step there is one
+more correction, which changes nothing but the derivative: it returns it to the constraint manifold. dA, dr and d M^(-1/2) are
+straight-line programs of the constants, q and v.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from udkjax.equations.closing import ITERATIONS
+from udkjax.equations.code import Code
+from udkjax.native.closing import POSITION, VELOCITIES, VELOCITY, Closing
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.least_norm import LEAST_NORM
+from udkjax.native.program import write
+from udkjax.native.trajectory import Lane, Places, _numbered
+from udkjax.straightline import Program, cotangents, tangents
+
+
+class _Differentiated(Closing):
+    """What both modes have in common: the change of the rows, and (A^+)^T. `moving` says which numbers of the scene move."""
+
+    def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
+        super().__init__(code, vector)
+        graph, e, outputs = code.graph, code.equations, code.outputs
+        self.slots = code.pattern.slots
+        self.changed = [*outputs["rows"][: self.slots], *e.psi, *e.psi_dot, *code.root]
+        inputs = code.prologue.inputs
+        self.numbers = [s for s, m in zip(inputs, moving, strict=True) if m]
+        self.count = len(self.numbers)
+        self.given = [*code.constants, e.t, *e.q, *e.v]
+        self.state = [*code.constants, *e.q, *e.v]
+        self.graph = graph
+        for name, count in (("Y", self.m), ("x", self.n), ("r", self.m), ("g", self.n)):
+            self.places.add(name, count)
+
+    def _shared(self):
+        """`transposed`: y = (A^+)^T x of what is in x, into Y; A is that of R."""
+        n, m = self.n, self.m
+        f, s = self._function("transposed", [(POINTER, "work"), (POINTER, "x"), (POINTER, "y")])
+        A, b = (Value(f, f.reserve(DOUBLE, max(c, 1)), POINTER) for c in (m * n, n))
+        with f.each(m * n) as i:
+            f.store(0.0, A, i)
+        with f.each(n) as i:
+            f.store(f.load(f.given["x"], i), b, i)
+        for row, column, slot, sign in self._entries(f):
+            f.store(self._entry(f, row, slot, sign), A, column * m + row)
+        rank = Value(f, f.reserve(DOUBLE), POINTER)
+        f.call(LEAST_NORM, A, b, f.given["y"], f.const(n, INT), f.const(m, INT), s.care, rank)
+
+    def _weight(self, f: Function, row: Value) -> Value:
+        return Lane(f, self.places).length / self._at(f, "rows", row)
+
+    def _entry(self, f: Function, row: Value, slot: Value, sign: Value) -> Value:
+        """An entry of A."""
+        return self._at(f, "R", slot) * sign * self._weight(f, row)
+
+    def _at(self, f: Function, name: str, i: Value | int, pointer: str = "work") -> Value:
+        places = self.places if pointer == "work" else self.ways
+        return f.load(f.given[pointer], f.like(i, INT, 1) + places[name])
+
+    def _set(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
+        places = self.places if pointer == "work" else self.ways
+        f.store(x, f.given[pointer], f.like(i, INT, 1) + places[name])
+
+    def _more(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
+        self._set(f, name, i, self._at(f, name, i, pointer) + x, pointer)
+
+    def _root(self, f: Function, i: Value) -> Value:
+        return self._at(f, "R", i + (self.slots + self.m + self.n))
+
+    def _corrected(self, f: Function, kind: int):
+        """x and y of the correction at the state in X, with A in R."""
+        self._call(f, "rows")
+        self._call(f, "psi_dot" if kind == VELOCITY else "psi")
+        s = Lane(f, self.places)
+        with f.each(self.m) as i:
+            self._set(f, "r", i, self._at(f, "psi", i))
+        f.call("solve", f.given["work"], f.const(0, INT), self._address(f, "r"), self._address(f, "x"), s.care)
+        f.call("transposed", f.given["work"], self._address(f, "x"), self._address(f, "Y"))
+
+    def _longest(self, f: Function) -> tuple[Value, Value]:
+        """The largest change of a coordinate by the whole correction, in units of the scene, and which it is."""
+        longest, which = f.variable(0.0), f.variable(0, INT)
+        with f.each(self.n) as i:
+            size = f.abs(self._root(f, i) * self._at(f, "x", i)) * self._at(f, "inverse unit", i)
+            which.value = f.select(size > longest.value, i, which.value)
+            longest.value = f.max(size, longest.value)
+        return longest.value, which.value
+
+
+class ClosingForward(_Differentiated):
+    """Closing along directions, each with memory of its own: a `way`."""
+
+    inputs = ("dnumbers", "dq", "dv")
+    outputs = ("dstate",)
+    along_directions = True
+
+    def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
+        super().__init__(code, moving, vector)
+        self.ways = w = Places(1, vector)
+        w.add("numbers", self.count)
+        w.add("constants", self.constants)
+        for name in ("q", "v", "g", "dx"):
+            w.add(name, self.n)
+        w.add("changes", len(self.changed))
+        w.add("right", self.m)
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        graph = self.graph
+        seeds = {s: graph.input(("closing", s.index), "tangent") for s in self.state}
+        changes = tangents(graph, self.changed, seeds)
+        w = self.ways
+        inputs = [*self._state(), *(("way", w["constants"] + k) for k in range(self.constants))]
+        inputs += [("way", w[x] + k) for x in "qv" for k in range(self.n)]
+        program = Program(graph, [*self.given, *seeds.values()], changes)
+        places = [("way", w["changes"] + k) for k in range(len(changes))]
+        self._write(program, "changes", ("work", "way"), inputs, places)
+        seeds = {s: graph.input(("number", s.index), "tangent") for s in self.numbers}
+        program = Program(graph, [*self.code.prologue.inputs, *seeds.values()], tangents(graph, self.code.constants, seeds))
+        inputs = [*_numbered("numbers", len(self.code.prologue.inputs)), *(("way", w["numbers"] + k) for k in range(self.count))]
+        places = [("way", w["constants"] + k) for k in range(self.constants)]
+        self.functions.append(write(program, "prologue_along", 1, ("numbers", "way"), inputs, places))
+        self._shared()
+        for name, kind in (("push_position", POSITION), ("push_velocity", VELOCITY)):
+            self._push(name, kind)
+        return super().text()
+
+    @contextmanager
+    def _each_way(self, f: Function) -> Iterator[Value]:
+        call = f.load(f.given["work"], self.places["call"], base=POINTER)
+        first = f.load(f.given["work"], self.places["ways"], base=POINTER)
+        with f.each(f.load(call, self.call.index("directions"), base=INT)) as p:
+            f.given["way"] = f.at(first, p * self.ways.size)
+            yield p
+
+    def _push(self, name: str, kind: int):
+        """The change of the state by a correction of it, s of it in positions: `scale`, whether it was limited: `limited`."""
+        f, s = self._function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
+        self._corrected(f, kind)
+        longest, which = self._longest(f)
+        residual, root = self.slots + (self.m if kind == VELOCITY else 0), self.slots + 2 * self.m
+        scale = f.given["scale"]
+        with self._each_way(f):
+            f.call("changes", f.given["work"], f.given["way"])
+            with f.each(self.n) as i:
+                self._set(f, "g", i, f.const(0.0), "way")
+            with f.each(self.m) as i:
+                self._set(f, "right", i, self._at(f, "changes", i + residual, "way"), "way")
+            for row, column, slot, sign in self._entries(f):
+                change = self._at(f, "changes", slot, "way") * sign
+                self._more(f, "g", column, change * self._weight(f, row) * self._at(f, "Y", row), "way")
+                self._more(f, "right", row, -(change * self._at(f, "x", column)), "way")
+            for row, column, slot, sign in self._entries(f):
+                self._more(f, "right", row, -(self._at(f, "R", slot) * sign * self._at(f, "g", column, "way")), "way")
+            right, dx = (f.at(f.given["way"], self.ways[x]) for x in ("right", "dx"))
+            f.call("solve", f.given["work"], f.const(0, INT), right, dx, s.care)
+            change = f.variable(0.0)  # of the longest step, over its length
+            with f.each(self.n) as i:
+                x, root_i = self._at(f, "x", i), self._root(f, i)
+                step = f.fma(root_i, self._at(f, "dx", i, "way") + self._at(f, "g", i, "way"), 0.0)
+                step = f.fma(self._at(f, "changes", i + root, "way"), x, step)
+                self._set(f, "dx", i, step, "way")
+                change.value = f.select(i.is_(which), step / (root_i * x), change.value)
+            change.value = f.select((f.given["limited"] > 0.5) & (longest > 0.0), change.value, 0.0)
+            to = "v" if kind == VELOCITY else "q"
+            with f.each(self.n) as i:
+                step, whole = self._at(f, "dx", i, "way"), self._root(f, i) * self._at(f, "x", i)
+                self._more(f, to, i, -(scale * (step - change.value * whole)), "way")
+
+    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
+        f.call("push_velocity" if kind == VELOCITY else "push_position", f.given["work"], scale, limited)
+
+    def _begun(self, f: Function, lane: Value, member: Value):
+        del lane
+        call = self._call_of(f)
+        with self._each_way(f) as p:
+            for name, to, count in (("dnumbers", "numbers", self.count), ("dq", "q", self.n), ("dv", "v", self.n)):
+                start = self._of_member(f, call, name, member)
+                with f.each(count) as i:
+                    self._set(f, to, i, f.load(start, p * count + i), "way")
+            f.call("prologue_along", self._of_member(f, call, "numbers", member), f.given["way"])
+
+    def _ended_closing(self, f: Function, member: Value):
+        call = self._call_of(f)
+        directions = f.load(call, self.call.index("directions"), base=INT)
+        with self._each_way(f) as p:
+            to = f.at(f.load(call, self.call.index("dstate"), base=POINTER), (member * directions + p) * (2 * self.n))
+            for k, x in enumerate("qv"):
+                with f.each(self.n) as i:
+                    f.store(self._at(f, x, i, "way"), to, i + k * self.n)
+
+    def _memory(self, f: Function, call: Value) -> list[Value]:
+        size = f.load(call, self.call.index("directions"), base=INT) * self.ways.size
+        block, start = self._allocated(f, size)
+        with f.each(size) as i:
+            f.store(0.0, start, i)
+        f.store(start, f.given["work"], self.places["ways"], base=POINTER)
+        return [block]
+
+
+class ClosingReverse(_Differentiated):
+    """Closing, and back: its corrections are recorded and walked back from a cotangent of the state."""
+
+    inputs = ("statebar",)
+    outputs = ("numbersbar", "qbar", "vbar")
+
+    def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
+        super().__init__(code, moving, vector)
+        n, most = self.n, ITERATIONS + 1 + VELOCITIES
+        self.row = 3 + 2 * n  # of the record: kind, scale, whether it was limited, q and v before
+        self.places.add("record", most * self.row)
+        self.places.add("records")
+        for name, count in (("bars", len(self.changed)), ("cbar", self.constants), ("B q", n), ("B v", n), ("w", n), ("u", self.m)):
+            self.places.add(name, count)
+        self.places.add("G c", self.constants)
+        for name in ("G q", "G v"):
+            self.places.add(name, n)
+        self.places.add("numbersbar", self.count)
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        graph, n = self.graph, self.n
+        seeds = [graph.input(("closing", k), "cotangent") for k in range(len(self.changed))]
+        program = Program(graph, [*self.given, *seeds], cotangents(graph, self.changed, seeds, self.state))
+        inputs = [*self._state(), *self._work("bars", len(seeds))]
+        found = [*self._work("G c", self.constants), *self._work("G q", n), *self._work("G v", n)]
+        self._write(program, "pull_rows", ("work",), inputs, found)
+        seeds = [graph.input(("constant", k), "cotangent") for k in range(self.constants)]
+        back = cotangents(graph, self.code.constants, seeds, self.numbers)
+        inputs = [*_numbered("numbers", len(self.code.prologue.inputs)), *self._work("cbar", self.constants)]
+        program = Program(graph, [*self.code.prologue.inputs, *seeds], back)
+        places = self._work("numbersbar", self.count)
+        self.functions.append(write(program, "prologue_back", 1, ("numbers", "work"), inputs, places))
+        self._shared()
+        for name, kind in (("pull_position", POSITION), ("pull_velocity", VELOCITY)):
+            self._pull(name, kind)
+        return super().text()
+
+    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
+        number = self._whole(f, self._at(f, "records", 0))
+        row = f.at(f.given["work"], number * self.row + self.places["record"])
+        for k, x in enumerate((f.const(float(kind)), scale, limited)):
+            f.store(x, row, k)
+        self._copied(f, row, 3, "X q", f.const(0, INT))
+        self._copied(f, row, 3 + self.n, "X v", f.const(0, INT))
+        self._set(f, "records", 0, self._at(f, "records", 0) + 1.0)
+
+    def _pull(self, name: str, kind: int):
+        """From the cotangent B of the state behind a correction to that of the state before it, in X."""
+        f, _ = self._function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
+        self._corrected(f, kind)
+        longest, which = self._longest(f)
+        residual, root = self.slots + (self.m if kind == VELOCITY else 0), self.slots + 2 * self.m
+        to = "B v" if kind == VELOCITY else "B q"
+        with f.each(len(self.changed)) as i:
+            self._set(f, "bars", i, f.const(0.0))
+        along = f.variable(0.0)
+        with f.each(self.n) as i:
+            bar = -(f.given["scale"] * self._at(f, to, i))
+            along.value = f.fma(bar, self._root(f, i) * self._at(f, "x", i), along.value)
+            self._set(f, "w", i, bar)
+        limits = (f.given["limited"] > 0.5) & (longest > 0.0)
+        with f.if_(limits):
+            length = self._root(f, which) * self._at(f, "x", which)
+            self._more(f, "w", which, -(along.value / length))
+        with f.each(self.n) as i:
+            bar = self._at(f, "w", i)
+            self._set(f, "bars", i + root, bar * self._at(f, "x", i))
+            self._set(f, "w", i, bar * self._root(f, i))
+            self._set(f, "g", i, bar * self._root(f, i))
+        f.call("transposed", f.given["work"], self._address(f, "w"), self._address(f, "u"))
+        for row, column, slot, sign in self._entries(f):
+            self._more(f, "g", column, -(self._entry(f, row, slot, sign) * self._at(f, "u", row)))
+        for row, column, slot, sign in self._entries(f):
+            bar = f.fma(self._at(f, "Y", row), self._at(f, "g", column), -(self._at(f, "u", row) * self._at(f, "x", column)))
+            self._more(f, "bars", slot, bar * sign * self._weight(f, row))
+        with f.each(self.m) as i:
+            self._set(f, "bars", i + residual, self._weight(f, i) * self._at(f, "u", i))
+        f.call("pull_rows", f.given["work"])
+        with f.each(self.constants) as i:
+            self._more(f, "cbar", i, self._at(f, "G c", i))
+        with f.each(self.n) as i:
+            for x in "qv":
+                self._more(f, f"B {x}", i, self._at(f, f"G {x}", i))
+
+    def _begun(self, f: Function, lane: Value, member: Value):
+        del lane
+        self._set(f, "records", 0, f.const(0.0))
+        with f.each(self.constants) as i:
+            self._set(f, "cbar", i, f.const(0.0))
+        bars = self._of_member(f, self._call_of(f), "statebar", member)
+        for k, x in enumerate("qv"):
+            with f.each(self.n) as i:
+                self._set(f, f"B {x}", i, f.load(bars, i + k * self.n))
+
+    def _ended_closing(self, f: Function, member: Value):
+        call = self._call_of(f)
+
+        def left() -> Value:
+            return self._at(f, "records", 0) > 0.5
+
+        with f.while_(left):
+            self._set(f, "records", 0, self._at(f, "records", 0) - 1.0)
+            row = f.at(f.given["work"], self._whole(f, self._at(f, "records", 0)) * self.row + self.places["record"])
+            for k, x in enumerate("qv"):
+                with f.each(self.n) as i:
+                    self._set(f, f"X {x}", i, f.load(row, i + (3 + k * self.n)))
+
+            def pull(name: str) -> Callable[[], None]:
+                return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))  # noqa: B023
+
+            f.choose(f.load(row, 0) > 0.5, pull("pull_velocity"), pull("pull_position"))
+        f.call("prologue_back", self._of_member(f, call, "numbers", member), f.given["work"])
+        for name, place, count in (("numbersbar", "numbersbar", self.count), ("qbar", "B q", self.n), ("vbar", "B v", self.n)):
+            to = f.at(f.load(call, self.call.index(name), base=POINTER), member * count)
+            with f.each(count) as i:
+                f.store(self._at(f, place, i), to, i)
