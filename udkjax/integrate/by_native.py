@@ -15,7 +15,7 @@ from udkjax.equations.scales import Scales
 from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.integrate.undifferentiated import undifferentiated
-from udkjax.native.operation import Kind, Tableau, compiled, native_p, shapes_of
+from udkjax.native.operation import Kind, Tableau, compiled, native_p, shapes_of, written
 from udkjax.native.program import UnsupportedError
 from udkjax.native.steps import DONE
 from udkjax.native.tableau import EULER
@@ -31,7 +31,7 @@ def closes(mechanism: Mechanism) -> bool:
     if is_large(mechanism) or jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     try:
-        compiled(_closing(mechanism), 1)
+        written(_closing(mechanism), 1)
     except UnsupportedError:
         return False
     return True
@@ -62,7 +62,7 @@ def closed_back(guess: Any, moving: Any, qbar: Array, vbar: Array) -> Any:
     bars = jnp.concatenate([qbar, vbar])[None]
     numbers, *states = (x[0] for x in native_p.bind(*_guess(*guess), bars, kind=kind, times=2)[-3:])
     found, parts = 0, []
-    leaves, tree = jax.tree.flatten(mechanism)
+    leaves, tree = jax.tree.flatten(mechanism, is_leaf=lambda x: x is None)
     for x, m in zip(leaves, jax.tree.leaves(moving[0], is_leaf=lambda x: x is None), strict=True):
         if m is True:
             parts.append(numbers[found : found + np.size(x)].reshape(np.shape(x)))
@@ -80,8 +80,8 @@ def _moved(moving: Any, change: Any) -> list[Any]:
 
 
 def _numbers_moving(mechanism: Mechanism, moving: Any) -> tuple[bool, ...]:
-    leaves = zip(jax.tree.leaves(mechanism), jax.tree.leaves(moving, is_leaf=lambda x: x is None), strict=True)
-    return (*(m is True for x, m in leaves for _ in range(np.size(x))), False)
+    leaves = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (mechanism, moving)), strict=True)
+    return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False)
 
 
 def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> list[Any]:
@@ -123,7 +123,7 @@ def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
     if not jax.config.jax_enable_x64:
         return "it computes in float64, which JAX is told not to"
     try:
-        compiled(_kind(problem), 1)
+        written(_kind(problem), 1)
     except UnsupportedError as error:
         return f"the scene takes {error}, which is no arithmetic on numbers"
     return ""
@@ -143,6 +143,13 @@ def known(problem: Problem) -> Raw:
 def solve(problem: Problem) -> Raw:
     """Integrate one problem; under vmap, as many as there are, in lanes."""
     return _raw(native_p.bind(*_inputs(problem), kind=_kind(problem), times=len(problem.ts)))
+
+
+def recorded(problem: Any, moving: Any) -> Raw:
+    """Integrate a problem by the code that `pulled` takes: no other is compiled."""
+    kind, n, times = _kind(problem, _moving(problem, moving), "reverse"), len(problem.q), len(problem.ts)
+    none = jnp.zeros((0, times, 2 * n)), jnp.zeros((0, 2 * n))
+    return _raw(native_p.bind(*_inputs(problem, kind.code), *none, kind=kind, times=times)[: len(OUTPUTS)])
 
 
 def serves_derivatives(problem: Problem, moving: Any) -> bool:

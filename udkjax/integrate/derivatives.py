@@ -198,7 +198,7 @@ class Run(Function):
         """The run, and its record if it is made for one."""
         problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
         if not self.is_plain and by_native.serves_derivatives(problem, which):
-            return by_native.solve(problem), None
+            return by_native.recorded(problem, which), None
         return _recorded(problem) if serves(problem) else (self.raw(xs), None)
 
     def __call__(self, xs: list[Array]) -> list[Array]:

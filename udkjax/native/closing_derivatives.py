@@ -104,7 +104,7 @@ class ClosingForward(_Differentiated):
 
     inputs = ("dnumbers", "dq", "dv")
     outputs = ("dstate",)
-    along_directions = True
+    directions_in = 1
 
     def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
         super().__init__(code, moving, vector)

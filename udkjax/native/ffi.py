@@ -53,7 +53,7 @@ def handler(trajectory: Trajectory, name: str) -> Function:
     put("members", dimension(outputs[0], 0))
     put("times", dimension("ts", 1))
     put("knots", dimension("breaks", 1))
-    put("directions", dimension(inputs[-1], 1) if trajectory.along_directions else 0)
+    put("directions", dimension(inputs[-1], trajectory.directions_in))
     for field in inputs:
         length = f.variable(1, INT, 1)
         with f.each(word(found[field], RANK), 1) as k:

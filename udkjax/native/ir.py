@@ -124,10 +124,15 @@ class Variable:
 
 
 class Function:
-    """A function that returns nothing. `name` and `arguments` (pairs of base type and name) are those of its definition."""
+    """A function. `name` and `arguments` (pairs of base type and name) are those of its definition.
 
-    def __init__(self, name: str, arguments: Sequence[tuple[str, str]], width: int = 1, returns: str = "void"):
-        self.name, self.width, self.returns = name, width, returns
+    One that runs `rare`ly is made small, which takes less to compile.
+    """
+
+    def __init__(
+        self, name: str, arguments: Sequence[tuple[str, str]], width: int = 1, returns: str = "void", rare: bool = False
+    ):
+        self.name, self.width, self.returns, self.rare = name, width, returns, rare
         self._arguments, self._lines, self._reserved = list(arguments), [], []
         self._count, self.declared = 0, set()
         self.given = {n: Value(self, f"%{n}", base) for base, n in arguments}
@@ -155,7 +160,8 @@ class Function:
         arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{n}" for base, n in self._arguments)
         end = "ret void" if self.returns == "void" else None
         body = "\n  ".join([*self._reserved, *self._lines, *([end] if end else [])])
-        return f"define {self.returns} @{self.name}({arguments}) {{\n  {body}\n}}\n"
+        rare = " cold minsize optsize" if self.rare else ""
+        return f"define {self.returns} @{self.name}({arguments}){rare} {{\n  {body}\n}}\n"
 
     # --- values
 

@@ -54,20 +54,31 @@ class Tableau:
         return hash(self._key)
 
 
+MODES: dict[str, Any] = {"forward": Forward, "reverse": Reverse}
+CLOSING: dict[str, Any] = {"closing forward": ClosingForward, "closing reverse": ClosingReverse}
+
+
+@lru_cache(maxsize=256)
+def written(kind: Kind, width: int) -> Trajectory:
+    """A kind of trajectory in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it."""
+    if kind.mode == "closing":
+        trajectory: Trajectory = Closing(kind.code, machine.lanes())
+    elif kind.mode in CLOSING:
+        trajectory = CLOSING[kind.mode](kind.code, kind.moving, machine.lanes())
+    else:
+        plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
+        trajectory = MODES[kind.mode](plan, kind.moving) if kind.moving is not None else Trajectory(plan)  # pyright: ignore
+    main = handler(trajectory, "call_frame")
+    trajectory.module = "\n".join([trajectory.text(), *sorted(main.declared), main.text()])
+    return trajectory
+
+
 class Compiled:
     """The machine code of one kind of trajectory, in so many lanes."""
 
     def __init__(self, kind: Kind, width: int):
-        if kind.mode == "closing":
-            trajectory: Trajectory = Closing(kind.code, machine.lanes())
-        elif kind.mode in CLOSING:
-            trajectory = CLOSING[kind.mode](kind.code, kind.moving, machine.lanes())
-        else:
-            plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
-            trajectory = MODES[kind.mode](plan, kind.moving) if kind.moving is not None else Trajectory(plan)  # pyright: ignore
-        self.trajectory = trajectory
-        main = handler(trajectory, "call_frame")
-        text = "\n".join([trajectory.text(), *sorted(main.declared), main.text()])
+        self.trajectory = written(kind, width)
+        text = self.trajectory.module
         self.name = f"udkjax_{machine.digest(text)}"
         self.library = machine.library(text)
         self._run = machine.function(self.library["run"], ctypes.c_void_p)
@@ -86,7 +97,7 @@ class Compiled:
         members, times = shapes[0][0], inputs[INPUTS.index("ts")].shape[1]
         following = ctypes.c_int64(0)
         fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
-        fields |= {"directions": inputs[-1].shape[1] if names.along_directions else 0, "next": ctypes.addressof(following)}
+        fields |= {"directions": inputs[-1].shape[names.directions_in], "next": ctypes.addressof(following)}
         call = (ctypes.c_int64 * len(names.call))(*(fields[name] for name in names.call))
         threads = min(os.cpu_count() or 1, members)
         if threads == 1:
@@ -95,12 +106,6 @@ class Compiled:
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(lambda _: self._run(ctypes.addressof(call)), range(threads)))
         return found
-
-
-MODES: dict[str, type[Trajectory]] = {"forward": Forward, "reverse": Reverse}
-
-
-CLOSING: dict[str, Any] = {"closing forward": ClosingForward, "closing reverse": ClosingReverse}
 
 
 @lru_cache(maxsize=256)
@@ -175,7 +180,7 @@ def _batched(inputs: Sequence[Any], axes: Sequence[int | None], kind: Kind, time
     members = max(x.shape[0 if axis is None else 1] for x, axis in zip(first, axes, strict=True))
 
     def each(x: Any, axis: int | None) -> Any:
-        if axis is None and x.shape[0] == 1:
+        if axis is None and x.shape[0] <= 1:
             return x
         x = x[None] if axis is None else x
         return jnp.broadcast_to(x, (size, members, *x.shape[2:])).reshape(size * members, *x.shape[2:])

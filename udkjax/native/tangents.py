@@ -58,7 +58,7 @@ class Forward(Differentiated):
 
     inputs = ("dconstants", "dq", "dv")
     outputs = ("dys", "dend")
-    along_directions = True
+    directions_in = 1
 
     def __init__(self, plan: Plan, moving: tuple[bool, ...]):
         super().__init__(plan, moving)

@@ -104,6 +104,7 @@ class Places:
         return self.places[name]
 
 
+RARE = ("solve", "finish_members", "begin", "arrive_carefully", "accelerate_carefully")  # once a run, or beside singularities
 _LANE = (  # numbers of each lane; `call` and `ways` are addresses
     *("call", "ways"),
     *(
@@ -165,7 +166,8 @@ class Trajectory:
     inputs: tuple[str, ...] = ()  # besides those of every run
     results: tuple[str, ...] = OUTPUTS
     outputs: tuple[str, ...] = ()
-    along_directions = False  # whether the last inputs and outputs have directions, after the members
+    directions_in = 0  # which dimension of the last input says how many directions there are
+    module = ""  # the text, once it is written
 
     @property
     def call(self) -> tuple[str, ...]:
@@ -311,7 +313,7 @@ class Trajectory:
     # --- helpers to write functions with
 
     def _function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
-        f = Function(name, arguments, self.plan.width)
+        f = Function(name, arguments, self.plan.width, rare=name in RARE)
         self.functions.append(f)
         return f, Lane(f, self.places)
 

@@ -24,7 +24,7 @@ HEAD = 3  # numbers of a point before its state: its time, how many outputs were
 
 
 class Reverse(Differentiated):
-    """A trajectory that is walked back, with cotangents of its outputs and its end."""
+    """A trajectory that is walked back, with cotangents of its outputs and its end; or not, where these have no members."""
 
     inputs = ("ysbar", "endbar")
     outputs = ("cbar", "qbar", "vbar")
@@ -65,12 +65,16 @@ class Reverse(Differentiated):
     # --- the record
 
     def _accepted(self, f: Function, s: Lane, accept: Value):
-        marked = f.select(accept, f.const(1.0, DOUBLE, f.width), 0.0)
-        with f.each(f.width) as k, f.if_(f.lane(marked, k) > 0.5):
-            self._note(f, s, k)
+        with f.if_(self._walks(f)):
+            for k in self._each_marked(f, accept):
+                self._note(f, s, k)
 
     def _begun(self, f: Function, lane: Value, member: Value):
         del member
+        with f.if_(self._walks(f)):
+            self._new_record(f, lane)
+
+    def _new_record(self, f: Function, lane: Value):
         s = Lane(f, self.places)
         record = f.op(f"call ptr @malloc(i64 {FIRST * self.row * 8})", POINTER)
         self._put_lane(f, "record", lane, record, POINTER)
@@ -343,5 +347,9 @@ class Reverse(Differentiated):
 
     def _next(self, f: Function, s: Lane, fill):
         with f.if_(~f.any_of(s.active > 0.5)):
-            f.call("walk", f.given["work"], f.given["call"])
+            with f.if_(self._walks(f)):
+                f.call("walk", f.given["work"], f.given["call"])
             fill()
+
+    def _walks(self, f: Function) -> Value:
+        return f.load(self._call_of(f), self.call.index("directions"), base=INT) > 0
