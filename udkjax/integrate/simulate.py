@@ -21,6 +21,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
 from udkjax.integrate.by_native import known, unserved
 from udkjax.integrate.derivatives import differentiable
+from udkjax.integrate.lanes import serves
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.pieces import pieces_of
 from udkjax.integrate.problem import Problem
@@ -93,7 +94,7 @@ def simulate(
     drift = number((DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE) if drift_tol is None else drift_tol)
     method = Auto() if method is None else method
     settings = (number(rtol), number(atol), method, stabilization, drift, _step(dt0), formulation)
-    choices = (solver, adjoint, max_steps, _meter(progress))
+    choices = (solver, _adjoint(adjoint), max_steps, _meter(progress))
 
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
@@ -174,11 +175,14 @@ def _simulate(
     native = engine != "diffrax" and not why
     if xp is np and not native:
         return None
-    if not native:
-        why = why if engine != "diffrax" else "it was asked for"
-        raw = by_diffrax(problem, adjoint, meter)
-    else:
+    taken = "native"
+    if native:
         raw = known(problem) if xp is np else differentiable(problem)
+    elif engine == "auto" and adjoint is None and meter is None and serves(problem):
+        taken, raw = f"lanes: {why}", differentiable(problem)
+    else:
+        taken = f"diffrax: {why if engine != 'diffrax' else 'it was asked for'}"
+        raw = by_diffrax(problem, adjoint, meter)
     later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
     q, v = xp.where(later, raw.q, q), xp.where(later, raw.v, v)
     ends: Any = (raw, ts, closed, missed, drift_tol)
@@ -193,7 +197,7 @@ def _simulate(
         ("solver", "Dopri8" if solver is None else type(solver).__name__),
         ("max_steps", str(max_steps)),
         ("first_step", "chosen" if dt0 is None else "given"),
-        ("engine", "native" if native else f"diffrax: {why}"),
+        ("engine", taken),
     )
     arrays = jax.tree.map(jnp.asarray, (ts, q, v, code, time, stats, rtol, atol))
     fields: Any = (*arrays, getattr(mechanism, "body_names", ()), chosen)
@@ -246,6 +250,15 @@ def by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
     from udkjax.integrate.by_diffrax import by_diffrax
 
     return by_diffrax(problem, adjoint, meter)
+
+
+def _adjoint(adjoint: Any) -> Any:
+    """An adjoint of diffrax's; None where derivatives are those of JAX, which `ForwardMode` leaves them to."""
+    if adjoint is None:
+        return None
+    import diffrax
+
+    return None if type(adjoint) is diffrax.ForwardMode else adjoint
 
 
 def _meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":
