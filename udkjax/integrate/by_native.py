@@ -47,7 +47,7 @@ def closed(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: An
 
 def closed_along(guess: Any, moving: Any, change: Any) -> tuple[Array, Array]:
     """The changes of q and v along a `change` of what is moving of (mechanism, scales, tol, t, q, v)."""
-    (mechanism, *_, q, v), (_, *_, dq, dv) = guess, change
+    (mechanism, *_, q, _), (*_, dq, dv) = guess, change
     n, kind = len(q), _closing(guess[0], _numbers_moving(mechanism, moving[0]), "closing forward")
     numbers = _vector(_moved(moving[0], change[0]), jnp)
     along = [numbers, *(jnp.zeros(n) if dx is None else dx for dx in (dq, dv))]

@@ -222,7 +222,8 @@ class ClosingReverse(_Differentiated):
         self.row = 3 + 2 * n  # of the record: kind, scale, whether it was limited, q and v before
         self.places.add("record", most * self.row)
         self.places.add("records")
-        for name, count in (("bars", len(self.changed)), ("cbar", self.constants), ("B q", n), ("B v", n), ("w", n), ("u", self.m)):
+        counts = {"bars": len(self.changed), "cbar": self.constants, "B q": n, "B v": n, "w": n, "u": self.m}
+        for name, count in counts.items():
             self.places.add(name, count)
         self.places.add("G c", self.constants)
         for name in ("G q", "G v"):
@@ -319,7 +320,7 @@ class ClosingReverse(_Differentiated):
                     self._set(f, f"X {x}", i, f.load(row, i + (3 + k * self.n)))
 
             def pull(name: str) -> Callable[[], None]:
-                return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))  # noqa: B023
+                return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))
 
             f.choose(f.load(row, 0) > 0.5, pull("pull_velocity"), pull("pull_position"))
         f.call("prologue_back", self._of_member(f, call, "numbers", member), f.given["work"])

@@ -36,7 +36,7 @@ def least_norm() -> Function:
         sweep.value = sweep.value + 1
         with f.each(m) as i, f.each(m, i + 1) as j:
             a, c, g = dot(i, i), dot(j, j), dot(i, j)
-            with f.if_(f.abs(g) > f.intrinsic("sqrt", a * c) * ROUNDING):
+            with f.if_(f.abs(g) > f.intrinsic("sqrt", a) * f.intrinsic("sqrt", c) * ROUNDING):
                 turned.value = f.const(1, INT)
                 zeta = (c - a) / (g * 2.0)
                 root = f.intrinsic("sqrt", f.fma(zeta, zeta, 1.0))

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +24,7 @@ from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
 from udkjax.native.ffi import handler
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
-from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, Plan, Trajectory
+from udkjax.native.trajectory import INFO, INPUTS, Plan, Trajectory
 from udkjax.native.walk import Reverse
 
 FEW = 2  # members up to which one follows another: eight lanes take as long as two members
@@ -78,12 +79,7 @@ class Compiled:
 
     def __init__(self, kind: Kind, width: int):
         self.trajectory = written(kind, width)
-        text = self.trajectory.module
-        self.name = f"udkjax_{machine.digest(text)}"
-        self.library = machine.library(text)
-        self._run = machine.function(self.library["run"], ctypes.c_void_p)
-        capsule = jax.ffi.pycapsule(ctypes.c_void_p(self.library["call_frame"]))
-        jax.ffi.register_ffi_target(self.name, capsule, platform="cpu")
+        self.name, self._run = loaded(self.trajectory.module)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Outputs of these shapes, on as many threads as there are cores."""
@@ -106,6 +102,26 @@ class Compiled:
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(lambda _: self._run(ctypes.addressof(call)), range(threads)))
         return found
+
+
+_LOADED: dict[str, tuple[machine.Library, Any]] = {}
+_LOADING = Lock()
+
+
+def loaded(text: str) -> tuple[str, Any]:
+    """Load the code of a module; return the name that XLA knows it by, and `run`.
+
+    XLA takes one address for a name, and programs that it has compiled call that whenever they run: what was loaded once stays,
+    and serves everyone who asks for the same text.
+    """
+    name = f"udkjax_{machine.digest(text)}"
+    with _LOADING:
+        if name not in _LOADED:
+            library = machine.library(text)
+            capsule = jax.ffi.pycapsule(ctypes.c_void_p(library["call_frame"]))
+            jax.ffi.register_ffi_target(name, capsule, platform="cpu")
+            _LOADED[name] = library, machine.function(library["run"], ctypes.c_void_p)
+        return name, _LOADED[name][1]
 
 
 @lru_cache(maxsize=256)

@@ -106,6 +106,8 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
             return -a[0]
         case "square":
             return a[0] * a[0]
+        case "one_minus_square":
+            return (1.0 - a[0]) * (a[0] + 1.0)
         case "integer_pow":
             return integer_power(a[0], parameters["y"])
         case "logistic":
@@ -165,7 +167,7 @@ def _log1p(f: Function, x: Value) -> Value:
     """log(1 + x) (Kahan)."""
     u = x + 1.0
     small = u.is_(1.0)
-    return f.select(small | ~f.is_finite(u), x, f.intrinsic("log", u) * x / f.select(small, 1.0, u - 1.0))
+    return f.select(small | ~(u < math.inf), x, f.intrinsic("log", u) * x / f.select(small, 1.0, u - 1.0))
 
 
 def integer_power(a: Value, n: int) -> Value:

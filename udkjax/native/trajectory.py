@@ -368,11 +368,20 @@ class Trajectory:
         s.ok = one()
         s.distance = f.const(np.inf, DOUBLE, f.width)
         begins = f.all_of((s.begin > 0.5) | (s.judged < 0.5))
-        with f.if_(~begins):
+
+        def take_stages():
             for i in range(1, stages):
                 self._stage_state(f, s, i)
                 self._stage(f, i)
                 self._checked(f, s, f"A{i}")
+
+        def clear_stages():
+            # They may hold what is no number, of a member that failed: no time at all would still multiply that.
+            with f.each(self.rowcount) as r:
+                for i in range(1, stages):
+                    self._put(f, f"A{i}", r, f.const(0.0, DOUBLE, self.plan.vector))
+
+        f.choose(begins, clear_stages, take_stages)
         self._stage_state(f, s, stages)
         setattr(s, "X t", s.t1)
         if not self.plan.projected:

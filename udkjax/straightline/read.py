@@ -29,8 +29,8 @@ _INLINED = (
 )
 _ELEMENTWISE = frozenset(
     """abs acos acosh and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma eq erf erf_inv
-    erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p logistic lt max min ne nextafter not or pow reduce_precision rem
-    round rsqrt select_n sign sin sinh tan tanh xor stop_gradient""".split()
+    erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p logistic lt max min ne nextafter not one_minus_square or
+    pow reduce_precision rem round rsqrt select_n sign sin sinh tan tanh xor stop_gradient""".split()
 )  # fmt: skip
 
 

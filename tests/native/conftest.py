@@ -1,0 +1,76 @@
+"""Functions as machine code, on arrays; and trajectories by it, next to those of another engine."""
+
+import ctypes
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from udkjax.native import machine
+from udkjax.native.ir import POINTER, Function
+from udkjax.native.program import write
+from udkjax.straightline import Graph, Program, trace
+
+WIDTHS = sorted({1, 2, machine.lanes()})
+
+
+def loaded(*functions: Function) -> Callable[..., None]:
+    """The last of some functions, to be called with arrays, whole numbers and numbers."""
+    declared = sorted(set().union(*(f.declared for f in functions)))
+    library = machine.Library(machine.compiled("\n".join([*declared, *(f.text() for f in functions)])))
+    last = functions[-1]
+    kinds = {POINTER: ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
+    run = machine.function(library[last.name], *(kinds[value.base] for value in last.given.values()))
+
+    def call(*arguments: Any, _alive: Any = library):
+        assert all(a.flags.c_contiguous for a in arguments if isinstance(a, np.ndarray))
+        run(*(a.ctypes.data if isinstance(a, np.ndarray) else a for a in arguments))
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def code():
+    return loaded
+
+
+@pytest.fixture(params=WIDTHS, ids=lambda width: f"{width} lanes")
+def width(request):
+    return request.param
+
+
+def as_machine_code(function: Callable, width: int, *examples: Any) -> Callable[..., np.ndarray]:
+    """A function of numbers as machine code, for arrays of them: (outputs, samples), of conditions zeros and ones."""
+    examples = tuple(np.asarray(e) for e in examples)
+    graph = Graph()
+    inputs = [graph.input(k, "argument", e.dtype) for k, e in enumerate(examples)]
+    arrays = []
+    for s in inputs:
+        array = np.empty((), object)
+        array[()] = s
+        arrays.append(array)
+    found = trace(lambda *a: jax.tree.leaves(function(*a)), *examples)(graph, *arrays)
+    outputs = [s for o in found for s in o.flat]
+    program = Program(graph, inputs, outputs)
+    places = [("x", k) for k in range(len(inputs))], [("y", k) for k in range(len(outputs))]
+    run = loaded(write(program, "program", width, ("x", "y"), *places))
+
+    def on(*samples: np.ndarray) -> np.ndarray:
+        x = np.stack([np.asarray(s, float) for s in np.broadcast_arrays(*samples)])
+        count = x.shape[1]
+        padded = np.concatenate([x, np.repeat(x[:, -1:], -count % width, axis=1)], axis=1)
+        y = np.empty((len(outputs), padded.shape[1]))
+        for k in range(0, padded.shape[1], width):
+            out = np.full((len(outputs), width), np.nan)
+            run(np.ascontiguousarray(padded[:, k : k + width]), out)
+            y[:, k : k + width] = out
+        return y[:, :count]
+
+    return on
+
+
+@pytest.fixture(scope="session")
+def on_machine():
+    return as_machine_code
