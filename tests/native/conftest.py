@@ -19,8 +19,8 @@ WIDTHS = sorted({1, 2, machine.lanes()})
 def loaded(*functions: Function) -> Callable[..., None]:
     """The last of some functions, to be called with arrays, whole numbers and numbers."""
     declared = sorted(set().union(*(f.declared for f in functions)))
-    library = machine.Library(machine.compiled("\n".join([*declared, *(f.text() for f in functions)])))
     last = functions[-1]
+    library = machine.Library(machine.compiled("\n".join([*declared, *(f.text() for f in functions)])), [last.name])
     kinds = {POINTER: ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
     run = machine.function(library[last.name], *(kinds[value.base] for value in last.given.values()))
 

@@ -6,8 +6,11 @@ file that is not whole is made again; the oldest go when there are too many.
 
 import ctypes
 import hashlib
+import itertools
 import os
+import sys
 import tempfile
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -58,27 +61,31 @@ def digest(text: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
-class Library:
-    """The machine code of one module, in memory for as long as this object lives: addresses of its functions by name."""
+@cache
+def _linker() -> Any:
+    """What loads object code: JITLink lays code and constants side by side, wherever in a process there is room for both."""
+    llvm = _llvm()
+    machine = llvm.Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
+    return llvm.create_lljit_compiler(machine, use_jit_link=sys.platform != "win32")
 
-    def __init__(self, code: bytes):
-        llvm = _llvm()
-        empty = llvm.parse_assembly("")
-        # The engine owns its target machine and takes it along when it goes.
-        machine = llvm.Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
-        self._engine = llvm.create_mcjit_compiler(empty, machine)
-        self._engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(code))
-        self._engine.finalize_object()
+
+class Library:
+    """The machine code of one module, in memory for as long as this object lives: addresses of some of its functions by name."""
+
+    _numbers = itertools.count()
+
+    def __init__(self, code: bytes, names: Sequence[str]):
+        builder = _llvm().JITLibraryBuilder().add_object_img(code).add_current_process()
+        for name in names:
+            builder.export_symbol(name)
+        self._tracker = builder.link(_linker(), f"library {next(self._numbers)}")
 
     def __getitem__(self, name: str) -> int:
-        address = self._engine.get_function_address(name)
-        if not address:
-            raise KeyError(name)
-        return address
+        return self._tracker[name]
 
 
-def library(text: str) -> Library:
-    """The code of a module: from disk, or compiled and put there."""
+def library(text: str, names: Sequence[str]) -> Library:
+    """The code of a module, with the functions of these names: from disk, or compiled and put there."""
     name = digest(text)
     folder = cache_folder()
     code = _read(folder / name) if folder else None
@@ -86,7 +93,7 @@ def library(text: str) -> Library:
         code = compiled(text)
         if folder:
             _write(folder / name, code)
-    return Library(code)
+    return Library(code, names)
 
 
 def compiled(text: str) -> bytes:

@@ -117,7 +117,7 @@ def loaded(text: str) -> tuple[str, Any]:
     name = f"udkjax_{machine.digest(text)}"
     with _LOADING:
         if name not in _LOADED:
-            library = machine.library(text)
+            library = machine.library(text, ("run", "call_frame"))
             capsule = jax.ffi.pycapsule(ctypes.c_void_p(library["call_frame"]))
             jax.ffi.register_ffi_target(name, capsule, platform="cpu")
             _LOADED[name] = library, machine.function(library["run"], ctypes.c_void_p)

@@ -39,13 +39,13 @@ def write(
     writer = Writer(f, program)
     for s, (pointer, place) in zip(program.inputs, inputs, strict=True):
         if program.uses(s):
-            writer.known[s.index] = _typed(f, f.load(f.given[pointer], place * width, width), s.node.dtype)
+            writer.known[s.index] = as_stored(f, f.load(f.given[pointer], place * width, width), s.node.dtype)
     for value, (pointer, place) in zip(writer.run(), outputs, strict=True):
         f.store(value, f.given[pointer], place * width, width)
     return f
 
 
-def _typed(f: Function, x: Value, dtype: Any) -> Value:
+def as_stored(f: Function, x: Value, dtype: Any) -> Value:
     """A number from memory as what it is in the graph."""
     if dtype.kind == "b":
         return x.is_not(0.0)
