@@ -124,7 +124,7 @@ class DenseRows:
         self.scales = jax.tree.map(np.asarray, scales)
         self._code = code(mechanism, (), False, None)
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(mechanism)]
-        self._constants = self._code.prologue([*map(float, scalars(leaves)), 0.0])
+        self._constants = self._code.prologue([*map(float, scalars(leaves)), 0.0, 0.0])
         self.count, self.size = self._code.pattern.shape
         self.names = self._code.equations.row_names
         self.root = self._run("closure", 0.0, np.zeros(self.size), np.zeros(self.size))[-self.size :]

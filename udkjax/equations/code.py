@@ -1,7 +1,7 @@
 """The programs of one structure: what has to be computed for a method and a stabilization, and nothing else."""
 
 from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -39,7 +39,7 @@ class Code:
         graph = self.graph = equations.graph
         self.gains = [graph.input(name, "parameter") for name in ("alpha", "beta")] if baumgarte else []
         self.drop = graph.input("drop", "parameter")
-        self.least = graph.input("least", "parameter") if elimination == "watch" else self.drop
+        self.least = graph.input("least", "parameter")
         self.n = len(equations.q)
         self.root = [graph.constant(1.0) / graph.sqrt(m) for m in equations.mass]
         self.kept = [i for i in range(len(equations.psi)) if i not in left_out]
@@ -58,10 +58,15 @@ class Code:
             self._eliminate()
         self._programs: dict[str, Program] = {}
         self._derivatives: dict[tuple[str, tuple[bool, ...]], Derivative] = {}
-        wanted = [s for name, outputs in self.outputs.items() for s in outputs]
-        self.constants = frontier(graph, wanted, lambda node: node.depends <= {"parameter"})
-        thresholds = [self.drop, *([self.least] if elimination == "watch" else [])]
-        self.prologue = Program(graph, [*equations.inputs, *self.gains, *thresholds], self.constants)
+        # One that checks has constants in common with the one that watches: derivatives by that are taken along them.
+        self.watching = Code(equations, left_out, baumgarte, "watch") if elimination == "check" else self
+        wanted = [s for code in dict.fromkeys((self, self.watching)) for outputs in code.outputs.values() for s in outputs]
+        self._take_constants(frontier(graph, wanted, lambda node: node.depends <= {"parameter"}))
+        self.watching._take_constants(self.constants)
+
+    def _take_constants(self, constants: list[Scalar]):
+        self.constants = constants
+        self.prologue = Program(self.graph, [*self.equations.inputs, *self.gains, self.drop, self.least], constants)
 
     def _eliminate(self):
         """The equation for rows that are independent: a = a_F + M^(-1) Psi_q^T y with D D^T y = b."""
@@ -142,11 +147,6 @@ class Code:
             self._programs[name] = Program(self.graph, [*self.constants, *state], self.outputs[name])
         return self._programs[name]
 
-    @cached_property
-    def watching(self) -> "Code":
-        """The same, that watches instead of checking."""
-        return Code(self.equations, self.left_out, bool(self.gains), "watch")
-
     def derivative(self, name: str, moving: tuple[bool, ...]) -> Derivative:
         """The derivative of "accelerations" or "projection" along some of constants, t, q and v: those that are `moving`."""
         if (name, moving) not in self._derivatives:
@@ -167,9 +167,8 @@ def is_large(mechanism: Mechanism) -> bool:
 def code(mechanism: Mechanism, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None) -> Code:
     """Return the code for a mechanism's structure; `elimination` is None, or what it does with small pivots.
 
-    "drop": it leaves out rows whose pivots are below `drop`; "check": it says where there are any; "watch": it does both, with a
-    threshold `least` of what it says that is larger than that of what it leaves out. (Derivatives of steps that are taken with
-    care are those of the rows that are left.)
+    "drop": it leaves out rows whose pivots are below `drop`; "check": it says where there are any below `least`; "watch": it does
+    both. (Derivatives of steps that are taken with care are those of the rows that are left.)
     """
     return _code(*structure(mechanism), left_out, baumgarte, elimination)
 

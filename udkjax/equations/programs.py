@@ -199,7 +199,7 @@ class Equations(MechanismMotion):
     def constants_of(self, mechanism: Mechanism, baumgarte: Baumgarte | None) -> list[Array]:
         """The constants as a function of the numbers of the scene and the gains."""
         gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
-        numbers = [*scalars(jax.tree.leaves(mechanism)), *gains, jnp.zeros(())]
+        numbers = [*scalars(jax.tree.leaves(mechanism)), *gains, jnp.zeros(()), jnp.zeros(())]
         return [jnp.asarray(c) for c in self.code.prologue(numbers)]
 
 
@@ -245,7 +245,7 @@ def prepare(
     constants = []
     if evaluated:
         leaves = jax.tree.leaves(mechanism)
-        numbers = [*scalars(leaves), *gains, drop]
+        numbers = [*scalars(leaves), *gains, drop, drop]
         moves = [move for leaf, move in zip(leaves, moving or [False] * len(leaves), strict=True) for _ in range(np.size(leaf))]
         found = programs.prologue.early(numbers, [*moves, *[False] * (len(numbers) - len(moves))])
         constants = [jnp.asarray(c) for c in found]

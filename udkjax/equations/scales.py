@@ -71,7 +71,7 @@ def _small(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
     """Where Psi_q has entries, their values, a_F, Psi_t and gamma at the initial guess, by the scene's programs."""
     programs = code(mechanism, (), False, None)
     rows, columns = programs.pattern.shape
-    given = [*scalars(jax.tree.leaves(mechanism)), 0.0]
+    given = [*scalars(jax.tree.leaves(mechanism)), 0.0, 0.0]
     constants = programs.prologue([*map(float, given)] if xp is np else given)
 
     def run(name: str, v: Any) -> Any:

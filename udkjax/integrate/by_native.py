@@ -81,13 +81,13 @@ def _moved(moving: Any, change: Any) -> list[Any]:
 
 def _numbers_moving(mechanism: Mechanism, moving: Any) -> tuple[bool, ...]:
     leaves = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (mechanism, moving)), strict=True)
-    return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False)
+    return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
 
 
 def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> list[Any]:
     settings = {"length": scales.length, "care": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
     given = {
-        "numbers": _vector([*jax.tree.leaves(mechanism), 0.0], jnp),
+        "numbers": _vector([*jax.tree.leaves(mechanism), 0.0, 0.0], jnp),
         "ts": _vector([t, t], jnp),
         "q": q,
         "v": v,
@@ -211,7 +211,7 @@ def _moving(problem: Any, moving: Any) -> tuple[bool, ...]:
 
 def _watching(code: Code) -> Code:
     """The code of derivatives: it leaves out what depends on other rows, where a step is taken with care."""
-    return code.watching if code.elimination == "check" else code
+    return code.watching
 
 
 def _kind(problem: Any, moving: tuple[bool, ...] | None = None, mode: str = "run") -> Kind:
@@ -227,14 +227,13 @@ def _inputs(problem: Any, code: Code | None = None, xp: Any = jnp) -> list[Any]:
     textbook = problem.equations.textbook
     method, rank_tol, baumgarte = textbook.method, textbook.method.rank_tol, textbook.baumgarte
     gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
-    thresholds = [method.branch_tol] if isinstance(method, Auto) else [rank_tol**2]
-    if code is not None and code.elimination == "watch":
-        thresholds = [(WITH_CARE * rank_tol) ** 2, *thresholds]
+    least = method.branch_tol if isinstance(method, Auto) else rank_tol**2
+    drop = (WITH_CARE * rank_tol) ** 2 if code is not None and code.elimination == "watch" else least
     first = 0.0 if problem.h is None else problem.h
     care = WITH_CARE * rank_tol
     settings = [problem.rtol, problem.atol, problem.smallest, first, problem.length, problem.rate, care, problem.max_steps]
     given = {
-        "numbers": _vector([*jax.tree.leaves(textbook.mechanism), *gains, *thresholds], xp),
+        "numbers": _vector([*jax.tree.leaves(textbook.mechanism), *gains, drop, least], xp),
         "ts": problem.ts,
         "q": problem.q,
         "v": problem.v,
