@@ -3,6 +3,7 @@
 import inspect
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -285,14 +286,15 @@ def test_results_tell_how_runs_end():
     pendulum = udk.library.compound_pendulum()
     state = udk.assemble(pendulum)
     apart = replace(state, q=state.q + 0.1)
-    for mechanism, choices, result, until in (
+    runs: list[tuple[udk.Mechanism, dict[str, Any], str, int | None]] = [
         (pendulum, {}, "successful", 11),
         (pendulum, {"max_steps": 5}, "step_limit", None),
         (pendulum, {"max_steps": 1}, "step_limit", 1),
         (pendulum, {"rtol": 1e-30, "atol": 1e-30}, "step_too_small", None),
         (pendulum, {"state": apart, "stabilization": None}, "drift", 1),
         (blowing(), {}, "not_finite", None),
-    ):
+    ]
+    for mechanism, choices, result, until in runs:
         solution = udk.simulate(mechanism, TEN, **choices, throw=False)
         assert solution.result == getattr(udk.Result, result), result
         reached = np.isfinite(np.asarray(solution.q)).all((1, 2))

@@ -125,13 +125,6 @@ def test_derivatives_take_the_program_as_it_is(linkage, batch):
     assert loop.whole != batch
 
 
-@ONLY_WHERE_TRIED
-def test_single_runs_are_made_of_fusions(linkage):
-    text, run = simulated(linkage, jnp.linspace(0.0, 0.5, 4))
-    assert fusions(text) >= 5
-    assert np.isfinite(run()).all()
-
-
 @pytest.mark.parametrize(
     "choices",
     [{"method": udk.SVD()}, {"method": udk.Varga()}, {"formulation": udk.Augmented()}, {"solver": diffrax.Kvaerno5()}],
@@ -139,34 +132,6 @@ def test_single_runs_are_made_of_fusions(linkage):
 )
 def test_what_is_no_straight_line_code_is_left_alone(linkage, choices):
     assert fusions(simulated(linkage, jnp.linspace(0.0, 0.05, 3), **choices)[0]) == 0
-
-
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_runs_that_are_differentiated_twice_hold_none(linkage, order):
-    """The second derivative takes the plain form, which asks LAPACK: no loop that it is in is one function."""
-
-    def end(mass):
-        changed = linkage.with_parameters({"body.link1.mass": mass})
-        return udk.simulate(changed, jnp.array([0.0, 0.05]), throw=False, adjoint=diffrax.ForwardMode()).q[-1, 0, 2]
-
-    derivative = end
-    for _ in range(order):
-        derivative = jax.jacfwd(derivative)
-    assert (fusions(jax.jit(derivative).lower(1.0).as_text()) > 0) == (TRIED and order == 1)
-
-
-@ONLY_WHERE_TRIED
-def test_a_loop_of_gigabytes_holds_none(linkage):
-    """XLA would not make one function of it; of those within that hand on little it does."""
-
-    def lowered(outputs):
-        ts = jax.ShapeDtypeStruct((outputs,), float)
-        return jax.jit(lambda ts: udk.simulate(linkage, ts, throw=False).q[-1]).lower(ts)
-
-    few, many = lowered(100), lowered(10**6)
-    assert fusions(few.as_text()) == 6  # accelerations, what ends a step, those of the fallback; projection of outputs
-    assert fusions(many.as_text()) < 6
-    many.compile()  # which would end the process
 
 
 @pytest.mark.parametrize("flag", [f"--xla_{flag}=1" for flag in fusion.FLAGS])

@@ -250,10 +250,9 @@ def _vector(parts: Sequence[Any], xp: Any) -> Any:
 
 
 def _raw(found: Sequence[Any]) -> Raw:
-    ys, violation, info = (x[0] for x in found)
-    q, v = ys[:, : ys.shape[1] // 2], ys[:, ys.shape[1] // 2 :]
+    q, v, violation, info = (x[0] for x in found)
     code, t, tried, accepted, evaluations, written = (info[k] for k in range(len(INFO)))
-    number = np.arange(len(ys))
-    reached = (number <= written) & (number < len(ys) - 1) | (code == DONE)
+    number = np.arange(len(q))
+    reached = (number <= written) & (number < len(q) - 1) | (code == DONE)
     counts = (x.astype(int) for x in (tried, accepted, evaluations))
     return Raw(q, v, violation, reached, code.astype(int), t, info[len(INFO) :], *counts)

@@ -24,7 +24,7 @@ from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
 from udkjax.native.ffi import handler
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
-from udkjax.native.trajectory import INFO, INPUTS, Plan, Trajectory
+from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, Plan, Trajectory
 from udkjax.native.walk import Reverse
 
 FEW = 2  # members up to which one follows another: eight lanes take as long as two members
@@ -146,7 +146,7 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
             assert kind.moving is not None
             shapes += [(members, sum(kind.moving)), (members, n), (members, n)]
         return shapes
-    shapes = [(members, times, 2 * n), (members, times), (members, len(INFO) + 2 * n)]
+    shapes = [(members, times, n), (members, times, n), (members, times), (members, len(INFO) + 2 * n)]
     if kind.mode == "forward":
         directions = inputs[-1].shape[1]
         shapes += [(members, directions, times, 2 * n), (members, directions, 2 * n)]
@@ -180,7 +180,7 @@ def _batched(inputs: Sequence[Any], axes: Sequence[int | None], kind: Kind, time
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
     ways = 3 if kind.mode.endswith("forward") else 0  # the last inputs, which have directions
-    results = 3  # the first outputs, which have none
+    results = len(Closing.results if kind.mode.startswith("closing") else OUTPUTS)  # the first outputs, which have none
     shared = len(inputs) - ways
     if ways and all(axis is None for axis in axes[:shared]):
 

@@ -68,7 +68,7 @@ OUTPUT_STEPS = 7  # of Newton's method to an output: where two branches of the m
 
 SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "care", "max_steps")
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
-OUTPUTS = ("ys", "violation", "info")
+OUTPUTS = ("qs", "vs", "violation", "info")
 INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the last q and v
 
 
@@ -816,9 +816,8 @@ class Trajectory:
         member = self._whole(f, f.lane(s.member, k))
         times = f.load(call, self.call.index("times"), base=INT)
         row = member * times + number
-        ys = f.at(f.load(call, self.call.index("ys"), base=POINTER), row * (2 * self.n))
-        self._copied(f, ys, 0, q, k)
-        self._copied(f, ys, self.n, v, k)
+        for name, x in (("qs", q), ("vs", v)):
+            self._copied(f, f.at(f.load(call, self.call.index(name), base=POINTER), row * self.n), 0, x, k)
         f.store(f.lane(s.violated, k), f.load(call, self.call.index("violation"), base=POINTER), row)
 
     def _copied(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work"):

@@ -286,12 +286,12 @@ class Reverse(Differentiated):
                     number, member = self._whole(f, self._lane(f, "written", k)), self._lane(f, "member", k)
                     self._put_lane(f, "next", k, self._input(f, call, "ts", member, number))
                     given(k, number, "Y")
-                    rows = (self._whole(f, member) * times + number) * (2 * n)
-                    state = f.at(f.load(call, self.call.index("ys"), base=POINTER), rows)
-                    for x, offset in (("q", 0), ("v", n)):
+                    row = (self._whole(f, member) * times + number) * n
+                    for x in "qv":
+                        state = f.at(f.load(call, self.call.index(f"{x}s"), base=POINTER), row)
                         with f.each(n) as i:
                             place = i * f.width + k + self._start(f"X {x}", "work")
-                            f.store(f.load(state, i + offset), f.given["work"], place)
+                            f.store(f.load(state, i), f.given["work"], place)
                 setattr(s, "X t", s.next)
                 mask = s.due > 0.5
                 self._projected_back(f, mask)
