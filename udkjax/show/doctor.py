@@ -14,9 +14,7 @@ from udkjax.study.machine import cores
 
 FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 FAST_PYTHON = (3, 12)
-OLDER_JAX = (
-    "single runs take a seventh longer"  # as `python -m benchmarks trajectory` measures it with jax 0.10; README says it too
-)
+OLDER_JAX = "what machine code does not serve takes longer"  # README says it, too
 
 
 def doctor() -> str:
