@@ -1,0 +1,82 @@
+"""Programs of loops (straightline/loops.py) as LLVM functions."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.program import Place, Writer, as_stored
+from udkjax.straightline.loops import ADD, LEAST, Clear, Kernel, LoopProgram, Slot
+
+
+class LoopWriter:
+    """The functions that programs of loops are made of, in one module: every kernel once."""
+
+    def __init__(self, width: int, prefix: str = ""):
+        self.width, self.prefix = width, prefix
+        self.functions: list[Function] = []
+        self.globals: list[str] = []
+        self._kernels: dict[tuple[Kernel, int], str] = {}
+        self._tables: dict[bytes, str] = {}
+
+    def write(self, program: LoopProgram, name: str, pointers: Sequence[str], at: Mapping[str, Place]):
+        """A function of some pointers; `at` says from where on each array lies: which pointer, and the how manieth number."""
+        f = Function(name, [(POINTER, x) for x in pointers], self.width)
+
+        def address(array: str) -> Value:
+            pointer, place = at[array]
+            return f.at(f.given[pointer], place * self.width)
+
+        for part in program.parts:
+            if isinstance(part, Clear):
+                with f.each(part.count) as i:
+                    f.store(part.value, address(part.array), (i + part.start) * self.width, self.width)
+            elif len(part.table):
+                arrays = [address(x) for x in part.kernel.arrays]
+                table = Value(f, self._table(part.table), POINTER)
+                f.call(self._kernel(part.kernel, part.table.shape[1]), *arrays, table, f.const(len(part.table), INT))
+        self.functions.append(f)
+
+    def _kernel(self, kernel: Kernel, columns: int) -> str:
+        if (kernel, columns) not in self._kernels:
+            self._kernels[kernel, columns] = name = f"{self.prefix}loop{len(self._kernels)}"
+            self.functions.append(self._written(kernel, columns, name))
+        return self._kernels[kernel, columns]
+
+    def _written(self, kernel: Kernel, columns: int, name: str) -> Function:
+        """`name(arrays..., table, count)`, of a table with so many columns."""
+        f = Function(name, [*((POINTER, a) for a in kernel.arrays), (POINTER, "table"), (INT, "count")], self.width)
+        width = self.width
+        with f.each(f.given["count"]) as i:
+            row = f.at(f.given["table"], i * columns, "i32")
+            bases: dict[tuple[str, int], Value] = {}
+
+            def address(slot: Slot) -> tuple[Value, int]:
+                if slot.base is None:
+                    return f.given[slot.array], slot.offset * width
+                if (slot.array, slot.base) not in bases:
+                    place = f.op(f"load i32, ptr {f.at(row, slot.base, 'i32').name}, align 4", "i32")
+                    whole = f.op(f"sext i32 {place.name} to i64", INT)
+                    bases[slot.array, slot.base] = f.at(f.given[slot.array], whole * width)
+                return bases[slot.array, slot.base], slot.offset * width
+
+            writer = Writer(f, kernel.program)
+            for s, slot in zip(kernel.program.inputs, kernel.inputs, strict=True):
+                if kernel.program.uses(s):
+                    writer.known[s.index] = as_stored(f, f.load(*address(slot), width), s.node.dtype)
+            for value, slot in zip(writer.run(), kernel.outputs, strict=True):
+                new = f.like(value, DOUBLE, width)
+                if slot.how == ADD:
+                    new = f.load(*address(slot), width) + new
+                elif slot.how == LEAST:  # what is not a number stays
+                    new = f.intrinsic("minimum", f.load(*address(slot), width), new)
+                f.store(new, *address(slot), width)
+        return f
+
+    def _table(self, table: np.ndarray) -> str:
+        data = np.ascontiguousarray(table, "<i4").tobytes()
+        if data not in self._tables:
+            self._tables[data] = name = f"@{self.prefix}table{len(self._tables)}"
+            text = "".join(f"\\{byte:02X}" for byte in data)
+            self.globals.append(f'{name} = private unnamed_addr constant [{len(data)} x i8] c"{text}", align 4')
+        return self._tables[data]

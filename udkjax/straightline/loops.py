@@ -1,0 +1,54 @@
+"""Programs of large scenes: loops over what is alike, each a small straight-line program.
+
+A `Kernel` is the program, with where its inputs and outputs lie relative to some bases; a `Loop` runs it for every row of a table
+of bases, in order. The code grows with the kinds of things that there are, the tables with their number.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.straightline.emit import Program
+
+SET, ADD, LEAST = "set", "add", "least"  # what becomes of an output: it replaces what is there, is added, or the smaller one stays
+
+
+class Slot(NamedTuple):
+    """Where a number lies: so many numbers behind a base in an array. `base` is a column of the table, or None: the array's start."""
+
+    array: str
+    base: int | None
+    offset: int = 0
+    how: str = SET
+
+
+class Kernel:
+    """A straight-line program of one thing among many that are alike."""
+
+    def __init__(self, program: Program, inputs: Sequence[Slot], outputs: Sequence[Slot]):
+        self.program, self.inputs, self.outputs = program, list(inputs), list(outputs)
+        used = {s.array for x, s in zip(program.inputs, inputs, strict=True) if program.uses(x)}
+        self.arrays = sorted(used | {s.array for s in outputs})
+
+
+class Loop(NamedTuple):
+    """A kernel for every row of a table of bases (things, columns)."""
+
+    kernel: Kernel
+    table: np.ndarray
+
+
+class Clear(NamedTuple):
+    """Some numbers of an array become a constant."""
+
+    array: str
+    start: int
+    count: int
+    value: float = 0.0
+
+
+class LoopProgram(NamedTuple):
+    """Loops one after another."""
+
+    parts: Sequence[Loop | Clear]
