@@ -68,6 +68,23 @@ class Code:
         self.constants = constants
         self.prologue = Program(self.graph, [*self.equations.inputs, *self.gains, self.drop, self.least], constants)
 
+    # What machine code asks of this as of `LargeCode`.
+
+    @property
+    def m(self) -> int:
+        """How many rows there are."""
+        return len(self.equations.psi)
+
+    @property
+    def made_of(self) -> int:
+        """How many numbers `rows` returns."""
+        return len(self.outputs["rows"])
+
+    @property
+    def drop_place(self) -> int | None:
+        """Which of the constants is `drop`, if any is."""
+        return next((k for k, s in enumerate(self.constants) if s.index == self.drop.index), None)
+
     def _eliminate(self):
         """The equation for rows that are independent: a = a_F + M^(-1) Psi_q^T y with D D^T y = b."""
         graph, e = self.graph, self.equations

@@ -11,14 +11,17 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations import large_fast
 from udkjax.equations.alike import Fields
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.code import structure
+from udkjax.equations.large_code import LargeCode, large_code
 from udkjax.equations.large_plain import by_method, plain_accelerations
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
 from udkjax.equations.motion import STEPS, Closed, MechanismMotion, Tangential, Vector
@@ -47,9 +50,12 @@ class LargeEquations(MechanismMotion):
     """
 
     numbers: dict[str, Any]
+    given: Array | None  # the numbers of the scene, in order: for machine code, which computes `numbers` itself
+    baumgarte: Any
     method: Pseudoinverse
     scales: Scales
     layout: Layout = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
     policy: RankPolicy = REVEAL  # where it drops rows, small pivots are taken for what they are
     dense: bool = eqx.field(static=True, default=False)  # whether the method is applied to D of all rows as a matrix
     loop: Loop | None = eqx.field(static=True, default=None)  # in which its programs run
@@ -190,6 +196,12 @@ class LargeEquations(MechanismMotion):
         return self.method.branch_tol if isinstance(self.method, Auto) else jnp.asarray(self.method.rank_tol) ** 2
 
     @property
+    def code(self) -> LargeCode:
+        """The programs of the rows kept, for machine code."""
+        tree, shapes = self.structure
+        return large_code(tree, shapes, self.left_out, self.stabilized, "watch" if isinstance(self.method, Auto) else "drop")
+
+    @property
     def elimination(self) -> BlockElimination:
         """D^+ of the rows kept, by levels."""
         return BlockElimination(self.layout.kept.pattern, jnp.sqrt(jnp.asarray(self.drop)), loop=self.loop)
@@ -230,17 +242,43 @@ class LargeEquations(MechanismMotion):
         return fall + self.numbers["root"] ** 2 * self.layout.loaded(jnp.concatenate(parts, -1))
 
 
-def prepare_large(mechanism: Mechanism, method: Pseudoinverse, gains: Sequence[Any], analysis: Analysis) -> LargeEquations:
+def prepare_large(
+    mechanism: Mechanism, method: Pseudoinverse, baumgarte: Any, analysis: Analysis, evaluated: bool = True
+) -> LargeEquations:
     """As `prepare`, with the method's thresholds decided."""
+    gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
     found = layout(*structure(mechanism), analysis.redundant_rows or (), bool(gains))
-    return LargeEquations(numbers=found.numbers(mechanism, gains), method=method, scales=analysis.scales, layout=found)
+    return LargeEquations(
+        numbers=found.numbers(mechanism, gains) if evaluated else {},
+        given=as_vector([*jax.tree.leaves(mechanism), *gains]),
+        baumgarte=baumgarte,
+        method=method,
+        scales=analysis.scales,
+        layout=found,
+        structure=structure(mechanism),
+    )
 
 
 def prepare_closing(mechanism: Mechanism, analysis: Analysis) -> LargeEquations:
     """Prepare a mechanism to be closed: with D^+ of all rows by elimination, which `DAMPING` keeps from dividing by nothing."""
     found = layout(*structure(mechanism), analysis.redundant_rows or (), False)
     method = BlockElimination(found.all.pattern, 0.0, DAMPING)
-    return LargeEquations(numbers=found.numbers(mechanism, ()), method=method, scales=analysis.scales, layout=found)
+    return LargeEquations(
+        numbers=found.numbers(mechanism, ()),
+        given=None,
+        baumgarte=None,
+        method=method,
+        scales=analysis.scales,
+        layout=found,
+        structure=structure(mechanism),
+    )
+
+
+def as_vector(leaves: Sequence[Any]) -> Any:
+    """All numbers of some arrays, in order: by NumPy where they are known."""
+    known = not any(isinstance(x, Tracer) for x in leaves)
+    parts = [np.ravel(np.asarray(x, float)) if known else jnp.ravel(jnp.asarray(x, float)) for x in leaves]
+    return np.concatenate(parts) if known else jnp.concatenate(parts)
 
 
 def _violation(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:

@@ -15,7 +15,6 @@ import numpy as np
 from jax import lax
 
 from udkjax.equations.alike import FREE, POSITIONS, VELOCITIES, ConstraintKind, Group
-from udkjax.equations.code import structure
 from udkjax.equations.layout import layout
 from udkjax.pinv.block_order import Elimination, eliminations
 from udkjax.pinv.sparse import absolute, greater, where
@@ -637,10 +636,6 @@ def _dot(graph: Graph, a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
 
 
 @lru_cache(maxsize=16)
-def _large_code(*key: Any) -> LargeCode:
-    return LargeCode(*key)
-
-
-def large_code(mechanism: Mechanism, left_out: tuple[int, ...], baumgarte: bool, elimination: str) -> LargeCode:
-    """Return the code for a mechanism's structure; `elimination` is "drop", or "watch": it says where pivots are small, too."""
-    return _large_code(*structure(mechanism), left_out, baumgarte, elimination)
+def large_code(tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool, elimination: str) -> LargeCode:
+    """Return the code for a structure; `elimination` is "drop", or "watch": it says where pivots are small, too."""
+    return LargeCode(tree, shapes, left_out, baumgarte, elimination)

@@ -234,7 +234,7 @@ def prepare(
     if is_large(mechanism) if large is None else large:
         from udkjax.equations.large import prepare_large  # and with it SciPy, which small scenes do without
 
-        return prepare_large(mechanism, chosen, gains, analysis)
+        return prepare_large(mechanism, chosen, baumgarte, analysis, evaluated)
     elimination, drop = "drop", tol**2
     if isinstance(chosen, Auto) and redundant is not None:
         elimination, drop = "check", chosen.branch_tol

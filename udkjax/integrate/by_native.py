@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.code import Code, code, is_large
+from udkjax.equations.large import LargeEquations
 from udkjax.equations.programs import WITH_CARE, Equations
 from udkjax.equations.scales import Scales
 from udkjax.integrate.problem import Problem, Raw
@@ -112,7 +113,9 @@ def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
         return "a progress meter is diffrax's"
-    if type(equations) is not Equations or problem.length is None:
+    if problem.length is None or not (
+        type(equations) is Equations or isinstance(equations, LargeEquations) and equations.by_levels
+    ):
         return f"it knows the Udwadia-Kalaba equation of a mechanism by elimination, not {type(equations).__name__}"
     if not is_explicit(problem.solver):
         return f"{type(problem.solver).__name__} is no explicit Runge-Kutta method"
@@ -154,7 +157,7 @@ def recorded(problem: Any, moving: Any) -> Raw:
 
 def serves_derivatives(problem: Problem, moving: Any) -> bool:
     """Whether there is machine code for the derivatives along what is `moving`: numbers of the scene, and initial states."""
-    if not serves(problem):
+    if not isinstance(problem.equations, Equations) or not serves(problem):
         return False
     moved = eqx.tree_at(lambda p: (p.q, p.v, p.equations), moving, (False, False, None), is_leaf=lambda x: x is None)
     equations = eqx.tree_at(
@@ -224,16 +227,19 @@ def _kind(problem: Any, moving: tuple[bool, ...] | None = None, mode: str = "run
 
 def _inputs(problem: Any, code: Code | None = None, xp: Any = jnp) -> list[Any]:
     """Those of a run, of one member."""
-    textbook = problem.equations.textbook
+    equations = problem.equations
+    large = isinstance(equations, LargeEquations)
+    textbook: Any = equations if large else equations.textbook
     method, rank_tol, baumgarte = textbook.method, textbook.method.rank_tol, textbook.baumgarte
     gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
     least = method.branch_tol if isinstance(method, Auto) else rank_tol**2
-    drop = (WITH_CARE * rank_tol) ** 2 if code is not None and code.elimination == "watch" else least
+    drop = (WITH_CARE * rank_tol) ** 2 if (code or equations.code).elimination == "watch" else least
+    numbers = [textbook.given] if large else [*jax.tree.leaves(textbook.mechanism), *gains]
     first = 0.0 if problem.h is None else problem.h
     care = WITH_CARE * rank_tol
     settings = [problem.rtol, problem.atol, problem.smallest, first, problem.length, problem.rate, care, problem.max_steps]
     given = {
-        "numbers": _vector([*jax.tree.leaves(textbook.mechanism), *gains, drop, least], xp),
+        "numbers": _vector([*numbers, drop, least], xp),
         "ts": problem.ts,
         "q": problem.q,
         "v": problem.v,

@@ -23,10 +23,12 @@ from typing import Any
 import numpy as np
 
 from udkjax.equations.code import Code
+from udkjax.equations.large_code import LargeCode
 from udkjax.equations.motion import FAR, STEPS
 from udkjax.equations.rank_policy import NOTHING_LEFT, TURNED, USELESS
 from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM, least_norm
+from udkjax.native.loops import LoopWriter
 from udkjax.native.power import power
 from udkjax.native.program import Place, write
 from udkjax.native.steps import (
@@ -76,7 +78,7 @@ INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the 
 class Plan:
     """What a trajectory's code depends on."""
 
-    code: Code
+    code: Code | LargeCode
     method: Method
     projected: bool
     breaks: bool
@@ -177,7 +179,7 @@ class Trajectory:
 
     def __init__(self, plan: Plan):
         self.plan, self.code, self.method = plan, plan.code, plan.method
-        code, n, m = plan.code, plan.code.n, len(plan.code.equations.psi)
+        code, n, m = plan.code, plan.code.n, plan.code.m
         self.n, self.m = n, m
         self.constants = len(code.constants)
         p = self.places = Places(plan.width, plan.vector)
@@ -196,14 +198,15 @@ class Trajectory:
             p.add(f"N{k}", n)
         p.add("rows", m)
         p.add("psi", m)
-        p.add("R", len(code.outputs["rows"]))
+        p.add("R", code.made_of)
+        if isinstance(code, LargeCode):
+            p.add("memory", code.memory)
         self.ways = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
         self.globals: list[str] = []
         self.stage_accelerations = ["P3 a", *(f"A{i}" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
-        drop = code.drop.index
-        self.drop = [s.index for s in code.constants].index(drop) if drop in [s.index for s in code.constants] else None
+        self.drop = code.drop_place
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
@@ -213,7 +216,7 @@ class Trajectory:
         self._differences()
         self._between()
         self._outputs()
-        if self.cares:
+        if self.reveals:
             self.functions.append(least_norm())
             self._solve()
             self._care()
@@ -264,10 +267,18 @@ class Trajectory:
         """Whether steps may be taken again with care."""
         return self.doubts and self.m > 0
 
+    @property
+    def reveals(self) -> bool:
+        """Whether a step with care takes all rows, by a rank-revealing method; else it leaves out those whose pivots are small."""
+        return self.cares and not isinstance(self.code, LargeCode)
+
     # --- the scene's programs
 
     def _programs(self):
         code, n = self.code, self.n
+        if isinstance(code, LargeCode):
+            self._loop_programs(code)
+            return
         state, changes = self._state(), [*self._work("X dq", n), *self._work("X dv", n)]
         safe = self._work("safe", 1)
         outputs = {
@@ -291,13 +302,27 @@ class Trajectory:
         inputs = _numbered("work", len(code.prologue.inputs))
         self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, _numbered("out", self.constants)))
 
+    def _loop_programs(self, code: LargeCode):
+        found = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
+        found |= {"dq1": "O dq", "dv1": "O dv", "made_of": "R"}
+        names = {x: found.get(x, x) for x in (*found, "constants", "psi", "safe", "distance", "memory")}
+        at = {x: ("work", self.places[place]) for x, place in names.items()}
+        writer = LoopWriter(self.plan.width)
+        for name in self._wanted():
+            writer.write(code.program(name), name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {}))
+        prologue = LoopWriter(1, "prologue_")
+        prologue.write(code.prologue, "prologue", ("work", "out"), {"numbers": ("work", 0), "constants": ("out", 0)})
+        for w in (writer, prologue):
+            self.functions += w.functions
+            self.globals += w.globals
+
     def _wanted(self) -> list[str]:
         """The programs that it calls."""
         wanted = ["accelerations", "rows", "psi"]
         if self.plan.projected:
             wanted += ["closer", "arrival", "tangential"] if self.method.ends else ["closer", "finish"]
             wanted += ["output"]
-        return wanted + (["psi_dot"] if self.cares else [])
+        return wanted + (["psi_dot"] if self.reveals else [])
 
     def _write(self, program: Program, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]):
         self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs))
@@ -400,11 +425,11 @@ class Trajectory:
             self._call(f, "arrival" if method.ends else "finish")
             unsafe = (s.judged > 0.5) & (s.safe < 0.5)
             if self.cares:
-                s.where(unsafe, ok=0.0)
+                s.where(unsafe if self.reveals else unsafe & (s.careful < 0.5), ok=0.0)
             if method.ends:
                 self._errors(f, s, "O a", "X dq", "X dv")
                 self._dropping(f, s, f.const(NOTHING_LEFT, DOUBLE, f.width), lambda: self._call(f, "tangential"))
-            if self.cares:
+            if self.reveals:
                 again = (s.judged > 0.5) & (s.careful > 0.5)
                 with f.if_(f.any_of(again)):
                     self._call(f, "arrive_carefully")
@@ -456,8 +481,8 @@ class Trajectory:
             return
         unsafe = (s.judged > 0.5) & (s.safe < 0.5)
         with f.if_(f.any_of(unsafe)):
-            if not self.cares:
-                s.where(unsafe, ok=0.0)
+            if not self.reveals:
+                s.where(unsafe & (s.careful < 0.5), ok=0.0)
                 return
             f.choose(
                 f.any_of(unsafe & (s.careful > 0.5)),
@@ -486,7 +511,8 @@ class Trajectory:
         with f.while_(lambda: f.any_of(s.moving > 0.5) & (k.value < steps)):
             self._call(f, "closer")
             moving = s.moving > 0.5
-            s.where(moving & (s.safe < 0.5), ok=0.0)
+            unsafe = moving & (s.safe < 0.5)
+            s.where(unsafe if self.reveals else unsafe & (s.careful < 0.5), ok=0.0)
             change = self._moved(f, moving)
             s.moving = f.select(moving & ~(change <= FAR), f.const(1.0, DOUBLE, f.width), 0.0)
             k.value = k.value + 1
@@ -1011,7 +1037,7 @@ class Trajectory:
                     self._put(f, "X v", r, v)
                 self._call(f, "rows")
                 total = f.variable(0.0)
-                with f.each(len(self.code.outputs["rows"])) as i:
+                with f.each(self.code.made_of) as i:
                     x = f.load(work, i * width + p["R"] * width, width)
                     total.value = f.fma(x, 0.0, total.value)
                 s.where(stopped & total.value.is_not(0.0), code=NOT_FINITE)
