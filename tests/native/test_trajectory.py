@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
-from udkjax.equations import constraints, loads
+from udkjax.equations import code, constraints, loads
 from udkjax.integrate import by_native
 
 TOL = 1e-9
@@ -65,9 +65,11 @@ def agrees(mechanism, ts, atol=1e-6, **choices):
     return solution
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, params=["written out", "loops"])
 def served(monkeypatch, request):
     """All of these runs are by machine code, but for those of tests that look themselves."""
+    if request.param == "loops":
+        monkeypatch.setattr(code, "LARGE", 0)
     seen, serves = [], by_native.serves
     monkeypatch.setattr(by_native, "serves", lambda problem: seen.append(serves(problem)) or seen[-1])
     yield seen

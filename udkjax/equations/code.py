@@ -193,7 +193,7 @@ def code(mechanism: Mechanism, left_out: tuple[int, ...], baumgarte: bool, elimi
 def structure(mechanism: Mechanism) -> tuple[Any, tuple]:
     """Return what the code depends on: the tree of the mechanism and the shapes of its numbers, not their values."""
     leaves, tree = jax.tree.flatten(mechanism.bare)
-    return tree, tuple((np.shape(leaf), jax.numpy.result_type(leaf)) for leaf in leaves)
+    return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
 
 
 def scalars(leaves: Sequence[Any]) -> list[Any]:

@@ -533,7 +533,9 @@ class LargeCode:
     def _eliminate(self, w: "_Writing", p: int, later: tuple[int, ...], drop: Scalar):
         graph, zero, one = w.graph, w.graph.constant(0.0), w.graph.constant(1.0)
         S = [[w.read("memory", 0, p + _triangle(i, j)) for j in range(i + 1)] for i in range(p)]
-        below = [[[w.read("memory", 2 + 2 * a, i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)]
+        below = [
+            [[w.read("memory", 2 + 2 * a, i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)
+        ]
         rows = [row for block in below for row in block]
         ratio = []
         for j in range(p):

@@ -114,7 +114,7 @@ def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
     if meter is not None:
         return "a progress meter is diffrax's"
     if problem.length is None or not (
-        type(equations) is Equations or isinstance(equations, LargeEquations) and equations.by_levels
+        type(equations) is Equations or (isinstance(equations, LargeEquations) and equations.by_levels)
     ):
         return f"it knows the Udwadia-Kalaba equation of a mechanism by elimination, not {type(equations).__name__}"
     if not is_explicit(problem.solver):

@@ -269,7 +269,7 @@ class Trajectory:
 
     @property
     def reveals(self) -> bool:
-        """Whether a step with care takes all rows, by a rank-revealing method; else it leaves out those whose pivots are small."""
+        """Whether a step with care takes all rows, by a rank-revealing method; else it leaves out rows with small pivots."""
         return self.cares and not isinstance(self.code, LargeCode)
 
     # --- the scene's programs

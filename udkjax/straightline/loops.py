@@ -11,11 +11,11 @@ import numpy as np
 
 from udkjax.straightline.emit import Program
 
-SET, ADD, LEAST = "set", "add", "least"  # what becomes of an output: it replaces what is there, is added, or the smaller one stays
+SET, ADD, LEAST = "set", "add", "least"  # an output replaces what is there, is added to it, or the smaller of both stays
 
 
 class Slot(NamedTuple):
-    """Where a number lies: so many numbers behind a base in an array. `base` is a column of the table, or None: the array's start."""
+    """Where a number lies: so many behind a base in an array. `base` is a column of the table, or None: the array's start."""
 
     array: str
     base: int | None
