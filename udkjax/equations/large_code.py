@@ -32,20 +32,27 @@ OF_ANGLE = (0, 0, 1)  # which of the two, of x, y and the angle
 OWN, RECORD, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
 DROP, LEAST_PIVOT, GAINS = 0, 1, 2  # constants of all
 
+SOLVES = 4  # in one program, at most
+SOLVED = ("right", "y", "x", "pull")  # of D D^T x = right, L y = right, pull = D^T x
+
 Parts = Iterator[Loop | Clear]
 
 
 class LargeCode:
     """Programs over arrays of numbers, by name. Each takes the constants, t, q and, where it needs them, v, dq and dv.
 
-    `accelerations` (a, safe), `closer` (q1, safe), `output` (v1, psi), `arrival` (v1, a, safe), `tangential` (dq1, dv1, distance),
-    `finish` (what the last two have), `psi` and `psi_dot` (psi), and `rows` (made_of: numbers that are finite where all is). What
-    they are says `Code`. `prologue` makes the constants of the numbers of the scene, the gains and two thresholds of pivots:
-    `drop`, below which a row is dropped, and `least`, below which a result is not `safe`.
+    `accelerations` (a, safe), `closer` (q1, safe), `output` (v1, psi), `arrival` (v1, a, safe), `tangential` (dq1, dv1,
+    distance), `finish` (what the last two have), `psi` and `psi_dot` (psi), and `rows` (made_of: numbers that are finite where
+    all is). What they are says `Code`. `prologue` makes the constants of the numbers of the scene, the gains and two thresholds of
+    pivots: `drop`, below which a row is dropped, and `least`, below which a result is not `safe`. What a program computes on the
+    way stays where it is in arrays of its own (`scratch`): none is written again within one program.
     """
 
-    def __init__(self, tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool, elimination: str):
+    def __init__(
+        self, tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool, elimination: str, every: bool = False
+    ):
         self.layout = found = layout(tree, shapes, left_out, baumgarte)
+        self._made_for = tree, shapes, left_out, baumgarte, elimination
         self.elimination, self.left_out = elimination, left_out
         starts = np.cumsum([0, *(int(np.prod(shape)) for shape, _ in shapes)])
         ids = [np.arange(a, b).reshape(s) for a, b, (s, _) in zip(starts, starts[1:], shapes, strict=False)]
@@ -56,27 +63,26 @@ class LargeCode:
         self.gravity = GAINS + self.gains
         self.of_bodies = self.gravity + 2
         self._constants = self.of_bodies + OF_BODY * self.bodies
-        self._memory = 0
-        self.sines, self.free = self._reserve(2 * self.bodies), self._reserve(self.n)
-        self.load, self.pull, self.ratio = self._reserve(self.n), self._reserve(self.n), self._reserve(1)
-        kept = [rows for _, _, rows in found.kept.parts for _ in rows]
-        self.rows_kept = len(found.kept.rows)
-        self.right = self._reserve(self.rows_kept)
-        self._kept = {k: rows for k, _, rows in found.kept.parts}
-        del kept
+        self._parts = (found.all if every else found.kept).parts
+        # What the programs leave for themselves: how many numbers of each name.
+        self.scratch = {"sines": 2 * self.bodies, "free": self.n, "load": self.n, "ratio": 1, "D": 0, "gram": 0}
+        rows = {k: rows for k, _, rows in self._parts}
         self._tables: dict[int, np.ndarray] = {}
         self._records: dict[int, dict[int, int]] = {}
         self._constant_start: dict[int, int] = {}
         rights = 0
         for k, group in enumerate(found.constraints):
-            self._tables[id(group)] = self._table(group, self._kept.get(k, ()), rights)
-            rights += len(self._kept.get(k, ())) * len(group.members)
+            self._tables[id(group)] = self._table(group, rows.get(k, ()), rights)
+            rights += len(rows.get(k, ())) * len(group.members)
         for group in found.forces:
             self._tables[id(group)] = self._table(group, (), 0)
         self._body_table = np.array([[3 * b, 2 * b, self._of_body(b)] for b in range(self.bodies)]).reshape(-1, 3)
         self._kernels: dict[Hashable, Kernel] = {}
         self._programs: dict[str, LoopProgram] = {}
         self._order()
+        self.scratch["factors"] = self.scratch["gram"]
+        for k in range(SOLVES):
+            self.scratch |= {f"{name}{k}": self.n if name == "pull" else rights for name in SOLVED}
 
     def _table(self, group: Group, kept: Sequence[int], right: int) -> np.ndarray:
         """Where what belongs to each element of a group begins."""
@@ -88,7 +94,7 @@ class LargeCode:
             for s in group.kind.outputs["D"]:
                 if s.constant is None:
                     place.setdefault(s.index, len(place))
-            record = self._reserve(len(place) * size)
+            record = self._reserve("D", len(place) * size)
             rows = self.layout.starts[group.members]
         else:
             rows = np.zeros(size, int)
@@ -101,9 +107,9 @@ class LargeCode:
     def _of_body(self, body: Any) -> Any:
         return self.of_bodies + OF_BODY * body
 
-    def _reserve(self, count: int) -> int:
-        self._memory += count
-        return self._memory - count
+    def _reserve(self, name: str, count: int) -> int:
+        self.scratch[name] += count
+        return self.scratch[name] - count
 
     # --- what trajectories ask
 
@@ -121,17 +127,17 @@ class LargeCode:
         return self.numbers + self.gains + 2
 
     @property
-    def memory(self) -> int:
-        """How many numbers the programs leave for themselves."""
-        return self._memory
-
-    @property
     def made_of(self) -> int:
         return self.n + self.m
 
     @property
     def watching(self) -> "LargeCode":
         return self
+
+    @cached_property
+    def careful(self) -> "LargeCode":
+        """The same with all rows, of the same constants: those left out may be independent in singular configurations."""
+        return LargeCode(*self._made_for, every=True)
 
     def program(self, name: str) -> LoopProgram:
         """One of the programs."""
@@ -172,27 +178,27 @@ class LargeCode:
     def _arrival(self) -> Parts:
         yield from self._to_velocities()
         yield from self._loads("v1")
-        yield from self._elements(("b",), "v1")
-        yield from self._solved()
-        yield self._fallen()
+        yield from self._elements(("b",), "v1", 1)
+        yield from self._solved(1)
+        yield self._fallen(1)
         yield self._safe()
 
     def _tangential(self) -> Parts:
         yield self._sincos()
         yield from self._elements(("D",), "v")
         yield from self._factorized()
-        yield from self._left_of_changes()
+        yield from self._left_of_changes(0)
 
-    def _left_of_changes(self) -> Parts:
-        for change in ("dq", "dv"):
-            yield from self._rates(change)
-            yield from self._solved()
-            yield self._without(change, f"{change}1")
+    def _left_of_changes(self, solve: int) -> Parts:
+        for k, change in enumerate(("dq", "dv"), solve):
+            yield from self._rates(change, k)
+            yield from self._solved(k)
+            yield self._without(change, f"{change}1", k)
         yield self._distance()
 
     def _finish(self) -> Parts:
         yield from self._arrival()
-        yield from self._left_of_changes()
+        yield from self._left_of_changes(2)
 
     def _psi(self) -> Parts:
         yield self._sincos()
@@ -208,7 +214,7 @@ class LargeCode:
 
         def falling(w: _Writing):
             for k in range(3):
-                free = w.read("memory", COORDINATES, self.free + k) if self.layout.forces else w.graph.constant(0.0)
+                free = w.read("free", COORDINATES, k) if self.layout.forces else w.graph.constant(0.0)
                 w.write(free, "made_of", COORDINATES, k)
 
         yield self._of_bodies("falling", falling)
@@ -258,15 +264,15 @@ class LargeCode:
 
     # --- kernels
 
-    def _kernel(self, key: Hashable, write: "Callable[[_Writing], None]") -> Kernel:
+    def _kernel(self, key: Hashable, write: "Callable[[_Writing], None]", graph: Graph | None = None) -> Kernel:
         if key not in self._kernels:
-            writing = _Writing()
+            writing = _Writing(graph)
             write(writing)
             self._kernels[key] = writing.kernel()
         return self._kernels[key]
 
-    def _of_bodies(self, key: Hashable, write: "Callable[[_Writing], None]") -> Loop:
-        return Loop(self._kernel(key, write), self._body_table)
+    def _of_bodies(self, key: Hashable, write: "Callable[[_Writing], None]", **names: str) -> Loop:
+        return Loop(self._kernel(key, write), self._body_table, names)
 
     def _once(self, key: Hashable, write: "Callable[[_Writing], None]") -> Loop:
         return Loop(self._kernel(key, write), np.zeros((1, 1), int))
@@ -275,7 +281,7 @@ class LargeCode:
         def pair(w: _Writing):
             angle = w.read("q", COORDINATES, 2)
             for k, (primitive, fold) in enumerate(((lax.sin_p, np.sin), (lax.cos_p, np.cos))):
-                w.write(w.graph.apply(primitive, {}, (angle,), float, fold), "memory", SINE, self.sines + k)
+                w.write(w.graph.apply(primitive, {}, (angle,), float, fold), "sines", SINE, k)
 
         return self._of_bodies("sincos", pair)
 
@@ -283,66 +289,59 @@ class LargeCode:
         """a_F, where there are forces: without them it is that of gravity."""
         if not self.layout.forces:
             return
-        yield Clear("memory", self.load, self.n)
+        yield Clear("load", 0, self.n)
         for group in self.layout.forces:
 
             def loads(w: _Writing, group: Group = group):
                 for k, s in enumerate(group.kind.outputs["loads"]):
-                    w.write(s, "memory", BODIES + 3 * (k // 3) + COORDINATES, self.load + k % 3, ADD)
+                    w.write(s, "load", BODIES + 3 * (k // 3) + COORDINATES, k % 3, ADD)
 
-            yield self._of_group("loads", group, v, loads)
+            yield self._of_group("loads", group, loads, v=v)
 
         def free(w: _Writing):
             for k, i in enumerate(OF_ANGLE):
-                load, mass = w.read("memory", COORDINATES, self.load + k), w.read("constants", CONSTANTS, COMPLIANCE + i)
-                w.write(self._falling(w, k) + mass * load, "memory", COORDINATES, self.free + k)
+                load, mass = w.read("load", COORDINATES, k), w.read("constants", CONSTANTS, COMPLIANCE + i)
+                w.write(self._falling(w, k) + mass * load, "free", COORDINATES, k)
 
         yield self._of_bodies("free", free)
 
     def _falling(self, w: "_Writing", k: int) -> Scalar:
         return w.read("constants", None, self.gravity + k) if k < 2 else w.graph.constant(0.0)
 
-    def _of_group(self, key: Hashable, group: Group, v: str, write: "Callable[[_Writing], None]") -> Loop:
+    def _of_group(self, key: Hashable, group: Group, write: "Callable[[_Writing], None]", **names: str) -> Loop:
         """A loop over the elements of a group, whose kind's inputs lie where they do in this scene."""
         kind = group.kind
 
         def bound(w: _Writing):
-            arrays = dict.fromkeys(POSITIONS, ("q", COORDINATES, 0)) | dict.fromkeys(VELOCITIES, (v, COORDINATES, 0))
-            arrays |= dict.fromkeys(FREE, ("memory", COORDINATES, self.free)) | dict.fromkeys(
-                ("sin", "cos"), ("memory", SINE, self.sines)
-            )
-            names = [*POSITIONS, *VELOCITIES, *FREE, "sin", "cos"]
+            arrays = dict.fromkeys(POSITIONS, ("q", COORDINATES, 0)) | dict.fromkeys(VELOCITIES, ("v", COORDINATES, 0))
+            arrays |= dict.fromkeys(FREE, ("free", COORDINATES, 0)) | dict.fromkeys(("sin", "cos"), ("sines", SINE, 0))
+            order = [*POSITIONS, *VELOCITIES, *FREE, "sin", "cos"]
             for k, s in enumerate(kind.constants):
                 w.bind(s, "constants", OWN, k)
             w.bind(kind.t, "t", None, 0)
             for name, body, s in kind.state:
                 array, column, start = arrays[name]
-                w.bind(s, array, BODIES + 3 * body + column, start + names.index(name) % 3 if name != "cos" else start + 1)
+                w.bind(s, array, BODIES + 3 * body + column, start + order.index(name) % 3 if name != "cos" else start + 1)
             write(w)
 
-        found = (key, id(group), v)
-        if found not in self._kernels:
-            writing = _Writing(kind.graph)
-            bound(writing)
-            self._kernels[found] = writing.kernel()
-        return Loop(self._kernels[found], self._tables[id(group)])
+        kernel = self._kernel((key, id(group)), bound, kind.graph)
+        return Loop(kernel, self._tables[id(group)], names)
 
-    def _elements(self, names: tuple[str, ...], v: str) -> Parts:
-        """D, and a right-hand side of the rows kept."""
-        for k, group, rows in self.layout.kept.parts:
-            del k
+    def _elements(self, names: tuple[str, ...], v: str, solve: int = 0) -> Parts:
+        """D, and a right-hand side."""
+        for _, group, rows in self._parts:
 
             def write(w: _Writing, group: Group = group, rows: Sequence[int] = rows):
                 outputs = group.kind.outputs
                 if "D" in names:
                     for index, place in self._records[id(group)].items():
-                        w.write(Scalar(group.kind.graph, index), "memory", RECORD, place)
+                        w.write(Scalar(group.kind.graph, index), "D", RECORD, place)
                 for name in names:
                     if name != "D":
                         for i, row in enumerate(rows):
-                            w.write(outputs[name][row], "memory", RIGHT, self.right + i)
+                            w.write(outputs[name][row], "right", RIGHT, i)
 
-            yield self._of_group(names, group, v, write)
+            yield self._of_group(names, group, write, v=v, right=f"right{solve}")
 
     def _residuals(self, name: str, array: str, start: int = 0) -> Parts:
         """Psi, Psi_dot or b of all rows in their order, into an array."""
@@ -352,19 +351,19 @@ class LargeCode:
                 for i, s in enumerate(group.kind.outputs[name]):
                     w.write(s, array, ROW, start + i)
 
-            yield self._of_group((name, array), group, "v", write)
+            yield self._of_group((name, array), group, write)
 
     def _entry(self, w: "_Writing", group: Group, row: int, k: int, record: int) -> Scalar:
         """An entry of D as it was left."""
         s = group.kind.outputs["D"][row * 3 * len(group.bodies) + k]
         if s.constant is not None:
             return w.graph.constant(s.constant)
-        found = w.read("memory", record, self._records[id(group)][s.index])
+        found = w.read("D", record, self._records[id(group)][s.index])
         return found if s.sign > 0 else -found
 
-    def _rates(self, change: str) -> Parts:
+    def _rates(self, change: str, solve: int) -> Parts:
         """Psi_q dx, of the rows kept."""
-        for _, group, rows in self.layout.kept.parts:
+        for _, group, rows in self._parts:
 
             def write(w: _Writing, group: Group = group, rows: Sequence[int] = rows):
                 for i, row in enumerate(rows):
@@ -372,57 +371,59 @@ class LargeCode:
                     for k in range(3 * len(group.bodies)):
                         base = BODIES + 3 * (k // 3)
                         weight = w.read("constants", base + CONSTANTS, WEIGHT + OF_ANGLE[k % 3])
-                        dx = w.read(change, base + COORDINATES, k % 3)
+                        dx = w.read("dx", base + COORDINATES, k % 3)
                         total = total + self._entry(w, group, row, k, RECORD) * (weight * dx)
-                    w.write(total, "memory", RIGHT, self.right + i)
+                    w.write(total, "right", RIGHT, i)
 
-            yield Loop(self._kernel(("rates", change, id(group)), write), self._tables[id(group)])
+            names = {"dx": change, "right": f"right{solve}"}
+            yield Loop(self._kernel(("rates", id(group)), write), self._tables[id(group)], names)
 
-    def _solved(self) -> Parts:
+    def _solved(self, solve: int = 0) -> Parts:
         """D^T (D D^T)^-1 of what is on the right, into `pull`."""
-        yield from self._substituted()
-        yield Clear("memory", self.pull, self.n)
-        for _, group, rows in self.layout.kept.parts:
+        names = {name: f"{name}{solve}" for name in SOLVED}
+        yield from self._substituted(names)
+        yield Clear(names["pull"], 0, self.n)
+        for _, group, rows in self._parts:
 
             def write(w: _Writing, group: Group = group, rows: Sequence[int] = rows):
-                y = [w.read("memory", RIGHT, self.right + i) for i in range(len(rows))]
+                y = [w.read("x", RIGHT, i) for i in range(len(rows))]
                 for k in range(3 * len(group.bodies)):
                     total = sum(
                         (self._entry(w, group, row, k, RECORD) * s for row, s in zip(rows, y, strict=True)), w.graph.constant(0.0)
                     )
                     if not total.is_zero:
-                        w.write(total, "memory", BODIES + 3 * (k // 3) + COORDINATES, self.pull + k % 3, ADD)
+                        w.write(total, "pull", BODIES + 3 * (k // 3) + COORDINATES, k % 3, ADD)
 
-            yield Loop(self._kernel(("pull", id(group)), write), self._tables[id(group)])
+            yield Loop(self._kernel(("pull", id(group)), write), self._tables[id(group)], names)
 
     def _pulled(self, w: "_Writing", k: int) -> Scalar:
         """M^(-1/2) of what is in `pull`."""
-        return w.read("constants", CONSTANTS, ROOT + OF_ANGLE[k]) * w.read("memory", COORDINATES, self.pull + k)
+        return w.read("constants", CONSTANTS, ROOT + OF_ANGLE[k]) * w.read("pull", COORDINATES, k)
 
-    def _fallen(self) -> Loop:
+    def _fallen(self, solve: int = 0) -> Loop:
         def write(w: _Writing):
             for k in range(3):
-                free = w.read("memory", COORDINATES, self.free + k) if self.layout.forces else self._falling(w, k)
+                free = w.read("free", COORDINATES, k) if self.layout.forces else self._falling(w, k)
                 w.write(free + self._pulled(w, k), "a", COORDINATES, k)
 
-        return self._of_bodies("fallen", write)
+        return self._of_bodies("fallen", write, pull=f"pull{solve}")
 
-    def _without(self, x: str, to: str) -> Loop:
+    def _without(self, x: str, to: str, solve: int = 0) -> Loop:
         def write(w: _Writing):
             for k in range(3):
-                w.write(w.read(x, COORDINATES, k) - self._pulled(w, k), to, COORDINATES, k)
+                w.write(w.read("from", COORDINATES, k) - self._pulled(w, k), "to", COORDINATES, k)
 
-        return self._of_bodies(("without", x, to), write)
+        return self._of_bodies("without", write, **{"from": x, "to": to, "pull": f"pull{solve}"})
 
     def _safe(self) -> Loop:
         def write(w: _Writing):
-            w.write(greater(w.read("memory", None, self.ratio), w.read("constants", None, LEAST_PIVOT)), "safe", None)
+            w.write(greater(w.read("ratio", None), w.read("constants", None, LEAST_PIVOT)), "safe", None)
 
         return self._once("safe", write)
 
     def _distance(self) -> Loop:
         def write(w: _Writing):
-            w.write(w.graph.sqrt(w.read("memory", None, self.ratio)), "distance", None)
+            w.write(w.graph.sqrt(w.read("ratio", None)), "distance", None)
 
         return self._once("distance", write)
 
@@ -430,20 +431,20 @@ class LargeCode:
 
     def _order(self):
         """In which order blocks are eliminated, and where they are kept."""
-        elements = [(g, rows, i) for _, g, rows in self.layout.kept.parts for i in range(len(g.members))]
+        elements = [(g, rows, i) for _, g, rows in self._parts for i in range(len(g.members))]
         bodies = [set(g.bodies[:, i].tolist()) for g, _, i in elements]
         sizes = [len(rows) for _, rows, _ in elements]
         self.eliminations: list[Elimination] = eliminations(sizes, bodies)
         self._elements_of_blocks, self._sizes = elements, sizes
-        self._diagonals = [self._reserve(p + p * (p + 1) // 2) for p in sizes]  # the entries as they were, and the factors
+        self._diagonals = [self._reserve("gram", p + p * (p + 1) // 2) for p in sizes]  # also as it was before any elimination
         place = {k: j for j, k in enumerate(k for e in self.eliminations for k in e.blocks)}
         self._places = place
-        self._off_start, self._off = self._memory, {}
+        self._off_start, self._off = self.scratch["gram"], {}
         for e in self.eliminations:
             for k, later in zip(e.blocks, e.later, strict=True):
                 for a in later:
-                    self._off[a, k] = self._reserve(sizes[a] * sizes[k])
-        self._off_size = self._memory - self._off_start
+                    self._off[a, k] = self._reserve("gram", sizes[a] * sizes[k])
+        self._off_size = self.scratch["gram"] - self._off_start
 
     def _right(self, block: int) -> int:
         group, _, i = self._elements_of_blocks[block]
@@ -456,11 +457,9 @@ class LargeCode:
     @cached_property
     def _gram(self) -> list[Loop | Clear]:
         """D D^T, block by block."""
-        sizes, found = self._sizes, list[Loop | Clear]([Clear("memory", self._off_start, self._off_size)])
-        if not self._off_size:
-            found = []
+        found: list[Loop | Clear] = [Clear("gram", self._off_start, self._off_size)] if self._off_size else []
         start = 0
-        for _, group, rows in self.layout.kept.parts:
+        for _, group, rows in self._parts:
             p, table = len(rows), self._tables[id(group)]
             diagonals = np.array(self._diagonals[start : start + len(group.members)])[:, None]
             start += len(group.members)
@@ -470,9 +469,9 @@ class LargeCode:
                 for i in range(p):
                     for j in range(i + 1):
                         s = _dot(w.graph, entries[i], entries[j])
-                        w.write(s, "memory", base, p + _triangle(i, j))
+                        w.write(s, "gram", base, p + _triangle(i, j))
                         if i == j:
-                            w.write(s, "memory", base, i)
+                            w.write(s, "gram", base, i)
 
             found.append(Loop(self._kernel(("diagonal", id(group)), write), np.concatenate([table, diagonals], 1)))
         holders: dict[int, list[tuple[int, int]]] = {}
@@ -499,15 +498,14 @@ class LargeCode:
                 two = [[self._entry(w, h, row, 3 * s + k, 1) for k in range(3)] for row in columns]
                 for i, x in enumerate(one):
                     for j, y in enumerate(two):
-                        w.write(_dot(w.graph, x, y), "memory", 2, i * len(two) + j, ADD)
+                        w.write(_dot(w.graph, x, y), "gram", 2, i * len(two) + j, ADD)
 
             found.append(Loop(self._kernel(key, product), np.array(table)))
-        del sizes
         return found
 
     def _factorized(self) -> Parts:
         yield from self._gram
-        yield Clear("memory", self.ratio, 1, np.inf)
+        yield Clear("ratio", 0, 1, np.inf)
         for e in self.eliminations:
             p, later = e.size, e.sizes
 
@@ -532,14 +530,12 @@ class LargeCode:
 
     def _eliminate(self, w: "_Writing", p: int, later: tuple[int, ...], drop: Scalar):
         graph, zero, one = w.graph, w.graph.constant(0.0), w.graph.constant(1.0)
-        S = [[w.read("memory", 0, p + _triangle(i, j)) for j in range(i + 1)] for i in range(p)]
-        below = [
-            [[w.read("memory", 2 + 2 * a, i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)
-        ]
+        S = [[w.read("gram", 0, p + _triangle(i, j)) for j in range(i + 1)] for i in range(p)]
+        below = [[[w.read("gram", 2 + 2 * a, i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)]
         rows = [row for block in below for row in block]
         ratio = []
         for j in range(p):
-            pivot, diagonal = S[j][j], w.read("memory", 0, j)
+            pivot, diagonal = S[j][j], w.read("gram", 0, j)
             inverse = where(greater(pivot, diagonal * drop), one / pivot, zero)
             ratio.append(absolute(pivot * (one / diagonal)))
             for i in range(j + 1, p):
@@ -548,16 +544,16 @@ class LargeCode:
                     S[i][k] = S[i][k] - lower * S[k][j]
                 for row in rows:
                     row[i] = row[i] - lower * row[j]
-                w.write(lower, "memory", 0, p + _triangle(i, j))
-            w.write(inverse, "memory", 0, p + _triangle(j, j))
+                w.write(lower, "factors", 0, p + _triangle(i, j))
+            w.write(inverse, "factors", 0, p + _triangle(j, j))
             S[j][j] = inverse
         for x in ratio:
-            w.write(x, "memory", None, self.ratio, LEAST)
+            w.write(x, "ratio", None, 0, LEAST)
         scaled = [[[s * S[j][j] for j, s in enumerate(row)] for row in block] for block in below]
         for a, block in enumerate(scaled):
             for i, row in enumerate(block):
                 for j, s in enumerate(row):
-                    w.write(s, "memory", 2 + 2 * a, i * p + j)
+                    w.write(s, "factors", 2 + 2 * a, i * p + j)
         base = 2 + 2 * len(later)
         for a, block in enumerate(scaled):
             for b in range(a + 1):
@@ -565,42 +561,42 @@ class LargeCode:
                     for j, other in enumerate(below[b]):
                         if a > b or j <= i:
                             place = i * later[b] + j if a > b else later[a] + _triangle(i, j)
-                            w.write(-_dot(graph, row, other), "memory", base, place, ADD)
+                            w.write(-_dot(graph, row, other), "gram", base, place, ADD)
                 base += 1
 
-    def _substituted(self) -> Parts:
-        """(D D^T)^-1 of what is on the right, in its place."""
+    def _substituted(self, names: dict[str, str]) -> Parts:
+        """x = (D D^T)^-1 of what is on the right."""
         for e in self.eliminations:
             p, later = e.size, e.sizes
 
             def forward(w: _Writing, p: int = p, later: tuple[int, ...] = later):
-                y = [w.read("memory", 1, self.right + i) for i in range(p)]
+                y = [w.read("right", 1, i) for i in range(p)]
                 for i in range(p):
                     for j in range(i):
-                        y[i] = y[i] - w.read("memory", 0, p + _triangle(i, j)) * y[j]
-                    w.write(y[i], "memory", 1, self.right + i)
+                        y[i] = y[i] - w.read("factors", 0, p + _triangle(i, j)) * y[j]
+                    w.write(y[i], "y", 1, i)
                 for a, size in enumerate(later):
                     for i in range(size):
-                        row = [w.read("memory", 2 + 2 * a, i * p + j) for j in range(p)]
-                        w.write(-_dot(w.graph, row, y), "memory", 3 + 2 * a, self.right + i, ADD)
+                        row = [w.read("factors", 2 + 2 * a, i * p + j) for j in range(p)]
+                        w.write(-_dot(w.graph, row, y), "right", 3 + 2 * a, i, ADD)
 
-            yield Loop(self._kernel(("forward", p, later), forward), self._block_table(e))
+            yield Loop(self._kernel(("forward", p, later), forward), self._block_table(e), names)
         for e in reversed(self.eliminations):
             p, later = e.size, e.sizes
 
             def backward(w: _Writing, p: int = p, later: tuple[int, ...] = later):
-                x = [w.read("memory", 1, self.right + i) * w.read("memory", 0, p + _triangle(i, i)) for i in range(p)]
+                x = [w.read("y", 1, i) * w.read("factors", 0, p + _triangle(i, i)) for i in range(p)]
                 for a, size in enumerate(later):
                     for i in range(size):
-                        s = w.read("memory", 3 + 2 * a, self.right + i)
+                        s = w.read("x", 3 + 2 * a, i)
                         for j in range(p):
-                            x[j] = x[j] - w.read("memory", 2 + 2 * a, i * p + j) * s
+                            x[j] = x[j] - w.read("factors", 2 + 2 * a, i * p + j) * s
                 for j in reversed(range(p)):
                     for i in range(j + 1, p):
-                        x[j] = x[j] - w.read("memory", 0, p + _triangle(i, j)) * x[i]
-                    w.write(x[j], "memory", 1, self.right + j)
+                        x[j] = x[j] - w.read("factors", 0, p + _triangle(i, j)) * x[i]
+                    w.write(x[j], "x", 1, j)
 
-            yield Loop(self._kernel(("backward", p, later), backward), self._block_table(e)[::-1])
+            yield Loop(self._kernel(("backward", p, later), backward), self._block_table(e)[::-1], names)
 
 
 class _Writing:

@@ -32,7 +32,7 @@ class LoopWriter:
                 with f.each(part.count) as i:
                     f.store(part.value, address(part.array), (i + part.start) * self.width, self.width)
             elif len(part.table):
-                arrays = [address(x) for x in part.kernel.arrays]
+                arrays = [address(part.array(x)) for x in part.kernel.arrays]
                 table = Value(f, self._table(part.table), POINTER)
                 f.call(self._kernel(part.kernel, part.table.shape[1]), *arrays, table, f.const(len(part.table), INT))
         self.functions.append(f)

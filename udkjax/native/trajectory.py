@@ -200,7 +200,13 @@ class Trajectory:
         p.add("psi", m)
         p.add("R", code.made_of)
         if isinstance(code, LargeCode):
-            p.add("memory", code.memory)
+            for name, count in code.scratch.items():
+                p.add(name, count)
+            if self.cares:
+                for name, count in code.careful.scratch.items():
+                    p.add(f"careful {name}", count)
+                for name in ("careful v", "careful a"):
+                    p.add(name, n)
         self.ways = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
         self.globals: list[str] = []
@@ -216,10 +222,13 @@ class Trajectory:
         self._differences()
         self._between()
         self._outputs()
-        if self.reveals:
-            self.functions.append(least_norm())
-            self._solve()
-            self._care()
+        if self.cares:
+            if isinstance(self.code, LargeCode):
+                self._care_by_loops()
+            else:
+                self.functions.append(least_norm())
+                self._solve()
+                self._care()
         self._begin()
         self._finish()
         self._derivatives()
@@ -267,11 +276,6 @@ class Trajectory:
         """Whether steps may be taken again with care."""
         return self.doubts and self.m > 0
 
-    @property
-    def reveals(self) -> bool:
-        """Whether a step with care takes all rows, by a rank-revealing method; else it leaves out rows with small pivots."""
-        return self.cares and not isinstance(self.code, LargeCode)
-
     # --- the scene's programs
 
     def _programs(self):
@@ -305,11 +309,16 @@ class Trajectory:
     def _loop_programs(self, code: LargeCode):
         found = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
         found |= {"dq1": "O dq", "dv1": "O dv", "made_of": "R"}
-        names = {x: found.get(x, x) for x in (*found, "constants", "psi", "safe", "distance", "memory")}
-        at = {x: ("work", self.places[place]) for x, place in names.items()}
+        at = {x: ("work", self.places[found.get(x, x)]) for x in (*found, "constants", "psi", "safe", "distance", *code.scratch)}
         writer = LoopWriter(self.plan.width)
         for name in self._wanted():
             writer.write(code.program(name), name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {}))
+        if self.cares:
+            places = {x: f"careful {x}" for x in code.careful.scratch}
+            places |= {"v1": "careful v", "a": "careful a", "safe": "rank", "distance": "rank"}
+            careful = at | {x: ("work", self.places[place]) for x, place in places.items()}
+            for name in ("accelerations", "closer", "arrival", "tangential"):
+                writer.write(code.careful.program(name), f"careful_{name}", ("work", "out"), careful)
         prologue = LoopWriter(1, "prologue_")
         prologue.write(code.prologue, "prologue", ("work", "out"), {"numbers": ("work", 0), "constants": ("out", 0)})
         for w in (writer, prologue):
@@ -322,7 +331,7 @@ class Trajectory:
         if self.plan.projected:
             wanted += ["closer", "arrival", "tangential"] if self.method.ends else ["closer", "finish"]
             wanted += ["output"]
-        return wanted + (["psi_dot"] if self.reveals else [])
+        return wanted + (["psi_dot"] if self.cares and isinstance(self.code, Code) else [])
 
     def _write(self, program: Program, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]):
         self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs))
@@ -425,11 +434,11 @@ class Trajectory:
             self._call(f, "arrival" if method.ends else "finish")
             unsafe = (s.judged > 0.5) & (s.safe < 0.5)
             if self.cares:
-                s.where(unsafe if self.reveals else unsafe & (s.careful < 0.5), ok=0.0)
+                s.where(unsafe, ok=0.0)
             if method.ends:
                 self._errors(f, s, "O a", "X dq", "X dv")
                 self._dropping(f, s, f.const(NOTHING_LEFT, DOUBLE, f.width), lambda: self._call(f, "tangential"))
-            if self.reveals:
+            if self.cares:
                 again = (s.judged > 0.5) & (s.careful > 0.5)
                 with f.if_(f.any_of(again)):
                     self._call(f, "arrive_carefully")
@@ -481,9 +490,6 @@ class Trajectory:
             return
         unsafe = (s.judged > 0.5) & (s.safe < 0.5)
         with f.if_(f.any_of(unsafe)):
-            if not self.reveals:
-                s.where(unsafe & (s.careful < 0.5), ok=0.0)
-                return
             f.choose(
                 f.any_of(unsafe & (s.careful > 0.5)),
                 lambda: self._call(f, "accelerate_carefully", name),
@@ -506,13 +512,20 @@ class Trajectory:
 
     def _newton(self, f: Function, s: Lane, steps: int, which: str = "judged"):
         """Newton's method to Psi = 0 of lanes that are `judged`, until it moves nothing but rounding errors."""
-        s.moving = getattr(s, which)
+
+        def closer(moving: Value):
+            self._call(f, "closer")
+            s.where(moving & (s.safe < 0.5), ok=0.0)
+
+        self._to_manifold(f, s, getattr(s, which) > 0.5, closer, steps)
+
+    def _to_manifold(self, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = STEPS):
+        """Newton's method of some lanes: `closer` leaves X q nearer to the manifold in C."""
+        s.moving = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
         k = f.variable(0, INT, 1)
         with f.while_(lambda: f.any_of(s.moving > 0.5) & (k.value < steps)):
-            self._call(f, "closer")
             moving = s.moving > 0.5
-            unsafe = moving & (s.safe < 0.5)
-            s.where(unsafe if self.reveals else unsafe & (s.careful < 0.5), ok=0.0)
+            closer(moving)
             change = self._moved(f, moving)
             s.moving = f.select(moving & ~(change <= FAR), f.const(1.0, DOUBLE, f.width), 0.0)
             k.value = k.value + 1
@@ -925,21 +938,18 @@ class Trajectory:
         # not safe; and, whether they are or not, what projection leaves of the errors.
         f, s = self._function("arrive_carefully", [(POINTER, "work"), (POINTER, "out")])
         careful = (s.judged > 0.5) & (s.careful > 0.5)
-        steps = f.variable(0, INT, 1)
-        s.moving = f.select(careful & (s.ok < 0.5), one(f), 0.0)
-        with f.while_(lambda: f.any_of(s.moving > 0.5) & (steps.value < STEPS)):
+
+        def closer(moving: Value):
             self._call(f, "rows")
             self._call(f, "psi")
             with f.each(self.rowcount) as r:
                 self._put(f, "C", r, self._vector(f, "X q", r))
-            for k, right, x in each_lane(f, s.moving > 0.5):
+            for k, right, x in each_lane(f, moving):
                 solved(f, k, right, x, "psi")
                 with f.each(n) as i:
                     put(f, "C", k, i, number(f, "X q", k, i) - root(f, k, i) * f.load(x, i))
-            moving = s.moving > 0.5
-            change = self._moved(f, moving)
-            s.moving = f.select(moving & ~(change <= FAR), one(f), 0.0)
-            steps.value = steps.value + 1
+
+        self._to_manifold(f, s, careful & (s.ok < 0.5), closer)
         self._call(f, "rows")
         doubtful = careful & (s.ok < 0.5)
         with f.if_(f.any_of(doubtful)):
@@ -965,6 +975,29 @@ class Trajectory:
                 f.call("solve", f.given["work"], k, right, x, f.const(np.sqrt(NOTHING_LEFT)))
                 with f.each(n) as i:
                     put(f, f"O {d}", k, i, number(f, f"X {d}", k, i) - root(f, k, i) * f.load(x, i))
+
+    def _care_by_loops(self):
+        """As `_care`, of a large scene: by elimination of all rows, without those whose pivots are small."""
+        f, s = self._function("accelerate_carefully", [(POINTER, "work"), (POINTER, "out")])
+        self._call(f, "careful_accelerations")
+        self._take(f, (s.judged > 0.5) & (s.careful > 0.5) & (s.safe < 0.5), "careful a", "out")
+        f, s = self._function("arrive_carefully", [(POINTER, "work"), (POINTER, "out")])
+        careful, doubtful = (s.judged > 0.5) & (s.careful > 0.5), s.ok < 0.5
+        self._to_manifold(f, s, careful & doubtful, lambda moving: self._call(f, "careful_closer"))
+        with f.if_(f.any_of(careful & doubtful)):
+            self._call(f, "careful_arrival")
+            for x in "va":
+                self._take(f, careful & doubtful, f"careful {x}", f"O {x}")
+        self._dropping(f, s, f.const(NOTHING_LEFT, DOUBLE, f.width), lambda: self._call(f, "careful_tangential"))
+
+    def _take(self, f: Function, mask: Value, source: str, to: str):
+        """An array of coordinates from another, in some lanes."""
+        start = 0 if to == "out" else self.places[to] * f.width
+        pointer = f.given["out" if to == "out" else "work"]
+        with f.each(self.rowcount) as r:
+            place = r * self.plan.vector + start
+            old = f.load(pointer, place, self.plan.vector)
+            f.store(f.select(mask, self._vector(f, source, r), old), pointer, place, self.plan.vector)
 
     # --- members
 

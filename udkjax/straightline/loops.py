@@ -4,7 +4,7 @@ A `Kernel` is the program, with where its inputs and outputs lie relative to som
 of bases, in order. The code grows with the kinds of things that there are, the tables with their number.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +37,11 @@ class Loop(NamedTuple):
 
     kernel: Kernel
     table: np.ndarray
+    names: Mapping[str, str] = {}  # of the kernel's arrays: which they are here, if another
+
+    def array(self, name: str) -> str:
+        """Which array one of the kernel's is."""
+        return self.names.get(name, name)
 
 
 class Clear(NamedTuple):
