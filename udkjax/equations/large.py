@@ -50,7 +50,8 @@ class LargeEquations(MechanismMotion):
     """
 
     numbers: dict[str, Any]
-    given: Array | None  # the numbers of the scene, in order: for machine code, which computes `numbers` itself
+    given: Array | None  # the numbers of the scene, in order: for machine code, which computes what depends on them itself
+    constants: Array | None  # of the code, for its derivatives
     baumgarte: Any
     method: Pseudoinverse
     scales: Scales
@@ -199,7 +200,7 @@ class LargeEquations(MechanismMotion):
     def code(self) -> LargeCode:
         """The programs of the rows kept, for machine code."""
         tree, shapes = self.structure
-        return large_code(tree, shapes, self.left_out, self.stabilized, "watch" if isinstance(self.method, Auto) else "drop")
+        return large_code(tree, shapes, self.left_out, self.stabilized, _elimination(self.method))
 
     @property
     def elimination(self) -> BlockElimination:
@@ -248,9 +249,14 @@ def prepare_large(
     """As `prepare`, with the method's thresholds decided."""
     gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
     found = layout(*structure(mechanism), analysis.redundant_rows or (), bool(gains))
+    given, constants = as_vector([*jax.tree.leaves(mechanism), *gains]), None
+    if evaluated and isinstance(given, Tracer):
+        kind = structure(mechanism)
+        constants = large_code(*kind, found.left_out, bool(gains), _elimination(method)).constants_of(given)
     return LargeEquations(
         numbers=found.numbers(mechanism, gains) if evaluated else {},
-        given=as_vector([*jax.tree.leaves(mechanism), *gains]),
+        given=given,
+        constants=constants,
         baumgarte=baumgarte,
         method=method,
         scales=analysis.scales,
@@ -266,12 +272,17 @@ def prepare_closing(mechanism: Mechanism, analysis: Analysis) -> LargeEquations:
     return LargeEquations(
         numbers=found.numbers(mechanism, ()),
         given=None,
+        constants=None,
         baumgarte=None,
         method=method,
         scales=analysis.scales,
         layout=found,
         structure=structure(mechanism),
     )
+
+
+def _elimination(method: Pseudoinverse) -> str:
+    return "watch" if isinstance(method, Auto) else "drop"
 
 
 def as_vector(leaves: Sequence[Any]) -> Any:

@@ -6,21 +6,22 @@ are eliminated in an order of least fill, those that meet later rows in the same
 whose pivots are too small are dropped.
 """
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jaxtyping import Array
 
 from udkjax.equations.alike import FREE, POSITIONS, VELOCITIES, ConstraintKind, Group
-from udkjax.equations.layout import layout
 from udkjax.pinv.block_order import Elimination, eliminations
 from udkjax.pinv.sparse import absolute, greater, where
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Graph, Program, Scalar
-from udkjax.straightline.loops import ADD, LEAST, SET, Clear, Kernel, Loop, LoopProgram, Slot
+from udkjax.straightline import Graph, Program, Scalar, trace
+from udkjax.straightline.loop_derivative import LoopDerivative
+from udkjax.straightline.loops import ADD, LEAST, SET, Clear, Kernel, Loop, LoopProgram, Slot, in_jax
 
 # Columns of the table of bodies: where its coordinates, its sine and its constants begin.
 COORDINATES, SINE, CONSTANTS = 0, 1, 2
@@ -33,7 +34,7 @@ OWN, RECORD, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
 DROP, LEAST_PIVOT, GAINS = 0, 1, 2  # constants of all
 
 SOLVES = 4  # in one program, at most
-SOLVED = ("right", "y", "x", "pull")  # of D D^T x = right, L y = right, pull = D^T x
+SOLVED = ("right", "sum", "y", "x", "pull")  # D D^T x = right and pull = D^T x; y = right - sum is that of L y = right
 
 Parts = Iterator[Loop | Clear]
 
@@ -43,14 +44,16 @@ class LargeCode:
 
     `accelerations` (a, safe), `closer` (q1, safe), `output` (v1, psi), `arrival` (v1, a, safe), `tangential` (dq1, dv1,
     distance), `finish` (what the last two have), `psi` and `psi_dot` (psi), and `rows` (made_of: numbers that are finite where
-    all is). What they are says `Code`. `prologue` makes the constants of the numbers of the scene, the gains and two thresholds of
-    pivots: `drop`, below which a row is dropped, and `least`, below which a result is not `safe`. What a program computes on the
-    way stays where it is in arrays of its own (`scratch`): none is written again within one program.
+    all is). What they are says `Code`. `prologue` makes the constants of the numbers of the scene, the gains and two thresholds:
+    `drop`, below which a row is dropped, and `least`, below which a result is not `safe`. What a program computes on the way
+    stays in arrays of its own (`scratch`): no number is written again once it has been read.
     """
 
     def __init__(
         self, tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool, elimination: str, every: bool = False
     ):
+        from udkjax.equations.layout import layout  # and with it SciPy, which small scenes do without
+
         self.layout = found = layout(tree, shapes, left_out, baumgarte)
         self._made_for = tree, shapes, left_out, baumgarte, elimination
         self.elimination, self.left_out = elimination, left_out
@@ -83,6 +86,7 @@ class LargeCode:
         self.scratch["factors"] = self.scratch["gram"]
         for k in range(SOLVES):
             self.scratch |= {f"{name}{k}": self.n if name == "pull" else rights for name in SOLVED}
+        self.kept = self.scratch | {"sines1": 2 * self.bodies, "q1": self.n, "v1": self.n}  # what derivatives know of a state
 
     def _table(self, group: Group, kept: Sequence[int], right: int) -> np.ndarray:
         """Where what belongs to each element of a group begins."""
@@ -153,7 +157,7 @@ class LargeCode:
         yield from self._elements(("D", "b"), "v")
         yield from self._factorized()
         yield from self._solved()
-        yield self._fallen()
+        yield self._fallen(0)
         yield self._safe()
 
     def _closer(self) -> Parts:
@@ -220,6 +224,59 @@ class LargeCode:
         yield self._of_bodies("falling", falling)
         yield from self._residuals("b", "made_of", self.n)
 
+    # --- derivatives
+
+    @cached_property
+    def evaluated(self) -> "dict[str, Evaluated]":
+        """The accelerations, and the projection of a state that is on the manifold, as their derivatives are taken.
+
+        No factorization is differentiated. The accelerations are refined once,
+
+            D D^T x = b,      D D^T x1 = b - D D^T x,      a = a_F + M^(-1/2) D^T (x + x1),
+
+        with x1 of nothing but rounding errors: with x and the factors fixed, the derivative of that is the one of a. A projection
+        is differentiated where all residuals vanish, and with them whatever they multiply: D is fixed, too.
+        """
+        fixed = {"t", "gram", "factors", "ratio"}
+        before = [self._sincos(), *self._loads("v"), *self._elements(("D", "b"))]
+        refined = [*self._pull(0), *self._left(0, 1), *self._solved(1), self._fallen(0, 1)]
+        accelerations = Evaluated(
+            LoopProgram([*before, *self._factorized(), *self._substituted(0), *refined, self._safe()]),
+            [*before, *refined],
+            fixed | {"sum0", "y0", "x0"},
+        )
+        position = [self._sincos(), *self._elements(("psi",)), *self._solved(0), self._without("q", "q1")]
+        velocity = [
+            self._sincos("q1", "sines1"),
+            *self._elements(("psi_dot",), "v", 1, q="q1", sines="sines1"),
+            *self._solved(1),
+            self._without("v", "v1", 1),
+        ]
+        projection = Evaluated(
+            LoopProgram([self._sincos(), *self._elements(("D",)), *self._factorized(), *position, *velocity]),
+            [*position, *velocity],
+            fixed | {"D"},
+        )
+        return {"accelerations": accelerations, "projection": projection}
+
+    def constants_of(self, given: Array) -> Array:
+        """The constants as a function of the numbers of the scene and the gains."""
+        numbers = jnp.concatenate([given, jnp.zeros(2)])
+        return in_jax(self.prologue, {"numbers": numbers, "constants": jnp.zeros(len(self.constants))})["constants"]
+
+    def _left(self, solve: int, to: int) -> Parts:
+        """What is left of the right-hand side of a solve: right - D pull, to be that of another."""
+        for _, group, rows in self._parts:
+
+            def write(w: _Writing, group: Group = group, rows: Sequence[int] = rows):
+                for i, row in enumerate(rows):
+                    entries = [self._entry(w, group, row, k, RECORD) for k in range(3 * len(group.bodies))]
+                    pull = [w.read("pull", BODIES + 3 * (k // 3) + COORDINATES, k % 3) for k in range(len(entries))]
+                    w.write(w.read("right", RIGHT, i) - _dot(w.graph, entries, pull), "left", RIGHT, i)
+
+            names = {"pull": f"pull{solve}", "right": f"right{solve}", "left": f"right{to}"}
+            yield Loop(self._kernel(("left", id(group)), write), self._tables[id(group)], names)
+
     @cached_property
     def prologue(self) -> LoopProgram:
         """From `numbers` to `constants`."""
@@ -277,13 +334,14 @@ class LargeCode:
     def _once(self, key: Hashable, write: "Callable[[_Writing], None]") -> Loop:
         return Loop(self._kernel(key, write), np.zeros((1, 1), int))
 
-    def _sincos(self) -> Loop:
+    def _sincos(self, q: str = "q", sines: str = "sines") -> Loop:
         def pair(w: _Writing):
-            angle = w.read("q", COORDINATES, 2)
-            for k, (primitive, fold) in enumerate(((lax.sin_p, np.sin), (lax.cos_p, np.cos))):
-                w.write(w.graph.apply(primitive, {}, (angle,), float, fold), "sines", SINE, k)
+            angle = np.asarray(w.read("q", COORDINATES, 2), object)
+            found = trace(lambda x: [jnp.sin(x), jnp.cos(x)], np.zeros(()))(w.graph, angle)
+            for k, s in enumerate(found):
+                w.write(s.item(), "sines", SINE, k)
 
-        return self._of_bodies("sincos", pair)
+        return self._of_bodies("sincos", pair, q=q, sines=sines)
 
     def _loads(self, v: str) -> Parts:
         """a_F, where there are forces: without them it is that of gravity."""
@@ -327,7 +385,7 @@ class LargeCode:
         kernel = self._kernel((key, id(group)), bound, kind.graph)
         return Loop(kernel, self._tables[id(group)], names)
 
-    def _elements(self, names: tuple[str, ...], v: str, solve: int = 0) -> Parts:
+    def _elements(self, names: tuple[str, ...], v: str = "v", solve: int = 0, **where: str) -> Parts:
         """D, and a right-hand side."""
         for _, group, rows in self._parts:
 
@@ -341,7 +399,7 @@ class LargeCode:
                         for i, row in enumerate(rows):
                             w.write(outputs[name][row], "right", RIGHT, i)
 
-            yield self._of_group(names, group, write, v=v, right=f"right{solve}")
+            yield self._of_group(names, group, write, v=v, right=f"right{solve}", **where)
 
     def _residuals(self, name: str, array: str, start: int = 0) -> Parts:
         """Psi, Psi_dot or b of all rows in their order, into an array."""
@@ -380,8 +438,12 @@ class LargeCode:
 
     def _solved(self, solve: int = 0) -> Parts:
         """D^T (D D^T)^-1 of what is on the right, into `pull`."""
-        names = {name: f"{name}{solve}" for name in SOLVED}
-        yield from self._substituted(names)
+        yield from self._substituted(solve)
+        yield from self._pull(solve)
+
+    def _pull(self, solve: int) -> Parts:
+        """D^T x."""
+        names = _of_solve(solve)
         yield Clear(names["pull"], 0, self.n)
         for _, group, rows in self._parts:
 
@@ -396,17 +458,20 @@ class LargeCode:
 
             yield Loop(self._kernel(("pull", id(group)), write), self._tables[id(group)], names)
 
-    def _pulled(self, w: "_Writing", k: int) -> Scalar:
+    def _pulled(self, w: "_Writing", k: int, name: str = "pull") -> Scalar:
         """M^(-1/2) of what is in `pull`."""
-        return w.read("constants", CONSTANTS, ROOT + OF_ANGLE[k]) * w.read("pull", COORDINATES, k)
+        return w.read("constants", CONSTANTS, ROOT + OF_ANGLE[k]) * w.read(name, COORDINATES, k)
 
-    def _fallen(self, solve: int = 0) -> Loop:
+    def _fallen(self, *solves: int) -> Loop:
+        names = ["pull", "more"][: len(solves)]
+
         def write(w: _Writing):
             for k in range(3):
                 free = w.read("free", COORDINATES, k) if self.layout.forces else self._falling(w, k)
-                w.write(free + self._pulled(w, k), "a", COORDINATES, k)
+                w.write(sum((self._pulled(w, k, name) for name in names), free), "a", COORDINATES, k)
 
-        return self._of_bodies("fallen", write, pull=f"pull{solve}")
+        where = {name: f"pull{solve}" for name, solve in zip(names, solves, strict=True)}
+        return self._of_bodies(("fallen", len(solves)), write, **where)
 
     def _without(self, x: str, to: str, solve: int = 0) -> Loop:
         def write(w: _Writing):
@@ -564,13 +629,15 @@ class LargeCode:
                             w.write(-_dot(graph, row, other), "gram", base, place, ADD)
                 base += 1
 
-    def _substituted(self, names: dict[str, str]) -> Parts:
+    def _substituted(self, solve: int) -> Parts:
         """x = (D D^T)^-1 of what is on the right."""
+        names = _of_solve(solve)
+        yield Clear(names["sum"], 0, self.scratch[names["sum"]])
         for e in self.eliminations:
             p, later = e.size, e.sizes
 
             def forward(w: _Writing, p: int = p, later: tuple[int, ...] = later):
-                y = [w.read("right", 1, i) for i in range(p)]
+                y = [w.read("right", 1, i) - w.read("sum", 1, i) for i in range(p)]
                 for i in range(p):
                     for j in range(i):
                         y[i] = y[i] - w.read("factors", 0, p + _triangle(i, j)) * y[j]
@@ -578,7 +645,7 @@ class LargeCode:
                 for a, size in enumerate(later):
                     for i in range(size):
                         row = [w.read("factors", 2 + 2 * a, i * p + j) for j in range(p)]
-                        w.write(-_dot(w.graph, row, y), "right", 3 + 2 * a, i, ADD)
+                        w.write(_dot(w.graph, row, y), "sum", 3 + 2 * a, i, ADD)
 
             yield Loop(self._kernel(("forward", p, later), forward), self._block_table(e), names)
         for e in reversed(self.eliminations):
@@ -597,6 +664,17 @@ class LargeCode:
                     w.write(x[j], "x", 1, j)
 
             yield Loop(self._kernel(("backward", p, later), backward), self._block_table(e)[::-1], names)
+
+
+class Evaluated(NamedTuple):
+    """A program, and what of it derivatives are taken of: with respect to all arrays but those that are `fixed`."""
+
+    program: LoopProgram
+    parts: Sequence[Loop | Clear]
+    fixed: set[str]
+
+    def derivative(self, fixed: Collection[str] = ()) -> LoopDerivative:
+        return LoopDerivative(self.parts, {*self.fixed, *fixed})
 
 
 class _Writing:
@@ -622,6 +700,10 @@ class _Writing:
     def kernel(self) -> Kernel:
         program = Program(self.graph, list(self._inputs), [s for s, _ in self._outputs])
         return Kernel(program, list(self._inputs.values()), [slot for _, slot in self._outputs])
+
+
+def _of_solve(solve: int) -> dict[str, str]:
+    return {name: f"{name}{solve}" for name in SOLVED}
 
 
 def _triangle(i: int, j: int) -> int:

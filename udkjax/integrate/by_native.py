@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.code import Code, code, is_large
-from udkjax.equations.large import LargeEquations
+from udkjax.equations.large_code import LargeCode
 from udkjax.equations.programs import WITH_CARE, Equations
 from udkjax.equations.scales import Scales
 from udkjax.integrate.problem import Problem, Raw
@@ -113,9 +113,7 @@ def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
         return "a progress meter is diffrax's"
-    if problem.length is None or not (
-        type(equations) is Equations or (isinstance(equations, LargeEquations) and equations.by_levels)
-    ):
+    if problem.length is None or not (type(equations) is Equations or getattr(equations, "by_levels", False)):
         return f"it knows the Udwadia-Kalaba equation of a mechanism by elimination, not {type(equations).__name__}"
     if not is_explicit(problem.solver):
         return f"{type(problem.solver).__name__} is no explicit Runge-Kutta method"
@@ -157,27 +155,39 @@ def recorded(problem: Any, moving: Any) -> Raw:
 
 def serves_derivatives(problem: Problem, moving: Any) -> bool:
     """Whether there is machine code for the derivatives along what is `moving`: numbers of the scene, and initial states."""
-    if not isinstance(problem.equations, Equations) or not serves(problem):
+    if not serves(problem):
         return False
-    moved = eqx.tree_at(lambda p: (p.q, p.v, p.equations), moving, (False, False, None), is_leaf=lambda x: x is None)
-    equations = eqx.tree_at(
-        lambda e: (e.constants, e.textbook.mechanism, e.textbook.baumgarte),
-        moving.equations,
-        (None, None, None),
-        is_leaf=lambda x: x is None,
-    )
-    return not any(x is True for x in jax.tree.leaves((moved, equations)))
+    given = eqx.tree_at(lambda p: p.equations, moving, None, is_leaf=lambda x: x is None)
+    others = eqx.tree_at(lambda p: (p.q, p.v), given, (False, False), is_leaf=lambda x: x is None)
+    return not any(x is True for x in jax.tree.leaves((others, _fixed(moving.equations))))
+
+
+def _fixed(equations: Any) -> Any:
+    """What equations hold besides what follows from the numbers of the scene."""
+    numbers = _of_numbers if hasattr(equations, "numbers") else _of_constants
+    return eqx.tree_at(numbers, equations, (None,) * len(numbers(equations)), is_leaf=lambda x: x is None)
+
+
+def _of_constants(equations: Any) -> tuple[Any, ...]:
+    return equations.constants, equations.textbook.mechanism, equations.textbook.baumgarte
+
+
+def _of_numbers(equations: Any) -> tuple[Any, ...]:
+    return equations.constants, equations.numbers, equations.given, equations.baumgarte
 
 
 def pushed(problem: Any, moving: Any, change: Any) -> tuple[Raw, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is moving."""
     kind = _kind(problem, _moving(problem, moving), "forward")
-    constants = [dx for dx, m in zip(change.equations.constants, moving.equations.constants, strict=True) if m is True]
+    if isinstance(problem.equations.code, LargeCode):
+        constants = change.equations.constants if moving.equations.constants is True else jnp.zeros(0)
+    else:
+        pairs = zip(change.equations.constants, moving.equations.constants, strict=True)
+        constants = _vector([jnp.zeros(0), *(dx for dx, m in pairs if m is True)], jnp)
     n = len(problem.q)
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
-    along = [jnp.stack(constants) if constants else jnp.zeros(0), dq, dv]
     *found, dys, dend = native_p.bind(
-        *_inputs(problem, kind.code), *(x[None, None] for x in along), kind=kind, times=len(problem.ts)
+        *_inputs(problem, kind.code), *(x[None, None] for x in (constants, dq, dv)), kind=kind, times=len(problem.ts)
     )
     return _raw(found), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
 
@@ -187,11 +197,14 @@ def pulled(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
     kind = _kind(problem, _moving(problem, moving), "reverse")
     bars = [ys[None], end[None]]
     cbar, qbar, vbar = native_p.bind(*_inputs(problem, kind.code), *bars, kind=kind, times=len(problem.ts))[len(OUTPUTS) :]
-    found = iter(cbar[0])
-    assert kind.moving is not None
-    by_node = {s.index: next(found) for s, m in zip(kind.code.constants, kind.moving, strict=True) if m}
-    pairs = zip(problem.equations.code.constants, moving.equations.constants, strict=True)
-    constants = [by_node[s.index] if m is True else None for s, m in pairs]
+    if isinstance(problem.equations.code, LargeCode):
+        constants: Any = cbar[0] if moving.equations.constants is True else None
+    else:
+        found = iter(cbar[0])
+        assert kind.moving is not None
+        by_node = {s.index: next(found) for s, m in zip(kind.code.constants, kind.moving, strict=True) if m}
+        pairs = zip(problem.equations.code.constants, moving.equations.constants, strict=True)
+        constants = [by_node[s.index] if m is True else None for s, m in pairs]
     none = jax.tree.map(lambda m: None, moving, is_leaf=lambda x: x is None)
     zeros = jax.tree.map(
         lambda m, x: jnp.zeros_like(x) if m is True else None, moving.equations, problem.equations, is_leaf=lambda x: x is None
@@ -208,6 +221,8 @@ def pulled(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
 def _moving(problem: Any, moving: Any) -> tuple[bool, ...]:
     """Of the constants of the code that watches: which have derivatives."""
     code = problem.equations.code
+    if isinstance(problem.equations.code, LargeCode):  # all or none
+        return (moving.equations.constants is True,) * len(code.constants)
     moves = {s.index for s, m in zip(code.constants, moving.equations.constants, strict=True) if m is True}
     return tuple(s.index in moves for s in _watching(code).constants)
 
@@ -228,7 +243,7 @@ def _kind(problem: Any, moving: tuple[bool, ...] | None = None, mode: str = "run
 def _inputs(problem: Any, code: Code | None = None, xp: Any = jnp) -> list[Any]:
     """Those of a run, of one member."""
     equations = problem.equations
-    large = isinstance(equations, LargeEquations)
+    large = isinstance(equations.code, LargeCode)
     textbook: Any = equations if large else equations.textbook
     method, rank_tol, baumgarte = textbook.method, textbook.method.rank_tol, textbook.baumgarte
     gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]

@@ -22,8 +22,8 @@ from udkjax.equations.code import Code
 from udkjax.native.closing import POSITION, VELOCITIES, VELOCITY, Closing
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM
-from udkjax.native.program import write
-from udkjax.native.trajectory import Lane, Places, _numbered
+from udkjax.native.program import numbered, write
+from udkjax.native.trajectory import Lane, Places
 from udkjax.straightline import Program, cotangents, tangents
 
 
@@ -129,7 +129,7 @@ class ClosingForward(_Differentiated):
         self._write(program, "changes", ("work", "way"), inputs, places)
         seeds = {s: graph.input(("number", s.index), "tangent") for s in self.numbers}
         program = Program(graph, [*self.code.prologue.inputs, *seeds.values()], tangents(graph, self.code.constants, seeds))
-        inputs = [*_numbered("numbers", len(self.code.prologue.inputs)), *(("way", w["numbers"] + k) for k in range(self.count))]
+        inputs = [*numbered("numbers", len(self.code.prologue.inputs)), *(("way", w["numbers"] + k) for k in range(self.count))]
         places = [("way", w["constants"] + k) for k in range(self.constants)]
         self.functions.append(write(program, "prologue_along", 1, ("numbers", "way"), inputs, places))
         self._shared()
@@ -240,7 +240,7 @@ class ClosingReverse(_Differentiated):
         self._write(program, "pull_rows", ("work",), inputs, found)
         seeds = [graph.input(("constant", k), "cotangent") for k in range(self.constants)]
         back = cotangents(graph, self.code.constants, seeds, self.numbers)
-        inputs = [*_numbered("numbers", len(self.code.prologue.inputs)), *self._work("cbar", self.constants)]
+        inputs = [*numbered("numbers", len(self.code.prologue.inputs)), *self._work("cbar", self.constants)]
         program = Program(graph, [*self.code.prologue.inputs, *seeds], back)
         places = self._work("numbersbar", self.count)
         self.functions.append(write(program, "prologue_back", 1, ("numbers", "work"), inputs, places))

@@ -17,7 +17,6 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from udkjax.equations.code import Code
 from udkjax.native import machine
 from udkjax.native.closing import Closing
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
@@ -33,7 +32,7 @@ FEW = 2  # members up to which one follows another: eight lanes take as long as 
 class Kind(NamedTuple):
     """Which trajectory: all that its code depends on but the number of lanes."""
 
-    code: Code
+    code: Any  # `Code` or `LargeCode`
     method: "Tableau"
     projected: bool
     breaks: bool

@@ -31,6 +31,11 @@ class UnsupportedError(ValueError):
 Place = tuple[str, int]  # which pointer, and the how manieth number from there
 
 
+def numbered(pointer: str, count: int) -> list[Place]:
+    """So many numbers from a pointer on."""
+    return [(pointer, k) for k in range(count)]
+
+
 def write(
     program: Program, name: str, width: int, pointers: Sequence[str], inputs: Sequence[Place], outputs: Sequence[Place]
 ) -> Function:

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from udkjax.native.ir import INT, POINTER, Function, Value
-from udkjax.native.program import Place
-from udkjax.native.trajectory import POINTS, Lane, Places, Plan, Trajectory, _numbered
+from udkjax.native.linearized import Linearized, linearized
+from udkjax.native.trajectory import POINTS, Lane, Places, Plan, Trajectory
 
 
 class Differentiated(Trajectory):
@@ -25,27 +25,26 @@ class Differentiated(Trajectory):
 
     def __init__(self, plan: Plan, moving: tuple[bool, ...]):
         super().__init__(plan)
-        of_inputs = (*moving, False, True, True)  # the constants, t, q, v
-        self.moving, self.count = moving, sum(moving)
-        self.of_accelerations = plan.code.derivative("accelerations", of_inputs)
-        self.of_projection = plan.code.derivative("projection", of_inputs) if plan.projected else None
-        for i in range(1, plan.method.stages + 1):  # the last: of the end
-            self.places.add(f"K{i}", len(self.of_accelerations.kept))
+        self.moving, self.count, self.last = moving, sum(moving), plan.method.stages
+        self.of_accelerations = linearized(self, "accelerations")
+        self.of_projection = linearized(self, "projection") if plan.projected else None
+        for i in range(1, self.last + 1):  # the last: of the end
+            self.places.add(f"K{i}", self.of_accelerations.kept)
         if self.of_projection:
-            self.places.add("KP", len(self.of_projection.kept))
-        self.last = plan.method.stages
+            self.places.add("KP", self.of_projection.kept)
 
     def _stage(self, f: Function, i: int):
         f.call("evaluation", f.given["work"], self._address(f, f"A{i}"), self._address(f, f"K{i}"))
 
-    def _evaluations(self):
-        """Accelerations, and the projection of a state that is on the manifold, with what their derivatives need to know."""
-        n, state, kept = self.n, self._state(), self.of_accelerations.kept
-        outputs = [*_numbered("out", n), *self._work("safe", 1), *_numbered("kept", len(kept))]
-        self._write(self.of_accelerations.evaluation("accelerations"), "evaluation", ("work", "out", "kept"), state, outputs)
-        if self.of_projection:
-            outputs = _numbered("kept", len(self.of_projection.kept))
-            self._write(self.of_projection.evaluation("projection"), "evaluation_projection", ("work", "kept"), state, outputs)
+    def _programs(self):
+        super()._programs()
+        for each in self._linearized:
+            each.evaluation()
+
+    @property
+    def _linearized(self) -> list[Linearized]:
+        """What has derivatives."""
+        return [x for x in (self.of_accelerations, self.of_projection) if x]
 
     def _evaluate_end(self, f: Function):
         """What is known of the state in X, that of a projection."""
@@ -75,20 +74,9 @@ class Forward(Differentiated):
             w.add(f"N{k}", self.n)
 
     def _derivatives(self):
-        self._evaluations()
-        n, w = self.n, self.ways
-
-        def way(name: str, count: int) -> list[Place]:
-            return [("way", w[name] + k) for k in range(count)]
-
-        tangents = [*way("constants", self.count), *way("X q", n), *way("X v", n)]
-        for name, derivative, outputs in (
-            ("forward", self.of_accelerations, _numbered("out", n)),
-            ("forward_projection", self.of_projection, [*way("O q", n), *way("O v", n)]),
-        ):
-            if derivative:
-                inputs = [*self._state(), *_numbered("kept", len(derivative.kept)), *tangents]
-                self._write(derivative.forward, name, ("work", "kept", "way", "out"), inputs, outputs)
+        for each in self._linearized:
+            each.forward()
+        w = self.ways
         self._differences("tangent_differences", ("way", w))
         self._between("tangent_between", ("way", w))
 

@@ -30,7 +30,7 @@ from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM, least_norm
 from udkjax.native.loops import LoopWriter
 from udkjax.native.power import power
-from udkjax.native.program import Place, write
+from udkjax.native.program import Place, numbered, write
 from udkjax.native.steps import (
     AHEAD,
     BEFORE,
@@ -78,7 +78,7 @@ INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the 
 class Plan:
     """What a trajectory's code depends on."""
 
-    code: Code | LargeCode
+    code: Any  # `Code` or `LargeCode`
     method: Method
     projected: bool
     breaks: bool
@@ -151,10 +151,6 @@ class Lane:
         f: Any = self.__dict__["_f"]
         for name, value in named.items():
             setattr(self, name, f.select(mask, f.like(value, DOUBLE, f.width), getattr(self, name)))
-
-
-def _numbered(pointer: str, count: int) -> list[Place]:
-    return [(pointer, k) for k in range(count)]
 
 
 class Trajectory:
@@ -286,7 +282,7 @@ class Trajectory:
         state, changes = self._state(), [*self._work("X dq", n), *self._work("X dv", n)]
         safe = self._work("safe", 1)
         outputs = {
-            "accelerations": [*_numbered("out", n), *safe],
+            "accelerations": [*numbered("out", n), *safe],
             "closer": [*self._work("C", n), *safe],
             "arrival": [*self._work("O v", n), *self._work("O a", n), *safe],
             "finish": [
@@ -303,8 +299,8 @@ class Trajectory:
         for name in self._wanted():
             inputs = [*state, *changes] if name in ("tangential", "finish") else state
             self._write(code.program(name), name, ("work", "out"), inputs, outputs[name])
-        inputs = _numbered("work", len(code.prologue.inputs))
-        self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, _numbered("out", self.constants)))
+        inputs = numbered("work", len(code.prologue.inputs))
+        self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, numbered("out", self.constants)))
 
     def _loop_programs(self, code: LargeCode):
         found = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
@@ -486,7 +482,7 @@ class Trajectory:
 
     def _checked(self, f: Function, s: Lane, name: str):
         """What becomes of accelerations whose pivots are too small to be trusted."""
-        if not self.doubts:
+        if not self.cares:
             return
         unsafe = (s.judged > 0.5) & (s.safe < 0.5)
         with f.if_(f.any_of(unsafe)):

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.steps import DONE
 from udkjax.native.tangents import Differentiated
-from udkjax.native.trajectory import POINTS, STRETCH, Lane, Plan, _numbered
+from udkjax.native.trajectory import POINTS, STRETCH, Lane, Plan
 
 FIRST = 512  # points that a record has room for, before it grows
 HEAD = 3  # numbers of a point before its state: its time, how many outputs were written before its step, whether it begins anew
@@ -48,16 +48,8 @@ class Reverse(Differentiated):
         self.row = HEAD + 3 * n
 
     def _derivatives(self):
-        self._evaluations()
-        n = self.n
-        found = [*self._work("G c", self.count), *self._work("G q", n), *self._work("G v", n)]
-        kept = _numbered("kept", len(self.of_accelerations.kept))
-        inputs = [*self._state(), *kept, *_numbered("bar", n)]
-        self._write(self.of_accelerations.reverse, "reverse", ("work", "kept", "bar"), inputs, found)
-        if self.of_projection:
-            kept = _numbered("kept", len(self.of_projection.kept))
-            inputs = [*self._state(), *kept, *self._work("Y q", n), *self._work("Y v", n)]
-            self._write(self.of_projection.reverse, "reverse_projection", ("work", "kept"), inputs, found)
+        for each in self._linearized:
+            each.reverse()
         self._transposed_differences()
         self._step_back()
         self._walk()

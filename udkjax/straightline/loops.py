@@ -7,7 +7,9 @@ of bases, in order. The code grows with the kinds of things that there are, the 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
+from jaxtyping import Array
 
 from udkjax.straightline.emit import Program
 
@@ -57,3 +59,30 @@ class LoopProgram(NamedTuple):
     """Loops one after another."""
 
     parts: Sequence[Loop | Clear]
+
+    @property
+    def arrays(self) -> set[str]:
+        """All arrays that it reads or writes."""
+        found = {part.array for part in self.parts if isinstance(part, Clear)}
+        return found.union(*({part.array(x) for x in part.kernel.arrays} for part in self.parts if isinstance(part, Loop)))
+
+
+def in_jax(program: LoopProgram, arrays: dict[str, Array]) -> dict[str, Array]:
+    """The arrays as a program leaves them, by JAX: of one in whose loops no row takes anything from another."""
+    found = dict(arrays)
+    for part in program.parts:
+        assert isinstance(part, Loop)
+        kernel, table = part.kernel, part.table
+        if not kernel.outputs or not len(table):
+            continue
+
+        def places(slot: Slot, table: np.ndarray = table) -> np.ndarray:
+            return slot.offset + (np.zeros(len(table), int) if slot.base is None else table[:, slot.base])
+
+        pairs = list(zip(kernel.program.inputs, kernel.inputs, strict=True))
+        values = [found[slot.array][places(slot)] if kernel.program.uses(s) else np.zeros(len(table)) for s, slot in pairs]
+        results = jax.vmap(kernel.program)(values) if values else kernel.program([])
+        for x, slot in zip(results, kernel.outputs, strict=True):
+            assert slot.how == SET
+            found[slot.array] = found[slot.array].at[places(slot)].set(x)
+    return found

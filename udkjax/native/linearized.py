@@ -1,0 +1,132 @@
+"""The functions of the derivatives of a scene's programs, written out or as loops.
+
+For the accelerations (no suffix) and for the projection of a state on the manifold (`_projection`) there are three,
+
+    evaluation(work, out, kept)     what it returns, and what its derivatives know of the state in X
+    forward(work, kept, way, out)   the change of what it returns, from those of the constants, of X q and X v of a way
+    reverse(work, kept, bar)        the cotangents G of the constants, q and v, from those of what it returns
+
+where the projection has no `out` to begin with, leaves its changes in O of a way, and finds its cotangents in Y.
+"""
+
+from typing import Any, Protocol
+
+from udkjax.equations.large_code import LargeCode
+from udkjax.native.loops import LoopWriter
+from udkjax.native.program import Place, numbered
+from udkjax.straightline.loop_derivative import COTANGENT, TANGENT
+from udkjax.straightline.loops import Clear, LoopProgram
+
+SUFFIXES = {"accelerations": "", "projection": "_projection"}
+
+
+class Linearized(Protocol):
+    """One of the programs with its derivative, in a trajectory that has `count` constants that move."""
+
+    kept: int  # how many numbers its derivatives know of a state
+
+    def evaluation(self) -> None:
+        """Write the function."""
+        ...
+
+    def forward(self) -> None:
+        """Write the function."""
+        ...
+
+    def reverse(self) -> None:
+        """Write the function."""
+        ...
+
+
+def linearized(trajectory: Any, name: str) -> Linearized:
+    """The one or the other, as the code of a trajectory is."""
+    return (ByLoops if isinstance(trajectory.code, LargeCode) else WrittenOut)(trajectory, name)
+
+
+class WrittenOut:
+    """Straight-line code."""
+
+    def __init__(self, trajectory: Any, name: str):
+        self._in, self._name, self._suffix = trajectory, name, SUFFIXES[name]
+        self._derivative = trajectory.code.derivative(name, (*trajectory.moving, False, True, True))  # the constants, t, q, v
+        self.kept = len(self._derivative.kept)
+
+    def evaluation(self):
+        t = self._in
+        pointers, outputs = ("work", "kept"), numbered("kept", self.kept)
+        if self._name == "accelerations":
+            pointers, outputs = ("work", "out", "kept"), [*numbered("out", t.n), *t._work("safe", 1), *outputs]
+        t._write(self._derivative.evaluation(self._name), f"evaluation{self._suffix}", pointers, t._state(), outputs)
+
+    def forward(self):
+        t, w = self._in, self._in.ways
+
+        def way(name: str, count: int) -> list[Place]:
+            return [("way", w[name] + k) for k in range(count)]
+
+        tangents = [*way("constants", t.count), *way("X q", t.n), *way("X v", t.n)]
+        outputs = numbered("out", t.n) if self._name == "accelerations" else [*way("O q", t.n), *way("O v", t.n)]
+        inputs = [*t._state(), *numbered("kept", self.kept), *tangents]
+        t._write(self._derivative.forward, f"forward{self._suffix}", ("work", "kept", "way", "out"), inputs, outputs)
+
+    def reverse(self):
+        t = self._in
+        found = [*t._work("G c", t.count), *t._work("G q", t.n), *t._work("G v", t.n)]
+        pointers, bars = ("work", "kept"), [*t._work("Y q", t.n), *t._work("Y v", t.n)]
+        if self._name == "accelerations":
+            pointers, bars = ("work", "kept", "bar"), numbered("bar", t.n)
+        inputs = [*t._state(), *numbered("kept", self.kept), *bars]
+        t._write(self._derivative.reverse, f"reverse{self._suffix}", pointers, inputs, found)
+
+
+class ByLoops:
+    """Loops, which keep all arrays that they leave behind."""
+
+    def __init__(self, trajectory: Any, name: str):
+        self._in, self._name, self._suffix = trajectory, name, SUFFIXES[name]
+        self._evaluated = trajectory.code.evaluated[name]
+        self._derivative = self._evaluated.derivative([] if trajectory.count else ["constants"])
+        used = self._evaluated.program.arrays
+        self._sizes = {x: count for x, count in trajectory.code.kept.items() if x in used}
+        self._at: dict[str, Place] = {}
+        self.kept, places = 0, trajectory.places
+        for x, count in self._sizes.items():
+            self._at[x] = ("kept", self.kept)
+            self.kept += count
+        if "along" not in places.places:  # changes or cotangents of what is kept, of both programs
+            places.add("along", sum(trajectory.code.kept.values()))
+        names = {"t": "X t", "q": "X q", "v": "X v", "constants": "constants", "safe": "safe"}
+        self._at |= {x: ("work", places[place]) for x, place in names.items()}
+
+    def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, Place]):
+        t = self._in
+        writer = LoopWriter(t.plan.width, f"{name}{self._suffix}_")
+        writer.write(program, f"{name}{self._suffix}", pointers, at)
+        t.functions += writer.functions
+        t.globals += writer.globals
+
+    def _along(self, prefix: str) -> dict[str, Place]:
+        start = self._in.places["along"]
+        return {prefix + x: ("work", start + place) for x, (pointer, place) in self._at.items() if pointer == "kept"}
+
+    def evaluation(self):
+        pointers = ("work", "out", "kept") if self._name == "accelerations" else ("work", "kept")
+        self._write(self._evaluated.program, "evaluation", pointers, self._at | {"a": ("out", 0)})
+
+    def forward(self):
+        w = self._in.ways
+        changes = {"constants": "constants", "q": "X q", "v": "X v", "q1": "O q", "v1": "O v"}
+        at = self._at | {"a": ("out", 0)} | self._along(TANGENT)
+        at |= {TANGENT + x: ("way", w[place]) for x, place in changes.items()} | {f"{TANGENT}a": ("out", 0)}
+        self._write(self._derivative.forward, "forward", ("work", "kept", "way", "out"), at)
+
+    def reverse(self):
+        t, p = self._in, self._in.places
+        found = {"constants": "G c", "q": "G q", "v": "G v", "q1": "Y q", "v1": "Y v"}
+        at = self._at | self._along(COTANGENT) | {COTANGENT + x: ("work", p[place]) for x, place in found.items()}
+        counts = self._sizes | {"constants": t.count, "q": t.n, "v": t.n}
+        cleared = [Clear(COTANGENT + x, 0, count) for x, count in counts.items() if x not in ("q1", "v1")]
+        pointers = ("work", "kept")
+        if self._name == "accelerations":
+            pointers, at = ("work", "kept", "bar"), at | {"a": ("bar", 0), f"{COTANGENT}a": ("bar", 0)}
+        self._write(LoopProgram([*cleared, *self._derivative.reverse.parts]), "reverse", pointers, at)
