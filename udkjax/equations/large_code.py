@@ -141,7 +141,9 @@ class LargeCode:
     @cached_property
     def careful(self) -> "LargeCode":
         """The same with all rows, of the same constants: those left out may be independent in singular configurations."""
-        return LargeCode(*self._made_for, every=True)
+        code = LargeCode(*self._made_for, every=True)
+        code._kernels = self._kernels
+        return code
 
     def program(self, name: str) -> LoopProgram:
         """One of the programs."""
@@ -275,7 +277,7 @@ class LargeCode:
                     w.write(w.read("right", RIGHT, i) - _dot(w.graph, entries, pull), "left", RIGHT, i)
 
             names = {"pull": f"pull{solve}", "right": f"right{solve}", "left": f"right{to}"}
-            yield Loop(self._kernel(("left", id(group)), write), self._tables[id(group)], names)
+            yield Loop(self._kernel(("left", id(group), rows), write), self._tables[id(group)], names)
 
     @cached_property
     def prologue(self) -> LoopProgram:
@@ -399,7 +401,7 @@ class LargeCode:
                         for i, row in enumerate(rows):
                             w.write(outputs[name][row], "right", RIGHT, i)
 
-            yield self._of_group(names, group, write, v=v, right=f"right{solve}", **where)
+            yield self._of_group((names, rows), group, write, v=v, right=f"right{solve}", **where)
 
     def _residuals(self, name: str, array: str, start: int = 0) -> Parts:
         """Psi, Psi_dot or b of all rows in their order, into an array."""
@@ -434,7 +436,7 @@ class LargeCode:
                     w.write(total, "right", RIGHT, i)
 
             names = {"dx": change, "right": f"right{solve}"}
-            yield Loop(self._kernel(("rates", id(group)), write), self._tables[id(group)], names)
+            yield Loop(self._kernel(("rates", id(group), rows), write), self._tables[id(group)], names)
 
     def _solved(self, solve: int = 0) -> Parts:
         """D^T (D D^T)^-1 of what is on the right, into `pull`."""
@@ -456,7 +458,7 @@ class LargeCode:
                     if not total.is_zero:
                         w.write(total, "pull", BODIES + 3 * (k // 3) + COORDINATES, k % 3, ADD)
 
-            yield Loop(self._kernel(("pull", id(group)), write), self._tables[id(group)], names)
+            yield Loop(self._kernel(("pull", id(group), rows), write), self._tables[id(group)], names)
 
     def _pulled(self, w: "_Writing", k: int, name: str = "pull") -> Scalar:
         """M^(-1/2) of what is in `pull`."""
@@ -538,7 +540,7 @@ class LargeCode:
                         if i == j:
                             w.write(s, "gram", base, i)
 
-            found.append(Loop(self._kernel(("diagonal", id(group)), write), np.concatenate([table, diagonals], 1)))
+            found.append(Loop(self._kernel(("diagonal", id(group), rows), write), np.concatenate([table, diagonals], 1)))
         holders: dict[int, list[tuple[int, int]]] = {}
         for block, (group, _, i) in enumerate(self._elements_of_blocks):
             for slot, body in enumerate(group.bodies[:, i].tolist()):
@@ -552,7 +554,7 @@ class LargeCode:
                     if early == late:
                         continue
                     (g, rows, _), (h, columns, _) = self._elements_of_blocks[late], self._elements_of_blocks[early]
-                    key = "pair", id(g), r, id(h), s
+                    key = "pair", id(g), rows, r, id(h), columns, s
                     kinds[key] = g, rows, r, h, columns, s
                     pairs.setdefault(key, []).append([self._record(late), self._record(early), self._off[late, early]])
         for key, table in pairs.items():

@@ -133,6 +133,7 @@ class Function:
         self, name: str, arguments: Sequence[tuple[str, str]], width: int = 1, returns: str = "void", rare: bool = False
     ):
         self.name, self.width, self.returns, self.rare = name, width, returns, rare
+        self.apart = False  # whether it is to be called, and never put in place of its call
         self._arguments, self._lines, self._reserved = list(arguments), [], []
         self._count, self.declared = 0, set()
         self.given = {n: Value(self, f"%{n}", base) for base, n in arguments}
@@ -160,7 +161,7 @@ class Function:
         arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{n}" for base, n in self._arguments)
         end = "ret void" if self.returns == "void" else None
         body = "\n  ".join([*self._reserved, *self._lines, *([end] if end else [])])
-        rare = " cold minsize optsize" if self.rare else ""
+        rare = (" cold minsize optsize" if self.rare else "") + (" noinline" if self.apart else "")
         return f"define {self.returns} @{self.name}({arguments}){rare} {{\n  {body}\n}}\n"
 
     # --- values

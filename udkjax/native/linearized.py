@@ -12,7 +12,6 @@ where the projection has no `out` to begin with, leaves its changes in O of a wa
 from typing import Any, Protocol
 
 from udkjax.equations.large_code import LargeCode
-from udkjax.native.loops import LoopWriter
 from udkjax.native.program import Place, numbered
 from udkjax.straightline.loop_derivative import COTANGENT, TANGENT
 from udkjax.straightline.loops import Clear, LoopProgram
@@ -99,11 +98,7 @@ class ByLoops:
         self._at |= {x: ("work", places[place]) for x, place in names.items()}
 
     def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, Place]):
-        t = self._in
-        writer = LoopWriter(t.plan.width, f"{name}{self._suffix}_")
-        writer.write(program, f"{name}{self._suffix}", pointers, at)
-        t.functions += writer.functions
-        t.globals += writer.globals
+        self._in.loops.write(program, f"{name}{self._suffix}", pointers, at)
 
     def _along(self, prefix: str) -> dict[str, Place]:
         start = self._in.places["along"]

@@ -12,41 +12,48 @@ from udkjax.straightline.loops import ADD, LEAST, Clear, Kernel, LoopProgram, Sl
 class LoopWriter:
     """The functions that programs of loops are made of, in one module: every kernel once."""
 
-    def __init__(self, width: int, prefix: str = ""):
-        self.width, self.prefix = width, prefix
+    def __init__(self, width: int):
+        self.width = width
         self.functions: list[Function] = []
         self.globals: list[str] = []
-        self._kernels: dict[tuple[Kernel, int], str] = {}
+        self._kernels: dict[tuple[Kernel, int, int], str] = {}
         self._tables: dict[bytes, str] = {}
 
-    def write(self, program: LoopProgram, name: str, pointers: Sequence[str], at: Mapping[str, Place]):
-        """A function of some pointers; `at` says from where on each array lies: which pointer, and the how manieth number."""
-        f = Function(name, [(POINTER, x) for x in pointers], self.width)
+    def write(
+        self, program: LoopProgram, name: str, pointers: Sequence[str], at: Mapping[str, Place], width: int | None = None
+    ) -> None:
+        """A function of some pointers; `at` says from where on each array lies: which pointer, and the how manieth number.
+
+        `width` is the number of lanes, if it is another than that of the others.
+        """
+        width = width or self.width
+        f = Function(name, [(POINTER, x) for x in pointers], width)
 
         def address(array: str) -> Value:
             pointer, place = at[array]
-            return f.at(f.given[pointer], place * self.width)
+            return f.at(f.given[pointer], place * width)
 
         for part in program.parts:
             if isinstance(part, Clear):
                 with f.each(part.count) as i:
-                    f.store(part.value, address(part.array), (i + part.start) * self.width, self.width)
+                    f.store(part.value, address(part.array), (i + part.start) * width, width)
             elif len(part.table):
                 arrays = [address(part.array(x)) for x in part.kernel.arrays]
                 table = Value(f, self._table(part.table), POINTER)
-                f.call(self._kernel(part.kernel, part.table.shape[1]), *arrays, table, f.const(len(part.table), INT))
+                f.call(self._kernel(part.kernel, part.table.shape[1], width), *arrays, table, f.const(len(part.table), INT))
         self.functions.append(f)
 
-    def _kernel(self, kernel: Kernel, columns: int) -> str:
-        if (kernel, columns) not in self._kernels:
-            self._kernels[kernel, columns] = name = f"{self.prefix}loop{len(self._kernels)}"
-            self.functions.append(self._written(kernel, columns, name))
-        return self._kernels[kernel, columns]
+    def _kernel(self, kernel: Kernel, columns: int, width: int) -> str:
+        key = kernel, columns, width
+        if key not in self._kernels:
+            self._kernels[key] = name = f"loop{len(self._kernels)}"
+            self.functions.append(self._written(kernel, columns, width, name))
+        return self._kernels[key]
 
-    def _written(self, kernel: Kernel, columns: int, name: str) -> Function:
+    def _written(self, kernel: Kernel, columns: int, width: int, name: str) -> Function:
         """`name(arrays..., table, count)`, of a table with so many columns."""
-        f = Function(name, [*((POINTER, a) for a in kernel.arrays), (POINTER, "table"), (INT, "count")], self.width)
-        width = self.width
+        f = Function(name, [*((POINTER, a) for a in kernel.arrays), (POINTER, "table"), (INT, "count")], width)
+        f.apart = True  # copies of kernels in each of their programs would take as often as long to compile
         with f.each(f.given["count"]) as i:
             row = f.at(f.given["table"], i * columns, "i32")
             bases: dict[tuple[str, int], Value] = {}
@@ -76,7 +83,7 @@ class LoopWriter:
     def _table(self, table: np.ndarray) -> str:
         data = np.ascontiguousarray(table, "<i4").tobytes()
         if data not in self._tables:
-            self._tables[data] = name = f"@{self.prefix}table{len(self._tables)}"
+            self._tables[data] = name = f"@table{len(self._tables)}"
             text = "".join(f"\\{byte:02X}" for byte in data)
             self.globals.append(f'{name} = private unnamed_addr constant [{len(data)} x i8] c"{text}", align 4')
         return self._tables[data]

@@ -205,7 +205,7 @@ class Trajectory:
                     p.add(name, n)
         self.ways = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
-        self.globals: list[str] = []
+        self.loops = LoopWriter(plan.width)
         self.stage_accelerations = ["P3 a", *(f"A{i}" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
         self.drop = code.drop_place
@@ -232,10 +232,9 @@ class Trajectory:
         return self._joined()
 
     def _joined(self) -> str:
-        declared = sorted(
-            set().union(*(f.declared for f in self.functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"}
-        )
-        return "\n".join([*declared, *self.globals, *(f.text() for f in self.functions)])
+        functions = [*self.functions, *self.loops.functions]
+        declared = sorted(set().union(*(f.declared for f in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
+        return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
 
     # What a trajectory with derivatives does besides (tangents.py, walk.py).
 
@@ -306,20 +305,18 @@ class Trajectory:
         found = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
         found |= {"dq1": "O dq", "dv1": "O dv", "made_of": "R"}
         at = {x: ("work", self.places[found.get(x, x)]) for x in (*found, "constants", "psi", "safe", "distance", *code.scratch)}
-        writer = LoopWriter(self.plan.width)
         for name in self._wanted():
-            writer.write(code.program(name), name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {}))
+            self.loops.write(
+                code.program(name), name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {})
+            )
         if self.cares:
             places = {x: f"careful {x}" for x in code.careful.scratch}
             places |= {"v1": "careful v", "a": "careful a", "safe": "rank", "distance": "rank"}
             careful = at | {x: ("work", self.places[place]) for x, place in places.items()}
             for name in ("accelerations", "closer", "arrival", "tangential"):
-                writer.write(code.careful.program(name), f"careful_{name}", ("work", "out"), careful)
-        prologue = LoopWriter(1, "prologue_")
-        prologue.write(code.prologue, "prologue", ("work", "out"), {"numbers": ("work", 0), "constants": ("out", 0)})
-        for w in (writer, prologue):
-            self.functions += w.functions
-            self.globals += w.globals
+                self.loops.write(code.careful.program(name), f"careful_{name}", ("work", "out"), careful)
+        at = {"numbers": ("work", 0), "constants": ("out", 0)}
+        self.loops.write(code.prologue, "prologue", ("work", "out"), at, width=1)
 
     def _wanted(self) -> list[str]:
         """The programs that it calls."""
