@@ -17,7 +17,7 @@ from udkjax.straightline import Program, Scalar, frontier, vector
 
 # Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
 # longer to trace and compile, the larger the scene (see the scaling benchmark).
-LARGE = 150
+LARGE = 40
 # What a row left out may disagree by, relative to its terms, and still count as satisfied: far above rounding, and above what
 # states carry that are closed to the tolerances of an integration.
 CONSISTENT = 1e-6

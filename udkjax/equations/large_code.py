@@ -33,6 +33,7 @@ OF_ANGLE = (0, 0, 1)  # which of the two, of x, y and the angle
 OWN, RECORD, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
 DROP, LEAST_PIVOT, GAINS = 0, 1, 2  # constants of all
 
+FIXED = ("t", "gram", "factors", "ratio")  # what no derivative is taken of
 SOLVES = 4  # in one program, at most
 SOLVED = ("right", "sum", "y", "x", "pull")  # D D^T x = right and pull = D^T x; y = right - sum is that of L y = right
 
@@ -167,7 +168,7 @@ class LargeCode:
         yield from self._elements(("D", "psi"), "v")
         yield from self._factorized()
         yield from self._solved()
-        yield self._without("q", "q1")
+        yield self._without("q", "q1", 0)
         yield self._safe()
 
     def _output(self) -> Parts:
@@ -179,7 +180,7 @@ class LargeCode:
         yield from self._elements(("D", "psi_dot"), "v")
         yield from self._factorized()
         yield from self._solved()
-        yield self._without("v", "v1")
+        yield self._without("v", "v1", 0)
 
     def _arrival(self) -> Parts:
         yield from self._to_velocities()
@@ -214,6 +215,20 @@ class LargeCode:
         yield self._sincos()
         yield from self._residuals("psi_dot", "psi")
 
+    def _rank(self) -> Parts:
+        """How many rows the last factorization has kept."""
+        yield Clear("rank", 0, 1)
+        for p in sorted(set(self._sizes)):
+
+            def count(w: _Writing, p: int = p):
+                zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
+                for j in range(p):
+                    inverse = w.read("factors", 0, p + _triangle(j, j))
+                    w.write(where(greater(absolute(inverse), zero), one, zero), "rank", None, 0, ADD)
+
+            blocks = [start for start, size in zip(self._diagonals, self._sizes, strict=True) if size == p]
+            yield Loop(self._kernel(("rank", p), count), np.array(blocks)[:, None])
+
     def _rows(self) -> Parts:
         yield self._sincos()
         yield from self._loads("v")
@@ -230,24 +245,17 @@ class LargeCode:
 
     @cached_property
     def evaluated(self) -> "dict[str, Evaluated]":
-        """The accelerations, and the projection of a state that is on the manifold, as their derivatives are taken.
+        """Programs as their derivatives are taken: no factorization is differentiated.
 
-        No factorization is differentiated. The accelerations are refined once,
+        Accelerations, and corrections of a `position` and a `velocity`, q - M^(-1/2) D^T x with D D^T x = Psi, are refined once,
 
             D D^T x = b,      D D^T x1 = b - D D^T x,      a = a_F + M^(-1/2) D^T (x + x1),
 
-        with x1 of nothing but rounding errors: with x and the factors fixed, the derivative of that is the one of a. A projection
-        is differentiated where all residuals vanish, and with them whatever they multiply: D is fixed, too.
+        with x1 of nothing but rounding errors: with x and the factors fixed, the derivative of that is the one of a. The
+        `projection` of a state on the manifold is differentiated where all residuals vanish, and with them whatever they
+        multiply: D is fixed, too.
         """
-        fixed = {"t", "gram", "factors", "ratio"}
-        before = [self._sincos(), *self._loads("v"), *self._elements(("D", "b"))]
-        refined = [*self._pull(0), *self._left(0, 1), *self._solved(1), self._fallen(0, 1)]
-        accelerations = Evaluated(
-            LoopProgram([*before, *self._factorized(), *self._substituted(0), *refined, self._safe()]),
-            [*before, *refined],
-            fixed | {"sum0", "y0", "x0"},
-        )
-        position = [self._sincos(), *self._elements(("psi",)), *self._solved(0), self._without("q", "q1")]
+        position = [self._sincos(), *self._elements(("psi",)), *self._solved(0), self._without("q", "q1", 0)]
         velocity = [
             self._sincos("q1", "sines1"),
             *self._elements(("psi_dot",), "v", 1, q="q1", sines="sines1"),
@@ -257,9 +265,20 @@ class LargeCode:
         projection = Evaluated(
             LoopProgram([self._sincos(), *self._elements(("D",)), *self._factorized(), *position, *velocity]),
             [*position, *velocity],
-            fixed | {"D"},
+            {*FIXED, "D"},
         )
-        return {"accelerations": accelerations, "projection": projection}
+        return {
+            "accelerations": self._refined([*self._loads("v"), *self._elements(("D", "b"))], self._fallen(0, 1), self._safe()),
+            "projection": projection,
+            "position": self._refined([*self._elements(("D", "psi"))], self._without("q", "q1", 0, 1)),
+            "velocity": self._refined([*self._elements(("D", "psi_dot"))], self._without("v", "v1", 0, 1)),
+        }
+
+    def _refined(self, elements: Sequence[Loop | Clear], result: Loop, *rest: Loop) -> "Evaluated":
+        before = [self._sincos(), *elements]
+        after = [*self._pull(0), *self._left(0, 1), *self._solved(1), result]
+        program = LoopProgram([*before, *self._factorized(), *self._substituted(0), *after, *rest])
+        return Evaluated(program, [*before, *after], {*FIXED, "sum0", "y0", "x0"})
 
     def constants_of(self, given: Array) -> Array:
         """The constants as a function of the numbers of the scene and the gains."""
@@ -475,12 +494,15 @@ class LargeCode:
         where = {name: f"pull{solve}" for name, solve in zip(names, solves, strict=True)}
         return self._of_bodies(("fallen", len(solves)), write, **where)
 
-    def _without(self, x: str, to: str, solve: int = 0) -> Loop:
+    def _without(self, x: str, to: str, *solves: int) -> Loop:
+        names = ["pull", "more"][: len(solves)]
+
         def write(w: _Writing):
             for k in range(3):
-                w.write(w.read("from", COORDINATES, k) - self._pulled(w, k), "to", COORDINATES, k)
+                w.write(w.read("from", COORDINATES, k) - sum(self._pulled(w, k, name) for name in names), "to", COORDINATES, k)
 
-        return self._of_bodies("without", write, **{"from": x, "to": to, "pull": f"pull{solve}"})
+        where = {name: f"pull{solve}" for name, solve in zip(names, solves, strict=True)}
+        return self._of_bodies(("without", len(solves)), write, **{"from": x, "to": to}, **where)
 
     def _safe(self) -> Loop:
         def write(w: _Writing):

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.code import Code, code, is_large
-from udkjax.equations.large_code import LargeCode
+from udkjax.equations.code import Code, code, is_large, structure
+from udkjax.equations.large_code import LargeCode, large_code
 from udkjax.equations.programs import WITH_CARE, Equations
 from udkjax.equations.scales import Scales
 from udkjax.integrate.problem import Problem, Raw
@@ -29,7 +29,7 @@ from udkjax.scene.mechanism import Mechanism
 
 def closes(mechanism: Mechanism) -> bool:
     """Whether machine code can close a mechanism."""
-    if is_large(mechanism) or jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
+    if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     try:
         written(_closing(mechanism), 1)
@@ -50,7 +50,7 @@ def closed_along(guess: Any, moving: Any, change: Any) -> tuple[Array, Array]:
     """The changes of q and v along a `change` of what is moving of (mechanism, scales, tol, t, q, v)."""
     (mechanism, *_, q, _), (*_, dq, dv) = guess, change
     n, kind = len(q), _closing(guess[0], _numbers_moving(mechanism, moving[0]), "closing forward")
-    numbers = _vector(_moved(moving[0], change[0]), jnp)
+    numbers = _vector(_moved(mechanism, moving[0], change[0]), jnp)
     along = [numbers, *(jnp.zeros(n) if dx is None else dx for dx in (dq, dv))]
     dstate = native_p.bind(*_guess(*guess), *(x[None, None] for x in along), kind=kind, times=2)[-1][0, 0]
     return dstate[:n], dstate[n:]
@@ -65,22 +65,26 @@ def closed_back(guess: Any, moving: Any, qbar: Array, vbar: Array) -> Any:
     found, parts = 0, []
     leaves, tree = jax.tree.flatten(mechanism, is_leaf=lambda x: x is None)
     for x, m in zip(leaves, jax.tree.leaves(moving[0], is_leaf=lambda x: x is None), strict=True):
-        if m is True:
-            parts.append(numbers[found : found + np.size(x)].reshape(np.shape(x)))
-            found += np.size(x)
-        else:
-            parts.append(None)
+        size = 0 if x is None or (m is not True and not is_large(mechanism)) else np.size(x)
+        parts.append(numbers[found : found + size].reshape(np.shape(x)) if m is True else None)
+        found += size
     assert len(states[0]) == n
     return jax.tree.unflatten(tree, parts), *(x if m is True else None for x, m in zip(states, moving[-2:], strict=True))
 
 
-def _moved(moving: Any, change: Any) -> list[Any]:
-    """The changes of the numbers that are moving, in order."""
-    pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (moving, change)), strict=True)
-    return [dx for m, dx in pairs if m is True]
+def _moved(mechanism: Mechanism, moving: Any, change: Any) -> list[Any]:
+    """The changes of the numbers that `_numbers_moving` marks, in order."""
+    trees = (jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (mechanism, moving, change))
+    leaves = [(x, m is True, dx) for x, m, dx in zip(*trees, strict=True) if x is not None]
+    if is_large(mechanism):
+        return [*(dx if m else jnp.zeros(np.shape(x)) for x, m, dx in leaves), jnp.zeros(2)]
+    return [dx for _, m, dx in leaves if m]
 
 
 def _numbers_moving(mechanism: Mechanism, moving: Any) -> tuple[bool, ...]:
+    """Of the numbers of a scene and two thresholds: which have derivatives. Loops do not tell them apart."""
+    if is_large(mechanism):
+        return (True,) * (sum(np.size(x) for x in jax.tree.leaves(mechanism)) + 2)
     leaves = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (mechanism, moving)), strict=True)
     return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
 
@@ -88,7 +92,7 @@ def _numbers_moving(mechanism: Mechanism, moving: Any) -> tuple[bool, ...]:
 def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> list[Any]:
     settings = {"length": scales.length, "care": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
     given = {
-        "numbers": _vector([*jax.tree.leaves(mechanism), 0.0, 0.0], jnp),
+        "numbers": _vector([*jax.tree.leaves(mechanism), tol**2 if is_large(mechanism) else 0.0, 0.0], jnp),
         "ts": _vector([t, t], jnp),
         "q": q,
         "v": v,
@@ -100,7 +104,9 @@ def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: An
 
 
 def _closing(mechanism: Mechanism, moving: tuple[bool, ...] | None = None, mode: str = "closing") -> Kind:
-    return Kind(code(mechanism, (), False, None), Tableau(EULER), projected=False, breaks=False, moving=moving, mode=mode)
+    large = is_large(mechanism)
+    programs = large_code(*structure(mechanism), (), False, "drop") if large else code(mechanism, (), False, None)
+    return Kind(programs, Tableau(EULER), projected=False, breaks=False, moving=moving, mode=mode)
 
 
 # --- problems

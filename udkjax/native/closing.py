@@ -32,8 +32,7 @@ class Closing(Trajectory):
     def text(self) -> str:
         """LLVM's text of the whole module."""
         self._programs()
-        self.functions.append(least_norm())
-        self._solve()
+        self._solver()
         self._begin()
         self._close()
         self._run()
@@ -42,12 +41,15 @@ class Closing(Trajectory):
     def _wanted(self) -> list[str]:
         return ["rows", "psi", "psi_dot"]
 
+    def _solver(self):
+        """The functions of D^+."""
+        self.functions.append(least_norm())
+        self._solve()
+
     def _close(self):
         """`close(work, call)`: the member in the one lane."""
         f, s = self._function("close", [(POINTER, "work"), (POINTER, "call")])
         work, n, m, p = f.given["work"], self.n, self.m, self.places
-        right, x = (Value(f, f.reserve("double", max(c, 1)), POINTER) for c in (m, n))
-        lane, slots = f.const(0, INT), self.code.pattern.slots
 
         def size() -> Value:
             """|Psi|, each row over its scale; not a number where a row is none."""
@@ -57,16 +59,6 @@ class Closing(Trajectory):
                 part = f.load(work, i + p["psi"]) / f.load(work, i + p["rows"])
                 total.value = f.fma(part, part, total.value)
             return f.intrinsic("sqrt", total.value)
-
-        def solve(to: str):
-            """-M^(-1/2) D^+ of what is in `psi`, as coordinates."""
-            self._call(f, "rows")
-            with f.each(m) as i:
-                f.store(f.load(work, i + p["psi"]), right, i)
-            f.call("solve", work, lane, right, x, s.care)
-            with f.each(n) as i:
-                root = f.load(work, i + (p["R"] + slots + m + n))
-                f.store(-(root * f.load(x, i)), work, i + p[to])
 
         def moved(scale: Value):
             with f.each(n) as i:
@@ -88,7 +80,7 @@ class Closing(Trajectory):
                 f.store(q, work, i + p["C"])
             better.value = f.select(before > largest.value * (ROUNDING * np.finfo(float).eps), f.const(1.0), 0.0)
             with f.if_(better.value > 0.5):
-                solve("X dq")
+                self._correction(f, s, POSITION, "X dq")
                 with f.each(n) as i:
                     step = f.abs(f.load(work, i + p["X dq"])) * f.load(work, i + p["inverse unit"])
                     longest.value = f.max(step, longest.value)
@@ -108,8 +100,7 @@ class Closing(Trajectory):
         self._taken(f, POSITION, f.const(1.0), f.const(0.0))
         for _ in range(VELOCITIES):
             self._taken(f, VELOCITY, f.const(1.0), f.const(0.0))
-            self._call(f, "psi_dot")
-            solve("X dv")
+            self._correction(f, s, VELOCITY, "X dv")
             with f.each(n) as i:
                 f.store(f.load(work, i + p["X v"]) + f.load(work, i + p["X dv"]), work, i + p["X v"])
         self._written(f, s)
@@ -128,8 +119,25 @@ class Closing(Trajectory):
             self._call(f, name)
             with f.each(self.m) as i:
                 f.store(f.load(work, i + self.places["psi"]), residuals, i + offset)
+        self._ranked(f)
         f.store(s.rank, address("rank", 1))
         self._ended_closing(f, member)
+
+    def _ranked(self, f: Function):
+        """Leave the rank of D in `rank`: `solve` does."""
+
+    def _correction(self, f: Function, s: Lane, kind: int, to: str):
+        """-M^(-1/2) D^+ Psi at the state in X, or of Psi_dot, as coordinates."""
+        work, n, m, p = f.given["work"], self.n, self.m, self.places
+        right, x = (Value(f, f.reserve("double", max(c, 1)), POINTER) for c in (m, n))
+        self._call(f, "psi_dot" if kind == VELOCITY else "psi")
+        self._call(f, "rows")
+        with f.each(m) as i:
+            f.store(f.load(work, i + p["psi"]), right, i)
+        f.call("solve", work, f.const(0, INT), right, x, s.care)
+        with f.each(n) as i:
+            root = f.load(work, i + (p["R"] + self.code.pattern.slots + m + n))
+            f.store(-(root * f.load(x, i)), work, i + p[to])
 
     # What closing with derivatives does besides (closing_derivatives.py).
 

@@ -27,8 +27,158 @@ from udkjax.native.trajectory import Lane, Places
 from udkjax.straightline import Program, cotangents, tangents
 
 
-class _Differentiated(Closing):
-    """What both modes have in common: the change of the rows, and (A^+)^T. `moving` says which numbers of the scene move."""
+class _Moving(Closing):
+    """What derivatives of any closing have in common. `moving` says which numbers of the scene move."""
+
+    numbers_moving: int
+
+    def _at(self, f: Function, name: str, i: Value | int, pointer: str = "work") -> Value:
+        places = self.places if pointer == "work" else self.ways
+        return f.load(f.given[pointer], f.like(i, INT, 1) + places[name])
+
+    def _set(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
+        places = self.places if pointer == "work" else self.ways
+        f.store(x, f.given[pointer], f.like(i, INT, 1) + places[name])
+
+    def _more(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
+        self._set(f, name, i, self._at(f, name, i, pointer) + x, pointer)
+
+
+class Along(_Moving):
+    """Closing along directions, each with memory of its own: a `way`.
+
+    It calls `push_position` and `push_velocity` (work, scale, limited): the change of the state by a correction of it, so much of
+    it in positions, and whether it was limited; and `prologue_along` (numbers, way, work).
+    """
+
+    inputs = ("dnumbers", "dq", "dv")
+    outputs = ("dstate",)
+    directions_in = 1
+
+    def _add_ways(self):
+        """The memory of a way."""
+        self.ways = w = Places(1, self.plan.vector)
+        w.add("numbers", self.numbers_moving)
+        w.add("constants", self.constants)
+        for name in ("X q", "X v", "O q", "O v"):
+            w.add(name, self.n)
+
+    @contextmanager
+    def _each_way(self, f: Function) -> Iterator[Value]:
+        call = f.load(f.given["work"], self.places["call"], base=POINTER)
+        first = f.load(f.given["work"], self.places["ways"], base=POINTER)
+        with f.each(f.load(call, self.call.index("directions"), base=INT)) as p:
+            f.given["way"] = f.at(first, p * self.ways.size)
+            yield p
+
+    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
+        f.call("push_velocity" if kind == VELOCITY else "push_position", f.given["work"], scale, limited)
+
+    def _begun(self, f: Function, lane: Value, member: Value):
+        del lane
+        call = self._call_of(f)
+        with self._each_way(f) as p:
+            for name, to, count in (("dnumbers", "numbers", self.numbers_moving), ("dq", "X q", self.n), ("dv", "X v", self.n)):
+                start = self._of_member(f, call, name, member)
+                with f.each(count) as i:
+                    self._set(f, to, i, f.load(start, p * count + i), "way")
+            f.call("prologue_along", self._of_member(f, call, "numbers", member), f.given["way"], f.given["work"])
+
+    def _ended_closing(self, f: Function, member: Value):
+        call = self._call_of(f)
+        directions = f.load(call, self.call.index("directions"), base=INT)
+        with self._each_way(f) as p:
+            to = f.at(f.load(call, self.call.index("dstate"), base=POINTER), (member * directions + p) * (2 * self.n))
+            for k, x in enumerate("qv"):
+                with f.each(self.n) as i:
+                    f.store(self._at(f, f"X {x}", i, "way"), to, i + k * self.n)
+
+    def _memory(self, f: Function, call: Value) -> list[Value]:
+        size = f.load(call, self.call.index("directions"), base=INT) * self.ways.size
+        block, start = self._allocated(f, size)
+        with f.each(size) as i:
+            f.store(0.0, start, i)
+        f.store(start, f.given["work"], self.places["ways"], base=POINTER)
+        return [block]
+
+
+class Back(_Moving):
+    """Closing, and back: its corrections are recorded and walked back from a cotangent of the state.
+
+    It calls `pull_position` and `pull_velocity` (work, scale, limited): from the cotangent B of the state behind a correction to
+    that of the state before it, in X; and `prologue_back` (numbers, work).
+    """
+
+    inputs = ("statebar",)
+    outputs = ("numbersbar", "qbar", "vbar")
+
+    def _add_record(self, numbers: int):
+        n, most, p = self.n, ITERATIONS + 1 + VELOCITIES, self.places
+        self.row = 3 + 2 * n  # of the record: kind, scale, whether it was limited, q and v before
+        p.add("record", most * self.row)
+        p.add("records")
+        for name, count in {"cbar": self.constants, "G c": self.constants, "numbersbar": numbers}.items():
+            p.add(name, count)
+        for name in ("B q", "B v", "G q", "G v"):
+            p.add(name, n)
+
+    def _pulled(self, f: Function):
+        """Add what a correction's derivative has found in G."""
+        with f.each(self.constants) as i:
+            self._more(f, "cbar", i, self._at(f, "G c", i))
+        with f.each(self.n) as i:
+            for x in "qv":
+                self._more(f, f"B {x}", i, self._at(f, f"G {x}", i))
+
+    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
+        number = self._whole(f, self._at(f, "records", 0))
+        row = f.at(f.given["work"], number * self.row + self.places["record"])
+        for k, x in enumerate((f.const(float(kind)), scale, limited)):
+            f.store(x, row, k)
+        self._copied(f, row, 3, "X q", f.const(0, INT))
+        self._copied(f, row, 3 + self.n, "X v", f.const(0, INT))
+        self._set(f, "records", 0, self._at(f, "records", 0) + 1.0)
+
+    def _begun(self, f: Function, lane: Value, member: Value):
+        del lane
+        self._set(f, "records", 0, f.const(0.0))
+        with f.each(self.constants) as i:
+            self._set(f, "cbar", i, f.const(0.0))
+        bars = self._of_member(f, self._call_of(f), "statebar", member)
+        for k, x in enumerate("qv"):
+            with f.each(self.n) as i:
+                self._set(f, f"B {x}", i, f.load(bars, i + k * self.n))
+
+    def _ended_closing(self, f: Function, member: Value):
+        call = self._call_of(f)
+
+        def left() -> Value:
+            return self._at(f, "records", 0) > 0.5
+
+        with f.while_(left):
+            self._set(f, "records", 0, self._at(f, "records", 0) - 1.0)
+            row = f.at(f.given["work"], self._whole(f, self._at(f, "records", 0)) * self.row + self.places["record"])
+            for k, x in enumerate("qv"):
+                with f.each(self.n) as i:
+                    self._set(f, f"X {x}", i, f.load(row, i + (3 + k * self.n)))
+
+            def pull(name: str) -> Callable[[], None]:
+                return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))
+
+            f.choose(f.load(row, 0) > 0.5, pull("pull_velocity"), pull("pull_position"))
+        f.call("prologue_back", self._of_member(f, call, "numbers", member), f.given["work"])
+        for name, place, count in (
+            ("numbersbar", "numbersbar", self.numbers_moving),
+            ("qbar", "B q", self.n),
+            ("vbar", "B v", self.n),
+        ):
+            to = f.at(f.load(call, self.call.index(name), base=POINTER), member * count)
+            with f.each(count) as i:
+                f.store(self._at(f, place, i), to, i)
+
+
+class _WrittenOut(_Moving):
+    """What both modes have in common: the change of the rows, and (A^+)^T."""
 
     def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
         super().__init__(code, vector)
@@ -37,7 +187,7 @@ class _Differentiated(Closing):
         self.changed = [*outputs["rows"][: self.slots], *e.psi, *e.psi_dot, *code.root]
         inputs = code.prologue.inputs
         self.numbers = [s for s, m in zip(inputs, moving, strict=True) if m]
-        self.count = len(self.numbers)
+        self.numbers_moving = len(self.numbers)
         self.given = [*code.constants, e.t, *e.q, *e.v]
         self.state = [*code.constants, *e.q, *e.v]
         self.graph = graph
@@ -65,17 +215,6 @@ class _Differentiated(Closing):
         """An entry of A."""
         return self._at(f, "R", slot) * sign * self._weight(f, row)
 
-    def _at(self, f: Function, name: str, i: Value | int, pointer: str = "work") -> Value:
-        places = self.places if pointer == "work" else self.ways
-        return f.load(f.given[pointer], f.like(i, INT, 1) + places[name])
-
-    def _set(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
-        places = self.places if pointer == "work" else self.ways
-        f.store(x, f.given[pointer], f.like(i, INT, 1) + places[name])
-
-    def _more(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
-        self._set(f, name, i, self._at(f, name, i, pointer) + x, pointer)
-
     def _root(self, f: Function, i: Value) -> Value:
         return self._at(f, "R", i + (self.slots + self.m + self.n))
 
@@ -99,19 +238,14 @@ class _Differentiated(Closing):
         return longest.value, which.value
 
 
-class ClosingForward(_Differentiated):
-    """Closing along directions, each with memory of its own: a `way`."""
-
-    inputs = ("dnumbers", "dq", "dv")
-    outputs = ("dstate",)
-    directions_in = 1
+class ClosingForward(_WrittenOut, Along):
+    """Closing along directions, with its programs written out."""
 
     def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
         super().__init__(code, moving, vector)
-        self.ways = w = Places(1, vector)
-        w.add("numbers", self.count)
-        w.add("constants", self.constants)
-        for name in ("q", "v", "g", "dx"):
+        self._add_ways()
+        w = self.ways
+        for name in ("g", "dx"):
             w.add(name, self.n)
         w.add("changes", len(self.changed))
         w.add("right", self.m)
@@ -123,30 +257,24 @@ class ClosingForward(_Differentiated):
         changes = tangents(graph, self.changed, seeds)
         w = self.ways
         inputs = [*self._state(), *(("way", w["constants"] + k) for k in range(self.constants))]
-        inputs += [("way", w[x] + k) for x in "qv" for k in range(self.n)]
+        inputs += [("way", w[f"X {x}"] + k) for x in "qv" for k in range(self.n)]
         program = Program(graph, [*self.given, *seeds.values()], changes)
         places = [("way", w["changes"] + k) for k in range(len(changes))]
         self._write(program, "changes", ("work", "way"), inputs, places)
         seeds = {s: graph.input(("number", s.index), "tangent") for s in self.numbers}
         program = Program(graph, [*self.code.prologue.inputs, *seeds.values()], tangents(graph, self.code.constants, seeds))
-        inputs = [*numbered("numbers", len(self.code.prologue.inputs)), *(("way", w["numbers"] + k) for k in range(self.count))]
+        inputs = [
+            *numbered("numbers", len(self.code.prologue.inputs)),
+            *(("way", w["numbers"] + k) for k in range(self.numbers_moving)),
+        ]
         places = [("way", w["constants"] + k) for k in range(self.constants)]
-        self.functions.append(write(program, "prologue_along", 1, ("numbers", "way"), inputs, places))
+        self.functions.append(write(program, "prologue_along", 1, ("numbers", "way", "work"), inputs, places))
         self._shared()
         for name, kind in (("push_position", POSITION), ("push_velocity", VELOCITY)):
             self._push(name, kind)
         return super().text()
 
-    @contextmanager
-    def _each_way(self, f: Function) -> Iterator[Value]:
-        call = f.load(f.given["work"], self.places["call"], base=POINTER)
-        first = f.load(f.given["work"], self.places["ways"], base=POINTER)
-        with f.each(f.load(call, self.call.index("directions"), base=INT)) as p:
-            f.given["way"] = f.at(first, p * self.ways.size)
-            yield p
-
     def _push(self, name: str, kind: int):
-        """The change of the state by a correction of it, s of it in positions: `scale`, whether it was limited: `limited`."""
         f, s = self._function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._corrected(f, kind)
         longest, which = self._longest(f)
@@ -174,61 +302,20 @@ class ClosingForward(_Differentiated):
                 self._set(f, "dx", i, step, "way")
                 change.value = f.select(i.is_(which), step / (root_i * x), change.value)
             change.value = f.select((f.given["limited"] > 0.5) & (longest > 0.0), change.value, 0.0)
-            to = "v" if kind == VELOCITY else "q"
+            to = "X v" if kind == VELOCITY else "X q"
             with f.each(self.n) as i:
                 step, whole = self._at(f, "dx", i, "way"), self._root(f, i) * self._at(f, "x", i)
                 self._more(f, to, i, -(scale * (step - change.value * whole)), "way")
 
-    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
-        f.call("push_velocity" if kind == VELOCITY else "push_position", f.given["work"], scale, limited)
 
-    def _begun(self, f: Function, lane: Value, member: Value):
-        del lane
-        call = self._call_of(f)
-        with self._each_way(f) as p:
-            for name, to, count in (("dnumbers", "numbers", self.count), ("dq", "q", self.n), ("dv", "v", self.n)):
-                start = self._of_member(f, call, name, member)
-                with f.each(count) as i:
-                    self._set(f, to, i, f.load(start, p * count + i), "way")
-            f.call("prologue_along", self._of_member(f, call, "numbers", member), f.given["way"])
-
-    def _ended_closing(self, f: Function, member: Value):
-        call = self._call_of(f)
-        directions = f.load(call, self.call.index("directions"), base=INT)
-        with self._each_way(f) as p:
-            to = f.at(f.load(call, self.call.index("dstate"), base=POINTER), (member * directions + p) * (2 * self.n))
-            for k, x in enumerate("qv"):
-                with f.each(self.n) as i:
-                    f.store(self._at(f, x, i, "way"), to, i + k * self.n)
-
-    def _memory(self, f: Function, call: Value) -> list[Value]:
-        size = f.load(call, self.call.index("directions"), base=INT) * self.ways.size
-        block, start = self._allocated(f, size)
-        with f.each(size) as i:
-            f.store(0.0, start, i)
-        f.store(start, f.given["work"], self.places["ways"], base=POINTER)
-        return [block]
-
-
-class ClosingReverse(_Differentiated):
-    """Closing, and back: its corrections are recorded and walked back from a cotangent of the state."""
-
-    inputs = ("statebar",)
-    outputs = ("numbersbar", "qbar", "vbar")
+class ClosingReverse(_WrittenOut, Back):
+    """Closing and back, with its programs written out."""
 
     def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
         super().__init__(code, moving, vector)
-        n, most = self.n, ITERATIONS + 1 + VELOCITIES
-        self.row = 3 + 2 * n  # of the record: kind, scale, whether it was limited, q and v before
-        self.places.add("record", most * self.row)
-        self.places.add("records")
-        counts = {"bars": len(self.changed), "cbar": self.constants, "B q": n, "B v": n, "w": n, "u": self.m}
-        for name, count in counts.items():
+        self._add_record(self.numbers_moving)
+        for name, count in {"bars": len(self.changed), "w": self.n, "u": self.m}.items():
             self.places.add(name, count)
-        self.places.add("G c", self.constants)
-        for name in ("G q", "G v"):
-            self.places.add(name, n)
-        self.places.add("numbersbar", self.count)
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
@@ -242,24 +329,14 @@ class ClosingReverse(_Differentiated):
         back = cotangents(graph, self.code.constants, seeds, self.numbers)
         inputs = [*numbered("numbers", len(self.code.prologue.inputs)), *self._work("cbar", self.constants)]
         program = Program(graph, [*self.code.prologue.inputs, *seeds], back)
-        places = self._work("numbersbar", self.count)
+        places = self._work("numbersbar", self.numbers_moving)
         self.functions.append(write(program, "prologue_back", 1, ("numbers", "work"), inputs, places))
         self._shared()
         for name, kind in (("pull_position", POSITION), ("pull_velocity", VELOCITY)):
             self._pull(name, kind)
         return super().text()
 
-    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
-        number = self._whole(f, self._at(f, "records", 0))
-        row = f.at(f.given["work"], number * self.row + self.places["record"])
-        for k, x in enumerate((f.const(float(kind)), scale, limited)):
-            f.store(x, row, k)
-        self._copied(f, row, 3, "X q", f.const(0, INT))
-        self._copied(f, row, 3 + self.n, "X v", f.const(0, INT))
-        self._set(f, "records", 0, self._at(f, "records", 0) + 1.0)
-
     def _pull(self, name: str, kind: int):
-        """From the cotangent B of the state behind a correction to that of the state before it, in X."""
         f, _ = self._function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._corrected(f, kind)
         longest, which = self._longest(f)
@@ -290,41 +367,4 @@ class ClosingReverse(_Differentiated):
         with f.each(self.m) as i:
             self._set(f, "bars", i + residual, self._weight(f, i) * self._at(f, "u", i))
         f.call("pull_rows", f.given["work"])
-        with f.each(self.constants) as i:
-            self._more(f, "cbar", i, self._at(f, "G c", i))
-        with f.each(self.n) as i:
-            for x in "qv":
-                self._more(f, f"B {x}", i, self._at(f, f"G {x}", i))
-
-    def _begun(self, f: Function, lane: Value, member: Value):
-        del lane
-        self._set(f, "records", 0, f.const(0.0))
-        with f.each(self.constants) as i:
-            self._set(f, "cbar", i, f.const(0.0))
-        bars = self._of_member(f, self._call_of(f), "statebar", member)
-        for k, x in enumerate("qv"):
-            with f.each(self.n) as i:
-                self._set(f, f"B {x}", i, f.load(bars, i + k * self.n))
-
-    def _ended_closing(self, f: Function, member: Value):
-        call = self._call_of(f)
-
-        def left() -> Value:
-            return self._at(f, "records", 0) > 0.5
-
-        with f.while_(left):
-            self._set(f, "records", 0, self._at(f, "records", 0) - 1.0)
-            row = f.at(f.given["work"], self._whole(f, self._at(f, "records", 0)) * self.row + self.places["record"])
-            for k, x in enumerate("qv"):
-                with f.each(self.n) as i:
-                    self._set(f, f"X {x}", i, f.load(row, i + (3 + k * self.n)))
-
-            def pull(name: str) -> Callable[[], None]:
-                return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))
-
-            f.choose(f.load(row, 0) > 0.5, pull("pull_velocity"), pull("pull_position"))
-        f.call("prologue_back", self._of_member(f, call, "numbers", member), f.given["work"])
-        for name, place, count in (("numbersbar", "numbersbar", self.count), ("qbar", "B q", self.n), ("vbar", "B v", self.n)):
-            to = f.at(f.load(call, self.call.index(name), base=POINTER), member * count)
-            with f.each(count) as i:
-                f.store(self._at(f, place, i), to, i)
+        self._pulled(f)

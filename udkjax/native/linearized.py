@@ -6,7 +6,8 @@ For the accelerations (no suffix) and for the projection of a state on the manif
     forward(work, kept, way, out)   the change of what it returns, from those of the constants, of X q and X v of a way
     reverse(work, kept, bar)        the cotangents G of the constants, q and v, from those of what it returns
 
-where the projection has no `out` to begin with, leaves its changes in O of a way, and finds its cotangents in Y.
+where the projection has no `out` to begin with, leaves its changes in O of a way, and finds its cotangents in Y. So have the
+corrections that close a mechanism, of its `position` and of its `velocity`, as loops.
 """
 
 from typing import Any, Protocol
@@ -16,7 +17,7 @@ from udkjax.native.program import Place, numbered
 from udkjax.straightline.loop_derivative import COTANGENT, TANGENT
 from udkjax.straightline.loops import Clear, LoopProgram
 
-SUFFIXES = {"accelerations": "", "projection": "_projection"}
+SUFFIXES = {"accelerations": "", "projection": "_projection", "position": "_position", "velocity": "_velocity"}
 
 
 class Linearized(Protocol):
@@ -96,6 +97,10 @@ class ByLoops:
             places.add("along", sum(trajectory.code.kept.values()))
         names = {"t": "X t", "q": "X q", "v": "X v", "constants": "constants", "safe": "safe"}
         self._at |= {x: ("work", places[place]) for x, place in names.items()}
+
+    def place(self, name: str) -> int:
+        """Where an array begins in what is kept."""
+        return self._at[name][1]
 
     def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, Place]):
         self._in.loops.write(program, f"{name}{self._suffix}", pointers, at)

@@ -17,8 +17,10 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
+from udkjax.equations.large_code import LargeCode
 from udkjax.native import machine
 from udkjax.native.closing import Closing
+from udkjax.native.closing_by_loops import ClosingByLoops, ForwardByLoops, ReverseByLoops
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
 from udkjax.native.ffi import handler
 from udkjax.native.tableau import Method
@@ -56,15 +58,17 @@ class Tableau:
 
 MODES: dict[str, Any] = {"forward": Forward, "reverse": Reverse}
 CLOSING: dict[str, Any] = {"closing forward": ClosingForward, "closing reverse": ClosingReverse}
+CLOSING_BY_LOOPS: dict[str, Any] = {"closing forward": ForwardByLoops, "closing reverse": ReverseByLoops}
 
 
 @lru_cache(maxsize=256)
 def written(kind: Kind, width: int) -> Trajectory:
     """A kind of trajectory in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it."""
+    loops = isinstance(kind.code, LargeCode)
     if kind.mode == "closing":
-        trajectory: Trajectory = Closing(kind.code, machine.lanes())
+        trajectory: Trajectory = (ClosingByLoops if loops else Closing)(kind.code, machine.lanes())
     elif kind.mode in CLOSING:
-        trajectory = CLOSING[kind.mode](kind.code, kind.moving, machine.lanes())
+        trajectory = (CLOSING_BY_LOOPS if loops else CLOSING)[kind.mode](kind.code, kind.moving, machine.lanes())
     else:
         plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
         trajectory = MODES[kind.mode](plan, kind.moving) if kind.moving is not None else Trajectory(plan)  # pyright: ignore

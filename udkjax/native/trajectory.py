@@ -304,7 +304,10 @@ class Trajectory:
     def _loop_programs(self, code: LargeCode):
         found = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
         found |= {"dq1": "O dq", "dv1": "O dv", "made_of": "R"}
-        at = {x: ("work", self.places[found.get(x, x)]) for x in (*found, "constants", "psi", "safe", "distance", *code.scratch)}
+        at = {
+            x: ("work", self.places[found.get(x, x)])
+            for x in (*found, "constants", "psi", "safe", "distance", "rank", *code.scratch)
+        }
         for name in self._wanted():
             self.loops.write(
                 code.program(name), name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {})
@@ -880,7 +883,7 @@ class Trajectory:
         """`solve`: x = D^+ right of one lane, with the rows weighted; D is that of R."""
         n, m = self.n, self.m
         table = [x for e in self.code.pattern.entries for x in (e.row, e.column, e.slot, e.sign)]
-        self.globals.append(f"@entries = private constant [{len(table)} x i64] [{', '.join(f'i64 {x}' for x in table)}]")
+        self.loops.globals.append(f"@entries = private constant [{len(table)} x i64] [{', '.join(f'i64 {x}' for x in table)}]")
         arguments = [(POINTER, "work"), (INT, "lane"), (POINTER, "right"), (POINTER, "x"), (DOUBLE, "tol")]
         f, s = self._function("solve", arguments)
         k, right = f.given["lane"], f.given["right"]
