@@ -1,7 +1,7 @@
 """Functions as machine code, on arrays; and trajectories by it, next to those of another engine."""
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,11 +16,11 @@ from udkjax.straightline import Graph, Program, trace
 WIDTHS = sorted({1, 2, machine.lanes()})
 
 
-def loaded(*functions: Function) -> Callable[..., None]:
+def loaded(*functions: Function, globals: Sequence[str] = ()) -> Callable[..., None]:
     """The last of some functions, to be called with arrays, whole numbers and numbers."""
     declared = sorted(set().union(*(f.declared for f in functions)))
     last = functions[-1]
-    library = machine.Library(machine.compiled("\n".join([*declared, *(f.text() for f in functions)])), [last.name])
+    library = machine.Library(machine.compiled("\n".join([*declared, *globals, *(f.text() for f in functions)])), [last.name])
     kinds = {POINTER: ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
     run = machine.function(library[last.name], *(kinds[value.base] for value in last.given.values()))
 

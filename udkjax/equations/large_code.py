@@ -263,7 +263,7 @@ class LargeCode:
             self._without("v", "v1", 1),
         ]
         projection = Evaluated(
-            LoopProgram([self._sincos(), *self._elements(("D",)), *self._factorized(), *position, *velocity]),
+            LoopProgram([self._sincos(), *self._elements(("D",)), *self._factorized(), *position[1:], *velocity]),
             [*position, *velocity],
             {*FIXED, "D"},
         )

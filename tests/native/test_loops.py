@@ -1,0 +1,255 @@
+"""Large scenes as programs of loops: held against the textbook, run row by row; their derivatives against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from tests import loops
+from udkjax.equations import constraints, loads
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.analysis import analyse
+from udkjax.equations.code import structure
+from udkjax.equations.large_code import large_code
+from udkjax.native.loops import LoopWriter
+from udkjax.pinv.block_order import eliminations
+from udkjax.straightline.loops import Clear, Loop
+
+O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
+NOTHING = 1e-20  # a threshold of pivots below that of any that is more than rounding
+
+
+def loaded() -> udk.Mechanism:
+    """Joints, drivers and force elements of several kinds."""
+    bodies = {f"b{k}": udk.Body(1.0 + 0.2 * k, 0.1 + 0.05 * k, [0.4 * k, 0.1], 0.2 * k, [0.1, -0.2 * k], 0.3) for k in range(6)}
+    return udk.Mechanism(
+        bodies,
+        {
+            "pin": udk.Revolute(["ground", "b0"], [[0.0, 0.0], [0.1, 0.2]]),
+            "pin2": udk.Revolute(["b0", "b1"], [[0.3, 0.0], [-0.1, 0.2]]),
+            "rod": udk.Distance(["b1", "b2"], [[0.1, 0.0], [0.1, 0.2]], 0.7),
+            "slide": udk.Prismatic(["ground", "b3"], O, 0.4),
+            "gear": udk.Gear(["b3", "b4"], [0.1, 0.3]),
+            "slot": udk.Slot(["b4", "b5"], [[0.2, 0.0], [0.0, 0.1]], axis=0.3),
+        },
+        {"turn": udk.Driver(["ground", "b0"], "angle", udk.Sine(1.0, 2.0, 0.3))},
+        {
+            "spring": udk.Spring(["b1", "b4"], [[0.1, 0.0], [0.0, 0.2]], 30.0, 0.4, 0.3),
+            "wind": udk.Force("b2", [1.0, 2.0], point=[0.1, 0.0]),
+            "rub": udk.Friction("pin2", 0.3, 0.1),
+        },
+    )
+
+
+SCENES = {
+    "linkage": udk.library.parallelogram,
+    "three four-bars": lambda: udk.library.n_four_bar(3),
+    "chain": lambda: udk.library.chain(4),
+    "scissor lift": udk.library.scissor_lift,
+    "gears": udk.library.planetary_gear,
+    "loaded": loaded,
+    "free": lambda: udk.Mechanism({"stone": udk.Body(1.0, 0.3, [0.1, 0.2], 0.3)}),
+}
+
+
+class At:
+    """The programs of a scene at some state near its guess, run row by row."""
+
+    def __init__(self, mechanism, baumgarte=None, every=False):
+        redundant = analyse(mechanism).redundant_rows or ()
+        gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
+        code = large_code(*structure(mechanism), redundant, bool(gains), "watch")
+        self.code, self.mechanism = code.careful if every else code, mechanism
+        state, random = udk.assemble(mechanism, throw=False), np.random.default_rng(1)
+        n = self.code.n
+        self.t = 0.2
+        self.q = np.ravel(state.q) + 1e-2 * random.standard_normal(n)
+        self.v = np.ravel(state.v) + 0.3 * random.standard_normal(n)
+        self.numbers = np.concatenate([np.ravel(x) for x in [*jax.tree.leaves(mechanism.bare), *gains, NOTHING, NOTHING]])
+        self.constants = np.zeros(len(self.code.constants))
+        loops.run(self.code.prologue, {"numbers": self.numbers, "constants": self.constants})
+        kept = [k for k in range(self.code.m) if every or k not in redundant]
+        self.weights = np.isin(np.arange(self.code.m), kept).astype(float)
+
+    def arrays(self, constants=None, q=None, v=None, **more):
+        code = self.code
+        found = {name: np.full(size, np.nan) for name, size in code.kept.items()}
+        found |= {x: np.full(code.n, np.nan) for x in ("a", "q1", "v1", "dq1", "dv1")}
+        found |= {x: np.full(1, np.nan) for x in ("safe", "distance", "rank")}
+        given = {"constants": self.constants, "t": np.array([self.t]), "q": self.q, "v": self.v}
+        given |= {k: x for k, x in (("constants", constants), ("q", q), ("v", v)) if x is not None}
+        return found | given | {"psi": np.full(code.m, np.nan), "made_of": np.full(code.made_of, np.nan)} | more
+
+    def run(self, name, **given):
+        found = self.arrays(**given)
+        loops.run(self.code.program(name), found)
+        return found
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def at(request):
+    return At(SCENES[request.param]())
+
+
+def test_accelerations_are_those_of_the_textbook(at):
+    found = at.run("accelerations")
+    expected = uk.accelerations(at.mechanism, at.t, at.q, at.v, udk.SVD(), None, jnp.asarray(at.weights))
+    assert_allclose(found["a"], expected, atol=1e-9 * max(1.0, np.abs(expected).max()))
+    assert found["safe"] == 1
+
+
+def test_accelerations_with_baumgarte_are_those_of_the_textbook():
+    gains = udk.Baumgarte(5.0, 7.0)
+    at = At(loaded(), gains)
+    expected = uk.accelerations(at.mechanism, at.t, at.q, at.v, udk.SVD(), gains, jnp.asarray(at.weights))
+    assert_allclose(at.run("accelerations")["a"], expected, atol=1e-8)
+
+
+def test_residuals_are_those_of_the_textbook(at):
+    assert_allclose(at.run("psi")["psi"], constraints.psi(at.mechanism, at.t, at.q), atol=1e-13)
+    assert_allclose(at.run("psi_dot")["psi"], constraints.psi_dot(at.mechanism, at.t, at.q, at.v), atol=1e-13)
+
+
+def test_corrections_take_residuals_away(at):
+    if not at.code.m:
+        return
+    kept = at.weights > 0
+    root, A = uk.root(at.mechanism), np.asarray(constraints.psi_q(at.mechanism, at.t, at.q))[kept]
+    D = A * root
+    psi, rate = (np.asarray(x)[kept] for x in (constraints.psi(at.mechanism, at.t, at.q), at.run("psi_dot")["psi"]))
+    for name, x, array, residual in (("closer", at.q, "q1", psi), ("output", at.v, "v1", rate)):
+        expected = x - root * (np.linalg.pinv(D) @ residual)
+        assert_allclose(at.run(name)[array], expected, atol=1e-9)
+
+
+def test_what_is_tangential(at):
+    random = np.random.default_rng(2)
+    dq, dv = random.standard_normal((2, at.code.n))
+    found = at.run("tangential", dq=dq, dv=dv)
+    again = at.run("finish", dq=dq, dv=dv)
+    A = np.asarray(constraints.psi_q(at.mechanism, at.t, at.q))[at.weights > 0]
+    mass = np.asarray(loads.mass(at.mechanism))
+    for name, given in (("dq1", dq), ("dv1", dv)):
+        assert_allclose(A @ found[name], 0.0, atol=1e-10)
+        left = mass * (given - found[name])  # a combination of rows
+        combination = np.linalg.lstsq(A.T, left, rcond=None)[0] if len(A) else np.zeros(0)
+        assert_allclose(A.T @ combination, left, atol=1e-9)
+        assert_allclose(again[name], found[name], atol=1e-12)
+
+
+def test_steps_with_care_take_all_rows():
+    """Beside singular configurations rows that are redundant elsewhere are not, and others are."""
+    at = At(udk.library.parallelogram(), every=True)
+    flat = np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0], [2.0, 0.0, 0.0]]).ravel()
+    at.numbers[-2] = 1e-10
+    loops.run(at.code.prologue, {"numbers": at.numbers, "constants": at.constants})
+    still = np.zeros(at.code.n)
+    expected = uk.accelerations(at.mechanism, at.t, flat, still, udk.SVD(1e-6), None, jnp.ones(at.code.m))
+    assert_allclose(at.run("accelerations", q=flat, v=still)["a"], expected, atol=1e-8)
+    ranks = at.run("accelerations", q=flat, v=still)
+    loops.run(at.code.program("rank"), ranks)
+    assert ranks["rank"] == np.linalg.matrix_rank(constraints.psi_q(at.mechanism, at.t, flat))
+
+
+def test_no_number_is_written_once_it_was_read():
+    """Derivatives rely on it."""
+    code = At(loaded()).code
+    programs = [evaluated.program for evaluated in code.evaluated.values()]
+    for program in programs:
+        read: set[tuple[str, int]] = set()
+        for part in program.parts:
+            if isinstance(part, Clear):
+                written = {(part.array, k) for k in range(part.start, part.start + part.count)}
+                assert not written & read
+                continue
+            assert isinstance(part, Loop)
+            places = [
+                [(part.array(s.array), s.offset + (0 if s.base is None else int(row[s.base]))) for s in slots]
+                for row in part.table
+                for slots in (part.kernel.inputs, part.kernel.outputs)
+            ]
+            for inputs, outputs in zip(places[::2], places[1::2], strict=True):
+                used = [p for p, s in zip(inputs, part.kernel.program.inputs, strict=True) if part.kernel.program.uses(s)]
+                read |= set(used)
+                assert not {p for p in outputs if p[0] != "ratio"} & read
+
+
+@pytest.mark.parametrize("name", ["accelerations", "projection", "position", "velocity"])
+def test_derivatives_against_differences(at, name):
+    code, random = at.code, np.random.default_rng(4)
+    results = {"accelerations": ["a"], "projection": ["q1", "v1"], "position": ["q1"], "velocity": ["v1"]}[name]
+    evaluated = code.evaluated[name]
+    q, v = at.q, at.v
+    for _ in range(6 if name == "projection" else 0):  # its derivatives are those of a state on the manifold
+        state = at.run("closer", q=q)
+        q = state["q1"]
+        v = at.run("output", q=q, v=v)["v1"]
+    dconstants = random.standard_normal(len(code.constants)) * at.constants
+    dconstants[:2] = 0.0
+    dq, dv = random.standard_normal((2, code.n))
+
+    def value(h):
+        found = at.arrays(at.constants + h * dconstants, q + h * dq, v + h * dv)
+        loops.run(evaluated.program, found)
+        return np.concatenate([found[x] for x in results])
+
+    h = 1e-6
+    slope = (value(h) - value(-h)) / (2 * h)
+    found = at.arrays(q=q, v=v)
+    loops.run(evaluated.program, found)
+    changes = {f"d_{x}": np.full(len(a), np.nan) for x, a in found.items()}
+    changes |= {"d_constants": dconstants, "d_q": dq, "d_v": dv}
+    forward = found | changes
+    loops.run(evaluated.derivative().forward, forward)
+    along = np.concatenate([forward[f"d_{x}"] for x in results])
+    assert_allclose(along, slope, atol=2e-7 * max(1.0, np.abs(slope).max()))
+    w = random.standard_normal(len(along))
+    reverse = found | {f"bar_{x}": np.zeros(len(a)) for x, a in found.items()}
+    for k, x in enumerate(results):
+        reverse[f"bar_{x}"] = w[k * code.n : (k + 1) * code.n].copy()
+    loops.run(evaluated.derivative().reverse, reverse)
+    total = reverse["bar_constants"] @ dconstants + reverse["bar_q"] @ dq + reverse["bar_v"] @ dv
+    assert_allclose(total, w @ along, rtol=1e-9, atol=1e-11)
+
+
+def test_constants_by_jax_are_those_of_the_loops(at):
+    assert_allclose(at.code.constants_of(jnp.asarray(at.numbers[:-2]))[2:], at.constants[2:], rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["finish", "rows"])
+def test_machine_code_runs_the_loops(at, name, code, width):
+    program = at.code.program(name)
+    random = np.random.default_rng(5)
+    given = at.arrays(dq=random.standard_normal(at.code.n), dv=random.standard_normal(at.code.n))
+    writer = LoopWriter(width)
+    names = sorted(program.arrays)
+    writer.write(program, "whole", names, {x: (x, 0) for x in names})
+    run = code(*writer.functions, globals=writer.globals)
+    wide = {x: np.repeat(given[x][:, None], width, 1).copy() for x in names}
+    run(*(wide[x] for x in names))
+    loops.run(program, given)
+    for x in names:
+        for lane in range(width):
+            assert_allclose(wide[x][:, lane], given[x], rtol=1e-9, atol=1e-9, err_msg=x)
+
+
+def test_the_code_does_not_grow_with_the_scene():
+    few, many = (large_code(*structure(udk.library.n_four_bar(n)), (), False, "drop") for n in (7, 70))
+    for code in (few, many):
+        for name in ("accelerations", "finish", "rows"):
+            code.program(name)
+    assert len(few._kernels) == len(many._kernels) < 60
+
+
+def test_blocks_that_are_alike_are_eliminated_in_a_run():
+    holds = [{2 * k, 2 * k + 1} for k in range(8)] + [{2 * k + 1, 2 * k + 2} for k in range(7)]
+    found = eliminations([2] * 15, holds)
+    seen: list[int] = []
+    for e in found:
+        for k, later in zip(e.blocks, e.later, strict=True):
+            assert not set(later) & set(seen)
+            seen.append(k)
+    assert sorted(seen) == list(range(15))
+    assert len(found) <= 8
