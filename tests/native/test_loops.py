@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests import loops
+from udkjax.equations import code as size
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse
@@ -253,3 +254,42 @@ def test_blocks_that_are_alike_are_eliminated_in_a_run():
             seen.append(k)
     assert sorted(seen) == list(range(15))
     assert len(found) <= 8
+
+
+# --- trajectories
+
+
+def changed(mechanism, scale):
+    """A mechanism with all its numbers changed a little."""
+    leaves, tree = jax.tree.flatten(mechanism.bare)
+    factors = 1.0 + 0.01 * np.sin(np.arange(len(leaves)))
+    return jax.tree.unflatten(tree, [x * (1.0 + scale * (f - 1.0)) for x, f in zip(leaves, factors, strict=True)])
+
+
+@pytest.mark.parametrize(("name", "assembled"), [("loaded", True), ("scissor lift", False)])
+def test_derivatives_of_runs_are_those_of_code_that_is_written_out(name, assembled, monkeypatch):
+    """And of closing what they start with, forward and reverse."""
+    mechanism = SCENES[name]()
+    analysis, state, ts = udk.analyse(mechanism), udk.assemble(mechanism), np.linspace(0.0, 0.3, 4)
+    random = np.random.default_rng(0)
+    dq, dv, w = random.standard_normal((3, *state.q.shape))
+    guess = udk.State(state.q + 5e-3 * dq, state.v) if assembled else state
+
+    def measure(scale, q, v):
+        scene = changed(mechanism, scale)
+        start = udk.State(q, v)
+        if assembled:
+            start = udk.assemble(scene, 0.0, start, throw=False, analysis=analysis)
+        run = udk.simulate(scene, ts, start, rtol=1e-9, atol=1e-9, throw=False, analysis=analysis)
+        return jnp.sum(w * run.q[-1]) + jnp.sum(w * run.v[1])
+
+    at, along = (0.0, guess.q, guess.v), (1.0, jnp.asarray(dq), jnp.asarray(dv))
+    found = []
+    for large in (10**6, 0):
+        monkeypatch.setattr(size, "LARGE", large)
+        jax.clear_caches()  # which do not know of it
+        value, slope = jax.jit(lambda *x: jax.jvp(measure, x, along))(*at)
+        gradient = jax.jit(jax.grad(measure, (0, 1, 2)))(*at)
+        assert_allclose(sum(jnp.vdot(g, d) for g, d in zip(gradient, along, strict=True)), slope, rtol=1e-9, atol=1e-9)
+        found.append((value, slope))
+    assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-6)
