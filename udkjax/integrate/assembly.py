@@ -117,7 +117,7 @@ def close(
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
         q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
         with np.errstate(all="ignore"):  # what is not finite does not close
-            q, v, psi, psi_dot, rank = _rows(mechanism, scales).assembled(np.asarray(t).item(), q, v)
+            q, v, psi, psi_dot, rank = _assembled_at_once(mechanism, scales, np.asarray(t).item(), q, v)
         state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
         found = Closure(state_found, number(psi), number(psi_dot), jax.device_put(np.asarray(rank)), scales)
     if state is None:
@@ -126,12 +126,15 @@ def close(
     return found
 
 
-def _rows(mechanism: Mechanism, scales: Scales) -> Any:
-    if not is_large(mechanism):
-        return DenseRows(mechanism, scales)
+def _assembled_at_once(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> Any:
+    """q and v closed, what is left of Psi and Psi_dot, and the rank of D, of known numbers."""
+    if not is_large(mechanism):  # for which it takes longer to compile anything
+        return DenseRows(mechanism, scales).assembled(t, q, v)
+    if by_native.closes(mechanism):
+        return by_native.closed_at_once(mechanism, scales, rank_tolerance(mechanism), t, q, v)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 
-    return SparseRows(mechanism)
+    return SparseRows(mechanism).assembled(t, q, v)
 
 
 # How each mechanism that still exists was last assembled: who simulates it again need not close it again.

@@ -40,9 +40,18 @@ def closes(mechanism: Mechanism) -> bool:
 
 def closed(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
     """q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D, from a guess at time t."""
-    inputs = _guess(mechanism, scales, tol, t, q, v)
-    state, residuals, rank = (x[0] for x in native_p.bind(*inputs, kind=_closing(mechanism), times=2))
-    n, m = len(q), len(residuals) // 2
+    return _parts(native_p.bind(*_guess(mechanism, scales, tol, t, q, v), kind=_closing(mechanism), times=2), len(q))
+
+
+def closed_at_once(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """As `closed`, of known numbers, without tracing anything."""
+    kind, inputs = _closing(mechanism), _guess(mechanism, scales, tol, t, q, v, np)
+    return _parts(compiled(kind, 1)(inputs, shapes_of(inputs, kind, 2)), len(q))
+
+
+def _parts(found: Sequence[Any], n: int) -> tuple[Any, Any, Any, Any, Any]:
+    state, residuals, rank = (x[0] for x in found)
+    m = len(residuals) // 2
     return state[:n], state[n:], residuals[:m], residuals[m:], rank[0].astype(int)
 
 
@@ -89,18 +98,19 @@ def _numbers_moving(mechanism: Mechanism, moving: Any) -> tuple[bool, ...]:
     return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
 
 
-def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> list[Any]:
+def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any, xp: Any = jnp) -> list[Any]:
     settings = {"length": scales.length, "care": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
     given = {
-        "numbers": _vector([*jax.tree.leaves(mechanism), tol**2 if is_large(mechanism) else 0.0, 0.0], jnp),
-        "ts": _vector([t, t], jnp),
+        "numbers": _vector([*jax.tree.leaves(mechanism), tol**2 if is_large(mechanism) else 0.0, 0.0], xp),
+        "ts": _vector([t, t], xp),
         "q": q,
         "v": v,
-        "settings": _vector([settings.get(name, 0.0) for name in SETTINGS], jnp),
+        "settings": _vector([settings.get(name, 0.0) for name in SETTINGS], xp),
         "rows": scales.rows,
-        "breaks": jnp.zeros(0),
+        "breaks": xp.zeros(0),
     }
-    return undifferentiated([jnp.asarray(given[name], float)[None] for name in INPUTS])
+    arrays = [xp.asarray(given[name], float)[None] for name in INPUTS]
+    return arrays if xp is np else undifferentiated(arrays)
 
 
 def _closing(mechanism: Mechanism, moving: tuple[bool, ...] | None = None, mode: str = "closing") -> Kind:
