@@ -196,6 +196,13 @@ def structure(mechanism: Mechanism) -> tuple[Any, tuple]:
     return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
 
 
+def as_vector(leaves: Sequence[Any]) -> Any:
+    """All numbers of some arrays, in order: by NumPy where they are known."""
+    known = not any(isinstance(x, Tracer) for x in leaves)
+    parts = [np.ravel(np.asarray(x, float)) if known else jax.numpy.ravel(jax.numpy.asarray(x, float)) for x in leaves]
+    return np.concatenate(parts) if known else jax.numpy.concatenate(parts)
+
+
 def scalars(leaves: Sequence[Any]) -> list[Any]:
     """All numbers of some arrays, in the order in which the graph counts them."""
     return [x for leaf in leaves for x in _numbers(leaf)]

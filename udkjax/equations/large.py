@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.equations import large_fast
 from udkjax.equations.alike import Fields
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.code import structure
+from udkjax.equations.code import as_vector, structure
 from udkjax.equations.large_code import LargeCode, large_code
 from udkjax.equations.large_plain import by_method, plain_accelerations
 from udkjax.equations.layout import Layout, Selection, fields_of, layout
@@ -283,13 +283,6 @@ def prepare_closing(mechanism: Mechanism, analysis: Analysis) -> LargeEquations:
 
 def _elimination(method: Pseudoinverse) -> str:
     return "watch" if isinstance(method, Auto) else "drop"
-
-
-def as_vector(leaves: Sequence[Any]) -> Any:
-    """All numbers of some arrays, in order: by NumPy where they are known."""
-    known = not any(isinstance(x, Tracer) for x in leaves)
-    parts = [np.ravel(np.asarray(x, float)) if known else jnp.ravel(jnp.asarray(x, float)) for x in leaves]
-    return np.concatenate(parts) if known else jnp.concatenate(parts)
 
 
 def _violation(equations: LargeEquations, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:

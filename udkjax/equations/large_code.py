@@ -21,7 +21,7 @@ from udkjax.pinv.sparse import absolute, greater, where
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Graph, Program, Scalar, trace
 from udkjax.straightline.loop_derivative import LoopDerivative
-from udkjax.straightline.loops import ADD, LEAST, SET, Clear, Kernel, Loop, LoopProgram, Slot, in_jax
+from udkjax.straightline.loops import ADD, LEAST, SET, Clear, Kernel, Loop, LoopProgram, Slot, by_arrays
 
 # Columns of the table of bodies: where its coordinates, its sine and its constants begin.
 COORDINATES, SINE, CONSTANTS = 0, 1, 2
@@ -283,7 +283,46 @@ class LargeCode:
     def constants_of(self, given: Array) -> Array:
         """The constants as a function of the numbers of the scene and the gains."""
         numbers = jnp.concatenate([given, jnp.zeros(2)])
-        return in_jax(self.prologue, {"numbers": numbers, "constants": jnp.zeros(len(self.constants))})["constants"]
+        return self._constants_by(numbers, jnp)
+
+    def _constants_by(self, numbers: Any, xp: Any) -> Any:
+        return by_arrays(self.prologue, {"numbers": numbers, "constants": xp.zeros(len(self.constants))}, xp)["constants"]
+
+    def geometry(self, numbers: Any, xp: Any) -> "Callable[[Any, Any, Any], tuple[Any, Any, Any]]":
+        """A function of t, q and v: Psi, Psi_dot and the entries of D at `entries`, of the numbers of the scene."""
+        constants = self._constants_by(xp.concatenate([numbers, xp.zeros(2)]), xp)
+        _, _, places, signs = self.entries
+
+        def evaluate(t: Any, q: Any, v: Any) -> tuple[Any, Any, Any]:
+            given = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v}
+            sizes = {"sines": self.scratch["sines"], "D": self.scratch["D"], "psi": self.m, "rate": self.m}
+            found = by_arrays(self.program("geometry"), given | {x: xp.zeros(size) for x, size in sizes.items()}, xp)
+            return found["psi"], found["rate"], xp.append(found["D"], 1.0)[places] * signs
+
+        return evaluate
+
+    def _geometry(self) -> Parts:
+        yield self._sincos()
+        yield from self._elements(("D",))
+        yield from self._residuals("psi", "psi")
+        yield from self._residuals("psi_dot", "rate")
+
+    @cached_property
+    def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of the entries of D: row, column, place among those left in `D` (behind them a one), and what that is multiplied by."""
+        found = [np.zeros((4, 0))]
+        for group in self.layout.constraints:
+            table, width = self._tables[id(group)], 3 * len(group.bodies)
+            for place, s in enumerate(group.kind.outputs["D"]):
+                if s.is_zero:
+                    continue
+                row, k = divmod(place, width)
+                own = s.constant is None
+                where = table[:, RECORD] + self._records[id(group)][s.index] if own else np.full(len(table), self.scratch["D"])
+                factor = np.full(len(table), s.sign if own else s.constant)
+                found.append(np.stack([table[:, ROW] + row, table[:, BODIES + 3 * (k // 3)] + k % 3, where, factor]))
+        row, column, place, factor = np.concatenate(found, 1)
+        return row.astype(int), column.astype(int), place.astype(int), factor
 
     def _left(self, solve: int, to: int) -> Parts:
         """What is left of the right-hand side of a solve: right - D pull, to be that of another."""

@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from udkjax.equations.code import code, is_large, scalars, structure
+from udkjax.equations.code import as_vector, code, is_large, scalars, structure
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -91,16 +91,20 @@ def _small(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
 
 def _large(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
     """The same of a large scene by its blocks, without gamma: the drivers' own accelerations do not count."""
-    from udkjax.equations.layout import layout  # and with it SciPy, which small scenes do without
+    from udkjax.equations.large_code import large_code
 
-    found = layout(*structure(mechanism), (), False)
-    numbers = found.numbers(mechanism, ())
-    _, rate, values = found.position(numbers, 0.0, q, 0 * v)
-    row, column, place = found.all.entries
-    root = xp.asarray(numbers["root"]).T.ravel()
-    entries = xp.asarray(values).ravel()[place] / root[column]
+    found = large_code(*structure(mechanism), (), False, "drop")
+    row, column, *_ = found.entries
+    _, rate, values = found.geometry(as_vector(jax.tree.leaves(mechanism)), xp)(0.0, q, 0 * v)
     free = xp.tile(xp.append(xp.asarray(mechanism.gravity), 0.0), len(q) // 3)
-    return (row, column), entries, free, xp.asarray(rate), xp.zeros(found.count)
+    return (row, column), values * xp.sqrt(mass_of(mechanism, xp))[column], free, rate, xp.zeros(found.m)
+
+
+def mass_of(mechanism: Mechanism, xp: Any) -> Any:
+    """The diagonal of the mass matrix, by NumPy or JAX."""
+    bodies = mechanism.bodies.values()
+    mass, inertia = (xp.stack([xp.asarray(getattr(body, name), float) for body in bodies]) for name in ("mass", "inertia"))
+    return xp.ravel(xp.stack([mass, mass, inertia], 1))
 
 
 def _scales(mechanism: Mechanism, guess: tuple[Any, ...], xp: Any) -> Scales:

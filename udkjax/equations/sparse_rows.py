@@ -17,10 +17,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from udkjax.equations.closing import close_position, is_closed
-from udkjax.equations.code import structure
-from udkjax.equations.layout import layout
+from udkjax.equations.code import as_vector, structure
+from udkjax.equations.large_code import large_code
 from udkjax.equations.redundancy import SAMPLES, tick
-from udkjax.equations.scales import RANK_TOL, known_scales
+from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
 from udkjax.pinv.sparse import minimum_degree
 from udkjax.scene.mechanism import Mechanism
 
@@ -100,46 +100,40 @@ class SparseRows:
     """
 
     def __init__(self, mechanism: Mechanism, kinematic: bool = False):
-        self._layout = layout(*structure(mechanism), (), False)
-        numbers = self._layout.numbers(mechanism, ())
-        self.count, self.size = self._layout.count, 3 * self._layout.bodies
-        self.names = self._layout.row_names
+        self._code = code = large_code(*structure(mechanism), (), False, "drop")
+        self.count, self.size = code.m, code.n
+        self.names = code.layout.row_names
         self.samples = SAMPLES if self.count <= MANY else SAMPLES // 3
         self.scales = jax.tree.map(np.asarray, known_scales(mechanism))
-        root = np.asarray(numbers["root"]).T.ravel()
+        root = 1 / np.sqrt(mass_of(mechanism, np))
         arm = float(self.scales.arm)
         self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
         self._stretch = self.metric / root
         self.tick = tick(self.scales)
-        self._evaluate = lambda t, q, v: self._layout.position(numbers, t, q, v)
-
-    @cached_property
-    def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Row, column and place in `columns` of every entry of D."""
-        return self._layout.all.entries
+        self._evaluate = code.geometry(as_vector(jax.tree.leaves(mechanism)), np)
 
     @cached_property
     def _order(self) -> list[int]:
         rows: list[set[int]] = [set() for _ in range(self.count)]
-        for i, k in zip(*self._places[:2], strict=True):
+        for i, k in zip(*self._code.entries[:2], strict=True):
             rows[i].add(k // 3)
         return minimum_degree(rows)
 
     def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
         """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
-        psi, _, values = (np.asarray(x) for x in self._evaluate(t, q, q))
+        psi, _, values = self._evaluate(t, q, q)
         D, length = self._scaled(values)
         return psi, length, D
 
     def _scaled(self, values: np.ndarray) -> tuple[Any, np.ndarray]:
-        row, column, place = self._places
-        D = csr_array((values.ravel()[place] * self._stretch[column], (row, column)), shape=(self.count, self.size))
+        row, column, *_ = self._code.entries
+        D = csr_array((values * self._stretch[column], (row, column)), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
         length[length == 0.0] = 1.0
         return csr_array(D.multiply(1 / length[:, None])), length
 
     def residual(self, t: float, q: np.ndarray) -> np.ndarray:
-        return np.asarray(self._evaluate(t, q, q)[0]) / self.scales.rows
+        return self._evaluate(t, q, q)[0] / self.scales.rows
 
     def correction(self, t: float, q: np.ndarray) -> np.ndarray:
         psi, length, D = self.at(t, q)
@@ -170,8 +164,8 @@ class SparseRows:
             return q, v, psi, psi, 0
         rank = self._position(t, q, D).rank
         for _ in range(3):  # what the first leaves because of its damping, and of rounding
-            v = v + self._solve(D, np.asarray(self._evaluate(t, q, v)[1]) / length)
-        return q, v, psi, np.asarray(self._evaluate(t, q, v)[1]), rank
+            v = v + self._solve(D, self._evaluate(t, q, v)[1] / length)
+        return q, v, psi, self._evaluate(t, q, v)[1], rank
 
     def parts_of(self, positions: list[SparsePosition]) -> list[tuple[np.ndarray, list["Part"]]]:
         """Sets of rows that depend on each other, and how each stands in the positions."""

@@ -67,6 +67,15 @@ class Program:
                     return self._run([np.float64(v) for v in values])
         return self._traced(self._typed(values))
 
+    def by_numpy(self, values: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """The same of arrays (rows,), element by element, without compiling anything."""
+        rows = len(values[0]) if values else 1
+        with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
+            if any(self.graph.nodes[i].kind == "call" for i in self.order):  # of an array primitive: one row after the other
+                found = [self([float(v[k]) for v in values]) for k in range(rows)]
+                return [np.array(x, float) for x in zip(*found, strict=True)]
+            return [np.broadcast_to(np.asarray(x), (rows,)) for x in self._run(values)]
+
     def within(self, loop: Loop, arrays: Sequence[Any]) -> list[Any]:
         """The same of all numbers of some arrays, as one fusion of a loop that XLA compiles into one function."""
         arrays = [jnp.asarray(x) for x in arrays]
@@ -219,7 +228,8 @@ def _evaluate(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, Any
                 return on_floats(*values)
             return traced(*(v if isinstance(v, jax.Array) else node.dtype.type(v) for v in values))
         case "sqrt":
-            return _library(values[0]).sqrt(values[0]) if isinstance(values[0], float) else jax.lax.sqrt(values[0])
+            x = values[0]
+            return jax.lax.sqrt(x) if isinstance(x, jax.Array) else _library(x).sqrt(x)
         case "apply":
             return _apply(node, values)
         case "call":
@@ -238,13 +248,13 @@ def _one_of_pair(node: Node, known: dict[int, Any], pairs: dict[int, tuple[Any, 
     return _negative(value) if name == "sin" and angle.sign < 0 else value
 
 
-def _library(x: float) -> Any:
-    return np if isinstance(x, np.floating) else math
+def _library(x: Any) -> Any:
+    return np if isinstance(x, np.floating | np.ndarray) else math
 
 
 def _apply(node: Node, values: list[Any]) -> Any:
     name = node.detail.primitive.name
-    if name in _FLOATS and isinstance(values[0], float):
+    if name in _FLOATS and isinstance(values[0], float | np.ndarray):
         return getattr(_library(values[0]), name)(values[0])
     floats = all(isinstance(v, float | int | bool | np.generic) for v in values)
     primitive, parameters = node.detail.primitive, node.detail.parameters

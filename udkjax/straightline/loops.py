@@ -5,11 +5,10 @@ of bases, in order. The code grows with the kinds of things that there are, the 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array
 
 from udkjax.straightline.emit import Program
 
@@ -67,11 +66,14 @@ class LoopProgram(NamedTuple):
         return found.union(*({part.array(x) for x in part.kernel.arrays} for part in self.parts if isinstance(part, Loop)))
 
 
-def in_jax(program: LoopProgram, arrays: dict[str, Array]) -> dict[str, Array]:
-    """The arrays as a program leaves them, by JAX: of one in whose loops no row takes anything from another."""
+def by_arrays(program: LoopProgram, arrays: dict[str, Any], xp: Any) -> dict[str, Any]:
+    """The arrays as a program leaves them, all rows of a loop at once, by NumPy or JAX: none may take anything from another."""
     found = dict(arrays)
     for part in program.parts:
-        assert isinstance(part, Loop)
+        if isinstance(part, Clear):
+            inside = np.arange(part.start, part.start + part.count)
+            found[part.array] = _placed(found[part.array], inside, xp.full(part.count, part.value), SET, xp)
+            continue
         kernel, table = part.kernel, part.table
         if not kernel.outputs or not len(table):
             continue
@@ -80,9 +82,17 @@ def in_jax(program: LoopProgram, arrays: dict[str, Array]) -> dict[str, Array]:
             return slot.offset + (np.zeros(len(table), int) if slot.base is None else table[:, slot.base])
 
         pairs = list(zip(kernel.program.inputs, kernel.inputs, strict=True))
-        values = [found[slot.array][places(slot)] if kernel.program.uses(s) else np.zeros(len(table)) for s, slot in pairs]
-        results = jax.vmap(kernel.program)(values) if values else kernel.program([])
-        for x, slot in zip(results, kernel.outputs, strict=True):
-            assert slot.how == SET
-            found[slot.array] = found[slot.array].at[places(slot)].set(x)
+        values = [found[part.array(x.array)][places(x)] if kernel.program.uses(s) else np.zeros(len(table)) for s, x in pairs]
+        run = kernel.program.by_numpy if xp is np or not values else jax.vmap(kernel.program)
+        for x, slot in zip(run(values), kernel.outputs, strict=True):
+            name = part.array(slot.array)
+            found[name] = _placed(found[name], places(slot), x, slot.how, xp)
     return found
+
+
+def _placed(array: Any, places: np.ndarray, x: Any, how: str, xp: Any) -> Any:
+    if xp is not np:
+        return array.at[places].add(x) if how == ADD else array.at[places].set(x)
+    array = array.copy()
+    (np.add.at if how == ADD else np.ndarray.__setitem__)(array, places, x)
+    return array
