@@ -287,9 +287,10 @@ def test_derivatives_of_runs_are_those_of_code_that_is_written_out(name, assembl
     found = []
     for large in (10**6, 0):
         monkeypatch.setattr(size, "LARGE", large)
-        jax.clear_caches()  # which do not know of it
+        jax.clear_caches()  # which do not know of it, nor shall others
         value, slope = jax.jit(lambda *x: jax.jvp(measure, x, along))(*at)
         gradient = jax.jit(jax.grad(measure, (0, 1, 2)))(*at)
         assert_allclose(sum(jnp.vdot(g, d) for g, d in zip(gradient, along, strict=True)), slope, rtol=1e-9, atol=1e-9)
         found.append((value, slope))
     assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-6)
+    jax.clear_caches()

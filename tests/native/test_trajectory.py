@@ -65,6 +65,13 @@ def agrees(mechanism, ts, atol=1e-6, **choices):
     return solution
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forgotten():
+    """What was traced with another limit of size is not left to other tests."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(autouse=True, params=["written out", "loops"])
 def served(monkeypatch, request):
     """All of these runs are by machine code, but for those of tests that look themselves."""

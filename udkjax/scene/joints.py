@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import BODY, POSITIVE, RADII, TURN, names, number, optional
-from udkjax.scene.splines import periodic
+from udkjax.scene.splines import interval, periodic, wrapped
 
 
 class Constraint(eqx.Module):
@@ -202,7 +202,7 @@ class Profile(eqx.Module):
 
     def piece(self, angle: Any) -> Any:
         """Return the number of the cubic at a polar angle (rad)."""
-        return jnp.sum(self.angle[0] + jnp.mod(angle - self.angle[0], 2 * jnp.pi) >= self.angle)
+        return interval(wrapped(angle, self.angle[0], 2 * jnp.pi), self.angle)
 
 
 def _profile(value) -> Profile:

@@ -7,10 +7,13 @@ A = (x_i+1 - x) / h and B = (x - x_i) / h,
 
 and S' is continuous where h_i-1 m_i-1 + 2 (h_i-1 + h_i) m_i + h_i m_i+1 = 6 (y_i+1 - y_i) / h_i - 6 (y_i - y_i-1) / h_i-1.
 Source: de Boor, A Practical Guide to Splines, chapter 4.
+
+All of it is arithmetic on numbers, choices between them, and loops of known length, so that it can be part of machine code.
 """
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -18,13 +21,10 @@ from jaxtyping import Array, Float
 def natural(x: Any, knots: Float[Array, " n"], values: Float[Array, " n"]) -> Any:
     """Evaluate the natural cubic spline (no curvature at the ends) at a scalar x; beyond the ends it is a straight line."""
     steps, slopes = jnp.diff(knots), jnp.diff(values) / jnp.diff(knots)
-    inner = jnp.zeros(knots.size - 2, knots.dtype)
-    if inner.size:
-        system = jnp.diag(2 * (steps[:-1] + steps[1:])) + jnp.diag(steps[1:-1], 1) + jnp.diag(steps[1:-1], -1)
-        inner = jnp.linalg.solve(system, 6 * jnp.diff(slopes))
-    curvatures = jnp.pad(inner, 1)
+    inner = _tridiagonal(2 * (steps[:-1] + steps[1:]), steps[1:-1], 6 * jnp.diff(slopes)[:, None])[:, 0]
     within = jnp.clip(x, knots[0], knots[-1])
-    value, slope = _cubic(within, knots, values, curvatures)
+    none = jnp.zeros(1, knots.dtype)
+    value, slope = _cubic(within, knots, values, jnp.concatenate([none, inner, none]))
     return value + slope * (x - within)
 
 
@@ -33,19 +33,62 @@ def periodic(x: Any, knots: Float[Array, " n"], values: Float[Array, " n"], peri
     n = knots.size
     closed, around = jnp.append(knots, knots[0] + period), jnp.append(values, values[0])
     steps, slopes = jnp.diff(closed), jnp.diff(around) / jnp.diff(closed)
-    before, k = jnp.roll(steps, 1), jnp.arange(n)  # row k: steps before and after knot k
-    system = jnp.zeros((n, n), knots.dtype).at[k, k].add(2 * (before + steps))
-    system = system.at[k, (k + 1) % n].add(steps).at[k, (k - 1) % n].add(before)
-    curvatures = jnp.linalg.solve(system, 6 * (slopes - jnp.roll(slopes, 1)))
-    within = knots[0] + jnp.mod(x - knots[0], period)
+    right = 6 * (slopes - jnp.roll(slopes, 1))
+    if n < 3:
+        curvatures = (2 * right - jnp.roll(right, 1)) / (3 * (steps + jnp.roll(steps, 1)))
+    else:
+        # The last row and column apart: what is left is tridiagonal (Schur complement).
+        diagonal = 2 * (jnp.roll(steps, 1) + steps)
+        corner = jnp.concatenate([steps[-1:], jnp.zeros(n - 3, knots.dtype), steps[-2:-1]])
+        one, other = _tridiagonal(diagonal[:-1], steps[: n - 2], jnp.stack([right[:-1], corner], 1)).T
+        last = (right[-1] - jnp.sum(corner * one)) / (diagonal[-1] - jnp.sum(corner * other))
+        curvatures = jnp.append(one - last * other, last)
+    within = wrapped(x, knots[0], period)
     return _cubic(within, closed, around, jnp.append(curvatures, curvatures[0]))[0]
+
+
+def wrapped(x: Any, start: Any, period: Any) -> Any:
+    """X, less as many periods as bring it between start and start + period."""
+    return x - period * jnp.floor((x - start) / period)
+
+
+def interval(x: Any, knots: Float[Array, " n"]) -> Any:
+    """How many of the knots x has reached."""
+    return jnp.sum(jnp.where(x >= knots, 1.0, 0.0))
 
 
 def _cubic(x, knots, values, curvatures):
     """Return the spline's value and slope at x within the knots."""
-    i = jnp.sum(x >= knots[1:-1])  # the interval
-    h, y0, y1, m0, m1 = knots[i + 1] - knots[i], values[i], values[i + 1], curvatures[i], curvatures[i + 1]
-    a, b = (knots[i + 1] - x) / h, (x - knots[i]) / h
+    reached = jnp.append(True, x >= knots[1:-1])
+    inside = reached & jnp.append(x < knots[1:-1], True)
+    ends = [knots[:-1], knots[1:], values[:-1], values[1:], curvatures[:-1], curvatures[1:]]
+    x0, x1, y0, y1, m0, m1 = jnp.sum(jnp.where(inside, jnp.stack(ends), 0.0), 1)
+    h = x1 - x0
+    a, b = (x1 - x) / h, (x - x0) / h
     value = a * y0 + b * y1 + ((a**3 - a) * m0 + (b**3 - b) * m1) * h**2 / 6
     slope = (y1 - y0) / h + ((3 * b**2 - 1) * m1 - (3 * a**2 - 1) * m0) * h / 6
     return value, slope
+
+
+def _tridiagonal(diagonal, beside, right):
+    """Solve a symmetric system that is dominated by its diagonal (n,), with `beside` (n - 1,) next to it, for columns (n, k)."""
+
+    def eliminate(before, row):
+        pivot, found = before
+        d, left, b = row
+        factor = left / pivot
+        below = d - factor * left, b - factor * found
+        return below, below
+
+    def substitute(after, row):
+        pivot, right, beside = row
+        found = (right - beside * after) / pivot
+        return found, found
+
+    if not len(diagonal):
+        return right
+    zero = jnp.zeros(1, diagonal.dtype)
+    start = jnp.ones((), diagonal.dtype), jnp.zeros_like(right[0])
+    _, (pivots, rights) = jax.lax.scan(eliminate, start, (diagonal, jnp.append(zero, beside), right))
+    rows = pivots, rights, jnp.append(beside, zero)
+    return jax.lax.scan(substitute, jnp.zeros_like(right[0]), rows, reverse=True)[1]

@@ -27,6 +27,7 @@ _INLINED = (
     "remat2",
     "checkpoint",
 )
+UNROLLED = 20_000  # operations of a loop of known length, of all rounds together: beyond it takes too long to compile
 _ELEMENTWISE = frozenset(
     """abs acos acosh and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma eq erf erf_inv
     erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p logistic lt max min ne nextafter not one_minus_square or
@@ -72,9 +73,11 @@ def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
     name, parameters = equation.primitive.name, equation.params
     if name in _INLINED:
         inner = next(parameters[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in parameters)
-        return read(graph, inner, inputs) if hasattr(inner, "consts") else _read(graph, inner, [], inputs)
+        return _inner(graph, inner, inputs)
     if name in _SHAPES:
         return [np.asarray(_SHAPES[name](*inputs, **parameters), object)]
+    if name == "scan" and parameters["length"] * len(getattr(parameters["jaxpr"], "jaxpr", parameters["jaxpr"]).eqns) <= UNROLLED:
+        return _unrolled(graph, equation, inputs)
     shape, dtype = equation.outvars[0].aval.shape, np.dtype(equation.outvars[0].aval.dtype)
     if name in _ARITHMETIC and np.issubdtype(dtype, np.floating):
         return [_elementwise(partial(_ARITHMETIC[name], **parameters), shape, inputs)]
@@ -89,6 +92,8 @@ def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
         return [_dot(graph, inputs[0], inputs[1], parameters["dimension_numbers"], shape)]
     if name in ("dynamic_slice", "gather") and all(s.constant is not None for i in inputs[1:] for s in i.flat):
         return [np.asarray(_select(equation, inputs), object)]
+    if name == "unstack":
+        return [np.asarray(x, object) for x in np.moveaxis(inputs[0], parameters["axis"], 0)]
     if name == "split":
         return np.split(inputs[0], np.cumsum(parameters["sizes"])[:-1], parameters["axis"])
     if all(s.constant is not None for i in inputs for s in i.flat) and not equation.effects:
@@ -96,6 +101,27 @@ def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
     details = Details(equation.primitive, parameters, tuple(i.shape for i in inputs))
     scalars = tuple(s for i in inputs for s in i.flat)
     return graph.call(details, scalars, [(v.aval.shape, v.aval.dtype) for v in equation.outvars])
+
+
+def _inner(graph: Graph, jaxpr: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    return read(graph, jaxpr, inputs) if hasattr(jaxpr, "consts") else _read(graph, jaxpr, [], inputs)
+
+
+def _unrolled(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """A loop of known length, round by round."""
+    body, order = equation.params["jaxpr"], range(equation.params["length"])
+    inner = getattr(body, "jaxpr", body)
+    # What is given round by round has one dimension more outside; before it come what is fixed, and what is handed on.
+    rows = sum(a.aval.shape != b.aval.shape for a, b in zip(equation.invars, inner.invars, strict=True))
+    carries = sum(a.aval.shape == b.aval.shape for a, b in zip(equation.outvars, inner.outvars, strict=True))
+    ends = np.cumsum([len(inputs) - carries - rows, carries])
+    fixed, state, each = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
+    found: dict[int, list[np.ndarray]] = {}
+    for k in reversed(order) if equation.params["reverse"] else order:
+        outputs = _inner(graph, body, [*fixed, *state, *(np.asarray(x[k], object) for x in each)])
+        state, found[k] = outputs[:carries], outputs[carries:]
+    columns = zip(*(found[k] for k in order), strict=True)
+    return [*state, *(np.stack([np.asarray(x, object) for x in column]) for column in columns)]
 
 
 def _elementwise(operation: Callable[..., Scalar], shape: tuple[int, ...], inputs: list[np.ndarray]) -> np.ndarray:
