@@ -245,14 +245,55 @@ def test_breakpoints_may_lie_close_together_and_out_of_order():
     agrees(pushed((0.5, 0.499999)), np.linspace(0.0, 1.0, 5), atol=1e-6)
 
 
-def test_splines_go_by_whatever_engine_there_is(served):
-    del served
+def test_splines():
     motion = udk.Spline([0.0, 0.2, 0.5], [0.0, 0.3, 0.2])
     mechanism = udk.Mechanism(
         {"a": body()}, {"pin": udk.Revolute(["ground", "a"], O)}, {"turn": udk.Driver(["ground", "a"], "angle", motion)}
     )
     solution = udk.simulate(mechanism, [0.0, 0.1, 0.2, 0.4], rtol=1e-6, atol=1e-6)
     assert_allclose(solution.q[:, 0, 2], [float(motion(t)) for t in solution.ts], atol=1e-9)
+
+
+def turned_by_a_cam(lift=0.2):
+    angles = np.linspace(0.0, 2 * np.pi, 9)[:-1]
+    return udk.Mechanism(
+        {"cam": udk.Body(1.0, 0.1, angular_velocity=3.0), "follower": udk.Body(0.5, 0.1, [0.0, 1.2])},
+        {
+            "pin": udk.Revolute(["ground", "cam"], O),
+            "guide": udk.Prismatic(["ground", "follower"], O, axis=np.pi / 2),
+            "contact": udk.Cam(["cam", "follower"], O, udk.Profile(angles, 1.0 + lift * np.cos(angles))),
+        },
+    )
+
+
+WRITTEN_OUT = pytest.mark.parametrize("served", ["written out"], indirect=True)  # loops know no pieces of the state
+
+
+@WRITTEN_OUT
+def test_cams():
+    """Also between steps, close to where one cubic of the profile meets the next."""
+    mechanism, ts = turned_by_a_cam(), np.linspace(0.0, 1.5, 61)
+    solution = agrees(mechanism, ts, atol=1e-7)
+    batch = jax.vmap(lambda tol: udk.simulate(mechanism, ts, rtol=tol, atol=tol, throw=False))(jnp.full(8, TOL))
+    assert_allclose(batch.q, np.broadcast_to(solution.q, batch.q.shape), atol=1e-9)
+
+
+@WRITTEN_OUT
+def test_derivatives_along_cams():
+    def lifted(lift):
+        return udk.simulate(turned_by_a_cam(lift), np.linspace(0.0, 1.5, 4), rtol=1e-11, atol=1e-11).q[-1, 0, 2]
+
+    analysis = udk.analyse(turned_by_a_cam())
+
+    def traced(radius):
+        scene = turned_by_a_cam().with_parameters({"joint.contact.profile.radius": radius})
+        return udk.simulate(scene, np.linspace(0.0, 1.5, 4), rtol=1e-9, atol=1e-9, analysis=analysis, throw=False).q[-1, 0, 2]
+
+    radius = turned_by_a_cam().joints["contact"].profile.radius
+    along = jnp.cos(jnp.arange(8) * jnp.pi / 4)
+    slope = (lifted(0.2 + 1e-4) - lifted(0.2 - 1e-4)) / 2e-4
+    assert_allclose(jax.jvp(traced, (radius,), (along,))[1], slope, rtol=2e-6)
+    assert_allclose(jnp.vdot(jax.grad(traced)(radius), along), slope, rtol=2e-6)
 
 
 def test_a_first_step_is_taken_as_given():

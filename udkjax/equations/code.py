@@ -27,10 +27,11 @@ class Code:
     """Named programs over one graph. Each takes the constants, t, q and, where it needs them, v.
 
     On all rows of Psi (D as the values of `pattern`): `rows` (D, b, a_F, M^(-1/2)), `closure` (D, Psi, M^(-1/2)), `psi`,
-    `psi_dot`; `energy`; and for elimination, on those not left out: `accelerations` (a, whether all pivots are safe), `nearer` (q
-    and v after a Newton step to Psi = 0 and to Psi_dot = 0, whether safe), `closer` (the same of q alone), `output` (the same of
-    v alone, and Psi of all rows), `arrival` (the same of v alone, and the accelerations with it), `tangential` (of changes of q
-    and v what projection leaves; their `Factors.distance`), `finish` (`arrival` and `tangential`, with its pivots; whether safe).
+    `psi_dot`; `pieces`; `energy`; and for elimination, on those not left out: `accelerations` (a, whether all pivots are
+    safe), `nearer` (q and v after a Newton step to Psi = 0 and to Psi_dot = 0, whether safe), `closer` (the same of q alone),
+    `output` (the same of v alone, and Psi of all rows), `arrival` (the same of v alone, and the accelerations with it),
+    `tangential` (of changes of q and v what projection leaves; their `Factors.distance`), `finish` (`arrival` and
+    `tangential`, with its pivots; whether safe).
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
 
@@ -52,6 +53,7 @@ class Code:
             "closure": [*values, *equations.psi, *self.root],
             "psi": equations.psi,
             "psi_dot": equations.psi_dot,
+            "pieces": equations.pieces,
             "energy": [equations.kinetic_energy, equations.potential_energy],
         }
         if elimination:

@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.scene.bodies import GROUND, Frame
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.joints import Constraint
 from udkjax.straightline import Differential, Graph, Scalar, operations, trace
 
 Row = dict[int, Scalar]
@@ -126,6 +128,31 @@ def applied(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: l
     numbers = [np.asarray(s, object) for s in (t, *q, *v)]
     (stored,) = energy(graph, leaves, numbers)
     return [scalar(s) for s in loads(graph, leaves, numbers)], scalar(stored)
+
+
+def has_pieces(element: Any) -> bool:
+    """Whether an element is smooth in pieces of the state, and says which it is in."""
+    return type(element).piece not in (Constraint.piece, ForceElement.piece)
+
+
+def piece(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]) -> Scalar:
+    """Which of its smooth pieces an element is in, on scalars."""
+    (found,) = _traced_piece(*kind)(graph, leaves, [np.asarray(s, object) for s in (t, *q, *v)])
+    return scalar(found)
+
+
+@lru_cache(maxsize=256)
+def _traced_piece(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> Any:
+    n = 3 * (len(ground) - sum(ground))
+    leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
+    number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+
+    def found(leaves, numbers):
+        element = jax.tree.unflatten(tree, leaves)
+        v = numbers[1 + n :] if isinstance(element, ForceElement) else None
+        return jnp.asarray(element.piece(numbers[0], *_frames(ground, numbers[1 : 1 + n], v)), number.dtype)
+
+    return trace(found, leaves, [number] * (1 + 2 * n))
 
 
 def _residual(element: Any, ground: tuple[bool, ...], t: Any, q: Any) -> jax.Array:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.elements import Alike, Row, alike, applied, differentiated, scalar
+from udkjax.equations.elements import Alike, Row, alike, applied, differentiated, has_pieces, piece, scalar
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Graph, Scalar
@@ -130,6 +130,20 @@ class Expressions:
         moving = self._moving(element)
         state = [self.t, [self.q[k] for k in moving], [self.v[k] for k in moving]]
         return applied(self.graph, self._alike(element), jax.tree.leaves(scalars), *state)
+
+    @cached_property
+    def pieces(self) -> list[Scalar]:
+        """In which of its pieces each element is that is smooth in pieces of the state."""
+        m, scene = self.mechanism, self.scene
+        pairs = [(e, scene.constraints[name]) for name, e in m.constraints.items()]
+        pairs += [(e, scene.forces[name]) for name, e in m.forces.items()]
+        found = []
+        for element, scalars in pairs:
+            if has_pieces(element):
+                moving = self._moving(element)
+                state = self.t, [self.q[k] for k in moving], [self.v[k] for k in moving]
+                found.append(piece(self.graph, self._alike(element), jax.tree.leaves(scalars), *state))
+        return found
 
 
 def _inputs(graph: Graph, name: str, group: str, leaf: Any) -> np.ndarray:

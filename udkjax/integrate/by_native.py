@@ -133,8 +133,8 @@ def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
         return f"it knows the Udwadia-Kalaba equation of a mechanism by elimination, not {type(equations).__name__}"
     if not is_explicit(problem.solver):
         return f"{type(problem.solver).__name__} is no explicit Runge-Kutta method"
-    if problem.pieces is not None:
-        return "an element is smooth in pieces of the state"
+    if problem.pieces is not None and isinstance(getattr(equations, "code", None), LargeCode):
+        return "an element of a large scene is smooth in pieces of the state"
     if jax.default_backend() != "cpu":
         return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
     if not jax.config.jax_enable_x64:
@@ -173,7 +173,7 @@ def serves_derivatives(problem: Problem, moving: Any) -> bool:
     """Whether there is machine code for the derivatives along what is `moving`: numbers of the scene, and initial states."""
     if not serves(problem):
         return False
-    given = eqx.tree_at(lambda p: p.equations, moving, None, is_leaf=lambda x: x is None)
+    given = eqx.tree_at(lambda p: (p.equations, p.pieces), moving, (None, None), is_leaf=lambda x: x is None)
     others = eqx.tree_at(lambda p: (p.q, p.v), given, (False, False), is_leaf=lambda x: x is None)
     return not any(x is True for x in jax.tree.leaves((others, _fixed(moving.equations))))
 
@@ -222,14 +222,17 @@ def pulled(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
         pairs = zip(problem.equations.code.constants, moving.equations.constants, strict=True)
         constants = [by_node[s.index] if m is True else None for s, m in pairs]
     none = jax.tree.map(lambda m: None, moving, is_leaf=lambda x: x is None)
-    zeros = jax.tree.map(
-        lambda m, x: jnp.zeros_like(x) if m is True else None, moving.equations, problem.equations, is_leaf=lambda x: x is None
-    )
-    equations = eqx.tree_at(lambda e: e.constants, zeros, constants, is_leaf=lambda x: x is None)
+
+    def zeros(moving: Any, values: Any) -> Any:
+        return jax.tree.map(lambda m, x: jnp.zeros_like(x) if m is True else None, moving, values, is_leaf=lambda x: x is None)
+
+    equations = zeros(moving.equations, problem.equations)
+    equations = eqx.tree_at(lambda e: e.constants, equations, constants, is_leaf=lambda x: x is None)
+    pieces = zeros(moving.pieces, problem.pieces)  # where they meet, motions are smooth enough not to depend on when that is
     return eqx.tree_at(
-        lambda p: (p.equations, p.q, p.v),
+        lambda p: (p.equations, p.pieces, p.q, p.v),
         none,
-        (equations, qbar[0] if moving.q is True else None, vbar[0] if moving.v is True else None),
+        (equations, pieces, qbar[0] if moving.q is True else None, vbar[0] if moving.v is True else None),
         is_leaf=lambda x: x is None,
     )
 
@@ -250,10 +253,8 @@ def _watching(code: Code) -> Code:
 
 def _kind(problem: Any, moving: tuple[bool, ...] | None = None, mode: str = "run") -> Kind:
     code = problem.equations.code
-    method = Tableau(method_of(problem.solver))
-    return Kind(
-        code if moving is None else _watching(code), method, problem.projected, problem.breakpoints is not None, moving, mode
-    )
+    method, breaks = Tableau(method_of(problem.solver)), problem.breakpoints is not None or problem.pieces is not None
+    return Kind(code if moving is None else _watching(code), method, problem.projected, breaks, moving, mode)
 
 
 def _inputs(problem: Any, code: Code | None = None, xp: Any = jnp) -> list[Any]:

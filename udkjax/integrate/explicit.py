@@ -27,11 +27,14 @@ from udkjax.integrate.crossing import ahead, around, far, passed
 from udkjax.integrate.first_step import first_step
 from udkjax.integrate.interpolation import Point, interpolated
 from udkjax.integrate.packing import Packing
-from udkjax.integrate.pieces import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, EXACT, TRIES, share_before
+from udkjax.integrate.pieces import share_before
 from udkjax.integrate.record import Record, blank, noted
 from udkjax.integrate.step import Task, Trial, attempt, tolerance
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.native.steps import (
+    AIM_ACROSS,
+    AIM_BEFORE,
+    AIM_BEYOND,
     BEFORE,
     CAUTIOUS,
     CUT,
@@ -39,6 +42,8 @@ from udkjax.native.steps import (
     DODGES,
     DONE,
     DOUBTED,
+    EDGE,
+    EXACT,
     FORESEEN,
     GAP,
     GROW,
@@ -50,6 +55,7 @@ from udkjax.native.steps import (
     STEEPEST,
     STEP_LIMIT,
     STEP_TOO_SMALL,
+    TRIES,
 )
 from udkjax.straightline import after, apart, when
 

@@ -14,18 +14,11 @@ from jaxtyping import Array, Int
 
 from udkjax.integrate.interpolation import Point, interpolated
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.native.steps import HALVINGS
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
-
-EDGE = 1e-7  # of a step: how long the one across is. What another piece does to a step is the square of the part that is there
-# Of a step: where a piece ends so close to either of its ends, these tell when to rounding.
-EXACT = 0.01
-# A step that is taken again ends a little beyond the piece; or, once it is known when that ends, just before; or it leads across.
-AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
-HALVINGS = 40
-TRIES = 8  # in a row to end a step where a piece does: a mechanism at rest there may be in either, by rounding
 
 
 class Pieces(eqx.Module):

@@ -35,6 +35,15 @@ ENDS_BEFORE, BEGINS_BEHIND = (
 GAP = ENDS_BEFORE + BEGINS_BEHIND
 SAME = 0.5  # of the smallest step: breakpoints that are so close count as one
 
+# Pieces of the state.
+EDGE = 1e-7  # of a step: how long the one across is. What another piece does to a step is the square of the part that is there
+# Of a step: where a piece ends so close to either of its ends, these tell when to rounding.
+EXACT = 0.01
+# A step that is taken again ends a little beyond the piece; or, once it is known when that ends, just before; or it leads across.
+AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
+HALVINGS = 40
+TRIES = 8  # in a row to end a step where a piece does: a mechanism at rest there may be in either, by rounding
+
 POINTS = 4  # states that an interpolating polynomial goes through: with three, velocities between steps are worse than at steps
 STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 

@@ -33,6 +33,9 @@ from udkjax.native.power import power
 from udkjax.native.program import Place, numbered, write
 from udkjax.native.steps import (
     AHEAD,
+    AIM_ACROSS,
+    AIM_BEFORE,
+    AIM_BEYOND,
     BEFORE,
     BEGINS_BEHIND,
     CAUTIOUS,
@@ -41,11 +44,14 @@ from udkjax.native.steps import (
     DODGES,
     DONE,
     DOUBTED,
+    EDGE,
     ENDS_BEFORE,
+    EXACT,
     EXPECTED,
     FORESEEN,
     GAP,
     GROW,
+    HALVINGS,
     LONGEST,
     NEAREST,
     NOT_FINITE,
@@ -62,6 +68,7 @@ from udkjax.native.steps import (
     STRETCH,
     SURE,
     TAKEN_BACK,
+    TRIES,
 )
 from udkjax.native.tableau import Method
 from udkjax.straightline import Program
@@ -106,7 +113,8 @@ class Places:
         return self.places[name]
 
 
-RARE = ("solve", "finish_members", "begin", "arrive_carefully", "accelerate_carefully")  # once a run, or beside singularities
+# Once a run, beside singularities, or where a piece may end.
+RARE = ("leave", "solve", "finish_members", "begin", "arrive_carefully", "accelerate_carefully")
 _LANE = (  # numbers of each lane; `call` and `ways` are addresses
     *("call", "ways"),
     *(
@@ -130,6 +138,7 @@ _LANE = (  # numbers of each lane; `call` and `ways` are addresses
     *(f"distance{k}" for k in range(POINTS - 1)),
     *SETTINGS,
     *("start", "end", "safe", "behind", "violated", "rank"),
+    *("crossing", "aim", "tries", "share", "low", "again"),
 )
 
 
@@ -195,6 +204,9 @@ class Trajectory:
         p.add("rows", m)
         p.add("psi", m)
         p.add("R", code.made_of)
+        self.pieces = len(code.outputs["pieces"]) if isinstance(code, Code) and plan.breaks else 0
+        for name in ("G", "G0"):
+            p.add(name, self.pieces)
         if isinstance(code, LargeCode):
             for name, count in code.scratch.items():
                 p.add(name, count)
@@ -214,6 +226,8 @@ class Trajectory:
         """LLVM's text of the whole module."""
         self._programs()
         self._attempt()
+        if self.pieces:
+            self._leave()
         self._decide()
         self._differences()
         self._between()
@@ -294,6 +308,7 @@ class Trajectory:
             "psi": self._work("psi", self.m),
             "rows": self._work("R", len(code.outputs["rows"])),
             "psi_dot": self._work("psi", self.m),
+            "pieces": self._work("G", self.pieces),
         }
         for name in self._wanted():
             inputs = [*state, *changes] if name in ("tangential", "finish") else state
@@ -323,7 +338,7 @@ class Trajectory:
 
     def _wanted(self) -> list[str]:
         """The programs that it calls."""
-        wanted = ["accelerations", "rows", "psi"]
+        wanted = ["accelerations", "rows", "psi", *(["pieces"] if self.pieces else [])]
         if self.plan.projected:
             wanted += ["closer", "arrival", "tangential"] if self.method.ends else ["closer", "finish"]
             wanted += ["output"]
@@ -574,7 +589,12 @@ class Trajectory:
             s.doubt = f.const(0.0, DOUBLE, f.width)
             dodge = f.const(False, BOOL, f.width)
         tried = where(judged, s.tried + 1.0, s.tried)
-        accept = judged & (error < 1.0) & ~dodge
+        again = f.const(False, BOOL, f.width)
+        if self.pieces:
+            s.again = where(judged, yes, 0.0)
+            f.call("leave", f.given["work"])
+            again = s.again > 0.5
+        accept = judged & (error < 1.0) & ~dodge & ~again
         stepped, begun = ~begin, judged & begin
         # --- the next step
         order, step = self.method.order, s.t1 - s.T3
@@ -587,7 +607,8 @@ class Trajectory:
         factor = f.max(factor, where(accept & ~steep, yes, SHRINK))
         factor = f.min(factor, where(accept, f.const(GROW, DOUBLE, f.width), SAFETY))
         h = where(judged, step * where(dodge, f.const(DODGE, DOUBLE, f.width), factor), s.h)
-        failed = judged & ~accept & stepped
+        h = where(again, s.h, h)
+        failed = judged & ~accept & stepped & ~again
         if self.doubts:
             h = where(failed, self._around(f, s, left, step, h), h)
         s.behind = h
@@ -631,6 +652,97 @@ class Trajectory:
             until = where(enough, until + where(s.lands > 0.5, s.smallest * GAP, 0.0), -np.inf)
         s.until = until
         s.where(accept, accepted=s.accepted + 1.0)
+
+    def _leave(self):
+        """What becomes of a step that ends in another piece of the motion, of lanes in `again`: whether it lands there, or not.
+
+        Else it is taken `again`, to end just before the piece does (integrate/pieces.py). The next step is a tiny one across,
+        behind which the run starts anew: so also what is known of accelerations at the ends of steps belongs to one piece.
+        """
+        f, s = self._function("leave")
+        where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
+
+        def pieces(t: Value, state: Callable[[Value], tuple[Value, Value]]):
+            setattr(s, "X t", t)
+            with f.each(self.rowcount) as r:
+                for x, value in zip("qv", state(r), strict=True):
+                    self._put(f, f"X {x}", r, value)
+            self._call(f, "pieces")
+
+        def moved() -> Value:
+            found = f.variable(f.const(False, BOOL, f.width), BOOL)
+            with f.each(self.pieces) as k:
+                one, other = (f.load(f.given["work"], k * f.width + self._start(x, "work"), f.width) for x in ("G", "G0"))
+                found.value = found.value | one.is_not(other)
+            return found.value
+
+        with f.each(self.rowcount) as r:
+            self._put(f, "C", r, self._vector(f, "X q", r))
+        pieces(s.T3, lambda r: (self._vector(f, "P3 q", r), self._vector(f, "P3 v", r)))
+        with f.each(self.pieces) as k:
+            f.store(
+                f.load(f.given["work"], k * f.width + self._start("G", "work"), f.width),
+                f.given["work"],
+                k * f.width + self._start("G0", "work"),
+                f.width,
+            )
+        pieces(s.t1, lambda r: (self._vector(f, "C", r), self._vector(f, "O v", r)))
+        judged, step = s.again > 0.5, s.t1 - s.T3
+        leaves = judged & (s.begin < 0.5) & moved() & f.is_finite(s.error)
+        s.share, s.low = yes, f.const(0.0, DOUBLE, f.width)
+        with f.if_(f.any_of(leaves)), f.each(HALVINGS):
+            middle = (s.low + s.share) * 0.5
+            s.behind = middle
+            pieces(f.fma(middle, step, s.T3), lambda r: self._on_the_way(f, s.behind, step, r))
+            other = moved()
+            s.where(leaves & other, share=s.behind)
+            s.where(leaves & ~other, low=s.behind)
+        setattr(s, "X t", s.t1)
+        with f.each(self.rowcount) as r:
+            self._put(f, "X q", r, self._vector(f, "C", r))
+            self._put(f, "X v", r, self._vector(f, "O v", r))
+        share, aim, good = s.share, s.aim, s.error < 1.0
+        again = leaves & aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
+        exact = f.min(share, yes - share) <= EXACT
+        s.where(leaves & ~again, lands=1.0)
+        short = (s.t1 < s.crossing - s.smallest) & (s.lands < 0.5)
+        reached = judged & good & ~leaves & ~short & aim.is_(float(AIM_BEFORE))
+        across = reached | (again & (share <= EDGE))
+        before, beyond = (f.const(float(x), DOUBLE, f.width) for x in (AIM_BEFORE, AIM_BEYOND))
+        aim = where(again, where(exact, before, beyond), where(short, aim, beyond))
+        expected = f.fma(where(exact, share - EDGE / 2, share + EXACT / 2), step, s.T3)
+        crossing = where(again, expected, where(short, s.crossing, inf))
+        crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.T3)), crossing)
+        tries = where(again, s.tries + 1.0, where(good, 0.0, s.tries))
+        s.where(judged, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
+        s.again = where(again, yes, 0.0)
+
+    def _on_the_way(self, f: Function, share: Value, step: Value, r: Value) -> tuple[Value, Value]:
+        """q and v a share of the step ahead, on the polynomial through its two ends (one register)."""
+        x, h = self._over(f, share), self._over(f, step)
+
+        def along(*coefficients: float) -> Value:
+            total = f.const(coefficients[-1], DOUBLE, self.plan.vector)
+            for c in reversed(coefficients[:-1]):
+                total = f.fma(total, x, c)
+            return total
+
+        ends = [self._vector(f, name, r) for name in ("P3 q", "C", "P3 v", "O v", "P3 a", "O a")]
+        weights = [
+            (1.0, 0.0, 0.0, -10.0, 15.0, -6.0),
+            (0.0, 0.0, 0.0, 10.0, -15.0, 6.0),
+            (0.0, 1.0, 0.0, -6.0, 8.0, -3.0),
+            (0.0, 0.0, 0.0, -4.0, 7.0, -3.0),
+            (0.0, 0.0, 0.5, -1.5, 1.5, -0.5),
+            (0.0, 0.0, 0.0, 0.5, -1.0, 0.5),
+        ]
+        scales = (None, None, h, h, h * h, h * h)
+        q = v = f.const(0.0, DOUBLE, self.plan.vector)
+        for end, c, scale in zip(ends, weights, scales, strict=True):
+            scaled = end if scale is None else end * scale
+            q = f.fma(along(*c), scaled, q)
+            v = f.fma(along(*(k * c[k] for k in range(1, 6))), scaled, v)
+        return q, v / h
 
     def _moved_point(self, f: Function, mask: Value, source: Any, to: str):
         sources = source if isinstance(source, tuple) else [f"{source} {x}" for x in "qva"]
@@ -700,18 +812,21 @@ class Trajectory:
             s.t1, s.behind = f.const(np.inf, DOUBLE, f.width), here
             self._each_break(f, s, here)
             end = s.t1
-            stop = f.min(end, f.const(np.inf, DOUBLE, f.width))
+            crossing = s.crossing if self.pieces else f.const(np.inf, DOUBLE, f.width)
+            stop = f.min(end, crossing)
             rest = f.min(stop, s.end) - here
             parts = f.max(float(POINTS - 1) - s.steps, 1.0)
             share = here + rest / parts
             several = (s.steps < float(POINTS - 2)) & (t1 > share) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
+            if self.pieces:
+                several = several & s.aim.is_not(float(AIM_ACROSS))
             t1 = where(several, share, t1)
             reaches = (t1 >= stop - s.smallest * 2.0) & (stop < s.end - s.smallest) & ~begin
             last = last & ~reaches & ~several
             final = s.end - f.max(s.end - end, 0.0)
             t1 = where(reaches, stop, where(last, final, t1))
             t1 = where(begin, s.behind, t1)
-            s.lands = where(reaches, yes, 0.0)
+            s.lands = where(reaches & (end <= crossing), yes, 0.0)
         t1 = where(begin, s.behind if self.plan.breaks else s.T3, t1)
         s.t1 = t1
         s.step = where((s.judged > 0.5) & ~begin, t1 - s.T3, 0.0)
@@ -1036,7 +1151,7 @@ class Trajectory:
         ts = self._of_member(f, call, "ts", member)
         times = f.load(call, self.call.index("times"), base=INT)
         start, end = f.load(ts), f.load(ts, times - 1)
-        for name, value in (("start", start), ("end", end), ("next", f.load(ts, 1)), ("rate", np.inf)):
+        for name, value in (("start", start), ("end", end), ("next", f.load(ts, 1)), ("rate", np.inf), ("crossing", np.inf)):
             put(name, value)
         for j in range(POINTS):
             put(f"T{j}", start)

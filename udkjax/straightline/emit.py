@@ -259,7 +259,7 @@ def _apply(node: Node, values: list[Any]) -> Any:
     floats = all(isinstance(v, float | int | bool | np.generic) for v in values)
     primitive, parameters = node.detail.primitive, node.detail.parameters
     if not floats:
-        values = jnp.broadcast_arrays(*values) if len({np.shape(v) for v in values}) > 1 else values
+        values = list(jnp.broadcast_arrays(*values)) if len({np.shape(v) for v in values}) > 1 else values
         return primitive.bind(*(jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)), **parameters)
     with jax.ensure_compile_time_eval():
         known = [jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)]
