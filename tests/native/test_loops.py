@@ -14,6 +14,7 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse
 from udkjax.equations.code import structure
 from udkjax.equations.large_code import large_code
+from udkjax.equations.scales import known_scales
 from udkjax.native.loops import LoopWriter
 from udkjax.pinv.block_order import eliminations
 from udkjax.straightline.loops import Clear, Loop
@@ -294,3 +295,13 @@ def test_derivatives_of_runs_are_those_of_code_that_is_written_out(name, assembl
         found.append((value, slope))
     assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-6)
     jax.clear_caches()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scales_are_those_of_code_that_is_written_out(name, monkeypatch):
+    found = []
+    for large in (10**6, 0):
+        monkeypatch.setattr(size, "LARGE", large)
+        found.append(jax.tree.leaves(known_scales(SCENES[name]())))
+    for one, other in zip(*found, strict=True):
+        assert_allclose(other, one, rtol=1e-12)

@@ -290,16 +290,37 @@ class LargeCode:
 
     def geometry(self, numbers: Any, xp: Any) -> "Callable[[Any, Any, Any], tuple[Any, Any, Any]]":
         """A function of t, q and v: Psi, Psi_dot and the entries of D at `entries`, of the numbers of the scene."""
-        constants = self._constants_by(xp.concatenate([numbers, xp.zeros(2)]), xp)
+        run = self._by_arrays("geometry", numbers, xp)
         _, _, places, signs = self.entries
 
         def evaluate(t: Any, q: Any, v: Any) -> tuple[Any, Any, Any]:
-            given = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v}
-            sizes = {"sines": self.scratch["sines"], "D": self.scratch["D"], "psi": self.m, "rate": self.m}
-            found = by_arrays(self.program("geometry"), given | {x: xp.zeros(size) for x, size in sizes.items()}, xp)
+            found = run(t, q, v)
             return found["psi"], found["rate"], xp.append(found["D"], 1.0)[places] * signs
 
         return evaluate
+
+    def loaded(self, numbers: Any, xp: Any) -> "Callable[[Any, Any, Any], tuple[Any, Any]]":
+        """A function of t, q and v: a_F, and b of all rows."""
+        run = self._by_arrays("rows", numbers, xp)
+        falling = xp.tile(xp.append(numbers[np.ravel(self.scene.gravity)], 0.0), self.bodies)
+
+        def evaluate(t: Any, q: Any, v: Any) -> tuple[Any, Any]:
+            found = run(t, q, v)["made_of"]
+            return found[: self.n] if self.layout.forces else falling, found[self.n :]
+
+        return evaluate
+
+    def _by_arrays(self, name: str, numbers: Any, xp: Any) -> "Callable[[Any, Any, Any], dict[str, Any]]":
+        """One of the programs in which no row of a loop takes anything from another, by NumPy or JAX."""
+        constants = self._constants_by(xp.concatenate([numbers, xp.zeros(2)]), xp)
+        program, sizes = self.program(name), self.scratch | {"psi": self.m, "rate": self.m, "made_of": self.made_of}
+        blank = {x: xp.zeros(size) for x, size in sizes.items() if x in program.arrays}
+
+        def run(t: Any, q: Any, v: Any) -> dict[str, Any]:
+            given = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v}
+            return by_arrays(program, blank | given, xp)
+
+        return run
 
     def _geometry(self) -> Parts:
         yield self._sincos()

@@ -90,14 +90,17 @@ def _small(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
 
 
 def _large(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
-    """The same of a large scene by its blocks, without gamma: the drivers' own accelerations do not count."""
+    """The same of a large scene, by its loops."""
     from udkjax.equations.large_code import large_code
 
     found = large_code(*structure(mechanism), (), False, "drop")
     row, column, *_ = found.entries
-    _, rate, values = found.geometry(as_vector(jax.tree.leaves(mechanism)), xp)(0.0, q, 0 * v)
-    free = xp.tile(xp.append(xp.asarray(mechanism.gravity), 0.0), len(q) // 3)
-    return (row, column), values * xp.sqrt(mass_of(mechanism, xp))[column], free, rate, xp.zeros(found.m)
+    numbers = as_vector(jax.tree.leaves(mechanism))
+    _, rate, values = found.geometry(numbers, xp)(0.0, q, 0 * v)
+    psi_q = values * xp.sqrt(mass_of(mechanism, xp))[column]
+    free, b = found.loaded(numbers, xp)(0.0, q, v)
+    gamma = np.bincount(row, psi_q * free[column], found.m) if xp is np else jnp.zeros(found.m).at[row].add(psi_q * free[column])
+    return (row, column), psi_q, free, rate, b + gamma
 
 
 def mass_of(mechanism: Mechanism, xp: Any) -> Any:
