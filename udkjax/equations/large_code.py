@@ -314,7 +314,8 @@ class LargeCode:
         """One of the programs in which no row of a loop takes anything from another, by NumPy or JAX."""
         constants = self._constants_by(xp.concatenate([numbers, xp.zeros(2)]), xp)
         program, sizes = self.program(name), self.scratch | {"psi": self.m, "rate": self.m, "made_of": self.made_of}
-        blank = {x: xp.zeros(size) for x, size in sizes.items() if x in program.arrays}
+        wanted = program.arrays | {"psi", "rate", "made_of", "D"}
+        blank = {x: xp.zeros(size) for x, size in sizes.items() if x in wanted}
 
         def run(t: Any, q: Any, v: Any) -> dict[str, Any]:
             given = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v}
