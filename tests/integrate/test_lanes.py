@@ -18,6 +18,7 @@ from udkjax.integrate import batched, lanes
 from udkjax.integrate.interpolation import Point
 from udkjax.integrate.step import stage_state
 from udkjax.integrate.tableau import method_of
+from udkjax.native import operation
 from udkjax.study.exact import exact_coordinates
 
 TS = np.linspace(0.0, 2.0, 21)
@@ -253,6 +254,7 @@ def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
     """A link's mass stands in few of the constants of a linkage; no other has a derivative."""
     moving, derivative = [], Code.derivative
     monkeypatch.setattr(Code, "derivative", lambda self, name, moves: moving.append(moves) or derivative(self, name, moves))
+    operation.written.cache_clear()
     linkage = udk.library.parallelogram(np.deg2rad(-45))
 
     def angle(mass):
