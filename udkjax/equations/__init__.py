@@ -16,8 +16,6 @@ from udkjax.equations.loads import kinetic_energy as kinetic_energy
 from udkjax.equations.loads import mass as mass
 from udkjax.equations.loads import potential_energy as potential_energy
 from udkjax.equations.partitioning import CoordinatePartitioning as CoordinatePartitioning
-from udkjax.equations.programs import Equations as Equations
-from udkjax.equations.programs import prepare as prepare
 from udkjax.equations.quantities import Energy as Energy
 from udkjax.equations.quantities import accelerations as accelerations
 from udkjax.equations.quantities import energy as energy
@@ -25,4 +23,5 @@ from udkjax.equations.quantities import equations_of as equations_of
 from udkjax.equations.quantities import reactions as reactions
 from udkjax.equations.quantities import violation as violation
 from udkjax.equations.textbook import TextbookEquations as TextbookEquations
+from udkjax.equations.textbook import prepare as prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte as Baumgarte

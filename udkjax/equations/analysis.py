@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations.code import code, is_large, structure
+from udkjax.equations.large_code import large_code
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.scales import Scales, known_scales, traced_scales
 from udkjax.scene.mechanism import Mechanism
@@ -121,9 +122,7 @@ def _analysed(mechanism: Mechanism, kind: Any) -> Analysis:
 
 def _row_names(mechanism: Mechanism) -> tuple[tuple[str, int], ...]:
     if is_large(mechanism):
-        from udkjax.equations.layout import layout  # and with it SciPy, which small scenes do without
-
-        return tuple(layout(*structure(mechanism), (), False).row_names)
+        return tuple(large_code(*structure(mechanism), (), False, "drop").layout.row_names)
     return tuple(code(mechanism, (), False, None).equations.row_names)
 
 

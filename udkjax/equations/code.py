@@ -7,13 +7,12 @@ from typing import Any
 import jax
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
 
 from udkjax.equations.derivative import Derivative
 from udkjax.equations.expressions import Expressions, expressions
 from udkjax.pinv.sparse import Factors, Row, absolute, all_of, at_least, factorize, multipliers, pattern, transpose_times
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Program, Scalar, frontier, vector
+from udkjax.straightline import Program, Scalar, frontier
 
 # Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
 # longer to trace and compile, the larger the scene (see the scaling benchmark).
@@ -217,8 +216,3 @@ def _numbers(leaf: Any) -> list[Any]:
         return [leaf[place] for place in np.ndindex(*np.shape(leaf))]
     flat = leaf.reshape(-1)
     return [jax.lax.index_in_dim(flat, k, keepdims=False) for k in range(flat.size)]  # a third of what flat[k] takes to trace
-
-
-def stacked(values: Sequence[Any]) -> Array:
-    """Some numbers as one vector."""
-    return vector(values)

@@ -1,7 +1,7 @@
 """The constraints of a mechanism along a motion: Psi, Psi_q, Psi_dot and gamma (de Falco, Pennestri, Vita 2005, section 3).
 
 Each joint and driver says what its residual is, and nothing more; all derivatives are taken of that by JAX. Here this is done
-as it reads, on arrays, without regard to which entries are zero. Faster forms of the same functions are held against this one.
+as it reads, on arrays, without regard to which entries are zero; elements that are alike speak together (kinds.py). Faster forms of the same functions are held against this one.
 
 In all of them t is the time (s), and q and v are the coordinates and velocities of the n / 3 bodies, x, y (m) and angle (rad) of
 one after another: flat (n,), or (bodies, 3), which is made flat. The m rows are those of the joints in their order, then those
@@ -12,9 +12,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.scene.bodies import GROUND, Frame
+from udkjax.equations.kinds import Kind, kinds, of_each
 from udkjax.scene.mechanism import Mechanism
 
 State = Float[ArrayLike, "n"] | Float[ArrayLike, "n/3 3"]
@@ -22,9 +23,8 @@ State = Float[ArrayLike, "n"] | Float[ArrayLike, "n/3 3"]
 
 def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
     """Psi(t, q), which is zero where all joints are closed (m, rad)."""
-    known = frames(mechanism, q)
-    rows = [c.residual(t, *(known[name] for name in mechanism.frames_of(c))) for c in mechanism.constraints.values()]
-    return vector([row for part in rows for row in part])
+    found = of_each(lambda c, *frames: vector(c.residual(t, *frames)), mechanism, [*mechanism.constraints.values()], bodies(q))
+    return jnp.concatenate([jnp.ravel(rows) for _, rows in found])[_places(found)] if found else jnp.zeros(0)
 
 
 def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
@@ -47,12 +47,17 @@ def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array
 
 def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
     """The constraint that each row of Psi belongs to, and its number within it."""
-    found = []
-    for name, c in mechanism.constraints.items():
-        known = frames(mechanism, mechanism.q0)
-        rows = jax.eval_shape(lambda c=c, known=known: vector(c.residual(0.0, *(known[n] for n in mechanism.frames_of(c)))))
-        found += [(name, k) for k in range(len(rows))]
-    return found
+    names, constraints = list(mechanism.constraints), [*mechanism.constraints.values()]
+    say = lambda c, *frames: vector(c.residual(0.0, *frames))  # noqa: E731
+    found = jax.eval_shape(lambda: [rows for _, rows in of_each(say, mechanism, constraints, bodies(mechanism.q0))])
+    size = dict((int(i), rows.shape[1]) for kind, rows in zip(kinds(mechanism, constraints), found, strict=True) for i in kind.members)
+    return [(name, k) for i, name in enumerate(names) for k in range(size[i])]
+
+
+def _places(found: list[tuple[Kind, Any]]) -> np.ndarray:
+    """Where the rows of all constraints in their order are among those of their kinds."""
+    owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in found])
+    return np.argsort(owner, kind="stable")
 
 
 def along_motion(f: Any, t: ArrayLike, q: State, v: State) -> Array:
@@ -61,14 +66,9 @@ def along_motion(f: Any, t: ArrayLike, q: State, v: State) -> Array:
     return jax.jvp(f, (t, q), (jnp.ones_like(t), v))[1]
 
 
-def frames(mechanism: Mechanism, q: State, v: State | None = None) -> dict[str, Frame]:
-    """The frame of each body and of the ground, by name; without v, joints and drivers see no velocities."""
-    q, rates = vector(q).reshape(-1, 3), None if v is None else vector(v).reshape(-1, 3)
-    found = {GROUND: Frame(0.0, 0.0, 0.0, 1.0, 0.0, *(() if v is None else (0.0, 0.0, 0.0)))}
-    for k, name in enumerate(mechanism.body_names):
-        x, y, angle = q[k]
-        found[name] = Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), *(() if rates is None else rates[k]))
-    return found
+def bodies(state: State) -> Float[Array, "n/3 3"]:
+    """q or v, body by body."""
+    return vector(state).reshape(-1, 3)
 
 
 def vector(values: Any) -> Float[Array, "n"]:

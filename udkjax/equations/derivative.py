@@ -25,12 +25,9 @@ from typing import TYPE_CHECKING
 
 from udkjax.straightline import Differential, Program, Scalar, frontier
 from udkjax.straightline.derivative import Row, accumulate, common_factors, product
-from udkjax.straightline.fusion import LARGEST
 
 if TYPE_CHECKING:
     from udkjax.equations.code import Code
-
-DIRECTIONS = 3  # of the linkage three in one program take a tenth less than side by side, four a sixth more
 
 
 class Derivative:
@@ -58,27 +55,12 @@ class Derivative:
         self.forward = Program(graph, [*self.given, *self.kept, *tangents], forward)
         self.reverse = Program(graph, [*self.given, *self.kept, *cotangents], reverse)
         self._evaluations: dict[str, Program] = {}
-        self._along: dict[tuple[str, int], Program] = {}
 
     def evaluation(self, name: str) -> Program:
         """The program of this name (or "projection", of no other result), which also returns what is `kept`."""
         if name not in self._evaluations:
             self._evaluations[name] = Program(self.code.graph, self.given, [*self._outputs(name), *self.kept])
         return self._evaluations[name]
-
-    def few(self, name: str) -> int:
-        """Along how many directions at a time `along` is to go: of more, batches take no longer, and less to compile."""
-        operations = len(self.evaluation(name).order)
-        return max(1, min(DIRECTIONS, (LARGEST - operations) // max(len(self.forward.order), 1)))
-
-    def along(self, name: str, directions: int) -> Program:
-        """The program of this name, and what `forward` gives for the tangents of so many directions, one after another."""
-        if (name, directions) not in self._along:
-            tangents = [self._tangents(k) for k in range(directions)]
-            found = [s for each in tangents for s in self.rules.forward(each)]
-            given = [*self.given, *(s for each in tangents for s in each)]
-            self._along[name, directions] = Program(self.code.graph, given, [*self._outputs(name), *found])
-        return self._along[name, directions]
 
     def _outputs(self, name: str) -> list[Scalar]:
         return [] if name == "projection" else self.code.outputs[name]

@@ -8,16 +8,15 @@ For a constraint with residual Psi(t, q) the graph gets, all by forward differen
 and Psi_q one column at a time, each along a unit vector whose zeros the graph folds away: a row is {column: scalar}.
 """
 
-import dataclasses
-from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.scene.bodies import GROUND, Frame
+from udkjax.equations.kinds import Alike
+from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Constraint
 from udkjax.straightline import Differential, Graph, Scalar, operations, trace
@@ -46,34 +45,6 @@ def _frames(ground: tuple[bool, ...], q: Any, v: Any = None) -> list[Frame]:
             frames.append(Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), *(() if v is None else v[k : k + 3])))
             k += 3
     return frames
-
-
-class Alike(NamedTuple):
-    """What elements have in common that are traced once: all but the names of their bodies and the values of their numbers."""
-
-    tree: Any
-    shapes: tuple
-    ground: tuple[bool, ...]  # which of its frames are the ground's
-
-    @property
-    def moving(self) -> int:
-        """How many bodies move in it."""
-        return len(self.ground) - sum(self.ground)
-
-
-def alike(element: Any, frames: Sequence[str]) -> Alike:
-    """Return an element's structure; `frames` are the names of the bodies that it sees."""
-    numbers = {name: GROUND if name == GROUND else str(k) for k, name in enumerate(frames)}
-    nameless = object.__new__(type(element))
-    for name, value in vars(element).items():
-        object.__setattr__(nameless, name, value)
-    for field in dataclasses.fields(element):
-        if field.name == "bodies" or "names" in field.metadata:
-            value = getattr(element, field.name)
-            renamed = numbers.get(value, "") if isinstance(value, str) else tuple(numbers.get(name, "") for name in value)
-            object.__setattr__(nameless, field.name, renamed)
-    leaves, tree = jax.tree.flatten(nameless)
-    return Alike(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(name == GROUND for name in frames))
 
 
 def differentiated(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):

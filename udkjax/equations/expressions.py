@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.elements import Alike, Row, alike, applied, differentiated, has_pieces, piece, scalar
+from udkjax.equations.elements import Row, applied, differentiated, has_pieces, piece, scalar
+from udkjax.equations.kinds import Alike, alike
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.straightline import Graph, Scalar

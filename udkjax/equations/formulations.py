@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.motion import Closed, Motion, Tangential, Vector
+from udkjax.equations.motion import Motion, Tangential, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
@@ -162,11 +162,6 @@ class Rewritten(Motion):
     def constrained(self) -> bool:
         return self.equations.constrained
 
-    @property
-    def branches(self) -> bool:
-        """Only a projection may branch, once a step: no reason to take a whole step without branching first."""
-        return False
-
 
 class Formulated(Rewritten):
     """A formulation for given states. Projection, and the rows that it leaves out, are those of the equations inside."""
@@ -180,18 +175,8 @@ class Formulated(Rewritten):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.project(t, q, v)
 
-    def closed(self, t: Any, q: Vector, v: Vector, steps: int) -> Closed:
-        return self.equations.closed(t, q, v, steps)
-
-    def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        return self.equations.as_projected(t, q, v)
-
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         return self.equations.tangential(t, q, v, dq, dv)
-
-    @property
-    def left_out(self) -> tuple[int, ...]:
-        return self.equations.left_out
 
 
 @eqx.filter_custom_jvp

@@ -42,14 +42,6 @@ class GeneralEquations(Motion):
     method: Pseudoinverse
     baumgarte: Baumgarte | None
 
-    @property
-    def left_out(self) -> tuple[int, ...]:
-        return ()
-
-    @property
-    def branches(self) -> bool:
-        return False
-
     def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         free, weight, plus, b = self._equation(t, q, v)
         return free if plus is None else free + weight(plus @ b)

@@ -1,7 +1,7 @@
 """The Udwadia-Kalaba equation of a large scene as programs of loops: over elements that are alike, and over blocks of D D^T.
 
 The same programs as in code.py, of the same names, with code that does not grow with the scene. D and the right-hand sides come
-from the programs of the elements (alike.py). A block of D D^T belongs to a constraint, or to two that hold the same body; blocks
+from the programs of the elements (element_programs.py). A block of D D^T belongs to a constraint, or to two that hold the same body; blocks
 are eliminated in an order of least fill, those that meet later rows in the same way by the same code. In all of the programs rows
 whose pivots are too small are dropped.
 """
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.alike import FREE, POSITIONS, VELOCITIES, ConstraintKind, Group
+from udkjax.equations.element_programs import FREE, POSITIONS, VELOCITIES, ConstraintPrograms, Group, Layout
 from udkjax.pinv.block_order import Elimination, eliminations
 from udkjax.pinv.sparse import absolute, greater, where
 from udkjax.scene.mechanism import Mechanism
@@ -53,9 +53,7 @@ class LargeCode:
     def __init__(
         self, tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool, elimination: str, every: bool = False
     ):
-        from udkjax.equations.layout import layout  # and with it SciPy, which small scenes do without
-
-        self.layout = found = layout(tree, shapes, left_out, baumgarte)
+        self.layout = found = Layout(jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes]), left_out, baumgarte)
         self._made_for = tree, shapes, left_out, baumgarte, elimination
         self.elimination, self.left_out = elimination, left_out
         starts = np.cumsum([0, *(int(np.prod(shape)) for shape, _ in shapes)])
@@ -67,7 +65,7 @@ class LargeCode:
         self.gravity = GAINS + self.gains
         self.of_bodies = self.gravity + 2
         self._constants = self.of_bodies + OF_BODY * self.bodies
-        self._parts = (found.all if every else found.kept).parts
+        self._parts = found.all if every else found.kept
         # What the programs leave for themselves: how many numbers of each name.
         self.scratch = {"sines": 2 * self.bodies, "free": self.n, "load": self.n, "ratio": 1, "D": 0, "gram": 0}
         rows = {k: rows for k, _, rows in self._parts}
@@ -91,12 +89,12 @@ class LargeCode:
 
     def _table(self, group: Group, kept: Sequence[int], right: int) -> np.ndarray:
         """Where what belongs to each element of a group begins."""
-        size, constants = len(group.members), len(group.kind.constants)
+        size, constants = len(group.members), len(group.programs.constants)
         own = self._constants + constants * np.arange(size)
         self._constants += constants * size
         record, place = 0, {}
-        if isinstance(group.kind, ConstraintKind):
-            for s in group.kind.outputs["D"]:
+        if isinstance(group.programs, ConstraintPrograms):
+            for s in group.programs.outputs["D"]:
                 if s.constant is None:
                     place.setdefault(s.index, len(place))
             record = self._reserve("D", len(place) * size)
@@ -335,7 +333,7 @@ class LargeCode:
         found = [np.zeros((4, 0))]
         for group in self.layout.constraints:
             table, width = self._tables[id(group)], 3 * len(group.bodies)
-            for place, s in enumerate(group.kind.outputs["D"]):
+            for place, s in enumerate(group.programs.outputs["D"]):
                 if s.is_zero:
                     continue
                 row, k = divmod(place, width)
@@ -385,14 +383,14 @@ class LargeCode:
         return LoopProgram(parts)
 
     def _prologue_of(self, group: Group, elements: Sequence[Any]) -> Loop:
-        kind, table = group.kind, self._tables[id(group)]
+        kind, table = group.programs, self._tables[id(group)]
         leaves = np.array([[np.ravel(x)[0] if np.size(x) else 0 for x in jax.tree.leaves(e)] for e in elements], int)
         leaves = leaves.reshape(len(elements), -1)
         w, columns = _Writing(kind.graph), table.shape[1]
         for k, leaf in enumerate(kind.leaves):
             for place, s in enumerate(leaf.flat):
                 w.bind(s, "numbers", columns + k, place)
-        if isinstance(kind, ConstraintKind):
+        if isinstance(kind, ConstraintPrograms):
             for k, s in enumerate(kind.roots):
                 w.bind(s, "constants", BODIES + 3 * (k // 2) + CONSTANTS, ROOT + k % 2)
             for k, s in enumerate([*kind.gains, *kind.gravity]):
@@ -433,7 +431,7 @@ class LargeCode:
         for group in self.layout.forces:
 
             def loads(w: _Writing, group: Group = group):
-                for k, s in enumerate(group.kind.outputs["loads"]):
+                for k, s in enumerate(group.programs.outputs["loads"]):
                     w.write(s, "load", BODIES + 3 * (k // 3) + COORDINATES, k % 3, ADD)
 
             yield self._of_group("loads", group, loads, v=v)
@@ -450,7 +448,7 @@ class LargeCode:
 
     def _of_group(self, key: Hashable, group: Group, write: "Callable[[_Writing], None]", **names: str) -> Loop:
         """A loop over the elements of a group, whose kind's inputs lie where they do in this scene."""
-        kind = group.kind
+        kind = group.programs
 
         def bound(w: _Writing):
             arrays = dict.fromkeys(POSITIONS, ("q", COORDINATES, 0)) | dict.fromkeys(VELOCITIES, ("v", COORDINATES, 0))
@@ -472,10 +470,10 @@ class LargeCode:
         for _, group, rows in self._parts:
 
             def write(w: _Writing, group: Group = group, rows: Sequence[int] = rows):
-                outputs = group.kind.outputs
+                outputs = group.programs.outputs
                 if "D" in names:
                     for index, place in self._records[id(group)].items():
-                        w.write(Scalar(group.kind.graph, index), "D", RECORD, place)
+                        w.write(Scalar(group.programs.graph, index), "D", RECORD, place)
                 for name in names:
                     if name != "D":
                         for i, row in enumerate(rows):
@@ -488,14 +486,14 @@ class LargeCode:
         for group in self.layout.constraints:
 
             def write(w: _Writing, group: Group = group):
-                for i, s in enumerate(group.kind.outputs[name]):
+                for i, s in enumerate(group.programs.outputs[name]):
                     w.write(s, array, ROW, start + i)
 
             yield self._of_group((name, array), group, write)
 
     def _entry(self, w: "_Writing", group: Group, row: int, k: int, record: int) -> Scalar:
         """An entry of D as it was left."""
-        s = group.kind.outputs["D"][row * 3 * len(group.bodies) + k]
+        s = group.programs.outputs["D"][row * 3 * len(group.bodies) + k]
         if s.constant is not None:
             return w.graph.constant(s.constant)
         found = w.read("D", record, self._records[id(group)][s.index])

@@ -3,12 +3,15 @@
 As it reads, on arrays, by JAX's derivatives of what each force element says of itself. t, q and v are those of constraints.py.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.equations.constraints import State, frames, vector
-from udkjax.scene.bodies import GROUND
+from udkjax.equations.constraints import State, bodies, vector
+from udkjax.equations.kinds import of_each
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -29,19 +32,24 @@ def kinetic_energy(mechanism: Mechanism, v: State) -> Float[Array, ""]:
 
 def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, ""]:
     """V (J): of gravity, zero at the origin, and of the force elements that have one. It does not depend on v."""
-    known = frames(mechanism, q, v)
     gravity = jnp.tile(jnp.append(mechanism.gravity, 0.0), len(mechanism.body_names))
-    stored = [e.potential(t, *(known[name] for name in mechanism.frames_of(e))) for e in mechanism.forces.values()]
-    return sum((V for V in stored if V is not None), -(mass(mechanism) * gravity) @ vector(q))
+    found = _of_forces(lambda e, *frames: e.potential(t, *frames), mechanism, q, v)
+    return sum((jnp.sum(V) for _, V in found if V is not None), -(mass(mechanism) * gravity) @ vector(q))
 
 
 def stated_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
     """The loads of the force elements that state them: all that does not come from a potential."""
-    known, n = frames(mechanism, q, v), 3 * len(mechanism.body_names)
-    total = {name: [jnp.zeros(())] * 3 for name in mechanism.body_names}
-    for element in mechanism.forces.values():
-        names = mechanism.frames_of(element)
-        for name, load in zip(names, element.loads(t, *(known[name] for name in names)) or [], strict=False):
-            if name != GROUND:
-                total[name] = [a + b for a, b in zip(total[name], load, strict=True)]
-    return vector([x for load in total.values() for x in load]) if n else jnp.zeros(0)
+
+    def loads(element: Any, *frames: Any) -> Any:
+        stated = element.loads(t, *frames)
+        return None if stated is None else jnp.stack([vector(list(load)) for load in stated])
+
+    total = jnp.zeros((len(mechanism.body_names), 3))
+    for kind, found in _of_forces(loads, mechanism, q, v):
+        if found is not None:
+            total = total.at[kind.bodies.T].add(found[:, ~np.array(kind.structure.ground)])
+    return total.ravel()
+
+
+def _of_forces(say: Any, mechanism: Mechanism, q: State, v: State) -> Any:
+    return of_each(say, mechanism, [*mechanism.forces.values()], bodies(q), bodies(v))

@@ -97,10 +97,6 @@ class Partitioned(Rewritten):
     def independent(self) -> Any:
         return None if self.dependent is None else ~self.dependent
 
-    @property
-    def left_out(self) -> tuple[int, ...]:
-        return ()
-
     def _plus(self, D: Float[Array, "m n"]) -> Plus:
         """D^+ of the dependent columns: zero for the others."""
         return SVD(self.formulation.rank_tol).plus(jnp.where(self.dependent, D, 0))

@@ -1,6 +1,6 @@
 """What one asks of a motion: accelerations, multipliers, reactions, energies, violations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +12,7 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.motion import Motion
-from udkjax.equations.programs import prepare
+from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.bodies import GROUND
@@ -35,18 +35,13 @@ def equations_of(
     method: Pseudoinverse | None = None,
     baumgarte: Baumgarte | None = None,
     formulation: Formulation | None = None,
-    moving: Sequence[bool] = (),
     analysis: Analysis | None = None,
-    evaluated: bool = True,
 ) -> Motion:
-    """Prepare the equations of motion of whatever has some, by the Udwadia-Kalaba equation or another formulation.
-
-    `moving`, `analysis` and `evaluated` are those of `prepare`.
-    """
+    """Prepare the equations of motion of whatever has some, by the Udwadia-Kalaba equation or another formulation."""
     if isinstance(system, ConstrainedSystem):
-        equations = prepare_general(system, method, baumgarte)
+        equations: Motion = prepare_general(system, method, baumgarte)
     else:
-        equations = prepare(system, method, baumgarte, moving=moving, analysis=analysis, evaluated=evaluated)
+        equations = prepare(system, method, baumgarte, analysis)
     return equations if formulation is None else formulation.of(equations)
 
 
@@ -64,15 +59,13 @@ def accelerations(
     """Return a (bodies, 3) at time t (s), coordinates q and velocities v; with `multipliers` also lambda, one a row of Psi.
 
     a = a_F + M^(-1/2) D^+ b and lambda = -(D^+)^T D^+ b, of minimum norm where constraints are redundant (m/s^2, rad/s^2; N, N m,
-    in the rows' order and with the sign of M a + Psi_q^T lambda = F). The state need not be closed. `Auto` looks at the rows that
-    it leaves out, too: where they are not satisfied they were not redundant after all, and it takes singular values of all rows.
-    `Auto` and `Elimination` take lambda from singular values: a choice of rows has no minimum-norm multipliers. A `formulation`
-    finds a in another way, but not lambda. `analysis` is that of `analyse`. For a `ConstrainedSystem` q, v and a are (n,).
+    in the rows' order and with the sign of M a + Psi_q^T lambda = F). The state need not be closed. `Auto` takes singular values.
+    A `formulation` finds a in another way, but not lambda. `analysis` is that of `analyse`. For a `ConstrainedSystem` q, v and a are (n,).
     """
-    equations = equations_of(mechanism, method, stabilization, formulation, analysis=analysis)
+    if isinstance(mechanism, Mechanism):
+        analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.bare
     t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
-    a = equations.accelerations(t, q.ravel(), v.ravel()).reshape(q.shape)
-    return (a, equations.multipliers(t, q.ravel(), v.ravel())) if multipliers else a
+    return _accelerations(mechanism, analysis, t, q, v, method, stabilization, formulation, multipliers)
 
 
 def violation(mechanism: Mechanism | ConstrainedSystem, solution: Any) -> Float[Array, "T m"]:
@@ -111,6 +104,13 @@ def reactions(
 
 
 # Functions of their own: what is compiled for one call serves the next.
+
+
+@eqx.filter_jit
+def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation, multipliers):
+    equations, flat = equations_of(mechanism, method, baumgarte, formulation, analysis), (q.ravel(), v.ravel())
+    a = equations.accelerations(t, *flat).reshape(q.shape)
+    return (a, equations.multipliers(t, *flat)) if multipliers else a
 
 
 def _psi(equations: Any, t: Any, q: Any, v: Any) -> Array:

@@ -1,26 +1,24 @@
 """The equations of motion of a mechanism by the textbook (udwadia_kalaba.py): any pseudoinverse, derivatives of any order."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.motion import MechanismMotion, Tangential, Vector
-from udkjax.equations.scales import Scales
+from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.pinv import Pseudoinverse
+from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Loop
 
 
 class TextbookEquations(MechanismMotion):
-    """The equations of motion of one mechanism by one pseudoinverse, of all rows but those that are `redundant`.
+    """The equations of motion of one mechanism by one pseudoinverse.
 
     Coordinates and velocities are flat vectors (3 bodies,): x, y, angle of each body in turn. Rows are weighted by
     `Scales.weights`.
@@ -30,16 +28,15 @@ class TextbookEquations(MechanismMotion):
     method: Pseudoinverse
     baumgarte: Baumgarte | None
     scales: Scales
-    redundant: tuple[int, ...] = eqx.field(static=True, default=())
-    loop: Loop | None = eqx.field(static=True, default=None)  # in which they are evaluated
+    redundant: tuple[int, ...] | None = eqx.field(static=True)  # rows that a method without a rank can leave out, if known
 
     def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         """a = a_F + M^(-1/2) D^+ b."""
-        return uk.accelerations(self._here, t, q, v, self.method, self.baumgarte, self.weights)
+        return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
 
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         """lambda = -(D^+)^T D^+ b."""
-        return uk.multipliers(self._here, t, q, v, self.method, self.baumgarte, self.weights)
+        return uk.multipliers(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric: see `correct`."""
@@ -51,11 +48,11 @@ class TextbookEquations(MechanismMotion):
 
     def correct(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """One Newton step in position and one in velocity: at a state on the manifold it has the tangents of a projection."""
-        return uk.project(self._here, t, q, v, self.method, self.weights, steps=1)
+        return uk.project(self.mechanism, t, q, v, self.method, self.scales.weights, steps=1)
 
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
-        mechanism, w = self._here, self.weights
+        mechanism, w = self.mechanism, self.scales.weights
         of = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
         return Tangential(*of(jnp.stack([dq, dv])))
 
@@ -88,7 +85,7 @@ class TextbookEquations(MechanismMotion):
 
     def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Any, Array, Vector]:
         """D^+, what it is to be applied to, and M^(-1/2): of "rows" b, of "closure" Psi, of "rate" Psi_dot; rows are weighted."""
-        mechanism, w = self._here, self.weights
+        mechanism, w = self.mechanism, self.scales.weights
         residual = {
             "rows": lambda: uk.b(mechanism, t, q, v, self.baumgarte, w),
             "closure": lambda: uk.weighted(w, constraints.psi(mechanism, t, q)),
@@ -97,18 +94,8 @@ class TextbookEquations(MechanismMotion):
         return uk.plus(self.method, uk.D(mechanism, t, q, w)), residual[name](), uk.root(mechanism)
 
     @property
-    def weights(self) -> Float[Array, "m"]:
-        """Those of the rows; zero for those that are left out."""
-        w = self.scales.weights
-        return w.at[np.array(self.redundant)].set(0.0) if self.redundant else w
-
-    @property
     def row_names(self) -> list[tuple[str, int]]:
         return constraints.row_names(self.mechanism)
-
-    @property
-    def left_out(self) -> tuple[int, ...]:
-        return self.redundant
 
     @property
     def constrained(self) -> bool:
@@ -118,23 +105,25 @@ class TextbookEquations(MechanismMotion):
     def stabilized(self) -> bool:
         return self.baumgarte is not None
 
-    @property
-    def branches(self) -> bool:
-        return False
 
-    @property
-    def quick(self) -> "TextbookEquations":
-        return self
+def prepare(
+    mechanism: Mechanism,
+    method: Pseudoinverse | None = None,
+    baumgarte: Baumgarte | None = None,
+    analysis: Analysis | None = None,
+) -> TextbookEquations:
+    """Prepare a mechanism for a method (default `Auto`). Its numbers may be traced.
 
-    def within(self, loop: Loop) -> "TextbookEquations":
-        return dataclasses.replace(self, loop=loop)
-
-    @property
-    def _here(self) -> Mechanism:
-        """The mechanism; and the loop around is told that there is more in it than arithmetic."""
-        if self.loop is not None:
-            self.loop.holds(False)
-        return self.mechanism
+    A method without a `rank_tol` gets `rank_tolerance`. `analysis` is that of `analyse`, by default made here.
+    """
+    analysis = analyse(mechanism) if analysis is None else analysis
+    mechanism = mechanism.bare
+    chosen: Any = Auto() if method is None else method
+    tol = rank_tolerance(mechanism) if chosen.rank_tol is None else chosen.rank_tol
+    chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)
+    if isinstance(chosen, Elimination) and not chosen.relative:
+        raise ValueError("Elimination compares each row with what remains of it: here its rank_tol must be relative")
+    return TextbookEquations(mechanism, chosen, baumgarte, analysis.scales, analysis.redundant_rows)
 
 
 # A projection is differentiated at the state that it returns, where all residuals vanish.
@@ -142,7 +131,7 @@ class TextbookEquations(MechanismMotion):
 
 @jax.custom_jvp
 def _project(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    return uk.project(equations._here, t, q, v, equations.method, equations.weights)
+    return uk.project(equations.mechanism, t, q, v, equations.method, equations.scales.weights)
 
 
 @_project.defjvp

@@ -32,11 +32,13 @@ from udkjax.equations.closing import (
     is_closed,
 )
 from udkjax.equations.code import is_large
-from udkjax.equations.programs import prepare_to_close
+from udkjax.equations.constraints import psi
+from udkjax.equations.textbook import prepare
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.integrate import by_native
 from udkjax.integrate.derivatives import Function, Linear, Mask, replaced, those
+from udkjax.pinv import SVD
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -151,7 +153,7 @@ def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State 
 
 
 def _assembled(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
-    return TracedRows(prepare_to_close(mechanism, analysis=analysis)).assembled(_closed, t, q, v)
+    return TracedRows(prepare(mechanism, SVD(), analysis=analysis)).assembled(_closed, t, q, v)
 
 
 class Assembly(Function):
@@ -175,9 +177,6 @@ class Assembly(Function):
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
         *_, q, v = self.guess(xs)
         return [q.shape, v.shape]
-
-    def pull(self, xs: list[Array], moving: Mask, ws: list[Array]) -> list[Array]:
-        return jax.vjp(lambda some: self(replaced(xs, moving, some)), those(xs, moving))[1](ws)[0]
 
     def forward(self, xs: list[Array], moving: Mask, vs: list[Array], run: Any) -> list[Array]:
         guess, which = self._native(xs, moving)
@@ -278,7 +277,7 @@ class Check(NamedTuple):
 def check(mechanism: Mechanism) -> Check:
     """Count rows, rank and degrees of freedom, name redundant rows, and say how well the initial guess closes."""
     closure = close(mechanism)
-    before = prepare_to_close(mechanism).violation(0.0, mechanism.q0.ravel(), mechanism.v0.ravel())[0]
+    before = psi(mechanism, 0.0, mechanism.q0)
     rows = len(before)
     closed = bool(closure.is_closed)
     found = analyse(mechanism)

@@ -9,7 +9,6 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion
-from udkjax.equations.rank_policy import REFUSE
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.first_step import first_step
@@ -64,14 +63,14 @@ def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array,
 
 
 def _first_step(problem: Problem, y0: Array) -> Array:
-    ts, equations, unit = problem.ts, undifferentiated(problem.equations.with_policy(REFUSE)), jnp.concatenate(problem.units())
+    ts, equations, unit = problem.ts, undifferentiated(problem.equations), jnp.concatenate(problem.units())
     return first_step(y0, derivative(ts[0], undifferentiated(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol, unit)
 
 
 def _controller(problem: Problem) -> Any:
     # Every coordinate and velocity meets its tolerance: the mean over a large mechanism would hide one that does not.
     settings: dict[str, Any] = {"norm": optx.max_norm, "dtmin": problem.smallest, "force_dtmin": False}
-    if is_explicit(problem.solver):  # the same steps as in lanes
+    if is_explicit(problem.solver):  # the same steps as by machine code
         settings |= {"safety": SAFETY, "factormin": SHRINK, "factormax": GROW}
     tolerances: dict[str, Any] = {"rtol": problem.rtol, "atol": problem.atol * jnp.concatenate(problem.units())}
     if problem.breakpoints is None:

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.code import Code, code, is_large, structure
+from udkjax.equations.code import Code, code, is_large, scalars, structure
+from udkjax.equations.elements import has_pieces
 from udkjax.equations.large_code import LargeCode, large_code
-from udkjax.equations.programs import WITH_CARE, Equations
 from udkjax.equations.scales import Scales
+from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.integrate.undifferentiated import undifferentiated
@@ -21,8 +22,15 @@ from udkjax.native.program import UnsupportedError
 from udkjax.native.steps import DONE
 from udkjax.native.tableau import EULER
 from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, SETTINGS
-from udkjax.pinv import Auto
+from udkjax.pinv import Auto, Elimination
 from udkjax.scene.mechanism import Mechanism
+
+# Steps with care begin on the constraint manifold, unless states are not projected, and only those beside singular configurations
+# take it. Rows that count as redundant there and are not leave what they hold back in velocities, as large as the threshold, and
+# rounding errors are as large as a unit over its square: both are least at some third root of a unit. With three times more,
+# linkages that turn back in singular configurations take up to a quarter less steps, but Peaucellier's may cross with errors of
+# 1e-5 in its energy, at any tolerance; with three times less they take up to two fifths more.
+WITH_CARE = 0.2
 
 # --- closing
 
@@ -129,11 +137,15 @@ def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
         return "a progress meter is diffrax's"
-    if problem.length is None or not (type(equations) is Equations or getattr(equations, "by_levels", False)):
-        return f"it knows the Udwadia-Kalaba equation of a mechanism by elimination, not {type(equations).__name__}"
+    if type(equations) is not TextbookEquations:
+        return f"it knows the Udwadia-Kalaba equation of a mechanism, not {type(equations).__name__}"
+    if not isinstance(equations.method, Auto | Elimination):
+        return f"it eliminates, and {type(equations.method).__name__} was asked for"
+    if isinstance(equations.method, Auto) and equations.redundant is None:
+        return "which rows are redundant is not known"
     if not is_explicit(problem.solver):
         return f"{type(problem.solver).__name__} is no explicit Runge-Kutta method"
-    if problem.pieces is not None and isinstance(getattr(equations, "code", None), LargeCode):
+    if is_large(equations.mechanism) and _has_pieces(equations.mechanism):
         return "an element of a large scene is smooth in pieces of the state"
     if jax.default_backend() != "cpu":
         return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
@@ -144,11 +156,6 @@ def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
     except UnsupportedError as error:
         return f"the scene takes {error}, which is no arithmetic on numbers"
     return ""
-
-
-def serves(problem: Problem) -> bool:
-    """Whether machine code can integrate a problem: one of scalar expressions, by an explicit Runge-Kutta method, on the CPU."""
-    return not unserved(problem)
 
 
 def known(problem: Problem) -> Raw:
@@ -169,41 +176,55 @@ def recorded(problem: Any, moving: Any) -> Raw:
     return _raw(native_p.bind(*_inputs(problem, kind.code), *none, kind=kind, times=times)[: len(OUTPUTS)])
 
 
-def serves_derivatives(problem: Problem, moving: Any) -> bool:
+def rows_kept(problem: Any) -> int:
+    """How many rows elimination takes."""
+    equations = problem.equations
+    return len(equations.scales.rows) - len(_left_out(equations))
+
+
+def serves_derivatives(moving: Any) -> bool:
     """Whether there is machine code for the derivatives along what is `moving`: numbers of the scene, and initial states."""
-    if not serves(problem):
-        return False
-    given = eqx.tree_at(lambda p: (p.equations, p.pieces), moving, (None, None), is_leaf=lambda x: x is None)
-    others = eqx.tree_at(lambda p: (p.q, p.v), given, (False, False), is_leaf=lambda x: x is None)
-    return not any(x is True for x in jax.tree.leaves((others, _fixed(moving.equations))))
+    served = lambda p: (p.equations.mechanism, p.equations.baumgarte, p.q, p.v)  # noqa: E731
+    others = eqx.tree_at(served, moving, (None,) * 4, is_leaf=lambda x: x is None)
+    return not any(x is True for x in jax.tree.leaves(others))
 
 
-def _fixed(equations: Any) -> Any:
-    """What equations hold besides what follows from the numbers of the scene."""
-    numbers = _of_numbers if hasattr(equations, "numbers") else _of_constants
-    return eqx.tree_at(numbers, equations, (None,) * len(numbers(equations)), is_leaf=lambda x: x is None)
+def _constants(equations: TextbookEquations, code: Any) -> Any:
+    """What the code computes of the numbers of the scene and the gains alone: a function of those, and they."""
+    arrays, rest = eqx.partition((equations.mechanism, equations.baumgarte), eqx.is_inexact_array)
+
+    def constants(arrays: Any) -> Any:
+        mechanism, baumgarte = eqx.combine(arrays, rest)
+        numbers = [*jax.tree.leaves(mechanism), *_gains(baumgarte), jnp.zeros(2)]
+        if isinstance(code, LargeCode):
+            return code.constants_of(_vector(numbers, jnp))
+        return [jnp.asarray(c) for c in code.prologue(scalars(numbers))]
+
+    return constants, arrays
 
 
-def _of_constants(equations: Any) -> tuple[Any, ...]:
-    return equations.constants, equations.textbook.mechanism, equations.textbook.baumgarte
+def _numbers_of(problem: Any) -> Any:
+    return problem.equations.mechanism, problem.equations.baumgarte
 
 
-def _of_numbers(equations: Any) -> tuple[Any, ...]:
-    return equations.constants, equations.numbers, equations.given, equations.baumgarte
+def _gains(baumgarte: Any) -> list[Any]:
+    return [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
 
 
 def pushed(problem: Any, moving: Any, change: Any) -> tuple[Raw, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is moving."""
     kind = _kind(problem, _moving(problem, moving), "forward")
-    if isinstance(problem.equations.code, LargeCode):
-        constants = change.equations.constants if moving.equations.constants is True else jnp.zeros(0)
+    constants, arrays = _constants(problem.equations, kind.code)
+    still = jax.tree.map(jnp.zeros_like, arrays)
+    dconstants = jax.jvp(constants, (arrays,), (eqx.combine(_numbers_of(change), still),))[1]
+    if isinstance(kind.code, LargeCode):
+        along = dconstants if any(kind.moving or ()) else jnp.zeros(0)
     else:
-        pairs = zip(change.equations.constants, moving.equations.constants, strict=True)
-        constants = _vector([jnp.zeros(0), *(dx for dx, m in pairs if m is True)], jnp)
+        along = _vector([jnp.zeros(0), *(dc for dc, m in zip(dconstants, kind.moving or (), strict=True) if m)], jnp)
     n = len(problem.q)
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     *found, dys, dend = native_p.bind(
-        *_inputs(problem, kind.code), *(x[None, None] for x in (constants, dq, dv)), kind=kind, times=len(problem.ts)
+        *_inputs(problem, kind.code), *(x[None, None] for x in (along, dq, dv)), kind=kind, times=len(problem.ts)
     )
     return _raw(found), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
 
@@ -213,37 +234,28 @@ def pulled(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
     kind = _kind(problem, _moving(problem, moving), "reverse")
     bars = [ys[None], end[None]]
     cbar, qbar, vbar = native_p.bind(*_inputs(problem, kind.code), *bars, kind=kind, times=len(problem.ts))[len(OUTPUTS) :]
-    if isinstance(problem.equations.code, LargeCode):
-        constants: Any = cbar[0] if moving.equations.constants is True else None
+    constants, arrays = _constants(problem.equations, kind.code)
+    values, back = jax.vjp(constants, arrays)
+    if isinstance(kind.code, LargeCode):
+        of_constants: Any = cbar[0] if any(kind.moving or ()) else jnp.zeros_like(values)
     else:
         found = iter(cbar[0])
-        assert kind.moving is not None
-        by_node = {s.index: next(found) for s, m in zip(kind.code.constants, kind.moving, strict=True) if m}
-        pairs = zip(problem.equations.code.constants, moving.equations.constants, strict=True)
-        constants = [by_node[s.index] if m is True else None for s, m in pairs]
+        of_constants = [next(found) if m else jnp.zeros_like(c) for c, m in zip(values, kind.moving or (), strict=True)]
+    (numbers,) = back(of_constants)
     none = jax.tree.map(lambda m: None, moving, is_leaf=lambda x: x is None)
-
-    def zeros(moving: Any, values: Any) -> Any:
-        return jax.tree.map(lambda m, x: jnp.zeros_like(x) if m is True else None, moving, values, is_leaf=lambda x: x is None)
-
-    equations = zeros(moving.equations, problem.equations)
-    equations = eqx.tree_at(lambda e: e.constants, equations, constants, is_leaf=lambda x: x is None)
-    pieces = zeros(moving.pieces, problem.pieces)  # where they meet, motions are smooth enough not to depend on when that is
-    return eqx.tree_at(
-        lambda p: (p.equations, p.pieces, p.q, p.v),
-        none,
-        (equations, pieces, qbar[0] if moving.q is True else None, vbar[0] if moving.v is True else None),
-        is_leaf=lambda x: x is None,
-    )
+    those = jax.tree.map(lambda m, x: x if m is True else None, _numbers_of(moving), numbers, is_leaf=lambda x: x is None)
+    q, v = qbar[0] if moving.q is True else None, vbar[0] if moving.v is True else None
+    return eqx.tree_at(lambda p: (*_numbers_of(p), p.q, p.v), none, (*those, q, v), is_leaf=lambda x: x is None)
 
 
 def _moving(problem: Any, moving: Any) -> tuple[bool, ...]:
-    """Of the constants of the code that watches: which have derivatives."""
-    code = problem.equations.code
-    if isinstance(problem.equations.code, LargeCode):  # all or none
-        return (moving.equations.constants is True,) * len(code.constants)
-    moves = {s.index for s, m in zip(code.constants, moving.equations.constants, strict=True) if m is True}
-    return tuple(s.index in moves for s in _watching(code).constants)
+    """Of the constants of the code of derivatives: which depend on what is moving. Loops do not tell them apart."""
+    code = _watching(_code(problem))
+    numbers, which = (jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_numbers_of(problem), _numbers_of(moving)))
+    moves = [m is True for x, m in zip(numbers, which, strict=True) if x is not None for _ in range(np.size(x))]
+    if isinstance(code, LargeCode):
+        return (any(moves),) * len(code.constants)
+    return code.prologue.depends_on([*moves, False, False])
 
 
 def _watching(code: Code) -> Code:
@@ -251,32 +263,47 @@ def _watching(code: Code) -> Code:
     return code.watching
 
 
+def _left_out(equations: TextbookEquations) -> tuple[int, ...]:
+    return equations.redundant or ()
+
+
+def _code(problem: Any) -> Any:
+    """The programs of a problem's scene."""
+    equations = problem.equations
+    drops, large = isinstance(equations.method, Elimination), is_large(equations.mechanism)
+    elimination = "drop" if drops else "watch" if large else "check"
+    settings = _left_out(equations), equations.baumgarte is not None, elimination
+    return large_code(*structure(equations.mechanism), *settings) if large else code(equations.mechanism, *settings)
+
+
 def _kind(problem: Any, moving: tuple[bool, ...] | None = None, mode: str = "run") -> Kind:
-    code = problem.equations.code
-    method, breaks = Tableau(method_of(problem.solver)), problem.breakpoints is not None or problem.pieces is not None
-    return Kind(code if moving is None else _watching(code), method, problem.projected, breaks, moving, mode)
+    programs, mechanism = _code(problem), problem.equations.mechanism
+    breaks = problem.breakpoints is not None or _has_pieces(mechanism)
+    method = Tableau(method_of(problem.solver))
+    return Kind(programs if moving is None else _watching(programs), method, problem.projected, breaks, moving, mode)
+
+
+def _has_pieces(mechanism: Mechanism) -> bool:
+    return any(has_pieces(e) for e in (*mechanism.constraints.values(), *mechanism.forces.values()))
 
 
 def _inputs(problem: Any, code: Code | None = None, xp: Any = jnp) -> list[Any]:
     """Those of a run, of one member."""
-    equations = problem.equations
-    large = isinstance(equations.code, LargeCode)
-    textbook: Any = equations if large else equations.textbook
-    method, rank_tol, baumgarte = textbook.method, textbook.method.rank_tol, textbook.baumgarte
-    gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
+    equations: TextbookEquations = problem.equations
+    method, rank_tol = equations.method, equations.method.rank_tol
     least = method.branch_tol if isinstance(method, Auto) else rank_tol**2
-    drop = (WITH_CARE * rank_tol) ** 2 if (code or equations.code).elimination == "watch" else least
-    numbers = [textbook.given] if large else [*jax.tree.leaves(textbook.mechanism), *gains]
+    programs = _code(problem) if code is None else code
+    drop = (WITH_CARE * rank_tol) ** 2 if programs.elimination == "watch" else least
     first = 0.0 if problem.h is None else problem.h
     care = WITH_CARE * rank_tol
     settings = [problem.rtol, problem.atol, problem.smallest, first, problem.length, problem.rate, care, problem.max_steps]
     given = {
-        "numbers": _vector([*numbers, drop, least], xp),
+        "numbers": _vector([*jax.tree.leaves(equations.mechanism), *_gains(equations.baumgarte), drop, least], xp),
         "ts": problem.ts,
         "q": problem.q,
         "v": problem.v,
         "settings": _vector(settings, xp),
-        "rows": textbook.scales.rows,
+        "rows": equations.scales.rows,
         "breaks": xp.zeros(0) if problem.breakpoints is None else problem.breakpoints,
     }
     arrays = [xp.asarray(given[name], float)[None] for name in INPUTS]

@@ -1,4 +1,4 @@
-"""Count right-hand sides exactly: also those of steps that were rejected, and of attempts that were made again.
+"""Count right-hand sides exactly: also those of steps that were rejected.
 
 diffrax counts steps, and where its controller rejects a step it restores the solver's state. The controller's own state it does
 not restore. So a step says beside its error estimate what it took, and the controller adds that up.
@@ -41,13 +41,6 @@ def tally(solver: Any, error: Any, before: Any, after: Any, made_jump: Any) -> T
         nothing_kept, _ = before
         stages = stages - jnp.where(nothing_kept | made_jump, 0, 1)
     return Tally(error, jnp.asarray(stages), jnp.asarray(0))
-
-
-def again(first: Tally, second: Tally) -> Tally:
-    """The error estimate of an attempt made again, with the calls of both."""
-    if first.evaluations is None:
-        return second
-    return Tally(second.error, first.evaluations + second.evaluations, second.before)
 
 
 class Counted(Wrapper):

@@ -1,23 +1,22 @@
 """Derivatives of a run, forward and reverse, of any order.
 
-A run is a function x -> f(x) of its numbers. Forward mode is that of the integrator itself: x' -> J x'. In reverse mode the steps
-are recorded and walked back (replay.py): w -> J^T w. Both together are one linear map with its transpose (`Linear`), to JAX a
-primitive, so that no derivative is ever transposed operation by operation.
+A run is a function x -> f(x) of its numbers. Its first derivatives, forward x' -> J x' and in reverse w -> J^T w, are machine code
+where that serves, else diffrax's. Both together are one linear map with its transpose (`Linear`), to JAX a primitive, so that no
+derivative is ever transposed operation by operation.
 
 A derivative of the map is one of two functions again, of x and a direction v, or of x and a cotangent w,
 
     g(x, v) = J(x) v,        h(x, w) = J(x)^T w.
 
 Forward mode of both is JAX's. In reverse mode, since w^T J(x) v is one number, of which derivatives may be taken in any order,
-the cotangents of x are d/dx (w^T J v) = dh(x, w) along v, and those of v and w are h and g. So forward mode through the
-integrator and through the way back is all that derivatives of higher orders take.
+the cotangents of x are d/dx (w^T J v) = dh(x, w) along v, and those of v and w are h and g. There h is found row by row by forward
+mode, w^T J e_k, so that forward mode through diffrax is all that derivatives of higher orders take.
 """
 
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -26,33 +25,25 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
-from udkjax.equations.linear import through_constants
-from udkjax.equations.programs import Equations
 from udkjax.integrate import by_native
-from udkjax.integrate.batched import one_by_one
-from udkjax.integrate.explicit import march
-from udkjax.integrate.lanes import Lanes, number_of, raw_of, serves, solve, task_of
+from udkjax.integrate.along import along
 from udkjax.integrate.problem import Problem, Raw
-from udkjax.integrate.record import Record
-from udkjax.integrate.replay import walked_back
 from udkjax.integrate.undifferentiated import undifferentiated
-from udkjax.straightline import along
 
 Mask = tuple[bool, ...]  # of a list of arrays: those that have tangents
 SMOOTH = tuple(Raw._fields.index(name) for name in ("q", "v", "y"))  # of `Raw`: what has derivatives
 
 
-def differentiable(problem: Problem) -> Raw:
-    """Integrate a problem, with derivatives of any order; of `Raw`, q, v and y have some.
+def differentiable(problem: Problem, native: bool) -> Raw:
+    """Integrate a problem by machine code or by diffrax, with derivatives of any order; of `Raw`, q, v and y have some.
 
     None are taken along numbers that do not depend on what is differentiated.
     """
     arrays, rest = eqx.partition(problem, eqx.is_inexact_array)
     xs, tree = jax.tree.flatten(arrays)
-    return _run(Run(rest, tree), xs)
+    return _run(Run(rest, tree, native), xs)
 
 
 @eqx.filter_custom_jvp
@@ -68,9 +59,9 @@ def _(primals, tangents):
     shapes = eqx.filter_eval_shape(_run, *primals)
 
     def in_parts(at: Any, *directions: list[Array]) -> tuple[list[Any], ...]:
-        """The run with its record, and linear maps of the directions."""
-        raw, record = at[0].recorded(undifferentiated(at[1]), moving)
-        linear = Linear(function=at[0], xs=at[1], run=(raw, record), moving=moving)
+        """The run, and linear maps of the directions."""
+        raw = at[0].recorded(undifferentiated(at[1]), moving)
+        linear = Linear(function=at[0], xs=at[1], run=raw, moving=moving)
         return list(_as_run(*at, raw)), *(linear.applied(direction) for direction in directions)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
@@ -109,9 +100,13 @@ class Function(eqx.Module):
     def __call__(self, xs: list[Array]) -> list[Array]:
         """f(x)."""
 
-    @abstractmethod
     def pull(self, xs: list[Array], moving: Mask, ws: list[Array]) -> list[Array]:
-        """J^T w, of those of x that are moving."""
+        """J^T w, of those of x that are moving: w^T J e for each unit vector e. Forward mode of it is JAX's, too."""
+        some = those(xs, moving)
+        units = jnp.eye(sum(x.size for x in some))
+        shapes = [x.shape for x in some]
+        row = lambda e: sum(map(jnp.vdot, ws, _change(self, xs, moving, _split(e, shapes))[1]))  # noqa: E731
+        return _split(jax.vmap(row)(units), shapes)
 
     @abstractmethod
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
@@ -132,34 +127,28 @@ class Function(eqx.Module):
         """The same in the form that is differentiated more than once."""
         return self
 
-    def counted_twice(self, xs: list[Array], dxs: list[Any], moving: Mask, bars: list[Array]) -> list[Array] | None:
-        """Of a change of cotangents, what JAX adds itself."""
-        return None
-
 
 class Run(Function):
     """Positions and velocities at the output times, and at the end, of the numbers of a problem. `rest` is what else it has.
 
-    A first derivative is that of the programs, which depend on constants made of the numbers of a scene; a further one is that of
-    the textbook, of the numbers themselves: `plain`.
+    Derivatives beyond the first are those of diffrax alone: `plain`.
     """
 
     rest: Problem
     tree: Any = eqx.field(static=True)
-    is_plain: bool = eqx.field(static=True, default=False)
+    native: bool = eqx.field(static=True)
 
     def problem(self, xs: list[Array]) -> Problem:
-        problem = eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
-        return replace(problem, equations=problem.equations.plain, fallback=False) if self.is_plain else problem
+        return eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
 
     @property
     def plain(self) -> "Run":
-        return replace(self, is_plain=True)
+        return replace(self, native=False)
 
     def fast(self, xs: list[Array]) -> Raw:
         """By machine code, which has no derivatives, if that serves."""
         problem = self.problem(xs)
-        return by_native.solve(problem) if by_native.serves(problem) else self.raw(xs)
+        return by_native.solve(problem) if self.native else _by_diffrax(problem)
 
     def forward(self, xs: list[Array], moving: Mask, vs: list[Array], run: Any) -> list[Array]:
         return super().forward(xs, moving, vs, run) if run is None else self.pushed(xs, moving, vs)[1]
@@ -168,97 +157,45 @@ class Run(Function):
         if run is None:
             return self.pull(xs, moving, ws)
         problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
-        if not self.is_plain and by_native.serves_derivatives(problem, which):
+        if self._is_native(xs, moving):
             q, v, y = ws
             found = by_native.pulled(problem, which, jnp.concatenate([q, v], axis=1), y)
             pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
             return [bar for m, bar in pairs if m is True]
-        raw, record = run
-        if record is None:
-            return self.through_diffrax("RecursiveCheckpointAdjoint", xs, moving, ws)
-        return self.walk(_pulled, xs, moving, raw, record, ws)
-
-    def pushed(self, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[Raw, list[Array]]:
-        """The run, and the change of its states along v, of those of x that are moving: by machine code, if that serves."""
-        problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
-        if not self.is_plain and by_native.serves_derivatives(problem, which):
-            rest = iter(vs)
-            change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in moving])
-            raw, found = by_native.pushed(problem, which, change)
-            return raw, list(found)
-        raw, change = _change(lambda xs: self.raw(xs), xs, moving, vs)
-        return raw, [change[k] for k in SMOOTH]
-
-    def raw(self, xs: list[Array]) -> Raw:
-        """By the engine that serves; under vmap in lanes, or one after another."""
-        problem = self.problem(xs)
-        return solve(problem) if serves(problem) else one_by_one(problem, partial(_by_diffrax, adjoint="ForwardMode"))
-
-    def recorded(self, xs: list[Array], moving: Mask) -> tuple[Raw, Any]:
-        """The run, and its record if it is made for one."""
-        problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
-        if not self.is_plain and by_native.serves_derivatives(problem, which):
-            return by_native.recorded(problem, which), None
-        return _recorded(problem) if serves(problem) else (self.raw(xs), None)
-
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        """Forward mode of it may be taken again, and mapped in any way: one run, in which all members wait for the slowest."""
-        problem = self.problem(xs)
-        raw = _marched(problem)[0] if serves(problem) else _by_diffrax(problem, "ForwardMode")
-        return [raw[k] for k in SMOOTH]
-
-    def pull(self, xs: list[Array], moving: Mask, ws: list[Array]) -> list[Array]:
-        problem = self.problem(xs)
-        if serves(problem):
-            return self.walk(walked_back, xs, moving, *_marched(problem), ws)
-        return self.through_diffrax("DirectAdjoint", xs, moving, ws)
-
-    def walk(self, back: Callable, xs: list[Array], moving: Mask, raw: Raw, record: Record, ws: list[Array]) -> list[Array]:
-        """The way back of a recorded run."""
-
-        def arrays(some: list[Array]) -> Problem:
-            return eqx.filter(self.problem(replaced(xs, moving, some)), eqx.is_inexact_array)
-
-        numbers, to_xs = jax.vjp(arrays, those(xs, moving))
-        which = replace(jax.tree.unflatten(self.tree, moving), fallback=numbers.fallback)
-        if self.is_plain and isinstance(which.equations, Equations):
-            textbook, none = which.equations.textbook, jax.tree.map(lambda _: False, numbers.equations)
-            which = replace(which, equations=replace(none, mechanism=textbook.mechanism, baumgarte=textbook.baumgarte))
-        some = jax.tree.map(lambda m, x: x if m else None, which, numbers)
-        q, v, y = ws
-        found = back(self.problem(xs), some, raw, record, jnp.concatenate([q, v], axis=1), y)
-        return to_xs(eqx.combine(found, jax.tree.map(jnp.zeros_like, numbers)))[0]
-
-    def through_diffrax(self, adjoint: str, xs: list[Array], moving: Mask, ws: list[Array]) -> list[Array]:
-        """Reverse mode by an adjoint of diffrax."""
 
         def function(some: list[Array]) -> list[Array]:
-            raw = _by_diffrax(self.problem(replaced(xs, moving, some)), adjoint)
+            raw = _by_diffrax(self.problem(replaced(xs, moving, some)), "RecursiveCheckpointAdjoint")
             return [raw[k] for k in SMOOTH]
 
         return jax.vjp(function, those(xs, moving))[1](ws)[0]
+
+    def pushed(self, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[Raw, list[Array]]:
+        """The run, and the change of its states along v, of those of x that are moving: by machine code, if that serves."""
+        if self._is_native(xs, moving):
+            rest, which = iter(vs), jax.tree.unflatten(self.tree, moving)
+            change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in moving])
+            raw, found = by_native.pushed(self.problem(xs), which, change)
+            return raw, list(found)
+        raw, change = _change(lambda xs: _by_diffrax(self.problem(xs)), xs, moving, vs)
+        return raw, [change[k] for k in SMOOTH]
+
+    def recorded(self, xs: list[Array], moving: Mask) -> Raw:
+        """The run, by the machine code of its reverse mode, if that serves: no other is compiled."""
+        if self._is_native(xs, moving):
+            return by_native.recorded(self.problem(xs), jax.tree.unflatten(self.tree, moving))
+        return _by_diffrax(self.problem(xs))
+
+    def _is_native(self, xs: list[Array], moving: Mask) -> bool:
+        return self.native and by_native.serves_derivatives(jax.tree.unflatten(self.tree, moving))
+
+    def __call__(self, xs: list[Array]) -> list[Array]:
+        raw = _by_diffrax(self.problem(xs))
+        return [raw[k] for k in SMOOTH]
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
         problem = eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
         (times,), (n,) = problem.ts.shape, problem.q.shape
         return [(times, n), (times, n), (2 * n,)]
-
-    def counted_twice(self, xs: list[Array], dxs: list[Any], moving: Mask, bars: list[Array]) -> list[Array]:
-        """Of a change of cotangents, what JAX adds itself, since the constants are functions of numbers that change."""
-        rest = iter(bars)
-        trees = xs, dxs, [next(rest) if m else None for m in moving], moving
-        at, along, given, which = (jax.tree.unflatten(self.tree, some).equations for some in trees)
-        none = jax.tree.unflatten(self.tree, [jnp.zeros_like(x) if m else None for x, m in zip(xs, moving, strict=True)])
-        if isinstance(at, Equations) and any(which.constants):
-            leaves, tree = jax.tree.flatten((which.textbook.mechanism, which.textbook.baumgarte), is_leaf=lambda x: x is None)
-            moved, constants = tuple(map(bool, leaves)), tuple(which.constants)
-            bars = [bar for bar, m in zip(given.constants, constants, strict=True) if m]
-            equations: Any = eqx.combine(at, self.rest.equations)
-            found = iter(through_constants(equations, along, constants, moved, bars))
-            mechanism, baumgarte = tree.unflatten([next(found) if m else None for m in moved])
-            textbook = replace(none.equations.textbook, mechanism=mechanism, baumgarte=baumgarte)
-            none = replace(none, equations=replace(none.equations, textbook=textbook))
-        return jax.tree.leaves(none)
 
 
 class Along(Function):
@@ -361,11 +298,7 @@ def _derivative(primals, tangents):
     dxs = [*at.xs, *parts]
     moving = tuple(dx is not None for dx in dxs)
     further = Linear(kind(function.plain, linear.moving), [*linear.xs, *_split(vector, linear.inputs)], None, moving)
-    slope = _bind(further, _flat(those(dxs, moving)))
-    if linear.transposed:
-        twice = function.counted_twice(linear.xs, at.xs, linear.moving, _split(found, linear.T.inputs))
-        slope = slope if twice is None else slope - _flat(twice)
-    return found, slope
+    return found, _bind(further, _flat(those(dxs, moving)))
 
 
 @eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
@@ -401,83 +334,9 @@ def _split(vector: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
     return [part.reshape(shape) for part, shape in zip(jnp.split(vector, ends), shapes, strict=True)]
 
 
-# --- runs and records
-
-
-def _by_diffrax(problem: Problem, adjoint: str) -> Raw:
+def _by_diffrax(problem: Problem, adjoint: str = "ForwardMode") -> Raw:
     import diffrax
 
     from udkjax.integrate.by_diffrax import by_diffrax
 
     return by_diffrax(problem, getattr(diffrax, adjoint)())
-
-
-def _marched(problem: Problem) -> tuple[Raw, Record]:
-    lanes = Lanes(problem.equations)
-    m = march(task_of(problem, lanes, recorded=True), problem.q, problem.v, number_of(problem.equations))
-    assert m.record is not None
-    return raw_of(problem, lanes, m), m.record
-
-
-def _recorded(problem: Problem) -> tuple[Raw, Record]:
-    """A run and its record; under vmap records are left blank, not to fill the memory: `_pulled` makes each where it needs it."""
-    arrays, static = eqx.partition(problem, eqx.is_array)
-
-    def single(arrays: Any) -> tuple[Raw, Record]:
-        return _marched(eqx.combine(arrays, static))
-
-    one = custom_vmap(single)
-
-    @one.def_vmap
-    def _(size, batched, arrays):
-        del size
-        found = jax.eval_shape(single, jax.tree.map(lambda x, b: x[0] if b else x, arrays, batched[0]))
-        every = jax.tree.map(lambda _: any(jax.tree.leaves(batched)), found[0])
-        if not any(jax.tree.leaves(batched)):  # only tangents are
-            return single(arrays), (every, jax.tree.map(lambda _: False, found[1]))
-        raw = jax.vmap(lambda arrays: solve(eqx.combine(arrays, static)), (_axes(batched[0]),))(arrays)
-        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), found[1])
-        return (raw, blank), (every, jax.tree.map(lambda _: False, blank))
-
-    return one(arrays)
-
-
-def _pulled(problem: Problem, moving: Problem, raw: Raw, record: Record, ys: Any, y: Any) -> Problem:
-    """The cotangents of what is `moving`."""
-    arrays, static = eqx.partition(problem, eqx.is_array)
-    moves = jax.tree.map(lambda x: x is not None, moving, is_leaf=lambda x: x is None)
-
-    def single(arrays: Any, raw: Raw, record: Record, bars: Any) -> Problem:
-        return walked_back(eqx.combine(arrays, static), eqx.filter(arrays, moves), raw, record, *bars)
-
-    def again(arrays: Any, bars: Any) -> Problem:
-        return single(arrays, *_marched(eqx.combine(arrays, static)), bars)
-
-    return _of_members(single, again)(arrays, raw, record, (ys, y))
-
-
-def _of_members(single: Callable, again: Callable) -> Callable:
-    """`single(arrays, raw, record, bars)`; under vmap, where problems differ, `again(arrays, bars)` of one after another."""
-    pulled = custom_vmap(lambda arrays, raw, record, bars: single(arrays, raw, record, bars))
-
-    @pulled.def_vmap
-    def _(size, batched, *inputs):
-        if any(jax.tree.leaves(batched[0])):
-
-            def member(k: Any) -> Problem:
-                arrays, _, _, bars = jax.tree.map(lambda x, b: x[k] if b else x, inputs, tuple(batched))
-                return again(arrays, bars)
-
-            found = jax.lax.map(member, jnp.arange(size))
-        elif any(jax.tree.leaves(batched[3])):  # of one problem; of one in a batch, if that of problems is the outer one
-            axes = _axes(batched[3])
-            found = _of_members(jax.vmap(single, (None, None, None, axes)), jax.vmap(again, (None, axes)))(*inputs)
-        else:  # only tangents are
-            found = single(*inputs)
-        return found, jax.tree.map(lambda _: any(jax.tree.leaves(batched)), found)
-
-    return pulled
-
-
-def _axes(batched: Any) -> Any:
-    return jax.tree.map(lambda b: 0 if b else None, batched)

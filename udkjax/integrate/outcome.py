@@ -11,7 +11,6 @@ from udkjax.equations.motion import Motion
 from udkjax.integrate.problem import Raw
 from udkjax.integrate.solution import Result
 from udkjax.native.steps import AHEAD, DONE, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
-from udkjax.straightline import when
 
 
 class Run(eqx.Module):
@@ -45,10 +44,7 @@ def stopped(equations: Motion, span: Array, status: Array, t: Array, y: Array) -
     q, v = jnp.split(y, 2)
     times = t + jnp.array([0.0, AHEAD]) * span
 
-    def finite(_: Array) -> Array:
-        return jnp.all(jax.lax.map(lambda later: equations.is_finite(later, q + (later - t) * v, v), times))
-
-    is_finite = when(status != DONE, finite, jnp.array(True))
+    is_finite = jnp.all(jax.lax.map(lambda later: equations.is_finite(later, q + (later - t) * v, v), times))
     return jnp.where((status == STEP_TOO_SMALL) & ~is_finite, NOT_FINITE, status)
 
 

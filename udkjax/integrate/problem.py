@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import Motion
-from udkjax.integrate.pieces import Pieces
 from udkjax.integrate.undifferentiated import undifferentiated
 
 
@@ -28,17 +27,14 @@ class Problem(eqx.Module):
     solver: Any = eqx.field(static=True)
     projected: bool = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
-    fallback: bool = eqx.field(static=True, default=True)  # whether steps that elimination cannot take are; else they end a run
     breakpoints: Float[Array, "k"] | None = None  # the times where the motion is not smooth, in any order; None: it is
-    pieces: Pieces | None = None  # in which the motion is smooth, of those that have some; None: nothing has
 
-    def units(self, lanes: tuple[int, ...] = ()) -> tuple[Any, Any]:
-        """What `atol` is relative to, of coordinates and of velocities, (n, *lanes) or to be broadcast so."""
-        one = jnp.ones((len(self.q), *[1] * len(lanes)))
+    def units(self) -> tuple[Any, Any]:
+        """What `atol` is relative to, of coordinates and of velocities (n,)."""
+        one = jnp.ones(len(self.q))
         if self.length is not None:
-            one = jnp.where(np.arange(len(self.q)).reshape(one.shape) % 3 == 2, one, self.length)
-        q, v = jnp.broadcast_arrays(one, one * self.rate)
-        return undifferentiated((q, v))
+            one = jnp.where(np.arange(len(self.q)) % 3 == 2, one, self.length)
+        return undifferentiated((one, one * self.rate))
 
 
 class Raw(NamedTuple):

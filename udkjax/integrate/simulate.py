@@ -1,7 +1,6 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,11 +18,9 @@ from udkjax.equations.partitioning import Partitioned
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
-from udkjax.integrate.by_native import known, unserved
+from udkjax.integrate.by_native import known, rows_kept, unserved
 from udkjax.integrate.derivatives import differentiable
-from udkjax.integrate.lanes import serves
 from udkjax.integrate.outcome import Run, counts, outcome
-from udkjax.integrate.pieces import pieces_of
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import Result, SimulationError, Solution
@@ -103,11 +100,9 @@ def simulate(
         analysis, bare = analyse(mechanism) if analysis is None else analysis, mechanism.bare
         if state is None and closure is None:
             closure = close(mechanism, start, analysis=analysis)
-    moves = [isinstance(x, Tracer) for x in jax.tree.leaves(mechanism)]
-    moving = tuple(moves) if any(moves) else ()
 
     def run(analysis: Analysis | None) -> tuple[Solution, Any]:
-        return _run(bare, analysis, ts, state, closure, *settings, *choices, moving, engine)
+        return _run(bare, analysis, ts, state, closure, *settings, *choices, engine)
 
     solution, missed = run(analysis)
     if isinstance(solution.code, Tracer):
@@ -152,43 +147,41 @@ def _simulate(
     adjoint,
     max_steps,
     meter,
-    moving,
     engine,
 ) -> Any:
     """As `_run`; by NumPy, None where machine code cannot."""
     if xp is np:
         ts, rtol, atol, drift_tol = (np.asarray(x) for x in (ts, rtol, atol, drift_tol))
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
-    equations = equations_of(mechanism, method, baumgarte, formulation, moving, analysis, evaluated=xp is jnp)
+    equations = equations_of(mechanism, method, baumgarte, formulation, analysis)
     projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, Partitioned))
-    start, closed, missed = _start(equations, state, closure, xp)
+    if state is None:
+        assert closure is not None
+        state, closed = closure.state, xp.asarray(closure.is_closed)
+    else:
+        closed = xp.array(True)
     # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
     loose_rtol, loose_atol = (xp.where(closed, tol, 1e3) for tol in (rtol, atol))
     ulp = np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1]))
-    q, v = xp.ravel(xp.asarray(start.q)), xp.ravel(xp.asarray(start.v))
+    q, v = xp.ravel(xp.asarray(state.q)), xp.ravel(xp.asarray(state.v))
     numbers: Any = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v, xp))
-    problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps)
-    problem = replace(problem, breakpoints=mechanism.breakpoints, pieces=pieces_of(mechanism))
-    why = unserved(problem, adjoint, meter)
+    problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, breakpoints=mechanism.breakpoints)
+    why = "it was asked for" if engine == "diffrax" else unserved(problem, adjoint, meter)
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
-    native = engine != "diffrax" and not why
-    if xp is np and not native:
+    if xp is np and why:
         return None
-    taken = "native"
-    if native:
-        raw = known(problem) if xp is np else differentiable(problem)
-    elif engine == "auto" and adjoint is None and meter is None and serves(problem):
-        taken, raw = f"lanes: {why}", differentiable(problem)
-    else:
-        taken = f"diffrax: {why if engine != 'diffrax' else 'it was asked for'}"
+    if adjoint is not None or meter is not None:
         raw = by_diffrax(problem, adjoint, meter)
+    else:
+        raw = known(problem) if xp is np else differentiable(problem, native=not why)
+    missed = xp.array(False) if why or closure is None else closed & (closure.rank > rows_kept(problem))
     later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
     q, v = xp.where(later, raw.q, q), xp.where(later, raw.v, v)
     ends: Any = (raw, ts, closed, missed, drift_tol)
     seen = Run(*ends)
     code, time, reached = outcome(seen if xp is np else undifferentiated(seen), xp)
-    q, v = (xp.where(reached[:, None], y, xp.nan).reshape(-1, *np.shape(start.q)) for y in (q, v))
+    q, v = (xp.where(reached[:, None], y, xp.nan).reshape(-1, *np.shape(state.q)) for y in (q, v))
     stats = counts(raw, projected, len(ts), xp)
     chosen = (
         ("method", type(method).__name__),
@@ -197,7 +190,7 @@ def _simulate(
         ("solver", "Dopri8" if solver is None else type(solver).__name__),
         ("max_steps", str(max_steps)),
         ("first_step", "chosen" if dt0 is None else "given"),
-        ("engine", taken),
+        ("engine", f"diffrax: {why}" if why else "native"),
     )
     arrays = jax.tree.map(jnp.asarray, (ts, q, v, code, time, stats, rtol, atol))
     fields: Any = (*arrays, getattr(mechanism, "body_names", ()), chosen)
@@ -205,15 +198,6 @@ def _simulate(
 
 
 _compiled = eqx.filter_jit(partial(_simulate, jnp))
-
-
-def _start(equations: Any, state: State | None, closure: Closure | None, xp: Any) -> tuple[State, Any, Any]:
-    """The initial state; whether it is closed; whether that takes rows left out as redundant."""
-    if state is not None:
-        return state, xp.array(True), xp.array(False)
-    assert closure is not None
-    closed, kept = xp.asarray(closure.is_closed), len(closure.psi) - len(equations.left_out)
-    return closure.state, closed, closed & (closure.rank > kept)
 
 
 def _units(analysis: Analysis | None, ts: Any, v: Any, xp: Any) -> tuple[Any, Any]:

@@ -57,3 +57,14 @@ AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one lo
 # steps were up to six times as many at tolerances of 1e-11. A hundredth keeps some of these; with none of it, runs that cross are
 # less exact than their tolerance says.
 TAKEN_BACK = 1e-3
+
+# A pivot, relative to its row's diagonal entry of D D^T: below are rounding errors; Newton's method corrects those of pivots above.
+NOTHING_LEFT = 1e-14
+# Over the pivot: by how much rounding errors turn the velocities that a row allows (rad; up to a third of that in the paper's
+# linkage). Rows of larger pivots than the second are of use to linkages that turn back there, however small the tolerance.
+TURNED, USELESS = 1e-15, 1e-8
+
+NEWTON_STEPS = 3  # in a projection, at most: the last of which usually finds nothing to do
+# Of the characteristic length, and rad: a Newton step that moves q by less leaves rounding errors, since it converges
+# quadratically.
+FAR = 1e-8

@@ -24,8 +24,6 @@ import numpy as np
 
 from udkjax.equations.code import Code
 from udkjax.equations.large_code import LargeCode
-from udkjax.equations.motion import FAR, STEPS
-from udkjax.equations.rank_policy import NOTHING_LEFT, TURNED, USELESS
 from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM, least_norm
 from udkjax.native.loops import LoopWriter
@@ -69,6 +67,11 @@ from udkjax.native.steps import (
     SURE,
     TAKEN_BACK,
     TRIES,
+    FAR,
+    NEWTON_STEPS,
+    NOTHING_LEFT,
+    TURNED,
+    USELESS,
 )
 from udkjax.native.tableau import Method
 from udkjax.straightline import Program
@@ -441,7 +444,7 @@ class Trajectory:
         else:
             if not method.ends:
                 self._errors(f, s, None, "X dq", "X dv")
-            self._newton(f, s, STEPS)
+            self._newton(f, s, NEWTON_STEPS)
             self._call(f, "arrival" if method.ends else "finish")
             unsafe = (s.judged > 0.5) & (s.safe < 0.5)
             if self.cares:
@@ -530,7 +533,7 @@ class Trajectory:
 
         self._to_manifold(f, s, getattr(s, which) > 0.5, closer, steps)
 
-    def _to_manifold(self, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = STEPS):
+    def _to_manifold(self, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):
         """Newton's method of some lanes: `closer` leaves X q nearer to the manifold in C."""
         s.moving = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
         k = f.variable(0, INT, 1)

@@ -4,6 +4,9 @@ import os
 import platform
 from pathlib import Path
 
+CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
+MEMBERS = 64  # of a chunk, on them
+
 
 def cores() -> int:
     """Return how many cores this process may use."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations import Baumgarte, energy
-from udkjax.equations.programs import prepare
+from udkjax.equations.textbook import prepare
 from udkjax.integrate import Projection, Result, simulate
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.solvers import solver_named

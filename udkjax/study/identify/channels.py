@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.equations.motion import MechanismMotion
-from udkjax.equations.programs import prepare
+from udkjax.equations.textbook import prepare
 from udkjax.pinv import SVD
 from udkjax.scene.bodies import GROUND, Frame, between
 from udkjax.scene.mechanism import Mechanism

@@ -18,15 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.integrate.assembly import State, close
-from udkjax.integrate.batched import CHUNKED
-from udkjax.integrate.lanes import LANES
-from udkjax.integrate.settled import close_all
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Solution
 from udkjax.integrate.solvers import forward_mode
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.channels import Channel, Quantity, measured
 from udkjax.study.identify.unknowns import Target, applied
+from udkjax.study.machine import CHUNKED, MEMBERS
 
 # Members from which on lanes pay for the half minute that their program takes to compile; fewer are computed one by one. Forward
 # derivatives of one member take 2 ms alone, 0.6 ms in lanes.
@@ -85,7 +83,7 @@ class Program:
         if key in self._latest:
             return self._latest[key]
         self.calls += size
-        together = size if jax.default_backend() not in CHUNKED else LANES if size >= MANY else 1
+        together = size if jax.default_backend() not in CHUNKED else MEMBERS if size >= MANY else 1
         starts = range(0, size, together)
         pieces = [jax.tree.map(lambda x, k=k: _rows(x, k, together), members) for k in starts]
         if len(pieces) > 1:
@@ -160,7 +158,7 @@ def _computed(static, arrays, members, tol):
 
     def every(members):
         mechs, states = jax.vmap(lambda member: _member(mechanism, member, targets))(members)
-        closures = close_all(mechs, members.ts[:, 0], states, settings["analysis"])
+        closures = jax.vmap(lambda m, t, state: close(m, t, state, settings["analysis"]))(mechs, members.ts[:, 0], states)
         return jax.vmap(lambda m, ts, c: _run(m, ts, c, tol, settings, channels, ends))(mechs, members.ts, closures)
 
     size = members.x.shape[1] + members.shift.shape[1]

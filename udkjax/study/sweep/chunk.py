@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Int
 
 from udkjax.equations.analysis import analyse
-from udkjax.integrate.batched import CHUNKED
-from udkjax.integrate.lanes import LANES, ROUND
 from udkjax.integrate.solution import Result
+from udkjax.study.machine import CHUNKED, MEMBERS
 from udkjax.study.sweep.measures import Named, guessed
 from udkjax.study.sweep.member import END, RESULT, STEPS, Kept, Recipe
 from udkjax.study.sweep.plan import Chunk, Group, Plan, Variable
 from udkjax.study.units import units_of
 
+WIDTH = 8  # members: a piece has a multiple, of what the widest vector units hold
 WIDE = 4096  # members of a piece where a device takes them all at once
 # Chunks of lanes in a piece, at most: to call a program takes what ten of its members take. And pieces that a group has at least,
 # before its pieces get larger: for as many devices there is something to do.
@@ -49,27 +49,30 @@ class Program:
         self._compiled: Any = None
 
     def _piece(self, members: int) -> int:
-        full = -(-members // ROUND) * ROUND
+        full = -(-members // WIDTH) * WIDTH
         if self.devices[0].platform not in CHUNKED:
             return min(WIDE, full)
         if not self.recipe.in_lanes:
             return 1
-        return min(LANES * max(1, min(TOGETHER, members // (LANES * MANY))), full)
+        return min(MEMBERS * max(1, min(TOGETHER, members // (MEMBERS * MANY))), full)
 
     @property
     def lanes(self) -> int | None:
         """How many members wait for each other; None: none does."""
-        return None if self.piece == 1 else min(self.piece, LANES) if self.devices[0].platform in CHUNKED else self.piece
+        return None if self.devices[0].platform in CHUNKED else self.piece
 
     def _computed(self, shared: Any, own: Any) -> tuple[Kept, Kept]:
         """What is kept, and the derivatives of it by each name, last."""
-        one = self.recipe.single if self.piece == 1 else self.recipe.batch
         names = self.recipe.names
+
+        def members(shift: Any) -> Kept:
+            return jax.vmap(lambda own: self.recipe(shared, own, shift))(own)
+
         if not names:
-            return one(shared, own, {}), {}
+            return members({}), {}
 
         def shifted(shift: Any) -> tuple[Kept, Kept]:
-            kept = one(shared, own, dict(zip(names, shift, strict=True)))
+            kept = members(dict(zip(names, shift, strict=True)))
             return {k: x for k, x in kept.items() if jnp.issubdtype(x.dtype, jnp.floating) and k != END}, kept
 
         slopes, kept = jax.jacfwd(shifted, has_aux=True)(jnp.zeros(len(names)))

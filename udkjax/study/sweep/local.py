@@ -8,8 +8,7 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 import jax
 import numpy as np
 
-from udkjax.integrate.batched import CHUNKED
-from udkjax.study.machine import cores
+from udkjax.study.machine import CHUNKED, cores
 from udkjax.study.sweep.chunk import run
 from udkjax.study.sweep.plan import Chunk, Plan
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.programs import prepare
+from udkjax.equations.textbook import prepare
 from udkjax.equations.quantities import energy, violation
 from udkjax.equations.scales import rank_tolerance
 from udkjax.integrate.solution import Solution

@@ -16,7 +16,6 @@ from jaxtyping import Array, Int
 
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.assembly import Closure, State, close
-from udkjax.integrate.settled import close_all
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solvers import forward_mode
 from udkjax.integrate.tableau import is_explicit
@@ -122,23 +121,10 @@ class Recipe:
                 found["method"] = _with(found.get("method") or Auto(), tol, numbers.pop(tol))
         return found | numbers | {"ts": ts}
 
-    def batch(self, shared: Any, own: Any, shift: Mapping[str, Array]) -> Kept:
-        """What is kept of members: leaves of `own` have the members first, and so has what is kept."""
-        if self.varied:
-            mechanisms = jax.vmap(lambda own: self.mechanism(shared, own, shift))(own)
-            analyses = self._setting("analysis", shared, own)
-            closures = close_all(mechanisms, self.plan.ts[0], analysis=analyses) if self.assembled else None
-            return jax.vmap(lambda *x: self._run(shared, shift, *x))(own, mechanisms, closures)
-        mechanism = self.mechanism(shared, own, shift) if self.names else self._setting("mechanism", shared, own)
-        closure = self._closure(shared, own, mechanism)
-        return jax.vmap(lambda own: self._run(shared, shift, own, mechanism, closure))(own)
-
-    def single(self, shared: Any, own: Any, shift: Mapping[str, Array]) -> Kept:
+    def __call__(self, shared: Any, own: Any, shift: Mapping[str, Array]) -> Kept:
         """What is kept of one member, and of no more."""
-        own = jax.tree.map(lambda x: x[0], own)
         mechanism = self.mechanism(shared, own, shift)
-        found = self._run(shared, shift, own, mechanism, self._closure(shared, own, mechanism))
-        return jax.tree.map(lambda x: x[None], found)
+        return self._run(shared, shift, own, mechanism, self._closure(shared, own, mechanism))
 
     def _closure(self, shared: Any, own: Any, mechanism: Mechanism) -> Closure | None:
         if shared[1] is not None or not self.assembled:

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive, set_current_trace
 from jax.interpreters import ad, batching, mlir, partial_eval
 
-from udkjax.straightline.fusion import differentiated
 
 Parts = Callable[..., tuple[list[Any], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
 
@@ -113,7 +112,16 @@ def _batched(xs: Sequence[Any], axes: Sequence[int | None], both: Both) -> tuple
 
 
 def _derivative(primals: Sequence[Any], tangents: Sequence[Any], both: Both) -> tuple[list[Any], list[Any]]:
-    return differentiated(both.seen, primals, tangents)
+    moving = [not isinstance(dx, ad.Zero) for dx in tangents]
+
+    def function(*some: Any) -> list[Any]:
+        rest = iter(some)
+        return both.seen(*[next(rest) if m else x for x, m in zip(primals, moving, strict=True)])
+
+    some, changes = ([x for x, m in zip(xs, moving, strict=True) if m] for xs in (primals, tangents))
+    found, slopes = jax.jvp(function, some, changes)
+    none = [dx.dtype == jax.dtypes.float0 for dx in slopes]
+    return found, [ad.Zero(jax.typeof(x).to_tangent_aval()) if n else dx for x, dx, n in zip(found, slopes, none, strict=True)]
 
 
 def _part(trace: Any, *xs: Any, both: Both) -> list[Any]:
