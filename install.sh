@@ -125,19 +125,13 @@ fi
 
 if [ -n "$reuse" ]; then
     say "using the environment in $venv: $("$venv/bin/python" --version)"
-    newer=${best#* } newer=${newer%% *}
-    if [ "$minor" -lt $fast ] && [ "${newer:-0}" -ge $fast ]; then
-        say "this machine has Python 3.$newer too, which is faster: remove $venv and run this again to use it"
-    fi
 else
     [ -n "$best" ] || die 3 "found no Python 3.$oldest or newer in PATH, pyenv or uv that runs; install one, or name it with --python"
     rest=${best#* } minor=${rest%% *} python=${rest#* }
     say "Python 3.$minor: $python"
     make_venv || die 1 "could not make an environment with pip in $venv; on Debian: apt install python3.$minor-venv"
 fi
-if [ "$minor" -lt $fast ]; then
-    say "Python 3.$minor gets an older JAX, on which runs take longer (udkjax doctor says by how much); Python 3.$fast or newer is better"
-elif [ "$minor" -gt $newest ]; then
+if [ "$minor" -gt $newest ]; then
     say "Python 3.$minor is newer than what the versions in constraints.txt were tested with"
 fi
 

@@ -54,5 +54,5 @@ def main(words: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    os.environ["UDKJAX_COMPILATION_CACHE"] = "0"  # what was compiled before would be found; `startup` looks at that by itself
+    os.environ["UDKJAX_CACHE"] = "0"  # what was compiled before would be found; `startup` looks at that by itself
     main()

@@ -168,7 +168,7 @@ def timing(case: str, words: dict[str, Any], ways: Iterable[str], spread: float,
     for way in ways:
         task = {"case": case, "words": words, "way": way, "starts": m.starts(count, spread).tolist(), "values": exact(m).tolist()}
         command = [sys.executable, "-m", "benchmarks.identification"]
-        environment = {**os.environ, "UDKJAX_COMPILATION_CACHE": "0"}
+        environment = {**os.environ, "UDKJAX_CACHE": "0"}
         ran = subprocess.run(command, input=json.dumps(task), env=environment, capture_output=True, text=True, check=False)
         if ran.returncode:
             raise RuntimeError(ran.stderr)

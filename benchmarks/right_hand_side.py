@@ -6,12 +6,12 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from udkjax.equations.rank_policy import REFUSE
 
 import udkjax as udk
 from benchmarks.common import Compiled, alternate, machine, ratio, report
 from benchmarks.scripts import by_cholesky, by_pinv
 from udkjax.equations import prepare
-from udkjax.equations.rank_policy import REFUSE
 
 EVALUATIONS, ROUNDS = 1000, 31
 

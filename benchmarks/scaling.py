@@ -10,11 +10,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from udkjax.equations.rank_policy import REFUSE
 
 import udkjax as udk
 from benchmarks.common import Compiled, in_turn, machine, report
 from udkjax.equations import prepare
-from udkjax.equations.rank_policy import REFUSE
 from udkjax.straightline import Loop
 
 SIZES = {"N-four-bar": (1, 2, 5, 10, 20, 40, 100, 200, 1000), "chain": (1, 10, 100, 1000)}

@@ -36,7 +36,7 @@ def waited(code: str, cache: Path, bytecode: Path) -> dict[str, float]:
     """
     dropped = ("JAX_COMPILATION_CACHE", "PYTHONDONTWRITEBYTECODE")
     environment = {name: text for name, text in os.environ.items() if not name.startswith(dropped)}
-    environment |= {"UDKJAX_COMPILATION_CACHE": str(cache), "PYTHONPYCACHEPREFIX": str(bytecode)}
+    environment |= {"UDKJAX_CACHE": str(cache), "PYTHONPYCACHEPREFIX": str(bytecode)}
     before, start = os.times(), time.perf_counter()
     subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.DEVNULL, check=True)
     after = os.times()

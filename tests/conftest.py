@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-# Programs compiled by the tests stay out of the user's cache; the processes of one run share theirs.
-OWN_CACHE = None if "UDKJAX_COMPILATION_CACHE" in os.environ else tempfile.mkdtemp(prefix="udkjax-cache-")
-if OWN_CACHE:
-    os.environ["UDKJAX_COMPILATION_CACHE"] = OWN_CACHE
+# What the tests compile stays out of the user's cache; the processes of one run share theirs.
+OWN_CACHE = None if "UDKJAX_CACHE" in os.environ else tempfile.mkdtemp(prefix="udkjax-cache-")
+CACHE = os.environ.setdefault("UDKJAX_CACHE", OWN_CACHE or "")
+jax.config.update("jax_compilation_cache_dir", f"{CACHE}/jax")
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 import udkjax as udk
 from udkjax.native import operation

@@ -1,24 +1,13 @@
 """Planar mechanisms with any redundancy of constraints: simulated, batched and differentiated in JAX.
 
 Nothing is imported before it is used, so that the command line answers at once. Importing this package turns float64 on in
-JAX, unless the environment says `JAX_ENABLE_X64=0`, and lets JAX keep compiled programs in the user's cache folder, unless it
-says `UDKJAX_COMPILATION_CACHE=0`, or names another folder there. On the CPU programs run in the thread that calls them, until
-`jax.config.update("jax_cpu_enable_async_dispatch", True)`. `XLA_FLAGS` is told to use vectors of 512 bits where the CPU has them,
-unless it says something of `xla_cpu_prefer_vector_width`, before JAX 0.12 to compile loops whole, and on JAX 0.12 what fusions of
-batches need (environment.py).
+JAX, unless the environment says `JAX_ENABLE_X64=0`, and does nothing else.
 """
 
+import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
-
-from udkjax.environment import (
-    disable_async_dispatch,
-    enable_compilation_cache,
-    enable_float64,
-    enable_fusions_of_batches,
-    enable_whole_loops,
-    enable_wide_vectors,
-)
 
 if TYPE_CHECKING:  # the public names, for type checkers and editors; a test compares them with those below
     from udkjax import equations as equations
@@ -151,9 +140,6 @@ def __dir__():
     return sorted({*globals(), *__all__})
 
 
-enable_float64()
-disable_async_dispatch()
-enable_whole_loops()
-enable_wide_vectors()
-enable_fusions_of_batches()
-enable_compilation_cache()
+os.environ["JAX_ENABLE_X64"] = os.environ.get("JAX_ENABLE_X64") or "1"
+if os.environ["JAX_ENABLE_X64"].lower() not in ("0", "n", "no", "f", "false", "off") and "jax" in sys.modules:
+    sys.modules["jax"].config.update("jax_enable_x64", True)  # it has read its environment already

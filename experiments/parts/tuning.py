@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from udkjax.integrate.interpolation import Point
+from udkjax.integrate.step import Task, attempt
 
 import udkjax as udk
 from experiments.parts.linkage import parallelogram, start
 from udkjax.equations import prepare
 from udkjax.equations.motion import Tangential
-from udkjax.integrate.interpolation import Point
 from udkjax.integrate.solution import Result
-from udkjax.integrate.step import Task, attempt
 from udkjax.native.tableau import DOPRI8
 from udkjax.pinv import Pseudoinverse
 from udkjax.study.identify.fitting import Fit, descend

@@ -1,4 +1,4 @@
-"""The textbook against what must hold of it, and every faster form against the textbook, in every scene of the library.
+"""The textbook against what must hold of it, and the programs against the textbook, in every scene of the library.
 
 Every type of joint, driver and force element is held against it in test_expressions.py.
 """
@@ -13,9 +13,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.equations import code as elements
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.rank_policy import REFUSE
 
 SVD = udk.SVD(1e-9)
 T0 = jnp.array(0.3)
@@ -163,41 +163,60 @@ def test_row_names_are_those_of_the_analysis(moved):
     assert tuple(constraints.row_names(moved[0])) == udk.analyse(moved[0]).row_names
 
 
-# --- every faster form against it
+# --- what else there is, against it
 
 
-@pytest.mark.parametrize("large", [False, True], ids=["programs", "blocks"])
-@pytest.mark.parametrize("method", [udk.Auto(), udk.Elimination(1e-7)], ids=["Auto", "Elimination"])
-def test_faster_forms_are_the_textbook(moved, method, large):
-    """Terms, energies, accelerations and multipliers; on the rows that are kept, since off the manifold the others disagree."""
+def named(program, constants, t, q, v):
+    return np.array(program([*constants, float(t), *q.tolist(), *v.tolist()]), float)
+
+
+@pytest.mark.parametrize("elimination", ["check", "drop"])
+def test_programs_are_the_textbook(moved, elimination):
+    """Terms, energies and accelerations; on the rows that are kept, since off the manifold the others disagree."""
     mech, q, v = moved
-    if large and isinstance(method, udk.Elimination):
-        pytest.skip("the terms are the same")
-    gains = udk.Baumgarte(2.0, 3.0)
-    analysis = udk.analyse(mech)
-
-    @eqx.filter_jit
-    def fast(mech, q, v):
-        equations = prepare(mech, method, gains, large=large, analysis=analysis).with_policy(REFUSE)
-        M, F, A, c = equations.matrices(T0, q, v)
-        psi, psi_dot = equations.violation(T0, q, v)
-        gamma = c + 2 * gains.alpha * psi_dot + gains.beta**2 * psi
-        T, V = equations.energy(T0, q, v)
-        found = {"psi": psi, "psi_q": A, "psi_dot": psi_dot, "gamma": gamma, "M": jnp.diag(M), "F": F, "T": T, "V": V}
-        return found | {"a": equations.accelerations(T0, q, v)}
-
+    gains, analysis = udk.Baumgarte(2.0, 3.0), udk.analyse(mech)
+    redundant = analysis.redundant_rows or ()
+    if elements.is_large(mech):
+        pytest.skip("written as loops (tests/native/test_loops.py)")
+    programs = elements.code(mech, redundant, True, elimination)
+    leaves = jax.tree.leaves(mech.bare)
+    constants = programs.prologue([*map(float, elements.scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14])
+    run = lambda name: named(programs.program(name), constants, T0, q, v)  # noqa: E731
+    (m, n), slots = programs.pattern.shape, programs.pattern.slots
+    values, b, free, root = np.split(run("rows"), [slots, slots + m, slots + m + n])
+    psi_q = programs.pattern.dense(values, np) / root
+    psi, psi_dot, (T, V) = run("psi"), run("psi_dot"), run("energy")
+    gamma = b + psi_q @ free + 4.0 * psi_dot + 9.0 * psi
+    found = {
+        "psi": psi,
+        "psi_q": psi_q,
+        "psi_dot": psi_dot,
+        "gamma": gamma,
+        "M": 1 / root**2,
+        "F": free / root**2,
+        "T": T,
+        "V": V,
+    }
     kept = np.ones(len(analysis.row_names))
-    kept[list(analysis.redundant_rows or ())] = 0.0
+    kept[list(redundant)] = 0.0
     expected = textbook(mech.bare, q, v, udk.SVD(1e-11), gains, analysis.scales.weights * kept)
-    for name, found in fast(mech.bare, q, v).items():
-        close_to(found, expected[name], 1e-8 if name == "a" else 1e-11)
+    for name, array in found.items():
+        close_to(array, expected[name], 1e-11)
+    close_to(run("accelerations")[:n], expected["a"], 1e-8)
 
 
-def test_multipliers_of_faster_forms_are_those_of_the_textbook(moved):
-    """Of minimum norm, of all rows, weighted."""
+@pytest.mark.parametrize("method", [udk.Elimination(1e-7), udk.Varga(1e-7), udk.Auto(1e-7)], ids=["Elimination", "Varga", "Auto"])
+def test_every_pseudoinverse_gives_what_singular_values_give(moved, method):
+    """Accelerations and multipliers of minimum norm, of all rows, weighted; where rows that are redundant agree."""
     mech, q, v = moved
     analysis = udk.analyse(mech)
     q, v = jax.jit(lambda m, q, v: uk.project(m, T0, q, v, SVD, steps=8))(mech.bare, q, v)
     expected = textbook(mech.bare, q, v, udk.SVD(1e-6), None, analysis.scales.weights)
-    found = eqx.filter_jit(lambda m, q, v: prepare(m, udk.Auto(1e-6), large=False, analysis=analysis).multipliers(T0, q, v))
-    close_to(found(mech.bare, q, v), expected["lambda"], 1e-9)
+
+    @eqx.filter_jit
+    def both(m, q, v):
+        equations = prepare(m, method, analysis=analysis)
+        return equations.accelerations(T0, q, v), equations.multipliers(T0, q, v)
+
+    for found, name in zip(both(mech.bare, q, v), ("a", "lambda"), strict=True):
+        close_to(found, expected[name], 1e-8)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.straightline import along
+from udkjax.integrate.along import along
 
 FEW = 3
 

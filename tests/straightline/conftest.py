@@ -33,7 +33,7 @@ class Emitted(NamedTuple):
         return tuple(results)
 
 
-def emit_function(function: Callable, *examples: Any, cut_every: int | None = None) -> Emitted:
+def emit_function(function: Callable, *examples: Any) -> Emitted:
     """Every element of the (array) arguments becomes one input, every element of the result one output."""
     examples = tuple(jnp.asarray(e) for e in examples)
     graph = Graph()
@@ -44,7 +44,7 @@ def emit_function(function: Callable, *examples: Any, cut_every: int | None = No
             array[place] = graph.input((k, place), "argument", example.dtype)
         inputs.append(array)
     outputs = trace(lambda *a: jax.tree.leaves(function(*a)), *examples)(graph, *inputs)
-    program = Program(graph, [s for a in inputs for s in a.flat], [s for o in outputs for s in o.flat], cut_every)
+    program = Program(graph, [s for a in inputs for s in a.flat], [s for o in outputs for s in o.flat])
     return Emitted(program, [o.shape for o in outputs])
 
 

@@ -1,7 +1,8 @@
 """The constraints of a mechanism along a motion: Psi, Psi_q, Psi_dot and gamma (de Falco, Pennestri, Vita 2005, section 3).
 
 Each joint and driver says what its residual is, and nothing more; all derivatives are taken of that by JAX. Here this is done
-as it reads, on arrays, without regard to which entries are zero; elements that are alike speak together (kinds.py). Faster forms of the same functions are held against this one.
+as it reads, on arrays, without regard to which entries are zero; elements that are alike speak together (kinds.py). Faster forms
+of the same functions are held against this one.
 
 In all of them t is the time (s), and q and v are the coordinates and velocities of the n / 3 bodies, x, y (m) and angle (rad) of
 one after another: flat (n,), or (bodies, 3), which is made flat. The m rows are those of the joints in their order, then those
@@ -49,9 +50,11 @@ def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
     """The constraint that each row of Psi belongs to, and its number within it."""
     names, constraints = list(mechanism.constraints), [*mechanism.constraints.values()]
     say = lambda c, *frames: vector(c.residual(0.0, *frames))  # noqa: E731
-    found = jax.eval_shape(lambda: [rows for _, rows in of_each(say, mechanism, constraints, bodies(mechanism.q0))])
-    size = dict((int(i), rows.shape[1]) for kind, rows in zip(kinds(mechanism, constraints), found, strict=True) for i in kind.members)
-    return [(name, k) for i, name in enumerate(names) for k in range(size[i])]
+    rows = jax.eval_shape(lambda: [rows for _, rows in of_each(say, mechanism, constraints, bodies(mechanism.q0))])
+    size = np.zeros(len(names), int)
+    for kind, found in zip(kinds(mechanism, constraints), rows, strict=True):
+        size[kind.members] = found.shape[1]
+    return [(name, k) for name, count in zip(names, size, strict=True) for k in range(count)]
 
 
 def _places(found: list[tuple[Kind, Any]]) -> np.ndarray:

@@ -93,7 +93,7 @@ force_programs = lru_cache(maxsize=256)(ForcePrograms)
 
 
 class Group(NamedTuple):
-    """All elements of one kind: their programs, their places among the constraints or forces, and the bodies that move in each."""
+    """All elements of one kind: their programs, places among the constraints or forces, and the bodies that move in each."""
 
     programs: Any
     members: np.ndarray  # (elements,)

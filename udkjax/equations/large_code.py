@@ -1,9 +1,9 @@
 """The Udwadia-Kalaba equation of a large scene as programs of loops: over elements that are alike, and over blocks of D D^T.
 
 The same programs as in code.py, of the same names, with code that does not grow with the scene. D and the right-hand sides come
-from the programs of the elements (element_programs.py). A block of D D^T belongs to a constraint, or to two that hold the same body; blocks
-are eliminated in an order of least fill, those that meet later rows in the same way by the same code. In all of the programs rows
-whose pivots are too small are dropped.
+from the programs of the elements (element_programs.py). A block of D D^T belongs to a constraint, or to two that hold the same
+body; blocks are eliminated in an order of least fill, those that meet later rows in the same way by the same code. In all of the
+programs rows whose pivots are too small are dropped.
 """
 
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence

@@ -11,6 +11,7 @@ from udkjax.equations.scales import Scales
 
 Vector = Float[Array, "n"]
 
+
 class Tangential(NamedTuple):
     """The parts of small changes of q and v within the constraint manifold."""
 

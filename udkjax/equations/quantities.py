@@ -60,7 +60,8 @@ def accelerations(
 
     a = a_F + M^(-1/2) D^+ b and lambda = -(D^+)^T D^+ b, of minimum norm where constraints are redundant (m/s^2, rad/s^2; N, N m,
     in the rows' order and with the sign of M a + Psi_q^T lambda = F). The state need not be closed. `Auto` takes singular values.
-    A `formulation` finds a in another way, but not lambda. `analysis` is that of `analyse`. For a `ConstrainedSystem` q, v and a are (n,).
+    A `formulation` finds a in another way, but not lambda. `analysis` is that of `analyse`. For a `ConstrainedSystem` q, v and a
+    are (n,).
     """
     if isinstance(mechanism, Mechanism):
         analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.bare

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive, set_current_trace
 from jax.interpreters import ad, batching, mlir, partial_eval
 
-
 Parts = Callable[..., tuple[list[Any], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
 
 

@@ -33,11 +33,11 @@ from udkjax.equations.closing import (
 )
 from udkjax.equations.code import is_large
 from udkjax.equations.constraints import psi
-from udkjax.equations.textbook import prepare
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
+from udkjax.equations.textbook import prepare
 from udkjax.integrate import by_native
-from udkjax.integrate.derivatives import Function, Linear, Mask, replaced, those
+from udkjax.integrate.derivatives import Function, Linear, Mask, those
 from udkjax.pinv import SVD
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism

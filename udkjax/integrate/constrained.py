@@ -16,11 +16,11 @@ from udkjax.integrate.wrapper import Wrapper
 class Constrained(Wrapper):
     """A diffrax solver for the motion of a mechanism: `args` are its equations, y is (q, v) in one vector.
 
-    With `projected` each step ends on the constraint manifold. A derivative at its end that the solver would keep for the next step
-    (FSAL) belongs to the state before projection; told that the state has jumped, the solver takes a new one. (Not so a multistep
-    method, which would forget its whole history: it sees for itself that its newest point was moved.) What projection takes back
-    of an error hardly counts. Where the equations integrate only some coordinates, errors are those of these alone. Error
-    estimates, with their counts, and interpolation are the wrapped solver's.
+    With `projected` each step ends on the constraint manifold. A derivative at its end that the solver would keep for the next
+    step (FSAL) belongs to the state before projection; told that the state has jumped, the solver takes a new one. (Not so a
+    multistep method, which would forget its whole history: it sees for itself that its newest point was moved.) What projection
+    takes back of an error hardly counts. Where the equations integrate only some coordinates, errors are those of these alone.
+    Error estimates, with their counts, and interpolation are the wrapped solver's.
     """
 
     solver: diffrax.AbstractSolver

@@ -1,16 +1,16 @@
 """Derivatives of a run, forward and reverse, of any order.
 
-A run is a function x -> f(x) of its numbers. Its first derivatives, forward x' -> J x' and in reverse w -> J^T w, are machine code
-where that serves, else diffrax's. Both together are one linear map with its transpose (`Linear`), to JAX a primitive, so that no
-derivative is ever transposed operation by operation.
+A run is a function x -> f(x) of its numbers. Its first derivatives, forward x' -> J x' and in reverse w -> J^T w, are machine
+code where that serves, else diffrax's. Both together are one linear map with its transpose (`Linear`), to JAX a primitive, so
+that no derivative is ever transposed operation by operation.
 
 A derivative of the map is one of two functions again, of x and a direction v, or of x and a cotangent w,
 
     g(x, v) = J(x) v,        h(x, w) = J(x)^T w.
 
 Forward mode of both is JAX's. In reverse mode, since w^T J(x) v is one number, of which derivatives may be taken in any order,
-the cotangents of x are d/dx (w^T J v) = dh(x, w) along v, and those of v and w are h and g. There h is found row by row by forward
-mode, w^T J e_k, so that forward mode through diffrax is all that derivatives of higher orders take.
+the cotangents of x are d/dx (w^T J v) = dh(x, w) along v, and those of v and w are h and g. There h is found row by row, w^T J e
+for each unit vector e, so that forward mode through diffrax is all that derivatives of higher orders take.
 """
 
 import math

@@ -15,6 +15,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import platformdirs
+
 LEVEL = 1  # of optimization: 2 takes a fifth longer to compile, and runs take as long
 KEPT_FILES = 2_000  # object files: some 100 MB
 _MAGIC = b"udkjax object 1\n"
@@ -108,11 +110,23 @@ def compiled(text: str) -> bytes:
 
 
 def cache_folder() -> Path | None:
-    """Where code is kept: `native` in the cache of compiled programs, or None where nothing is."""
-    from udkjax.environment import cache_folder as of_programs
+    """Where code is kept: in the user's cache folder, or where `UDKJAX_CACHE` says; None where that is 0."""
+    choice = os.environ.get("UDKJAX_CACHE", "").strip()
+    if choice == "0":
+        return None
+    return Path(choice).expanduser() if choice else platformdirs.user_cache_path("udkjax")
 
-    base = of_programs()
-    return None if base is None else Path(base) / "native"
+
+def kept() -> list[tuple[float, int, Path]]:
+    """When each file of code was last used or made, its size in bytes, and where it is."""
+    folder, found = cache_folder(), []
+    try:
+        for file in folder.iterdir() if folder else ():
+            status = file.stat()
+            found.append((max(status.st_atime, status.st_mtime), status.st_size, file))
+    except OSError:  # not there yet, or another process has just removed a file
+        pass
+    return found
 
 
 def _read(path: Path) -> bytes | None:

@@ -58,7 +58,7 @@ AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one lo
 # less exact than their tolerance says.
 TAKEN_BACK = 1e-3
 
-# A pivot, relative to its row's diagonal entry of D D^T: below are rounding errors; Newton's method corrects those of pivots above.
+# A pivot, relative to its row's diagonal entry of D D^T: below are rounding errors; Newton's method corrects those above.
 NOTHING_LEFT = 1e-14
 # Over the pivot: by how much rounding errors turn the velocities that a row allows (rad; up to a third of that in the paper's
 # linkage). Rows of larger pivots than the second are of use to linkages that turn back there, however small the tolerance.

@@ -2,19 +2,15 @@
 
 import os
 import platform
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
-from udkjax.environment import programs_in
 from udkjax.integrate.solution import versions
+from udkjax.native import machine
 from udkjax.study.machine import cores
 
 FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
-FAST_PYTHON = (3, 12)
-OLDER_JAX = "what machine code does not serve takes longer"  # README says it, too
 
 
 def doctor() -> str:
@@ -25,7 +21,8 @@ def doctor() -> str:
         "cores": f"{cores()} of {os.cpu_count()}",
         "devices": ", ".join(f"{device} ({device.device_kind})" for device in jax.devices()),
         "precision": f"{jnp.result_type(float)}",
-        "compiled programs": _cache(),
+        "engine": f"machine code, {machine.lanes()} lanes; diffrax where a run needs it",
+        "machine code": _cache(),
         "environment": ", ".join(f"{key}={value}" for key, value in sorted(os.environ.items()) if key.startswith(FLAGS)) or "-",
     }
     width = max(map(len, lines))
@@ -34,20 +31,10 @@ def doctor() -> str:
 
 
 def _cache() -> str:
-    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if not folder or not jax.config.jax_enable_compilation_cache:  # pyright: ignore[reportAttributeAccessIssue]
-        return "not kept"
-    sizes = [size for _, size, _ in programs_in(Path(folder))]
-    return f"{len(sizes)} kept in {folder}, {sum(sizes) / 2**20:.0f} MiB"
+    sizes, folder = [size for _, size, _ in machine.kept()], machine.cache_folder()
+    return "not kept" if folder is None else f"{len(sizes)} kept in {folder}, {sum(sizes) / 2**20:.1f} MiB"
 
 
 def _advice():
-    if sys.version_info < FAST_PYTHON:
-        yield (
-            f"Python {platform.python_version()} cannot have jax 0.12; with an older one {OLDER_JAX}: "
-            "install Python 3.12 or newer, remove .venv and run install.sh again"
-        )
-    elif jax.__version_info__ < (0, 12):
-        yield f"with jax {jax.__version__}, older than 0.12, {OLDER_JAX}: pip install --upgrade jax"
     if jnp.result_type(float) != jnp.float64:
         yield "float64 is off, so that loops close to single precision only: unset JAX_ENABLE_X64, or set it to 1"

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.textbook import prepare
 from udkjax.equations.quantities import energy, violation
 from udkjax.equations.scales import rank_tolerance
+from udkjax.equations.textbook import prepare
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto
 from udkjax.scene.checks import quoted, suggestion

@@ -1,7 +1,5 @@
-"""Batches of explicit Runge-Kutta runs: in lanes, each the same as alone, and as by diffrax."""
+"""Batches of runs by machine code: each the same as alone, and as by diffrax."""
 
-from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import diffrax
@@ -12,18 +10,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
-from udkjax.equations import prepare
 from udkjax.equations.code import Code
-from udkjax.integrate import batched, lanes
-from udkjax.integrate.interpolation import Point
-from udkjax.integrate.step import stage_state
-from udkjax.integrate.tableau import method_of
 from udkjax.native import operation
 from udkjax.study.exact import exact_coordinates
 
 TS = np.linspace(0.0, 2.0, 21)
 SOLVERS = {s.__name__: s() for s in (diffrax.Dopri8, diffrax.Tsit5, diffrax.Dopri5, diffrax.Bosh3, udk.Verner65)}
-MEMBERS = lanes.LANES + 6  # more than a chunk holds, and no multiple of what is rounded up to
+MEMBERS = 70  # no multiple of what a vector holds
 
 
 @pytest.fixture(scope="module")
@@ -94,15 +87,6 @@ def test_a_batch_of_batches(pendulum, batch):
     assert found.q.shape == (2, 2, len(TS), 1, 3)
 
 
-def test_the_form_for_other_devices(pendulum, batch, monkeypatch):
-    """A batch taken whole by vmap, as a GPU takes it."""
-    for module in (batched, lanes):
-        monkeypatch.setattr(module, "CHUNKED", ())
-    found = jax.jit(jax.vmap(last(pendulum)))(*members(MEMBERS))
-    assert_allclose(found.q, batch.q, rtol=0, atol=1e-12)
-    assert_allclose(found.stats["steps"], batch.stats["steps"])
-
-
 def test_outputs_of_a_batch_are_kept_once(pendulum):
     """What is beside them is one chunk's, and what they violate the constraints by; nor are velocities kept that nobody uses."""
     ts = np.linspace(0.0, 2.0, 801)
@@ -139,39 +123,6 @@ def test_the_same_motion_as_by_diffrax(pendulum, solver):
     steps = int(theirs.stats["steps"])
     assert abs(int(ours.stats["steps"]) - steps) <= 2 + 0.1 * steps  # the same step size control, but that ours foresees failures
     assert int(ours.stats["right_hand_sides"]) <= int(theirs.stats["right_hand_sides"]) + 30
-
-
-@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
-def test_the_stages_of_second_order_are_those_of_the_tableau(solver):
-    """A step of q'' = a(t, q, v) by the reduced tableau against the tableau itself, on (q, v)."""
-    method, tableau = method_of(solver), solver.tableau
-    f = lambda t, y: np.array([y[1], -np.sin(y[0]) - 0.3 * y[1] + np.cos(t)])  # noqa: E731
-    t, h, y = 0.2, 0.1, np.array([0.4, -0.7])
-    k = [f(t, y)]
-    for c, row in zip(tableau.c, tableau.a_lower, strict=True):
-        k.append(f(t + c * h, y + h * np.dot(row, k)))
-    expected, error = y + h * np.dot(tableau.b_sol, k), h * np.dot(tableau.b_error, k)
-    a = np.array([x[1] for x in k])[: method.stages]
-    assert_allclose(y[1] + h * method.v[-1] @ a, expected[1], rtol=1e-14)
-    assert_allclose(y[0] + h * (y[1] + h * method.q[-1] @ a), expected[0], rtol=1e-14)
-    assert_allclose([h * h * method.error_q @ a, h * method.error_v @ a], error, rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
-@pytest.mark.parametrize("shape", [(), (3,)], ids=["one run", "lanes"])
-def test_a_stage_is_made_of_the_accelerations_before_it(solver, shape):
-    """In lanes by sums of its own for each: of what comes later, whatever it is, none is used."""
-    method, rng = method_of(solver), np.random.default_rng(0)
-    t, h = np.broadcast_to(0.3, shape), rng.uniform(0.1, 0.2, shape)
-    q, v, a = (rng.standard_normal((*n, *shape)) for n in ((2,), (2,), (method.stages + 1, 2)))
-    here, last = Point(*map(jnp.asarray, (t, q, v, a[0]))), (jnp.full_like(q, np.nan),) * 2
-    stage = jax.jit(lambda a, i: stage_state(method, here, jnp.asarray(h), a, i, last))
-    for i, c in enumerate(method.nodes[1:], 1):
-        before = np.where((np.arange(len(a)) < i).reshape(-1, 1, *[1] * len(shape)), a, np.nan if shape else 0.0)
-        found = stage(before, i)
-        of_v, of_q = (np.tensordot(row[i][:i], a[:i], 1) for row in (method.v, method.q))
-        for x, y in zip(found, (t + c * h, q + h * (c * v + h * of_q), v + h * of_v), strict=True):
-            assert_allclose(x, y, rtol=0, atol=1e-13)
 
 
 def test_outputs_are_as_exact_as_steps(pendulum):
@@ -228,26 +179,6 @@ def test_one_direction_for_all_members(pendulum):
     _, slopes = jax.vmap(lambda x: jax.jvp(angle, (x,), (1.0,)))(inertias)
     ahead, behind = (jax.vmap(angle)(inertias + h) for h in (1e-4, -1e-4))
     assert_allclose(slopes, (ahead - behind) / 2e-4, rtol=1e-4)
-
-
-def test_outputs_side_by_side_are_those_one_after_another(placed):
-    """Also where some beside singular configurations take more of Newton's steps than the others of their chunk."""
-    angles = jnp.concatenate([jnp.linspace(-1.0, 1.0, 2 * lanes.LANES + 10), jnp.array([1e-3, 1e-5, 0.0])])
-    states = jnp.stack(jax.vmap(placed)(angles, jnp.ones_like(angles)), 1).reshape(len(angles), 24)
-    states += 1e-6 * np.random.default_rng(0).standard_normal(states.shape)
-    one, times = lanes.Lanes(prepare(udk.library.parallelogram())), jnp.zeros(len(angles))
-    units = lambda shape=(): (jnp.ones((12, *[1] * len(shape))),) * 2  # noqa: E731
-    problem: Any = SimpleNamespace(atol=jnp.asarray(1e-6), rtol=jnp.zeros(()), units=units)
-
-    @partial(jax.jit, static_argnums=1)
-    def closed(states, wide):
-        return lanes._each_output(one, partial(lanes._output, problem), times, states, wide)
-
-    (found, violated), (expected, violated_then) = closed(states, True), closed(states, False)
-    ordinary = np.abs(angles) > 1e-4
-    assert_allclose(found[ordinary], expected[ordinary], rtol=0, atol=1e-14)
-    assert_allclose(violated[ordinary], 0.0, atol=1e-12)
-    assert np.all(violated <= 1.01 * violated_then + 1e-15) and violated.max() < 1e-6 < jnp.abs(found - states).max()
 
 
 def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
