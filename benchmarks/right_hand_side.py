@@ -6,7 +6,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from udkjax.equations.rank_policy import REFUSE
 
 import udkjax as udk
 from benchmarks.common import Compiled, alternate, machine, ratio, report
@@ -17,7 +16,7 @@ EVALUATIONS, ROUNDS = 1000, 31
 
 
 def candidates(mechanism) -> dict:
-    """Right-hand sides y -> y', by name; `Auto, a stage` is what an integrator evaluates at each stage, without the branch."""
+    """Right-hand sides y -> y' in JAX, by name."""
 
     def ours(equations):
         return lambda y: jnp.concatenate([y[12:], equations.accelerations(0.0, y[:12], y[12:])])
@@ -26,7 +25,6 @@ def candidates(mechanism) -> dict:
     return {
         "script, jnp.linalg.pinv": by_pinv,
         "script, Cholesky": by_cholesky,
-        "udkjax Auto, a stage": ours(prepare(mechanism, udk.Auto()).with_policy(REFUSE)),
         **{f"udkjax {type(m).__name__}": ours(prepare(mechanism, m)) for m in methods},
     }
 

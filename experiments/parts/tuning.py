@@ -8,15 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from udkjax.integrate.interpolation import Point
-from udkjax.integrate.step import Task, attempt
 
 import udkjax as udk
 from experiments.parts.linkage import parallelogram, start
 from udkjax.equations import prepare
-from udkjax.equations.motion import Tangential
+from udkjax.integrate.by_diffrax import derivative
 from udkjax.integrate.solution import Result
-from udkjax.native.tableau import DOPRI8
 from udkjax.pinv import Pseudoinverse
 from udkjax.study.identify.fitting import Fit, descend
 from udkjax.study.identify.problem import Evaluated
@@ -141,23 +138,16 @@ def drift_of_steps(mechanism: udk.Mechanism, method: Pseudoinverse, most: int) -
 
     def run(gains: Any, state: udk.State, span: Any, steps: Any) -> Any:
         equations: Any = prepare(mechanism, method, udk.Baumgarte(gains[0], gains[1]))
-        # None of the estimates of errors is looked at: tolerances of one, and all errors last.
-        lasting = lambda t, q, v, dq, dv: Tangential(dq, dv, jnp.array(True))  # noqa: E731
-        one = jnp.ones(())
-        numbers = (jnp.stack([0.0, span]), one, one, (one, one), one, jnp.zeros(()))
-        arrived = lambda t, q, v: (q, v, equations.accelerations(t, q, v))  # noqa: E731
-        ended = lambda *at: (*arrived(*at[:3]), lasting(*at))  # noqa: E731
-        task = Task(equations.accelerations, arrived, lasting, ended, None, False, *numbers, None, 1, DOPRI8)
-        h, no, q, v = span / steps, jnp.array(False), state.q.ravel(), state.v.ravel()
-        t = jnp.zeros(())
-        first = Point(t, q, v, equations.accelerations(t, q, v))
-        rows = equations.violation(t, q, v)[0]
+        terms, solver, h = diffrax.ODETerm(derivative), diffrax.Dopri8(), span / steps
+        y = jnp.concatenate([state.q.ravel(), state.v.ravel()])
+        start = solver.init(terms, jnp.zeros(()), h, y, equations)
 
         def step(k, carry):
-            here, psi = carry
-            to = attempt(task, here, h, here.t + h, no).to
-            return to, psi.at[k].set(equations.violation(to.t, to.q, to.v)[0])
+            y, psi = carry
+            y, *_ = solver.step(terms, k * h, (k + 1) * h, y, equations, start, jnp.array(True))
+            return y, psi.at[k].set(equations.violation((k + 1) * h, *jnp.split(y, 2))[0])
 
-        return jax.lax.fori_loop(0, steps, step, (first, jnp.zeros((most, len(rows)))))[1]
+        rows = equations.violation(0.0, *jnp.split(y, 2))[0]
+        return jax.lax.fori_loop(0, steps, step, (y, jnp.zeros((most, len(rows)))))[1]
 
     return run

@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import constraints, loads, prepare
-from udkjax.pinv import Elimination
+from udkjax.equations import analyse, constraints, loads, prepare
+from udkjax.equations.code import code, scalars
 
 P = [[0.2, -0.1], [-0.3, 0.15]]
 
@@ -158,19 +158,20 @@ def states(mech):
 
 @pytest.fixture(scope="module")
 def terms(mech, states):
-    """What the compiled programs say."""
+    """What the programs say."""
 
-    def at(mech, t, q, v):
-        equations = prepare(mech, Elimination(), large=False)
-        m, n = equations.code.pattern.shape
-        outputs = jnp.stack(equations.run("rows", t, q, v))
-        b, free, root = outputs[-2 * n - m : -2 * n], outputs[-2 * n : -n], outputs[-n:]
-        A = equations.jacobian(t, q)
-        psi, psi_dot = equations.violation(t, q, v)
-        kinetic, potential = equations.run("energy", t, q, v)
+    programs = code(mech, analyse(mech).redundant_rows or (), False, "drop")
+    constants = programs.prologue([*map(float, scalars(jax.tree.leaves(mech.bare))), 1e-8, 1e-8])
+    (m, n), slots = programs.pattern.shape, programs.pattern.slots
+
+    def at(t, q, v):
+        run = lambda name: np.array(programs.program(name)([*constants, t, *q.tolist(), *v.tolist()]), float)  # noqa: E731
+        values, b, free, root = np.split(run("rows"), [slots, slots + m, slots + m + n])
+        A = programs.pattern.dense(values, np) / root
+        kinetic, potential = run("energy")
         return {
-            "psi": psi,
-            "psi_dot": psi_dot,
+            "psi": run("psi"),
+            "psi_dot": run("psi_dot"),
             "psi_q": A,
             "gamma": b + A @ free,
             "mass": root**-2,
@@ -179,7 +180,8 @@ def terms(mech, states):
             "potential": potential,
         }
 
-    return jax.jit(lambda *states: jax.lax.map(lambda s: at(mech, *s), states))(*states)
+    each = [at(float(t), np.asarray(q), np.asarray(v)) for t, q, v in zip(*states, strict=True)]
+    return {name: np.stack([found[name] for found in each]) for name in each[0]}
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +204,7 @@ def expected(mech, states):
 
 @pytest.fixture(scope="module")
 def owner(mech):
-    return np.array([name for name, _ in prepare(mech, Elimination(), large=False).row_names])
+    return np.array([name for name, _ in prepare(mech).row_names])
 
 
 NAMES = """revolute|revolute of two|to ground|prismatic|slot|weld|distance|angle|gear|inner gear|rack|cam|ellipse
@@ -234,14 +236,16 @@ def test_one_force_element_alone(mech, states, name):
     alone = udk.Mechanism(mech.bodies, pin, forces={name: mech.forces[name]}, gravity=(0.0, 0.0))
     t, q, v = (s[1] for s in states)
     q = q.at[0].set(-0.5)  # at the stop
-    free = jnp.stack(prepare(alone, Elimination(), large=False).run("rows", t, q, v)[-18:-9])
+    programs = code(alone, (), False, "drop")
+    constants = programs.prologue([*map(float, scalars(jax.tree.leaves(alone.bare))), 1e-8, 1e-8])
+    free = jnp.array(programs.program("rows")([*constants, float(t), *q.tolist(), *v.tolist()])[-18:-9])
     assert jnp.abs(free).max() > 1e-3
     assert_allclose(free * loads.mass(alone), loads.force(alone, t, q, v), rtol=1e-12, atol=1e-12)
 
 
 def test_values_are_inputs_and_types_are_structure(mech):
     other = jax.tree.map(lambda x: 1.1 * x, mech)
-    assert prepare(other, Elimination(), large=False).code is prepare(mech, Elimination(), large=False).code
+    assert code(other, (), False, "drop") is code(mech, (), False, "drop")
 
 
 @pytest.fixture(scope="module")

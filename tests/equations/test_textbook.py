@@ -205,12 +205,12 @@ def test_programs_are_the_textbook(moved, elimination):
     close_to(run("accelerations")[:n], expected["a"], 1e-8)
 
 
-@pytest.mark.parametrize("method", [udk.Elimination(1e-7), udk.Varga(1e-7), udk.Auto(1e-7)], ids=["Elimination", "Varga", "Auto"])
+@pytest.mark.parametrize("method", [udk.Elimination(1e-6), udk.Varga(1e-6), udk.Auto(1e-6)], ids=["Elimination", "Varga", "Auto"])
 def test_every_pseudoinverse_gives_what_singular_values_give(moved, method):
     """Accelerations and multipliers of minimum norm, of all rows, weighted; where rows that are redundant agree."""
-    mech, q, v = moved
-    analysis = udk.analyse(mech)
-    q, v = jax.jit(lambda m, q, v: uk.project(m, T0, q, v, SVD, steps=8))(mech.bare, q, v)
+    mech, _, v = moved
+    analysis, q = udk.analyse(mech), udk.assemble(mech, T0).q.ravel()
+    q, v = jax.jit(lambda m, q, v: uk.project(m, T0, q, v, udk.SVD(1e-6), steps=3))(mech.bare, q, v)
     expected = textbook(mech.bare, q, v, udk.SVD(1e-6), None, analysis.scales.weights)
 
     @eqx.filter_jit

@@ -43,7 +43,8 @@ def by_diffrax(
     saved: Any = (run.ys, run.ts)
     (ys, end), (_, t_end) = saved
     reached = ts <= t_end[0]
-    ys = jnp.where(reached[:, None], ys, y0)  # a run without any accepted step has saved nothing
+    later = reached & (jnp.arange(len(ts)) > 0)
+    ys = jnp.where(later[:, None], ys, y0)  # a run without any accepted step has saved nothing
     if problem.projected:
         ys = jnp.concatenate([ys[:1], project_all(problem.equations, ts[1:], ys[1:])])
     violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))

@@ -44,7 +44,10 @@ def stopped(equations: Motion, span: Array, status: Array, t: Array, y: Array) -
     q, v = jnp.split(y, 2)
     times = t + jnp.array([0.0, AHEAD]) * span
 
-    is_finite = jnp.all(jax.lax.map(lambda later: equations.is_finite(later, q + (later - t) * v, v), times))
+    def finite(_: Array) -> Array:
+        return jnp.all(jax.lax.map(lambda later: equations.is_finite(later, q + (later - t) * v, v), times))
+
+    is_finite = jax.lax.cond(status != DONE, finite, lambda _: jnp.array(True), 0)
     return jnp.where((status == STEP_TOO_SMALL) & ~is_finite, NOT_FINITE, status)
 
 

@@ -2,7 +2,6 @@
 
 from udkjax.pinv.auto import Auto as Auto
 from udkjax.pinv.elimination import Elimination as Elimination
-from udkjax.pinv.elimination import SparseElimination as SparseElimination
 from udkjax.pinv.gram_schmidt import GramSchmidt as GramSchmidt
 from udkjax.pinv.greville import Greville as Greville
 from udkjax.pinv.householder import Householder as Householder

@@ -7,15 +7,13 @@ says that the row depends on them; it is dropped, and counted out of the rank.
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
 from heapq import heapify, heappop, heappush
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from udkjax.straightline import Graph, Program, Scalar, frontier
+from udkjax.straightline import Graph, Scalar
 
 Row = dict[int, Scalar]
 
@@ -39,27 +37,12 @@ class Pattern(NamedTuple):
     def slots(self) -> int:
         return 1 + max((e.slot for e in self.entries), default=-1)
 
-    def dense(self, values: Any, numpy: Any = jnp) -> Any:
+    def dense(self, values: Any, numpy: Any) -> Any:
         """Return the matrix of the given values (slots,)."""
         place, sign = np.full(self.shape, self.slots), np.zeros(self.shape)
         for e in self.entries:
             place[e.row, e.column], sign[e.row, e.column] = e.slot, e.sign
         return numpy.append(values, 0.0)[place] * sign
-
-    def matvec(self, values: Any, x: Any) -> Any:
-        """D x."""
-        rows, columns, slots, signs = self._arrays
-        return jnp.zeros(self.shape[0], x.dtype).at[rows].add(signs * values[slots] * x[columns])
-
-    def rmatvec(self, values: Any, y: Any) -> Any:
-        """D^T y."""
-        rows, columns, slots, signs = self._arrays
-        return jnp.zeros(self.shape[1], y.dtype).at[columns].add(signs * values[slots] * y[rows])
-
-    @property
-    def _arrays(self):
-        entries = np.array(self.entries).reshape(-1, 4)
-        return entries[:, 0], entries[:, 1], entries[:, 2], entries[:, 3].astype(float)
 
 
 def pattern(rows: Sequence[Row], columns: int) -> tuple[Pattern, list[Scalar]]:
@@ -242,37 +225,3 @@ def all_of(conditions: Sequence[Scalar], graph: Graph) -> Scalar:
         if c.constant is not True:
             result = c if result.constant is True else result.graph.apply(lax.and_p, {}, (result, c), bool, np.logical_and)
     return result
-
-
-class EliminationProgram:
-    """The straight-line code of one pattern, on arrays: `factor(values, tol)` and `solve(lower, b)`."""
-
-    def __init__(self, pattern: Pattern):
-        graph = Graph()
-        values = [graph.input(k, "value") for k in range(pattern.slots)]
-        tol = graph.input("tol", "value")
-        b = [graph.input(k, "right") for k in range(pattern.shape[0])]
-        rows: list[Row] = [{} for _ in b]
-        for e in pattern.entries:
-            rows[e.row][e.column] = values[e.slot] if e.sign > 0 else -values[e.slot]
-        factors = factorize(rows, graph, tol * tol)
-        y = multipliers(factors, b)
-        lower = frontier(graph, y, lambda node: "right" not in node.depends)
-        self._factor = Program(graph, [*values, tol], [*lower, *factors.above(tol * tol)])
-        self._solve = Program(graph, [*lower, *b], y)
-        self._lower = len(lower)
-
-    def factor(self, values: Any, tol: Any) -> tuple[Any, Any]:
-        outputs = self._factor([*_scalars(values), tol])
-        lower, kept = outputs[: self._lower], outputs[self._lower :]
-        return jnp.stack([jnp.asarray(x, values.dtype) for x in lower]), jnp.stack([jnp.asarray(k) for k in kept])
-
-    def solve(self, lower: Any, b: Any) -> Any:
-        return jnp.stack(self._solve([*_scalars(lower), *_scalars(b)]))
-
-
-program = lru_cache(maxsize=64)(EliminationProgram)
-
-
-def _scalars(array: Any) -> list[Any]:
-    return [array[k] for k in range(len(array))]

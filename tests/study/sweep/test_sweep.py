@@ -90,7 +90,7 @@ def test_the_dataset_says_what_it_is(data, pendulum):
     assert data.time.attrs["units"] == "1"  # runs of other lengths have their own times
     assert data.attrs["setting_max_steps"] == STEPS and udk.loads(data.attrs["scene"]).name == pendulum.name
     assert "position_error" in data and "rank" not in data and "q" not in data
-    assert data.attrs["lane_efficiency"] == data.steps.values.sum() / (24 * data.steps.values.max())  # 18 members in 24 lanes
+    assert "lane_efficiency" not in data.attrs  # machine code lets no member wait
 
 
 def test_what_is_not_finished_is_marked(plan, finished):

@@ -22,8 +22,8 @@ COORDINATES = ("x", "y", "angle")
 def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> Any:
     """Return the xarray Dataset of a plan, from (members, what was kept of them) in any order.
 
-    What is not among them is not a number, and has the result -1. `lane_efficiency` is the part of the steps that there was room
-    for in the vector lanes which members took: a lane that is done waits for the slowest.
+    What is not among them is not a number, and has the result -1. `lane_efficiency`, where members are
+    computed side by side, is the part of the steps that there was room for which they took: who is done waits for the slowest.
     """
     import xarray
 
