@@ -1,6 +1,6 @@
-"""How one right-hand side grows with the scene: operations, time, memory, and what it takes until the first one is evaluated.
+"""How one right-hand side grows with the scene, and what it takes until the first run is there.
 
-Each is evaluated as a run evaluates it: in a loop that XLA compiles into one function.
+Measured in whole runs by machine code, projected, with what a step takes besides: time over the right-hand sides counted.
 """
 
 import statistics
@@ -8,20 +8,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
-from udkjax.equations.rank_policy import REFUSE
 
 import udkjax as udk
-from benchmarks.common import Compiled, in_turn, machine, report
-from udkjax.equations import prepare
-from udkjax.straightline import Loop
+from benchmarks.common import in_turn, machine, report
 
 SIZES = {"N-four-bar": (1, 2, 5, 10, 20, 40, 100, 200, 1000), "chain": (1, 10, 100, 1000)}
-STRAIGHT = (1, 2, 5, 10, 20)  # N-four-bars as straight-line code, whatever the size: more is no fusion
-UP_TO = 200  # the exponents are those of N-four-bars of 1 to so many
+FROM, UP_TO = 10, 1000  # the exponent is that of N-four-bars of so many: of fewer, what a call takes counts as well
 ROUNDS, AT_LEAST = 9, 0.05  # s
-EVALUATIONS = 40_000  # of one four-bar in a call: to hand over the numbers of 20 takes as long as 50 of their right-hand sides
+TS = np.array([0.0, 0.2])  # s
 
 
 def n_four_bar(n: int) -> udk.Mechanism:
@@ -34,40 +29,35 @@ def chain(n: int) -> udk.Mechanism:
     return udk.library.chain(n, 0.4)
 
 
-def measured(name: str, make: Any, n: int, large: bool | None, evaluations: int) -> tuple[dict[str, Any], Any]:
-    """Build, compile and count a loop of evaluations, as in a run: each needs the one before; and what times it."""
+def measured(name: str, make: Any, n: int) -> tuple[dict[str, Any], Any]:
+    """Build a scene, analyse and run it for the first time; and what times further runs."""
     seconds = {}
 
     def timed(part: str, function: Any) -> Any:
-        start = time.process_time()
+        start = time.perf_counter()
         result = function()
-        seconds[f"{part}_s"] = time.process_time() - start
+        seconds[f"{part}_s"] = time.perf_counter() - start
         return result
 
     mechanism = timed("build", lambda: make(n))
-    equations = timed("prepare", lambda: prepare(mechanism, large=large))
-    y = np.asarray(mechanism.q0).ravel(), np.asarray(mechanism.v0).ravel()
+    timed("analyse", lambda: udk.assemble(mechanism))
+    first = timed("first_run", lambda: udk.simulate(mechanism, TS))
+    evaluations = int(first.stats["right_hand_sides"])
+    row = {"name": name, "n": n, "bodies": len(mechanism.body_names), "right_hand_sides": evaluations, **seconds}
 
-    def repeat(e: Any, q: Any, v: Any, rounds: Any) -> Any:
-        inside = e.with_policy(REFUSE).within(Loop())
-        step = lambda _, y: (y[0] + 1e-12 * y[1], y[1] + 1e-12 * inside.accelerations(0.0, *y))  # noqa: E731
-        return jax.lax.fori_loop(0, rounds, step, (q, v))
+    def per_evaluation(at_least: float) -> float:
+        runs, start = 0, time.process_time()
+        while not runs or time.process_time() - start < at_least:
+            udk.simulate(mechanism, TS)
+            runs += 1
+        return (time.process_time() - start) / runs / evaluations
 
-    lowered = timed("trace", lambda: jax.jit(repeat).lower(equations, *y, evaluations))
-    compiled = timed("compile", lowered.compile)
-    cost, memory = compiled.cost_analysis(), compiled.memory_analysis()
-    bodies = len(mechanism.body_names)
-    figures = {"name": name, "n": n, "bodies": bodies, "form": type(equations).__name__, "flops": cost["flops"], **seconds}
-    figures["temporary_bytes"], figures["argument_bytes"] = memory.temp_size_in_bytes, memory.argument_size_in_bytes
-
-    program = Compiled(repeat, equations, *y, evaluations)
-    return figures, lambda at_least: program.cpu_seconds(equations, *y, evaluations, at_least=at_least) / evaluations
+    return row, per_evaluation
 
 
-def exponent(rows: list[dict[str, Any]], key: str, form: str | None = None) -> float:
-    """The slope of a straight line through the logarithms; of one form of the equations, what was measured of it besides, too."""
-    named = [row for row in rows if row["name"].startswith("N-four-bar") and (form or row["name"] == "N-four-bar")]
-    chosen = [(row["n"], row[key]) for row in named if form in (None, row["form"]) and row["n"] <= UP_TO and row[key] > 0]
+def exponent(rows: list[dict[str, Any]]) -> float:
+    """The slope of a straight line through the logarithms."""
+    chosen = [(row["n"], row["us"]) for row in rows if row["name"] == "N-four-bar" and FROM <= row["n"] <= UP_TO]
     n, cost = np.log(np.array(chosen, float).reshape(-1, 2)).T
     return float(np.polyfit(n, cost, 1)[0]) if len(chosen) > 1 else float("nan")
 
@@ -76,29 +66,21 @@ def main(smoke: bool = False, out: Path | None = None):
     """Print figures for every size, and with what power of N they grow; with `out` also draw them, beside the figures."""
     about = machine()
     sizes = {"N-four-bar": (1, 2), "chain": (2,)} if smoke else SIZES
-    cases = [("N-four-bar", n_four_bar, n, None) for n in sizes["N-four-bar"]]
-    cases += [("chain", chain, n, None) for n in sizes["chain"]]
-    cases += [("N-four-bar, straight-line code", n_four_bar, n, False) for n in (() if smoke else STRAIGHT)]
-    cases += [("N-four-bar, by levels", n_four_bar, n, True) for n in ((1,) if smoke else STRAIGHT)]
+    cases = [(name, make, n) for name, make in (("N-four-bar", n_four_bar), ("chain", chain)) for n in sizes[name]]
     figures, timers = [], {}
-    for k, (name, make, n, large) in enumerate(cases):
-        row, seconds = measured(name, make, n, large, 2 if smoke else max(100, EVALUATIONS // n))
+    for k, case in enumerate(cases):
+        row, seconds = measured(*case)
         figures.append(row)
         timers[k] = lambda seconds=seconds: seconds(0.0 if smoke else AT_LEAST)
     times = in_turn(timers, 1 if smoke else ROUNDS)
-    print(
-        f"{'one right-hand side':32} {'N':>5} bodies {'us':>9} {'flops':>9} {'kB':>7} {'build':>6} {'trace':>6} {'compile':>8} s"
-    )
+    print(f"{'one right-hand side':20} {'N':>5} bodies {'us':>9} {'build':>7} {'analyse':>8} {'first run':>9} s")
     for k, row in enumerate(figures):
         row["us"] = statistics.median(times[k]) * 1e6
-        until = f"{row['build_s'] + row['prepare_s']:6.2f} {row['trace_s']:6.2f} {row['compile_s']:8.2f}"
-        kb = row["temporary_bytes"] / 1e3
-        print(f"{row['name']:32} {row['n']:5} {row['bodies']:6} {row['us']:9.2f} {row['flops']:9.0f} {kb:7.0f} {until}")
-    exponents = {key: exponent(figures, key) for key in ("flops", "us", "temporary_bytes")}
-    print("N-four-bar grows as N^" + ", N^".join(f"{value:.2f} ({key})" for key, value in exponents.items()))
-    forms = dict.fromkeys(row["form"] for row in figures)
-    print("of one form: " + ", ".join(f"{form} N^{exponent(figures, 'us', form):.2f} (us)" for form in forms))
-    figures.append({"name": "exponents, N-four-bar", **exponents})
+        until = f"{row['build_s']:7.2f} {row['analyse_s']:8.2f} {row['first_run_s']:9.2f}"
+        print(f"{row['name']:20} {row['n']:5} {row['bodies']:6} {row['us']:9.2f} {until}")
+    power = exponent(figures)
+    print(f"N-four-bar grows as N^{power:.2f}, from N = {FROM} to {UP_TO}")
+    figures.append({"name": "exponents, N-four-bar", "us": power})
     report(about, figures, out)
     if out:
         draw(figures, out.with_suffix(".png"))
@@ -106,15 +88,14 @@ def main(smoke: bool = False, out: Path | None = None):
 
 
 def draw(figures: list[dict[str, Any]], file: Path):
-    """Draw time and operations against the number of bodies."""
+    """Draw time against the number of bodies."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 3.6), layout="constrained")
-    rows = [row for row in figures if "bodies" in row]
-    for axes, (key, label) in zip(figure.subplots(1, 2), {"us": "CPU time (µs)", "flops": "operations"}.items(), strict=True):
-        for name in dict.fromkeys(row["name"] for row in rows):
-            x, y = zip(*((row["bodies"], row[key]) for row in rows if row["name"] == name), strict=True)
-            axes.loglog(x, y, marker="o", ms=3, label=name)
-        axes.set(xlabel="bodies", ylabel=f"one right-hand side: {label}")
-    axes.legend(frameon=False, fontsize="small")  # pyright: ignore
+    figure = Figure(figsize=(5.0, 3.6), layout="constrained")
+    rows, axes = [row for row in figures if "bodies" in row], figure.subplots()
+    for name in dict.fromkeys(row["name"] for row in rows):
+        x, y = zip(*((row["bodies"], row["us"]) for row in rows if row["name"] == name), strict=True)
+        axes.loglog(x, y, marker="o", ms=3, label=name)
+    axes.set(xlabel="bodies", ylabel="one right-hand side: CPU time (µs)")
+    axes.legend(frameon=False, fontsize="small")
     figure.savefig(file, dpi=150)

@@ -1,5 +1,7 @@
 """First derivatives of the programs: those of the textbook, from the factors at hand."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,7 +54,8 @@ def test_they_are_those_of_the_textbook(scene, name):
             kept[list(analysis.redundant_rows or ())] = 0.0
             equations = prepare(mech, udk.SVD(1e-11), gains, analysis)
             w = equations.scales.weights * kept
-            equations = TextbookEquations(mech, equations.method, gains, _Weighted(w), ())  # pyright: ignore
+            scales: Any = _Weighted(w)
+            equations = TextbookEquations(mechanism=mech, method=equations.method, baumgarte=gains, scales=scales, redundant=())
             found = equations.accelerations(t, q, v) if name == "accelerations" else equations.correct(t, q, v)
             return jnp.concatenate(found) if isinstance(found, tuple) else found
 
@@ -70,7 +73,7 @@ def test_they_are_those_of_the_textbook(scene, name):
     weights = random.standard_normal(len(found))
     back = np.array(derivative.reverse([*given, *kept, *weights.tolist()]))
     terms = np.abs(weights) @ np.abs(found)
-    assert_allclose(back @ dots, weights @ found, rtol=0, atol=1e-10 * terms)
+    assert_allclose(back @ dots, weights @ found, rtol=0, atol=1e-10 * float(terms))
 
 
 class _Weighted:

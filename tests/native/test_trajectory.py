@@ -1,6 +1,7 @@
 """Trajectories by machine code are those that the equations of textbooks give, found in another way."""
 
 import inspect
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -16,7 +17,6 @@ from scipy.integrate import solve_ivp
 
 import udkjax as udk
 from udkjax.equations import analysis, code, constraints, loads
-from udkjax.integrate import by_native
 
 TOL = 1e-9
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
@@ -78,8 +78,15 @@ def served(monkeypatch, request):
     if request.param == "loops":
         monkeypatch.setattr(code, "LARGE", 0)
         monkeypatch.setattr(analysis, "_analyses", analysis._Cache())  # what is found by loops is not left to other tests
-    seen, serves = [], by_native.serves
-    monkeypatch.setattr(by_native, "serves", lambda problem: seen.append(serves(problem)) or seen[-1])
+    seen, module = [], sys.modules["udkjax.integrate.simulate"]
+    reason = module.unserved
+
+    def unserved(*given):
+        why = reason(*given)
+        seen.append(not why)
+        return why
+
+    monkeypatch.setattr(module, "unserved", unserved)
     yield seen
     if "served" not in inspect.signature(request.function).parameters:
         assert all(seen)

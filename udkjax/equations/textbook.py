@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations import constraints, loads
@@ -28,11 +29,11 @@ class TextbookEquations(MechanismMotion):
     method: Pseudoinverse
     baumgarte: Baumgarte | None
     scales: Scales
-    redundant: tuple[int, ...] | None = eqx.field(static=True)  # rows that a method without a rank can leave out, if known
+    redundant: tuple[int, ...] | None = eqx.field(static=True)  # rows that elimination leaves out; None: they are not known
 
     def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         """a = a_F + M^(-1/2) D^+ b."""
-        return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
+        return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.weights)
 
     def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
         """lambda = -(D^+)^T D^+ b."""
@@ -48,11 +49,11 @@ class TextbookEquations(MechanismMotion):
 
     def correct(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """One Newton step in position and one in velocity: at a state on the manifold it has the tangents of a projection."""
-        return uk.project(self.mechanism, t, q, v, self.method, self.scales.weights, steps=1)
+        return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
     def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
-        mechanism, w = self.mechanism, self.scales.weights
+        mechanism, w = self.mechanism, self.weights
         of = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
         return Tangential(*of(jnp.stack([dq, dv])))
 
@@ -85,13 +86,20 @@ class TextbookEquations(MechanismMotion):
 
     def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Any, Array, Vector]:
         """D^+, what it is to be applied to, and M^(-1/2): of "rows" b, of "closure" Psi, of "rate" Psi_dot; rows are weighted."""
-        mechanism, w = self.mechanism, self.scales.weights
+        mechanism, w = self.mechanism, self.weights
         residual = {
             "rows": lambda: uk.b(mechanism, t, q, v, self.baumgarte, w),
             "closure": lambda: uk.weighted(w, constraints.psi(mechanism, t, q)),
             "rate": lambda: uk.weighted(w, constraints.psi_dot(mechanism, t, q, v)),
         }
         return uk.plus(self.method, uk.D(mechanism, t, q, w)), residual[name](), uk.root(mechanism)
+
+    @property
+    def weights(self) -> Float[Array, "m"]:
+        """Those of the rows; elimination, which tells no small pivot from rounding, leaves out what is known to be redundant."""
+        if not isinstance(self.method, Elimination) or not self.redundant:
+            return self.scales.weights
+        return self.scales.weights.at[np.array(self.redundant)].set(0.0)
 
     @property
     def row_names(self) -> list[tuple[str, int]]:
@@ -123,7 +131,9 @@ def prepare(
     chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)
     if isinstance(chosen, Elimination) and not chosen.relative:
         raise ValueError("Elimination compares each row with what remains of it: here its rank_tol must be relative")
-    return TextbookEquations(mechanism, chosen, baumgarte, analysis.scales, analysis.redundant_rows)
+    return TextbookEquations(
+        mechanism=mechanism, method=chosen, baumgarte=baumgarte, scales=analysis.scales, redundant=analysis.redundant_rows
+    )
 
 
 # A projection is differentiated at the state that it returns, where all residuals vanish.
@@ -131,7 +141,7 @@ def prepare(
 
 @jax.custom_jvp
 def _project(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    return uk.project(equations.mechanism, t, q, v, equations.method, equations.scales.weights)
+    return uk.project(equations.mechanism, t, q, v, equations.method, equations.weights)
 
 
 @_project.defjvp

@@ -287,10 +287,11 @@ def _has_pieces(mechanism: Mechanism) -> bool:
     return any(has_pieces(e) for e in (*mechanism.constraints.values(), *mechanism.forces.values()))
 
 
-def _inputs(problem: Any, code: Code | None = None, xp: Any = jnp) -> list[Any]:
+def _inputs(problem: Any, code: Any = None, xp: Any = jnp) -> list[Any]:
     """Those of a run, of one member."""
     equations: TextbookEquations = problem.equations
-    method, rank_tol = equations.method, equations.method.rank_tol
+    method: Any = equations.method
+    rank_tol = method.rank_tol
     least = method.branch_tol if isinstance(method, Auto) else rank_tol**2
     programs = _code(problem) if code is None else code
     drop = (WITH_CARE * rank_tol) ** 2 if programs.elimination == "watch" else least

@@ -105,7 +105,7 @@ class Function(eqx.Module):
         some = those(xs, moving)
         units = jnp.eye(sum(x.size for x in some))
         shapes = [x.shape for x in some]
-        row = lambda e: sum(map(jnp.vdot, ws, _change(self, xs, moving, _split(e, shapes))[1]))  # noqa: E731
+        row = lambda e: jnp.vdot(_flat(ws), _flat(_change(self, xs, moving, _split(e, shapes))[1]))  # noqa: E731
         return _split(jax.vmap(row)(units), shapes)
 
     @abstractmethod
