@@ -75,7 +75,7 @@ def analyse(mechanism: Mechanism) -> Analysis:
     Which rows are redundant depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of
     the known one that it was made from by `with_parameters`: rows that are left out are watched, and a run whose numbers made one
     of them independent says so. One whose numbers are all traced, as an argument of a function under `jit`, has no origin: its
-    redundant rows stay unknown, and `Auto` then takes singular values throughout, which is right and a hundred times slower.
+    redundant rows stay unknown, and `Auto` then takes singular values throughout, by diffrax: right, and a hundred times slower.
     Analyse before the trace, and hand it on: `simulate(mechanism, ts, analysis=analysis)`.
     """
     if not mechanism.is_known:
