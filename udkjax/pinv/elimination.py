@@ -50,10 +50,12 @@ class Elimination(Dense):
         return Factors(D, both[back][:, back], jnp.sum(kept))
 
     def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
-        return dot(factors.D.T, dot(factors.S, b))
+        x = dot(factors.D.T, dot(factors.S, b))
+        return x + dot(factors.D.T, dot(factors.S, b - dot(factors.D, x)))  # refined once: S was made of explicit inverses
 
     def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
-        return dot(factors.S.T, dot(factors.D, c))
+        y = dot(factors.S.T, dot(factors.D, c))
+        return y + dot(factors.S.T, dot(factors.D, c - dot(factors.D.T, y)))
 
 
 def _cholesky(
