@@ -15,9 +15,9 @@ BRANCH_TOL = 1e-6
 class Auto(Dense):
     """Elimination where the rows are known to be independent, else the truncated `SVD`.
 
-    Machine code eliminates the rows of a mechanism that `analyse` found independent, until one of the pivots falls to `branch_tol`
-    times its row's diagonal entry of D D^T: steps beside singular configurations are taken with all rows, of which those are
-    dropped that depend on others. Of a matrix of which nothing is known, and by diffrax, it is the `SVD`.
+    Machine code eliminates the rows of a mechanism that `analyse` found independent, until one of the pivots falls to
+    `branch_tol` times its row's diagonal entry of D D^T: steps beside singular configurations are taken with all rows, of which
+    those are dropped that depend on others. Of a matrix of which nothing is known, and by diffrax, it is the `SVD`.
     """
 
     branch_tol: Float[Array, ""] | None = eqx.field(converter=number, default=BRANCH_TOL)
