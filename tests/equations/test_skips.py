@@ -11,7 +11,7 @@ from udkjax.equations.analysis import analyse
 from udkjax.equations.code import code
 
 GROUND = "ground"
-PAIR = 40  # operations that a sine and a cosine take
+PAIR = 51  # operations that a sine and a cosine take together, where they are arithmetic
 CHOICES = ("gt", "ge", "and", "select_n")
 
 
@@ -240,12 +240,12 @@ def derivative(mechanism, name="accelerations", t=False, q=True, v=True, constan
     return found.derivative(name, (*moving, t, q, v))
 
 
-@pytest.mark.parametrize("direction", ["forward", "reverse"])
-def test_a_derivative_takes_half_of_what_the_accelerations_take_and_factorizes_nothing(linkage, plain, direction):
+@pytest.mark.parametrize(("direction", "most"), [("forward", 0.5), ("reverse", 0.6)])
+def test_a_derivative_takes_half_of_what_the_accelerations_take_and_factorizes_nothing(linkage, plain, direction, most):
     found = derivative(linkage)
     more = arithmetic(found.evaluation("accelerations").count()) - arithmetic(plain)  # what the derivative needs to know
     further = getattr(found, direction).count()
-    assert arithmetic(further) + more <= 0.55 * (arithmetic(plain) + PAIR * plain["sincos"])
+    assert arithmetic(further) + more <= most * (arithmetic(plain) + PAIR * plain["sincos"])
     assert not {"div", "sqrt", "sincos"} & set(further)
     assert found.evaluation("accelerations").count()["div"] == 11
 

@@ -219,4 +219,4 @@ def test_every_pseudoinverse_gives_what_singular_values_give(moved, method):
         return equations.accelerations(T0, q, v), equations.multipliers(T0, q, v)
 
     for found, name in zip(both(mech.bare, q, v), ("a", "lambda"), strict=True):
-        close_to(found, expected[name], 1e-8)
+        close_to(found, expected[name], 1e-9)

@@ -43,10 +43,6 @@ class TextbookEquations(MechanismMotion):
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric: see `correct`."""
         return _project(self, t, q, v)
 
-    def as_projected(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """A state on the manifold, with the derivatives that `project` has where it returns it."""
-        return _as_projected(self, t, q, v)
-
     def correct(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """One Newton step in position and one in velocity: at a state on the manifold it has the tangents of a projection."""
         return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
@@ -152,6 +148,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def _as_projected(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    """A state on the manifold, with the derivatives that `project` has where it returns it."""
     del equations, t
     return q, v
 

@@ -19,18 +19,11 @@ from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.native.operation import Kind, Tableau, compiled, native_p, shapes_of, written
 from udkjax.native.program import UnsupportedError
-from udkjax.native.steps import DONE
+from udkjax.native.steps import DONE, WITH_CARE
 from udkjax.native.tableau import EULER
 from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, SETTINGS
 from udkjax.pinv import Auto, Elimination
 from udkjax.scene.mechanism import Mechanism
-
-# Steps with care begin on the constraint manifold, unless states are not projected, and only those beside singular configurations
-# take it. Rows that count as redundant there and are not leave what they hold back in velocities, as large as the threshold, and
-# rounding errors are as large as a unit over its square: both are least at some third root of a unit. With three times more,
-# linkages that turn back in singular configurations take up to a quarter less steps, but Peaucellier's may cross with errors of
-# 1e-5 in its energy, at any tolerance; with three times less they take up to two fifths more.
-WITH_CARE = 0.2
 
 # --- closing
 

@@ -659,7 +659,7 @@ class Trajectory:
     def _leave(self):
         """What becomes of a step that ends in another piece of the motion, of lanes in `again`: whether it lands there, or not.
 
-        Else it is taken `again`, to end just before the piece does (integrate/pieces.py). The next step is a tiny one across,
+        Else it is taken `again`, to end just before the piece does. The next step is a tiny one across,
         behind which the run starts anew: so also what is known of accelerations at the ends of steps belongs to one piece.
         """
         f, s = self._function("leave")
@@ -759,11 +759,11 @@ class Trajectory:
         return f.fma(s.rtol, fastest / s.omega, s.atol)
 
     def _far(self, f: Function, s: Lane, distance: Value, rounding: float = BEFORE) -> Value:
-        """Whether a step as long as the one that is tried may begin so far away from singular configurations (crossing.py)."""
+        """Whether a step as long as the one that is tried may begin so far away from singular configurations."""
         return (distance > NEAREST) & (distance * distance * distance * s.tolerance > s.h * s.omega * rounding)
 
     def _ahead(self, f: Function, s: Lane) -> Value:
-        """The time that is left until a singular configuration (crossing.py): a root of the parabola through three distances."""
+        """The time that is left until a singular configuration: a root of the parabola through three distances."""
         t2, t1, t0, d2, d1, d0 = s.T1, s.T2, s.T3, s.distance0, s.distance1, s.distance2
         slope, before = (d0 - d1) / (t0 - t1), (d1 - d2) / (t1 - t2)
         curve = (slope - before) / (t0 - t2)
@@ -771,7 +771,7 @@ class Trajectory:
         return -d0 / (slope - curve * (d0 / slope))
 
     def _around(self, f: Function, s: Lane, left: Value, step: Value, otherwise: Value) -> Value:
-        """In place of a step that failed, one with its nodes far from the singular configuration ahead (crossing.py)."""
+        """In place of a step that failed, one with its nodes far from the singular configuration ahead."""
         low, high = (float(x) for x in self.method.clearings)
         share = left / step
         across = left / f.select(share < low, f.const(low, DOUBLE, f.width), high)

@@ -48,10 +48,6 @@ class Scalar:
     def is_zero(self) -> bool:
         return self.constant == 0.0
 
-    @property
-    def is_float(self) -> bool:
-        return np.issubdtype(self.node.dtype, np.floating)
-
     def __eq__(self, other):
         return isinstance(other, Scalar) and (self.index, self.sign) == (other.index, other.sign) and self.graph is other.graph
 

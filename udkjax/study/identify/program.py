@@ -26,8 +26,7 @@ from udkjax.study.identify.channels import Channel, Quantity, measured
 from udkjax.study.identify.unknowns import Target, applied
 from udkjax.study.machine import CHUNKED, MEMBERS
 
-# Members from which on lanes pay for the half minute that their program takes to compile; fewer are computed one by one. Forward
-# derivatives of one member take 2 ms alone, 0.6 ms in lanes.
+# Members from which on they are computed in lanes; fewer are computed one by one, which takes no further program.
 MANY = 1024
 # Evaluations that are kept, since a fit goes back to its best, and the bytes up to which one is.
 AGAIN, KEPT = 6, 2**24

@@ -25,7 +25,7 @@ from udkjax.study.units import units_of
 
 WIDTH = 8  # members: a piece has a multiple, of what the widest vector units hold
 WIDE = 4096  # members of a piece where a device takes them all at once
-# Chunks of lanes in a piece, at most: to call a program takes what ten of its members take. And pieces that a group has at least,
+# Times `MEMBERS` in a piece, at most: to call a program takes what ten of its members take. And pieces that a group has at least,
 # before its pieces get larger: for as many devices there is something to do.
 TOGETHER, MANY = 8, 16
 PROGRAMS = 64  # that are kept: a program holds its plan

@@ -1,8 +1,8 @@
-"""Cut a sweep into chunks: members alike in cost together, so that none waits for another.
+"""Cut a sweep into chunks: members alike in cost together.
 
-In lanes, a member that is done waits for the slowest of its lanes' chunk. So members are ordered by the steps that they will
-take: a sample is run, and a polynomial in the axes fitted to the logarithm of its steps. The longest come first: what is left for
-the end, where devices wait for the last chunk, is short.
+Where a device takes members side by side, one that is done waits for the slowest of its piece. So members are ordered by the
+steps that they will take: a sample is run, and a polynomial in the axes fitted to the logarithm of its steps. The longest come
+first: what is left for the end, where devices wait for the last chunk, is short.
 """
 
 from itertools import combinations_with_replacement
