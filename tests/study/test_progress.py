@@ -1,22 +1,95 @@
+"""Progress means the same in every function: a line after two seconds, at once, never, or a callable's own."""
+
 import os
+import threading
+import time
+from itertools import pairwise
 
-from udkjax.study import progress
-from udkjax.study.progress import Line, Progress
+import pytest
+
+from udkjax.study import progress as module
+from udkjax.study.progress import Line, Progress, reporting
 
 
-def test_progress_writes_over_itself_on_a_terminal_and_is_sparing_elsewhere(streams):
-    terminal, file = streams(True), streams(False)
-    for stream in (terminal, file):
-        tell = Progress(stream)
-        for k in range(11):
-            tell(f"run {k}", k / 10)
-    assert terminal.text.count("\r") == 11 and terminal.text.count("\n") == 1
-    assert file.text.count("\n") == 2  # the first and the last
-    assert "run 10 (100 %" in file.text and "left" not in file.text.splitlines()[-1]
+def work(progress, steps=4, pause=0.0):
+    with reporting(progress, steps, "count") as report:
+        for k in range(steps):
+            report(message=f"number {k}")
+            time.sleep(pause)
+            report(k + 1, f"number {k}")
+
+
+def test_a_callable_gets_each_state():
+    seen: list[Progress] = []
+    work(seen.append)
+    assert [state.done for state in seen] == [0, 1, 1, 2, 2, 3, 3, 4]
+    assert {(state.what, state.total) for state in seen} == {("count", 4)} and seen[-1].message == "number 3"
+    assert all(one.seconds <= two.seconds for one, two in pairwise(seen))
+
+
+def test_what_a_callable_raises_ends_the_computation():
+    def stop(state):
+        if state.done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work(stop)
+
+
+def test_false_is_silent_and_true_is_not(capsys):
+    work(False)
+    assert capsys.readouterr() == ("", "")
+    work(True)
+    shown = capsys.readouterr()
+    assert shown.out == "" and "count: 100%" in shown.err and "number 3" in shown.err
+
+
+@pytest.mark.parametrize("progress", [None, "auto"])
+def test_by_default_there_is_a_line_only_after_the_time_of_patience(capsys, monkeypatch, progress):
+    work(progress)
+    assert capsys.readouterr() == ("", "")
+    monkeypatch.setattr(module, "PATIENCE", 0.02)
+    monkeypatch.setattr(module, "FILE_INTERVAL", 0.0)
+    work(progress, pause=0.05)
+    assert "100%" in capsys.readouterr().err
+
+
+def test_the_line_appears_while_the_first_piece_takes_long(capsys, monkeypatch):
+    monkeypatch.setattr(module, "PATIENCE", 0.02)
+    with reporting(None, None, "compile"):
+        for _ in range(100):
+            time.sleep(0.02)
+            if "compile: 00:0" in capsys.readouterr().err:
+                return
+    pytest.fail("there was no line")
+
+
+def test_nothing_remains_of_it(monkeypatch):
+    monkeypatch.setattr(module, "PATIENCE", 60.0)
+    before = threading.active_count()
+    with pytest.raises(ZeroDivisionError), reporting(None, 1, "fail"):
+        raise ZeroDivisionError
+    for _ in range(100):
+        if threading.active_count() == before:
+            return
+        time.sleep(0.02)
+    pytest.fail("the timer goes on")
+
+
+def test_what_is_left_and_the_text():
+    assert Progress("sweep", 25, 100, 10.0).left == pytest.approx(30.0)
+    assert Progress("sweep", 0, 100, 10.0).left is None and Progress("fit", 3, None, 1.0).left is None
+    assert str(Progress("sweep", 25, 100, 10.0, "none failed")) == "sweep: 25 % (10 s, about 30 s left) none failed"
+    assert str(Progress("fit", 3, None, 1.2, "step 3")) == "fit: (1 s) step 3"
+
+
+def test_other_values_are_refused():
+    with pytest.raises(TypeError, match='progress must be None, "auto", True, False or a function'):
+        work("loud")
 
 
 def test_what_was_longer_is_covered_and_nothing_goes_on_in_the_next_line(monkeypatch, streams, notebook):
-    monkeypatch.setattr(progress.shutil, "get_terminal_size", lambda: os.terminal_size((10, 24)))
+    monkeypatch.setattr(module.shutil, "get_terminal_size", lambda: os.terminal_size((10, 24)))
     terminal = streams(True)
     for stream in (terminal, notebook):
         line = Line(stream)

@@ -41,7 +41,7 @@ def report(
     from udkjax.show.report import write
     from udkjax.study.cases import FULL, QUICK
     from udkjax.study.paper import study
-    from udkjax.study.progress import Progress
+    from udkjax.study.progress import reporting
     from udkjax.study.record import read, save
 
     if from_file:
@@ -50,7 +50,9 @@ def report(
         except (OSError, ValueError) as problem:
             refuse(f"cannot read {from_file}: {problem}")
     else:
-        data = study(QUICK if quick else FULL, start, seed, tell=Progress())
+        with reporting(None, 1.0, "report") as report_progress:
+            tell = lambda what, part: report_progress(part, what)  # noqa: E731
+            data = study(QUICK if quick else FULL, start, seed, tell=tell)
     target.parent.mkdir(exist_ok=True)
     if not from_file:
         save(data, target.with_suffix(".nc"))

@@ -1,9 +1,140 @@
-"""How far a long computation is: one line that is written over, in a terminal or a notebook; elsewhere a line now and then."""
+"""How far a long computation is, reported the same way by every function that has a `progress` argument."""
 
 import shutil
 import sys
+import threading
 import time
-from typing import TextIO
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal, TextIO, TypeAlias
+
+PATIENCE = 2.0  # s: a computation that takes no longer needs no line to say so
+TERMINAL_INTERVAL, FILE_INTERVAL = 0.2, 15.0  # s between two states of a line that is written over, and of one that cannot be
+
+BAR = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a computation is: what a callable given as `progress=` receives, once at least for everything that is done.
+
+    Attributes:
+        what: what is being computed, such as "identify".
+        done: how much of it is done, in the units of `total`.
+        total: how much there is to do; None where that is not known beforehand.
+        seconds: time since the computation began (s).
+        message: what else there is to say of its state.
+    """
+
+    what: str
+    done: float
+    total: float | None
+    seconds: float
+    message: str = ""
+
+    @property
+    def left(self) -> float | None:
+        """Time that the rest takes at the pace so far (s); None where it cannot be said."""
+        return self.seconds * (self.total / self.done - 1.0) if self.total and self.done > 0 else None
+
+    def __str__(self) -> str:
+        part = "" if not self.total else f" {100 * self.done / self.total:.0f} %"
+        left = "" if self.left is None or self.done == self.total else f", about {self.left:.0f} s left"
+        return f"{self.what}:{part} ({self.seconds:.0f} s{left}){f' {self.message}' if self.message else ''}"
+
+
+ProgressOption: TypeAlias = Callable[[Progress], Any] | bool | Literal["auto"] | None
+
+
+class Report:
+    """What a computation calls: `report(done, message)`; with None for `done`, as much is done as before."""
+
+    def __init__(self, show: Callable[[Progress], Any], what: str, total: float | None):
+        self.show, self.begun = show, time.monotonic()
+        self.state = Progress(what, 0, total, 0.0)
+
+    def __call__(self, done: float | None = None, message: str = "") -> None:
+        before = self.state
+        done = before.done if done is None else done
+        self.state = Progress(before.what, done, before.total, time.monotonic() - self.begun, message)
+        self.show(self.state)
+
+
+@contextmanager
+def reporting(progress: ProgressOption, total: float | None, what: str) -> Iterator[Report]:
+    """Report the progress of the computation in the body of a `with` statement.
+
+    Args:
+        progress: None or "auto" writes a line to stderr if the computation takes longer than two seconds, True at once, False
+            never; a callable gets a `Progress` at each report. What it raises ends the computation.
+        total: how much there is to do, in any unit; None where that is not known.
+        what: what is being computed, as it stands before the line.
+
+    Returns:
+        The function `report(done, message="")` to call whenever some of it is done.
+
+    Raises:
+        TypeError: `progress` is none of these.
+    """
+    if callable(progress):
+        yield Report(progress, what, total)
+    elif progress is False:
+        yield Report(lambda state: None, what, total)
+    elif progress is None or progress is True or progress == "auto":
+        line = _Line(what, total, 0.0 if progress is True else PATIENCE)
+        try:
+            yield Report(line.show, what, total)
+        finally:
+            line.close()
+    else:
+        raise TypeError(f'progress must be None, "auto", True, False or a function of a Progress, is {progress!r}')
+
+
+class _Line:
+    """A bar of tqdm on stderr, made by a timer: so it appears too while the first piece of work compiles."""
+
+    def __init__(self, what: str, total: float | None, patience: float):
+        self.what, self.total, self.begun = what, total, time.time()
+        self.bar: Any = None
+        self.state: Progress | None = None
+        self.lock = threading.Lock()
+        self.timer = threading.Timer(patience, self._open)
+        self.timer.daemon = True
+        if patience:
+            self.timer.start()
+        else:
+            self._open()
+
+    def _open(self) -> None:
+        from tqdm.auto import tqdm
+
+        interval = TERMINAL_INTERVAL if sys.stderr.isatty() or "ipykernel" in sys.modules else FILE_INTERVAL
+        layout = "{desc}: {elapsed}{postfix}" if self.total is None else BAR
+        with self.lock:
+            bar = tqdm(desc=self.what, total=self.total, file=sys.stderr, mininterval=interval, miniters=0, bar_format=layout)
+            bar.start_t = self.begun
+            self.bar = bar
+            self._update()
+
+    def show(self, state: Progress) -> None:
+        with self.lock:
+            self.state = state
+            self._update()
+
+    def _update(self) -> None:
+        if self.bar is not None and self.state is not None:
+            self.bar.set_postfix_str(self.state.message, refresh=False)
+            self.bar.update(self.state.done - self.bar.n)
+
+    def close(self) -> None:
+        self.timer.cancel()
+        with self.lock:
+            if self.bar is not None:
+                self.bar.close()
+
+
+# --- what sweeps still use
 
 OFTEN = 0.2  # s between two looks of what is written over
 QUIET = 15.0  # s between lines where they cannot be written over
@@ -32,18 +163,3 @@ class Line:
             text = text[: shutil.get_terminal_size().columns - 1]
         print(f"\r{text:<{self._width}}", end="\n" if last else "", file=self.stream, flush=True)
         self._width = len(text)
-
-
-class Progress:
-    """Say what is being done, which part of everything is done, and how long the rest will take."""
-
-    def __init__(self, stream: TextIO | None = None):
-        self.line = Line(stream)
-        self.begun = time.monotonic()
-
-    def __call__(self, what: str, part: float) -> None:
-        """Show that `what` is being done, and that `part` (0 to 1) of everything is done."""
-        spent = time.monotonic() - self.begun
-        left = f", about {spent * (1 / part - 1):.0f} s left" if 0 < part < 1 else ""
-        if part >= 1 or self.line.due(0.0):
-            self.line.say(f"{what} ({100 * part:.0f} %, {spent:.0f} s{left})", last=part >= 1)
