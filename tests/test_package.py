@@ -15,14 +15,14 @@ ROOT = Path(udkjax.__file__).parent
 
 BELOW = {
     "environment": set(),
-    "straightline": set(),
-    "pinv": {"straightline"},
+    "expressions": set(),
+    "pinv": {"expressions"},
     "scene": set(),
-    "equations": {"scene", "pinv", "straightline"},
-    "native": {"equations", "scene", "pinv", "straightline"},
-    "integrate": {"native", "equations", "scene", "pinv", "straightline"},
-    "study": {"integrate", "equations", "scene", "pinv", "straightline"},
-    "show": {"native", "study", "integrate", "equations", "scene", "pinv", "straightline"},
+    "equations": {"scene", "pinv", "expressions"},
+    "native": {"equations", "scene", "pinv", "expressions"},
+    "integrate": {"native", "equations", "scene", "pinv", "expressions"},
+    "study": {"integrate", "equations", "scene", "pinv", "expressions"},
+    "show": {"native", "study", "integrate", "equations", "scene", "pinv", "expressions"},
 }
 ONLY_IN = {
     "diffrax": {"integrate", "cli"},

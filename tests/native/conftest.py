@@ -8,10 +8,10 @@ import jax
 import numpy as np
 import pytest
 
+from udkjax.expressions import Graph, Program, trace
 from udkjax.native import machine
 from udkjax.native.ir import POINTER, Function
 from udkjax.native.program import write
-from udkjax.straightline import Graph, Program, trace
 
 WIDTHS = sorted({1, 2, machine.lanes()})
 

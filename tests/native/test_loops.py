@@ -15,9 +15,9 @@ from udkjax.equations.analysis import analyse
 from udkjax.equations.code import structure
 from udkjax.equations.large_code import large_code
 from udkjax.equations.scales import known_scales
+from udkjax.expressions.loops import Clear, Loop
 from udkjax.native.loops import LoopWriter
 from udkjax.pinv.block_order import eliminations
-from udkjax.straightline.loops import Clear, Loop
 
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
 NOTHING = 1e-20  # a threshold of pivots below that of any that is more than rounding

@@ -9,10 +9,10 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.equations.derivative import Derivative
-from udkjax.equations.expressions import Expressions, expressions
+from udkjax.equations.scalar_equations import ScalarEquations, scalar_equations
+from udkjax.expressions import Program, Scalar, frontier
 from udkjax.pinv.sparse import Factors, Row, absolute, all_of, at_least, factorize, multipliers, pattern, transpose_times
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Program, Scalar, frontier
 
 # Bodies, constraints and force elements. Straight-line code evaluates faster, up to several times this size; but it takes the
 # longer to trace and compile, the larger the scene (see the scaling benchmark).
@@ -34,7 +34,7 @@ class Code:
     Each factorizes D D^T itself: to hand the factors on takes longer, and longer still to compile.
     """
 
-    def __init__(self, equations: Expressions, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None):
+    def __init__(self, equations: ScalarEquations, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None):
         self.equations, self.elimination = equations, elimination
         graph = self.graph = equations.graph
         self.gains = [graph.input(name, "parameter") for name in ("alpha", "beta")] if baumgarte else []
@@ -174,7 +174,7 @@ class Code:
 
 @lru_cache(maxsize=64)
 def _code(tree: Any, shapes: tuple, left_out: tuple[int, ...], baumgarte: bool, elimination: str | None) -> Code:
-    return Code(expressions(tree, shapes), left_out, baumgarte, elimination)
+    return Code(scalar_equations(tree, shapes), left_out, baumgarte, elimination)
 
 
 def is_large(mechanism: Mechanism) -> bool:

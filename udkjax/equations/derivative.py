@@ -23,8 +23,8 @@ A projection is differentiated at the state that it returns, where all residuals
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from udkjax.straightline import Differential, Program, Scalar, frontier
-from udkjax.straightline.derivative import Row, accumulate, common_factors, product
+from udkjax.expressions import Differential, Program, Scalar, frontier
+from udkjax.expressions.derivative import Row, accumulate, common_factors, product
 
 if TYPE_CHECKING:
     from udkjax.equations.code import Code

@@ -9,8 +9,8 @@ import numpy as np
 
 from udkjax.equations.elements import applied, differentiated
 from udkjax.equations.kinds import Alike, kinds
+from udkjax.expressions import Graph, Scalar, frontier
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Graph, Scalar, frontier
 
 POSITIONS, VELOCITIES = ("x", "y", "angle"), ("vx", "vy", "omega")
 FREE = ("fx", "fy", "fangle")  # of a_F

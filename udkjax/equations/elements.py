@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations.kinds import Alike
+from udkjax.expressions import Differential, Graph, Scalar, operations, trace
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Constraint
-from udkjax.straightline import Differential, Graph, Scalar, operations, trace
 
 Row = dict[int, Scalar]
 

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.element_programs import FREE, POSITIONS, VELOCITIES, ConstraintPrograms, Group, Layout
+from udkjax.expressions import Graph, Program, Scalar, trace
+from udkjax.expressions.loop_derivative import LoopDerivative
+from udkjax.expressions.loops import ADD, LEAST, SET, Clear, Kernel, Loop, LoopProgram, Slot, by_arrays
 from udkjax.pinv.block_order import Elimination, eliminations
 from udkjax.pinv.sparse import absolute, greater, where
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Graph, Program, Scalar, trace
-from udkjax.straightline.loop_derivative import LoopDerivative
-from udkjax.straightline.loops import ADD, LEAST, SET, Clear, Kernel, Loop, LoopProgram, Slot, by_arrays
 
 # Columns of the table of bodies: where its coordinates, its sine and its constants begin.
 COORDINATES, SINE, CONSTANTS = 0, 1, 2

@@ -6,13 +6,13 @@ is that of equations/large_code.py; the length of a step that is limited is a fu
 
 from typing import Any
 
+from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
+from udkjax.expressions.loops import Clear, LoopProgram
 from udkjax.native.closing import POSITION, VELOCITY, Closing
 from udkjax.native.closing_derivatives import Along, Back
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.linearized import ByLoops
 from udkjax.native.trajectory import Lane
-from udkjax.straightline.loop_derivative import COTANGENT, TANGENT, LoopDerivative
-from udkjax.straightline.loops import Clear, LoopProgram
 
 KINDS = {"position": (POSITION, "q"), "velocity": (VELOCITY, "v")}
 

@@ -19,12 +19,12 @@ from contextlib import contextmanager
 
 from udkjax.equations.closing import ITERATIONS
 from udkjax.equations.code import Code
+from udkjax.expressions import Program, cotangents, tangents
 from udkjax.native.closing import POSITION, VELOCITIES, VELOCITY, Closing
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM
 from udkjax.native.program import numbered, write
 from udkjax.native.trajectory import Lane, Places
-from udkjax.straightline import Program, cotangents, tangents
 
 
 class _Moving(Closing):

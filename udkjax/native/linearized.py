@@ -13,9 +13,9 @@ corrections that close a mechanism, of its `position` and of its `velocity`, as 
 from typing import Any, Protocol
 
 from udkjax.equations.large_code import LargeCode
+from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
+from udkjax.expressions.loops import Clear, LoopProgram
 from udkjax.native.program import Place, numbered
-from udkjax.straightline.loop_derivative import COTANGENT, TANGENT
-from udkjax.straightline.loops import Clear, LoopProgram
 
 SUFFIXES = {"accelerations": "", "projection": "_projection", "position": "_position", "velocity": "_velocity"}
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from udkjax.expressions import Program
 from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, typed
-from udkjax.straightline import Program
 
 SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
 COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]

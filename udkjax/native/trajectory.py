@@ -24,6 +24,7 @@ import numpy as np
 
 from udkjax.equations.code import Code
 from udkjax.equations.large_code import LargeCode
+from udkjax.expressions import Program
 from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM, least_norm
 from udkjax.native.loops import LoopWriter
@@ -74,7 +75,6 @@ from udkjax.native.steps import (
     USELESS,
 )
 from udkjax.native.tableau import Method
-from udkjax.straightline import Program
 
 OUTPUT_STEPS = 7  # of Newton's method to an output: where two branches of the manifold meet, it halves the distance in each
 

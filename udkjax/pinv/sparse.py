@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax import lax
 
-from udkjax.straightline import Graph, Scalar
+from udkjax.expressions import Graph, Scalar
 
 Row = dict[int, Scalar]
 

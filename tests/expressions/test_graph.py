@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from udkjax.straightline import Graph, Program, Scalar
+from udkjax.expressions import Graph, Program, Scalar
 
 
 def operations(graph: Graph) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from udkjax.straightline.emit import Program
+from udkjax.expressions.emit import Program
 
 SET, ADD, LEAST = "set", "add", "least"  # an output replaces what is there, is added to it, or the smaller of both stays
 

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from udkjax.straightline.graph import Details, Graph, Scalar
+from udkjax.expressions.graph import Details, Graph, Scalar
 
 _INLINED = (
     "jit",

@@ -1,7 +1,7 @@
 """A mechanism's equations as one graph of scalar expressions, built once for each structure.
 
 Numbers are inputs of the graph, so one graph serves all values of masses, lengths and gains. It holds more than any run needs;
-the programs taken from it (straightline/emit.py) compute only the outputs that they are asked for.
+the programs taken from it (expressions/emit.py) compute only the outputs that they are asked for.
 """
 
 from functools import cached_property, lru_cache
@@ -13,18 +13,18 @@ import numpy as np
 
 from udkjax.equations.elements import Row, applied, differentiated, has_pieces, piece, scalar
 from udkjax.equations.kinds import Alike, alike
+from udkjax.expressions import Graph, Scalar
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
-from udkjax.straightline import Graph, Scalar
 
 
 @lru_cache(maxsize=64)
-def expressions(tree: Any, shapes: tuple) -> "Expressions":
+def scalar_equations(tree: Any, shapes: tuple) -> "ScalarEquations":
     """Return the graph of the mechanisms with this tree and with numbers of these shapes and types."""
-    return Expressions(jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes]))
+    return ScalarEquations(jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes]))
 
 
-class Expressions:
+class ScalarEquations:
     """Psi, Psi_q, Psi_dot, gamma, M, F and the energies of a mechanism, as scalars of one graph."""
 
     def __init__(self, mechanism: Mechanism):

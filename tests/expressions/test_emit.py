@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.straightline import Graph, Program, frontier, trace
+from udkjax.expressions import Graph, Program, frontier, trace
 
 X = np.array([0.3, -0.7, 1.1])
 

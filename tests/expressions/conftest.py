@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.straightline import Graph, Program, trace
+from udkjax.expressions import Graph, Program, trace
 
 
 class Emitted(NamedTuple):

@@ -15,8 +15,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from udkjax.straightline.graph import Details, Graph, Node, Scalar
-from udkjax.straightline.read import read
+from udkjax.expressions.graph import Details, Graph, Node, Scalar
+from udkjax.expressions.read import read
 
 Row = dict[int, Scalar]  # partial derivatives, by the index of the node with respect to which they are taken
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.straightline.graph import Details, Graph, Node, Scalar
+from udkjax.expressions.graph import Details, Graph, Node, Scalar
 
 _PAIR = ("sin", "cos")
 _FLOATS = (*_PAIR, "tanh", "exp")  # of these names math and NumPy have functions, too
