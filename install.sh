@@ -1,9 +1,10 @@
 #!/bin/sh
 # Puts udkjax into a virtual environment of its own, .venv, with the newest Python of this machine that runs. Safe to repeat.
 #
-#   sh install.sh               what a user needs
+#   sh install.sh               what a user needs, with all extras
 #   sh install.sh --test        and what the tests need
 #   sh install.sh --dev         and what style and type checks need
+#   sh install.sh --docs        and what builds the documentation
 #   sh install.sh --python X    with this Python: a version (3.11), a name or a path
 #   sh install.sh --venv DIR    in DIR instead of .venv
 #
@@ -24,11 +25,12 @@ die() {
 }
 usage() { sed -n '2,/^set /{s/^# \{0,1\}//p;}' "$0"; }
 
-venv=.venv extras='' wanted=''
+venv=.venv extras=all wanted=''
 while [ $# -gt 0 ]; do
     case $1 in
-    --test) extras=${extras:+$extras,}test ;;
-    --dev) extras=${extras:+$extras,}dev ;;
+    --test) extras=$extras,test ;;
+    --dev) extras=$extras,dev ;;
+    --docs) extras=$extras,docs ;;
     --python | --venv)
         [ $# -ge 2 ] || die 2 "$1 needs a value"
         if [ "$1" = --python ]; then wanted=$2; else venv=$2; fi
@@ -135,7 +137,7 @@ if [ "$minor" -gt $newest ]; then
     say "Python 3.$minor is newer than what the versions in constraints.txt were tested with"
 fi
 
-target=".${extras:+[$extras]}"
+target=".[$extras]"
 say "installing udkjax and what it needs into $venv"
 if ! { works uv && uv pip install --quiet --python "$venv/bin/python" -c constraints.txt -e "$target" 2>/dev/null; }; then
     "$venv/bin/python" -m pip --disable-pip-version-check install --quiet -c constraints.txt -e "$target" ||

@@ -1,19 +1,24 @@
+import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import get_args
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray
 
 from tests.command_line import udkjax
+from udkjax.cli import COMMANDS, common
+from udkjax.extras import MissingExtraError
+from udkjax.integrate import Result
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PARALLELOGRAM = EXAMPLES / "parallelogram.toml"
 
 
-@pytest.mark.parametrize("command", [[], ["report"], ["simulate"], ["sweep"], ["identify"], ["check"], ["doctor"]])
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
 def test_help_is_printed_without_importing_jax(command):
     code = (
         "import sys, atexit; from udkjax.cli import main\n"
@@ -201,3 +206,65 @@ def test_doctor_names_versions_and_devices(capsys):
     shown = capsys.readouterr().out
     for word in ("udkjax", "jax", "jaxlib", "equinox", "diffrax", "numpy", "python", "devices", "float64", "cores"):
         assert word in shown
+
+
+def test_json_is_alone_on_stdout_and_words_go_to_stderr(tmp_path, capsys):
+    out = tmp_path / "run.nc"
+    assert udkjax("simulate", PARALLELOGRAM, "--t1", 0.5, "--out", out, "--json") == 0
+    shown = capsys.readouterr()
+    found = json.loads(shown.out)
+    assert found["result"] == "successful" and found["end_time"] == 0.5
+    assert found["files"] == [str(out), str(out.with_suffix(".png"))]
+    assert 0 < found["error"] < 1e-7 and found["right_hand_sides"] > 0
+    assert "wrote" in shown.err
+
+    assert udkjax("check", PARALLELOGRAM, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["coordinates"], found["rank"], found["degrees_of_freedom"], found["closed"]) == (12, 11, 1, True)
+    assert len(found["redundant"]) == 1 and found["mass"] > 0
+
+    assert udkjax("doctor", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["engine"] == "native"
+
+
+def test_what_json_cannot_hold_is_written_as_what_it_can():
+    given = {
+        "arrays": [np.arange(3), jnp.ones((2, 1))],
+        "numbers": (np.float32(0.5), float("nan"), np.inf, 3, True, None),
+        "names": {"result": Result.step_limit, "file": Path("a"), 7: np.array("text")},
+    }
+    assert common.plain(given) == {
+        "arrays": [[0, 1, 2], [[1.0], [1.0]]],
+        "numbers": [0.5, None, None, 3, True, None],
+        "names": {"result": "step_limit", "file": "a", "7": "text"},
+    }
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (MissingExtraError("optax is not installed: pip install 'udkjax[identify]'"), 2, "pip install 'udkjax[identify]'"),
+        (KeyboardInterrupt(), 130, "udkjax: stopped"),
+        (BrokenPipeError(), 1, ""),
+    ],
+)
+def test_what_is_raised_in_a_command_becomes_its_exit_code(capsys, monkeypatch, error, code, words):
+    def raised(*_):
+        raise error
+
+    monkeypatch.setattr("udkjax.show.doctor.facts", raised)
+    monkeypatch.setattr(sys.stderr, "close", lambda: None)
+    assert udkjax("doctor") == code
+    assert words in capsys.readouterr().err
+
+
+def test_a_defect_keeps_its_traceback(monkeypatch):
+    monkeypatch.setattr("udkjax.show.doctor.facts", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        udkjax("doctor")
+
+
+def test_every_command_offers_json(capsys):
+    for command in {*COMMANDS} - {"sweep", "identify"}:
+        assert udkjax(command, "--help") == 0
+        assert "--json" in capsys.readouterr().out, command

@@ -2,19 +2,24 @@
 
 import ast
 import os
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import udkjax
+from udkjax.extras import EXTRAS
 
 ROOT = Path(udkjax.__file__).parent
 
+GROUND_FLOOR = {"deprecation", "extras"}  # every floor may import them
 BELOW = {
-    "environment": set(),
+    "deprecation": set(),
+    "extras": set(),
     "expressions": set(),
     "pinv": {"expressions"},
     "scene": set(),
@@ -62,7 +67,7 @@ def violations(root: Path) -> list[str]:
             if library != "udkjax":
                 allowed = floor in ONLY_IN.get(library, {floor})
             else:
-                allowed = "*" in known or (rest and rest[0] in known | {floor})
+                allowed = "*" in known or (rest and rest[0] in known | GROUND_FLOOR | {floor})
             if not allowed:
                 found.append(f"{place}: {module}")
     return found
@@ -148,6 +153,62 @@ print({"jax", "diffrax", "optimistix", "lineax", "scipy", "xarray", "pandas", "m
 
 def test_a_run_by_default_imports_no_other_solvers():
     assert python(DEFAULT, UDKJAX_CACHE=os.environ["UDKJAX_CACHE"]) == "{'jax'}"
+
+
+OPTIONAL = ("anywidget", "dask", "distributed", "h5netcdf", "h5py", "matplotlib", "optax", "pandas", "tyro", "xarray")
+CORE = f"""
+import sys
+for name in {OPTIONAL}:
+    sys.modules[name] = None  # as if it were not installed
+import diffrax, numpy as np
+import udkjax as udk
+mech = udk.loads(udk.dumps(udk.library.parallelogram()))
+for solver in (None, diffrax.Tsit5()):
+    sol = udk.simulate(mech, np.linspace(0.0, 0.5, 6), solver=solver)
+    assert abs(udk.violation(mech, sol)).max() < 1e-12
+missing = []
+for use in ("sol.to_xarray(mech)", "from udkjax.show.plots import trajectory", "from udkjax.cli import main; main(['--help'])"):
+    try:
+        exec(use)
+    except ImportError as error:
+        missing.append(str(error))
+    except SystemExit as end:
+        missing.append(end.code)
+print(missing)
+"""
+
+
+def test_the_core_needs_no_extra_and_a_missing_one_is_named():
+    shown = python(CORE, UDKJAX_CACHE=os.environ["UDKJAX_CACHE"])
+    cures = [
+        f"{package} is not installed: pip install 'udkjax[{extra}]'"
+        for package, extra in (("xarray", "io"), ("matplotlib", "plot"))
+    ]
+    assert shown == str([*cures, 2])
+
+
+def test_every_optional_package_has_its_extra():
+    project = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())["project"]
+    core = {re.split(r"[\[>=<]", line)[0] for line in project["dependencies"]}
+    assert core.isdisjoint(EXTRAS)
+    extras = {name: " ".join(lines) for name, lines in project["optional-dependencies"].items()}
+    transitive = {"distributed": "dask", "h5py": "h5netcdf", "pandas": "xarray"}  # comes with it
+    for package, extra in EXTRAS.items():
+        assert transitive.get(package, package) in extras[extra]
+
+
+def test_an_old_name_works_and_warns_of_the_new_one(monkeypatch):
+    monkeypatch.setitem(udkjax._RENAMED, "Mechanismus", "udkjax.scene.Mechanism")
+    with pytest.warns(DeprecationWarning, match=r"udkjax\.Mechanismus is now udkjax\.scene\.Mechanism") as seen:
+        assert udkjax.Mechanismus is udkjax.Mechanism
+    assert seen[0].filename == __file__
+
+
+def test_no_warning_is_given_by_importing_and_running():
+    code = "import udkjax as udk; udk.simulate(udk.library.double_pendulum(), [0.0, 0.1]); print('quiet')"
+    clean = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu", "UDKJAX_CACHE": os.environ["UDKJAX_CACHE"]}
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], env=clean, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("quiet\n", "")
 
 
 FLOAT = "print(jnp.result_type(float))"

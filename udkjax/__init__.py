@@ -119,6 +119,7 @@ _NAMES = {
     "udkjax.study.sweep": "sweep Axis Zipped Sobol LatinHypercube Random SweepError",
     "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }
+_RENAMED: dict[str, str] = {}  # old public names and what they are now, with their module: see udkjax.deprecation
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __version__ = "0.1.0"
@@ -131,7 +132,7 @@ def __getattr__(name: str):
     elif name in _HOME:
         value = getattr(import_module(_HOME[name]), name)
     else:
-        raise AttributeError(f"module 'udkjax' has no attribute {name!r}")
+        return import_module("udkjax.deprecation").deprecated_getattr(__name__, _RENAMED, stacklevel=3)(name)
     globals()[name] = value
     return value
 

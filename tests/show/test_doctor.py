@@ -1,21 +1,42 @@
 import jax
 
+import udkjax as udk
 from udkjax.show import doctor
 
 
 def test_a_good_environment_gets_no_advice():
-    assert list(doctor._advice()) == []
-    assert "nothing to complain about" in doctor.doctor()
+    found = doctor.facts()
+    assert found["advice"] == [] and found["missing_extras"] == []
+    assert (found["engine"], found["precision"]) == ("native", "float64")
+    assert {"udkjax", "jax", "jaxlib", "equinox", "diffrax", "llvmlite", "numpy", "python"} <= set(found["versions"])
+    shown = doctor.summary(found)
+    assert "nothing to complain about" in shown and found["versions"]["jax"] in shown and "engine" in shown
 
 
 def test_single_precision_is_said():
     with jax.enable_x64(False):
-        assert any("float64 is off" in line for line in doctor._advice())
+        assert any("float64 is off" in line for line in doctor._advice("native", ""))
 
 
-def test_where_machine_code_is_kept_is_said(monkeypatch, tmp_path):
+def test_where_machine_code_is_cached_is_said(monkeypatch, tmp_path):
+    monkeypatch.setattr(doctor, "engine_here", lambda: ("native", "by default"))
     monkeypatch.setenv("UDKJAX_CACHE", str(tmp_path))
     (tmp_path / "0123").write_bytes(bytes(3 * 2**20))
-    assert f"1 kept in {tmp_path}, 3.0 MiB" in doctor.doctor()
+    assert f"1 in {tmp_path}, 3.0 MiB" in doctor.summary(doctor.facts())
     monkeypatch.setenv("UDKJAX_CACHE", "0")
-    assert "not kept" in doctor.doctor()
+    assert "nothing, as UDKJAX_CACHE=0 says" in doctor.summary(doctor.facts())
+
+
+def test_an_engine_that_does_not_work_is_said(monkeypatch):
+    def broken(*_, **__):
+        raise OSError("no executable memory")
+
+    monkeypatch.setattr(doctor, "simulate", broken)
+    found = doctor.facts()
+    assert found["engine"] == "none" and "no executable memory" in found["engine_reason"]
+    assert any("machine code is not used" in line for line in found["advice"])
+
+
+def test_the_reason_is_that_of_the_run(monkeypatch):
+    monkeypatch.setattr(doctor, "simulate", lambda *given: udk.simulate(*given, engine="diffrax"))
+    assert doctor.engine_here() == ("diffrax", "it was asked for")

@@ -6,7 +6,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.integrate import Result, Solution
-from udkjax.show.plots import apart, attachments, largest, outline, placed, trajectory
+from udkjax.show.plots import apart, attachments, outline, placed, trajectory
 from udkjax.study import exact_coordinates
 
 
@@ -48,12 +48,6 @@ def test_placed_turns_anticlockwise():
     np.testing.assert_allclose(
         placed(np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([3.0, 4.0, np.pi / 2])), [[3, 5], [2, 4]], atol=1e-15
     )
-
-
-def test_largest_violation_takes_names_and_arrays():
-    rows = np.array([[0.0, -3.0], [1.0, 2.0]])
-    np.testing.assert_array_equal(largest(rows), [3, 2])
-    np.testing.assert_array_equal(largest({"A": rows, "motor": np.array([0.0, 5.0])}), [3, 5])
 
 
 def test_trajectory_draws_the_mechanism_where_it_is(linkage, exact):

@@ -1,33 +1,23 @@
-"""The command line: `udkjax report | simulate | sweep | identify | check | doctor`.
+"""The command line: `udkjax COMMAND`, each command a function in the module of its name.
 
 Only the standard library and tyro are imported before a command is known, so that help comes at once.
 """
 
 import atexit
 import gc
+from importlib import import_module
 
-import tyro
+from udkjax.cli.exits import exit_codes
 
-from udkjax.cli.check import check
-from udkjax.cli.doctor import doctor
-from udkjax.cli.identify import identify
-from udkjax.cli.report import report
-from udkjax.cli.simulate import simulate
-from udkjax.cli.sweep import sweep
+COMMANDS = ("report", "simulate", "sweep", "identify", "check", "doctor")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one command; exit with 1 after a run that failed, with 2 after wrong input."""
+    """Run one command; exit with one of the codes of `udkjax.cli.exits`."""
     # At its end Python would look for garbage among all that JAX has made, for a third of a second.
     atexit.register(gc.freeze)
-    commands = {
-        "report": report,
-        "simulate": simulate,
-        "sweep": sweep,
-        "identify": identify,
-        "check": check,
-        "doctor": doctor,
-    }
-    tyro.extras.subcommand_cli_from_dict(
-        commands, prog="udkjax", args=arguments, description="Planar mechanisms, however redundantly constrained."
-    )
+    with exit_codes():
+        from udkjax.cli.common import parse_and_run
+
+        commands = {name: getattr(import_module(f"udkjax.cli.{name}"), name) for name in COMMANDS}
+        parse_and_run(commands, arguments)

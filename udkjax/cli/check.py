@@ -2,20 +2,29 @@
 
 import sys
 
-from udkjax.cli.common import BAD_RUN, Scene, load
+from udkjax.cli.common import BAD_RUN, Json, Scene, load, show
 
 
-def check(scene: Scene, /) -> None:
+def check(scene: Scene, /, json: Json = False) -> None:
     """Count what a scene is made of, name its redundant constraints, and try to close it; exit with 1 if it stays open.
 
     Args:
         scene: the mechanism.
+        json: write the results as JSON.
     """
     mech, _ = load(scene)
+    from udkjax.equations import analyse
     from udkjax.integrate.assembly import check as checked
     from udkjax.show.summary import check_summary
 
-    found = checked(mech)
-    print(check_summary(mech, found))
+    found, scales = checked(mech), analyse(mech)
+    results = {
+        **found._asdict(),
+        "redundant": [{"constraint": name, "row": row} for name, row in found.redundant],
+        "length": scales.length,
+        "time": scales.time,
+        "mass": scales.mass,
+    }
+    show(results, check_summary(mech, found), json)
     if not found.closed:
         sys.exit(BAD_RUN)

@@ -1,17 +1,54 @@
-"""What the commands share: how they read a scene, refuse wrong input, and end."""
+"""What the commands share: options that are spelled alike, how a scene is read, and how results are shown.
 
+A command is a function of its options that imports what it needs when it runs:
+
+    def modes(scene: Scene, /, count: int = 5, json: Json = False) -> None:
+        '''Find the natural frequencies of a scene at rest.
+
+        Args:
+            scene: the mechanism.
+            count: how many.
+            json: write the results as JSON.
+        '''
+        mech, _ = load(scene)
+        from udkjax.show.summary import table
+        from udkjax.study.modes import modes as compute
+
+        found = compute(mech)
+        show({"frequencies": found.frequencies}, table(mech.name, {...}), json)
+
+Wrong input ends with `refuse("--count 0: must be positive")`, a run that failed with `fail(...)` after `show(...)`.
+"""
+
+import json as json_text
+import math
 import sys
+from collections.abc import Callable, Mapping
+from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
+from udkjax.cli.exits import BAD_INPUT, BAD_RUN, INTERRUPTED, fail, refuse, say
+from udkjax.extras import OptionalImport
+
+with OptionalImport():
+    import tyro
 
 if TYPE_CHECKING:
     from udkjax import Mechanism
 
-BAD_RUN, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes; the last as of a shell
+__all__ = ["BAD_INPUT", "BAD_RUN", "INTERRUPTED", "Json", "Quiet", "Scene", "fail", "load", "refuse", "say", "show"]
 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml")]
+Json = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
+
+def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[str] | None) -> None:
+    """Run the command that the arguments (default: those of the process) name, with their options."""
+    tyro.extras.subcommand_cli_from_dict(
+        dict(commands), prog="udkjax", args=arguments, description="Planar mechanisms, however redundantly constrained."
+    )
 
 
 def load(scene: Path) -> tuple["Mechanism", str]:
@@ -23,10 +60,34 @@ def load(scene: Path) -> tuple["Mechanism", str]:
     except (OSError, UnicodeDecodeError) as problem:
         refuse(f"cannot read {scene}: {problem}")
     except udk.SceneError as problem:
-        refuse(str(problem))
+        refuse(problem)
 
 
-def refuse(problem: str) -> NoReturn:
-    """Say what is wrong with the input, and exit."""
-    print(f"udkjax: {problem}", file=sys.stderr)
-    sys.exit(BAD_INPUT)
+def show(results: Mapping[str, Any], text: str, json: bool) -> None:
+    """Write what a command found to stdout: as text, or as one JSON object, and the text then to stderr.
+
+    Args:
+        results: what was found, by names that scripts can rely on; arrays become lists, what is not finite becomes null.
+        text: the same for people.
+        json: whether JSON was asked for.
+    """
+    if json:
+        print(text, file=sys.stderr)
+        print(json_text.dumps(plain(results), ensure_ascii=False, allow_nan=False))
+    else:
+        print(text)
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON knows it: arrays and tuples as lists, enumerations by name, paths as text, NaN and inf as None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Enum):
+        return value.name
+    if hasattr(value, "tolist"):  # an array or a number of NumPy or JAX
+        return plain(value.tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)

@@ -1,8 +1,15 @@
 """`udkjax doctor`."""
 
+from udkjax.cli.common import Json, show
 
-def doctor() -> None:
-    """Tell versions, devices and precision, ready to paste into a bug report."""
-    from udkjax.show import doctor as show
 
-    print(show.doctor())
+def doctor(json: Json = False) -> None:
+    """Tell versions, devices, precision and which engine is used and why, ready to paste into a bug report.
+
+    Args:
+        json: write the results as JSON.
+    """
+    from udkjax.show.doctor import facts, summary
+
+    found = facts()
+    show(found, summary(found), json)

@@ -5,7 +5,22 @@ from typing import Annotated
 
 import tyro
 
-from udkjax.cli.common import refuse
+from udkjax.cli.common import Json, refuse, show
+
+# Of each run, in the JSON.
+VERDICT = (
+    "group",
+    "method",
+    "solver",
+    "tol",
+    "alpha",
+    "beta",
+    "verdict",
+    "error_max",
+    "psi2_end",
+    "right_hand_sides",
+    "accepted",
+)
 
 
 def report(
@@ -14,6 +29,7 @@ def report(
     start: float = -45.0,
     seed: int = 0,
     from_file: Annotated[Path | None, tyro.conf.arg(name="from", metavar="FILE.nc")] = None,
+    json: Json = False,
 ) -> None:
     """Do the paper's study again, with what would have been better, and write a page about it (HTML) with its data (NetCDF).
 
@@ -26,6 +42,7 @@ def report(
         start: angle of the links (degrees) from which they are released at rest.
         seed: of the starts that differ by rounding errors.
         from_file: draw the page from this file instead of running anything.
+        json: write the results as JSON.
     """
     target = out if out.suffix == ".html" else out / "report.html"
     if seed < 0:
@@ -54,8 +71,10 @@ def report(
             tell = lambda what, part: report_progress(part, what)  # noqa: E731
             data = study(QUICK if quick else FULL, start, seed, tell=tell)
     target.parent.mkdir(exist_ok=True)
+    files = [target]
     if not from_file:
-        save(data, target.with_suffix(".nc"))
-        print(f"wrote {target.with_suffix('.nc')}")
+        files.insert(0, target.with_suffix(".nc"))
+        save(data, files[0])
     write(data, target)
-    print(f"wrote {target}")
+    verdicts = [dict(zip(VERDICT, row)) for row in zip(*(data[name].values for name in VERDICT))]
+    show({"runs": verdicts, "files": files}, "\n".join(f"wrote {file}" for file in files), json)

@@ -1,14 +1,13 @@
 """`udkjax simulate`."""
 
 import math
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from udkjax.cli.common import BAD_RUN, Scene, load, refuse
+from udkjax.cli.common import Json, Scene, fail, load, refuse, show
 
 # The names of udkjax.study.choices, which cannot be imported before a command is known: it imports JAX.
 Method = Literal["auto", "elimination", "svd", "varga", "greville", "householder", "gram-schmidt"]
@@ -36,6 +35,7 @@ def simulate(
     dt0: float | None = None,
     max_steps: int | None = None,
     plot: Path | None = None,
+    json: Json = False,
 ) -> None:
     """Simulate a scene: write its motion (NetCDF) and a picture of it, and say how far both can be trusted.
 
@@ -57,6 +57,7 @@ def simulate(
         dt0: first step to try (s); by default it is chosen.
         max_steps: give up after so many steps.
         plot: picture to write; by default beside the NetCDF file.
+        json: write the results as JSON.
     """
     if not 0 < dt <= t1 - t0 < math.inf:
         refuse(f"from --t0 {t0:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
@@ -77,6 +78,7 @@ def simulate(
     import udkjax as udk
     from udkjax.show.plots import trajectory
     from udkjax.show.summary import run_summary
+    from udkjax.study.accuracy import accuracy
     from udkjax.study.choices import choice
 
     gains = {"alpha": alpha, "beta": beta} if stabilization == "baumgarte" else {}
@@ -101,11 +103,20 @@ def simulate(
     data.attrs |= {"scene": text, "scene_file": scene.name}
     data.to_netcdf(out, engine="h5netcdf")
     trajectory(mech, sol).savefig(plot, dpi=150)
-    print(run_summary(mech, sol, seconds["all"], seconds["compiling"]))
-    print(f"wrote {out} and {plot}")
+    found = accuracy(mech, sol)
+    results = {
+        "result": sol.result,
+        "end_time": sol.time,
+        **sol.stats,
+        **found._asdict(),
+        "seconds": seconds["all"],
+        "seconds_compiling": seconds["compiling"],
+        "files": [out, plot],
+    }
+    text = run_summary(mech, sol, found, seconds["all"], seconds["compiling"])
+    show(results, f"{text}\nwrote {out} and {plot}", json)
     if sol.result:
-        print(f"udkjax: {sol.cause}", file=sys.stderr)
-        sys.exit(BAD_RUN)
+        fail(sol.cause)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from udkjax.extras import OptionalImport
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -80,7 +81,8 @@ class Solution(eqx.Module):
 
         With the mechanism, its numbers (the attribute `parameters`, as JSON) and its text (`scene`, as TOML) are inside too.
         """
-        import xarray
+        with OptionalImport():
+            import xarray
 
         coordinates = ("x", "y", "angle")
         dims = ("time", "body", "coordinate")
@@ -123,7 +125,7 @@ def versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
     found = {"python": sys.version.split()[0]}
-    for package in ("udkjax", "jax", "jaxlib", "diffrax", "equinox", "numpy"):
+    for package in ("udkjax", "jax", "jaxlib", "diffrax", "equinox", "llvmlite", "numpy"):
         try:
             found[package] = version(package)
         except PackageNotFoundError:

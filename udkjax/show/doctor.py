@@ -2,39 +2,82 @@
 
 import os
 import platform
+from collections.abc import Iterator
+from importlib.util import find_spec
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from udkjax.extras import EXTRAS
+from udkjax.integrate import simulate
 from udkjax.integrate.solution import versions
 from udkjax.native import machine
-from udkjax.study.machine import cores
+from udkjax.scene.library import double_pendulum
+from udkjax.study.machine import cores, processor
 
 FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 
 
-def doctor() -> str:
-    """Describe versions, devices, precision and cores, and what could be better."""
-    lines = {
-        **versions(),
+def facts() -> dict[str, Any]:
+    """Return versions, devices, precision, engine, cache and what could be better, by names that scripts can rely on."""
+    folder, sizes = machine.cache_folder(), [size for _, size, _ in machine.kept()]
+    engine, reason = engine_here()
+    return {
+        "versions": versions(),
+        "missing_extras": sorted({extra for package, extra in EXTRAS.items() if find_spec(package) is None}),
         "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
-        "cores": f"{cores()} of {os.cpu_count()}",
-        "devices": ", ".join(f"{device} ({device.device_kind})" for device in jax.devices()),
+        "processor": processor(),
+        "cores": cores(),
+        "cores_of_machine": os.cpu_count(),
+        "devices": [f"{device} ({device.device_kind})" for device in jax.devices()],
         "precision": f"{jnp.result_type(float)}",
-        "engine": f"machine code, {machine.lanes()} lanes; diffrax where a run needs it",
-        "machine code": _cache(),
-        "environment": ", ".join(f"{key}={value}" for key, value in sorted(os.environ.items()) if key.startswith(FLAGS)) or "-",
+        "engine": engine,
+        "engine_reason": reason,
+        "lanes": machine.lanes(),
+        "cache": None if folder is None else str(folder),
+        "cached_programs": len(sizes),
+        "cached_bytes": sum(sizes),
+        "environment": {key: value for key, value in sorted(os.environ.items()) if key.startswith(FLAGS)},
+        "advice": list(_advice(engine, reason)),
+    }
+
+
+def engine_here() -> tuple[str, str]:
+    """Return which engine a small simulation runs on here, "native", "diffrax" or "none", and why."""
+    try:
+        solution = simulate(double_pendulum(), np.array([0.0, 0.1]))
+    except Exception as error:
+        return "none", f"a small simulation fails: {type(error).__name__}: {error}"
+    engine, _, reason = dict(solution.settings)["engine"].partition(": ")
+    return engine, reason or "by default; diffrax where a choice of yours needs it, as `Solution.settings` says"
+
+
+def summary(found: dict[str, Any]) -> str:
+    """Describe what `facts` found."""
+    cached = f"{found['cached_programs']} in {found['cache']}, {found['cached_bytes'] / 2**20:.1f} MiB"
+    if found["cache"] is None:
+        cached = "nothing, as UDKJAX_CACHE=0 says"
+    lines = {
+        **found["versions"],
+        "missing extras": ", ".join(found["missing_extras"]) or "none",
+        "system": found["system"],
+        "processor": found["processor"],
+        "cores": f"{found['cores']} of {found['cores_of_machine']}",
+        "devices": ", ".join(found["devices"]),
+        "precision": found["precision"],
+        "engine": f"{found['engine']}: {found['engine_reason']}",
+        "machine code": f"{found['lanes']} lanes; cached: {cached}",
+        "environment": ", ".join(f"{key}={value}" for key, value in found["environment"].items()) or "-",
     }
     width = max(map(len, lines))
-    advice = [f"! {line}" for line in _advice()] or ["nothing to complain about"]
+    advice = [f"! {line}" for line in found["advice"]] or ["nothing to complain about"]
     return "\n".join([f"{key:<{width}}  {value}" for key, value in lines.items()] + advice)
 
 
-def _cache() -> str:
-    sizes, folder = [size for _, size, _ in machine.kept()], machine.cache_folder()
-    return "not kept" if folder is None else f"{len(sizes)} kept in {folder}, {sum(sizes) / 2**20:.1f} MiB"
-
-
-def _advice():
+def _advice(engine: str, reason: str) -> Iterator[str]:
     if jnp.result_type(float) != jnp.float64:
         yield "float64 is off, so that loops close to single precision only: unset JAX_ENABLE_X64, or set it to 1"
+    if engine != "native":
+        yield f"machine code is not used here ({reason}): simulations take up to a hundred times as long"

@@ -5,11 +5,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
+from udkjax.extras import OptionalImport
 from udkjax.show.plots import COLOURS
+
+with OptionalImport():
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
 PANELS = 24  # of the picture of the fit, each a channel of a record; those beyond are only in the dataset
 COLUMNS = 3

@@ -4,13 +4,16 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
+from udkjax.extras import OptionalImport
 from udkjax.show.fit_figures import fit, plain, residuals, title
 from udkjax.show.plots import COLOURS
 from udkjax.show.profile_figures import profiles
+
+with OptionalImport():
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
 WRITTEN = 14  # parameters up to which correlations are written as numbers too
 WORST = 1e3  # percent: standard errors that are larger are drawn as this

@@ -1,15 +1,17 @@
 """Pictures of a trajectory, as matplotlib figures that belong to nobody else."""
 
-from collections.abc import Mapping
-
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from udkjax.equations import energy, violation
+from udkjax.extras import OptionalImport
 from udkjax.integrate import Solution
 from udkjax.scene import GROUND, Mechanism
+from udkjax.study.accuracy import largest_violation
+
+with OptionalImport():
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, told apart by everyone; the yellow is left out, since thin lines of it vanish on white.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
@@ -96,7 +98,7 @@ def draw_angles(axes: Axes, mech: Mechanism, ts, q: Float[np.ndarray, "T bodies 
 
 def draw_violation(axes: Axes, ts, violated) -> None:
     """Draw the largest violation of any constraint over time, in metres or radians."""
-    size = largest(violated)
+    size = largest_violation(violated)
     axes.semilogy(ts, np.maximum(size, ROUNDING), color=COLOURS[1], lw=1)
     axes.set_ylim(ROUNDING, 1e3 * np.nanmax(size, initial=ROUNDING))
     axes.set_ylabel("violation (m, rad)")
@@ -117,13 +119,6 @@ def legend(axes: Axes) -> None:
     axes.legend(
         loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2, ncols=4, fontsize="small", frameon=False, handlelength=1.2
     )
-
-
-def largest(violated) -> Float[np.ndarray, " T"]:
-    """Return the largest violation over all constraints at each time, from values by name or from one array."""
-    values = violated.values() if isinstance(violated, Mapping) else [violated]
-    rows = [np.abs(np.asarray(value)).reshape(len(value), -1).max(axis=1, initial=0.0) for value in values]
-    return np.max(rows, axis=0)
 
 
 def attachments(mech: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:

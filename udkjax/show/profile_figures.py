@@ -3,11 +3,14 @@
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
+from udkjax.extras import OptionalImport
 from udkjax.show.fit_figures import plain, title
 from udkjax.show.plots import COLOURS
+
+with OptionalImport():
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COLUMNS = 3
 FAR = 3.0  # times the limit: what is higher is not drawn

@@ -8,11 +8,13 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from matplotlib import rc_context
-from matplotlib.figure import Figure
-
+from udkjax.extras import OptionalImport
 from udkjax.show import report_figures, report_tables
 from udkjax.show.report_findings import findings, growth_time, nfunc_note, psi2_note, repeat, second_choice
+
+with OptionalImport():
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
 FIGURES: dict[str, tuple[Callable[[Any], Figure], str, str]] = {
     "linkage": (

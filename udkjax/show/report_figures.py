@@ -1,13 +1,16 @@
 """The pictures of the report, each drawn from its dataset (udkjax.study.record) and from nothing else."""
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
+from udkjax.extras import OptionalImport
 from udkjax.scene import loads
 from udkjax.show.plots import COLOURS, draw_motion
 from udkjax.study import exact_coordinates
+
+with OptionalImport():
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 WIDTH = 9.2  # inches, of the page's column
 LEAST_PSI2 = 1e-36  # m2: below the square of any rounding error; drawn in place of zero, which has no logarithm

@@ -1,13 +1,9 @@
 """What the command line says about a mechanism and about a run."""
 
-import numpy as np
-
-from udkjax.equations import energy, violation
 from udkjax.equations.analysis import analyse
 from udkjax.integrate import Solution
 from udkjax.scene import Mechanism
-from udkjax.show.plots import largest
-from udkjax.study import exact_coordinates
+from udkjax.study.accuracy import Accuracy
 
 
 def check_summary(mech: Mechanism, check) -> str:
@@ -29,12 +25,12 @@ def check_summary(mech: Mechanism, check) -> str:
     return table(mech.name or "mechanism", lines)
 
 
-def run_summary(mech: Mechanism, sol: Solution, seconds: float, compiling: float) -> str:
+def run_summary(mech: Mechanism, sol: Solution, accuracy: Accuracy, seconds: float, compiling: float) -> str:
     """Describe how a run ended, what it took and how far it can be trusted."""
     lines = {
         "result": sol.cause if sol.result else sol.result.name,
         "work": work(sol),
-        **accuracy(mech, sol),
+        **trust(accuracy),
         "time": f"{seconds:.2f} s, {compiling:.2f} s of it to compile",
     }
     return table(f"{mech.name or 'mechanism'}, {float(sol.ts[0]):g} to {float(sol.ts[-1]):g} s, {len(sol.ts)} instants", lines)
@@ -51,17 +47,14 @@ def work(sol: Solution) -> str:
     return ", ".join(f"{int(sol.stats[key])} {name}" for key, name in named.items() if int(sol.stats.get(key, -1)) >= 0)
 
 
-def accuracy(mech: Mechanism, sol: Solution) -> dict[str, str]:
-    """Describe the largest violation, the drift of the energy and, where one is known, the error against the exact solution."""
-    lines = {"violation": f"{np.nanmax(largest(violation(mech, sol))):.2e} m or rad at most"}
-    parts = energy(mech, sol)
-    total = np.asarray(parts.total)
-    scale = np.nanmax(np.asarray(parts.kinetic))
-    lines["energy"] = f"changes by {np.nanmax(np.abs(total - total[0])):.2e} J at most; kinetic up to {scale:.3g} J"
-    exact = exact_coordinates(mech, sol.ts, sol.q[0], sol.v[0])
-    if exact is not None:
-        error = np.nanmax(np.abs(np.asarray(sol.q) - exact))
-        lines["exact solution"] = f"missed by {error:.2e} m or rad at most"
+def trust(accuracy: Accuracy) -> dict[str, str]:
+    """Describe the largest violation, the change of the energy and, where one is known, the error against the exact solution."""
+    lines = {
+        "violation": f"{accuracy.violation:.2e} m or rad at most",
+        "energy": f"changes by {accuracy.energy_change:.2e} J at most; kinetic up to {accuracy.kinetic_energy:.3g} J",
+    }
+    if accuracy.error is not None:
+        lines["exact solution"] = f"missed by {accuracy.error:.2e} m or rad at most"
     return lines
 
 

@@ -6,12 +6,15 @@ from math import prod
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, Normalize
-from matplotlib.figure import Figure
 
+from udkjax.extras import OptionalImport
 from udkjax.integrate import Result
 from udkjax.show.plots import COLOURS, legend
+
+with OptionalImport():
+    from matplotlib.axes import Axes
+    from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, Normalize
+    from matplotlib.figure import Figure
 
 RESULT, MEMBER = "result", "member"  # the variable of the codes, and the dimension of a design
 OTHER = "not computed"  # what has a code of no `Result`

@@ -1,0 +1,45 @@
+"""How commands end: the exit codes, and what is said on stderr."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NoReturn
+
+from udkjax.extras import MissingExtraError
+
+BAD_RUN = 1  # it ran, and failed
+BAD_INPUT = 2  # it did not run: wrong options, an unreadable file, a missing package; tyro exits with it, too
+INTERRUPTED = 130  # Ctrl-C, as of a shell
+
+
+def say(text: str) -> None:
+    """Write a line to stderr, where all words go that are not a result."""
+    print(f"udkjax: {text}", file=sys.stderr)
+
+
+def refuse(problem: object) -> NoReturn:
+    """Say what is wrong with the input, and exit."""
+    say(str(problem))
+    sys.exit(BAD_INPUT)
+
+
+def fail(problem: object) -> NoReturn:
+    """Say why a run failed, and exit."""
+    say(str(problem))
+    sys.exit(BAD_RUN)
+
+
+@contextmanager
+def exit_codes() -> Iterator[None]:
+    """Turn what a command may raise into a line on stderr and an exit code; a defect of ours keeps its traceback."""
+    try:
+        yield
+    except MissingExtraError as error:
+        refuse(error)
+    except KeyboardInterrupt:
+        print(file=sys.stderr)  # the terminal's ^C stands on this line
+        say("stopped")
+        sys.exit(INTERRUPTED)
+    except BrokenPipeError:  # whoever read our output, such as `head`, has had enough
+        sys.stderr.close()
+        sys.exit(BAD_RUN)

@@ -1,0 +1,43 @@
+"""Packages that only some parts need, and how to get them where they are missing."""
+
+from types import TracebackType
+
+# The extras of pyproject.toml by the top-level modules that they bring.
+EXTRAS = {
+    "anywidget": "notebook",
+    "dask": "dask",
+    "distributed": "dask",
+    "h5netcdf": "io",
+    "h5py": "io",
+    "matplotlib": "plot",
+    "optax": "identify",
+    "pandas": "io",
+    "tyro": "cli",
+    "xarray": "io",
+}
+
+
+class MissingExtraError(ModuleNotFoundError):
+    """A package is missing that an extra of udkjax brings."""
+
+
+class OptionalImport:
+    """Inside `with OptionalImport():`, a missing package of an extra raises an error that says how to install it.
+
+    Any other import error is passed on as it is.
+    """
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if isinstance(error, ModuleNotFoundError) and not isinstance(error, MissingExtraError) and cure(error):
+            raise MissingExtraError(cure(error), name=error.name, path=error.path) from None
+
+
+def cure(error: ModuleNotFoundError) -> str:
+    """Say how to install what is missing; an empty text where no extra brings it."""
+    missing = (error.name or "").partition(".")[0]
+    if missing not in EXTRAS:
+        return ""
+    return f"{missing} is not installed: pip install 'udkjax[{EXTRAS[missing]}]'"
