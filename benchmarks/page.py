@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterable
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.table import VERDICT, Figures, Rows
-from udkjax.show.report import embedded
+from experiments.paper import page
+from experiments.paper.page import embedded
 
 WIDTH = 9.2  # inches
 MOTIONS = {-45.0: "released at −45°", 60.0: "released at +60°: singular configurations"}
@@ -20,7 +20,7 @@ STYLES = {"udkjax": {"color": "black", "lw": 2.2}, "C++": {"color": "#c03030", "
 
 def write(figures: Figures, judged: Rows, about: dict[str, Any], missing: Iterable[str], target: Path) -> None:
     """Write the page of what the benchmarks returned, by name."""
-    style = re.search(r"<style>.*?</style>", files("udkjax.show").joinpath("report.html").read_text(encoding="utf-8"), re.DOTALL)
+    style = re.search(r"<style>.*?</style>", Path(page.__file__).with_name("page.html").read_text(encoding="utf-8"), re.DOTALL)
     missing = list(missing)
     parts = [
         "<!DOCTYPE html>",

@@ -146,46 +146,6 @@ def test_a_run_that_fails_says_why_and_keeps_what_it_got(tmp_path, capsys):
     assert out.with_suffix(".png").exists()
 
 
-def test_a_report_is_drawn_from_its_data_alone(tmp_path, monkeypatch, capsys, study_data):
-    from udkjax.show import report
-    from udkjax.study.record import save
-
-    monkeypatch.setattr(report, "figure", lambda data, name: f"<p>{name}</p>")  # tests/show draws them
-
-    save(study_data, tmp_path / "study.nc")
-    assert udkjax("report", "--from", tmp_path / "study.nc", "--out", tmp_path / "pages") == 0
-    assert "report.html" in capsys.readouterr().out
-    assert [file.name for file in (tmp_path / "pages").iterdir()] == ["report.html"]  # no data is made anew
-    page = (tmp_path / "pages" / "report.html").read_text()
-    assert page.startswith("<!DOCTYPE html>") and "<p>figure_2</p>" in page
-
-
-@pytest.mark.parametrize(
-    ("arguments", "cause"),
-    [
-        (["--start", "10"], "--start 10"),
-        (["--start", "-90"], "at -90 they hang"),
-        (["--seed", "-1"], "--seed -1"),
-        (["--out", "report.pdf"], "neither a page"),
-        (["--out", "nowhere/report.html"], "no folder nowhere"),
-        (["--out", "nowhere/report"], "no folder nowhere"),
-        (["--from", "nowhere.nc"], "cannot read nowhere.nc"),
-    ],
-)
-def test_wrong_input_of_a_report_is_refused_before_anything_is_run(tmp_path, monkeypatch, capsys, arguments, cause):
-    monkeypatch.chdir(tmp_path)
-    assert udkjax("report", *arguments) == 2
-    assert cause in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_file_of_something_else_is_no_report(tmp_path, capsys):
-    xarray.Dataset({"q": ("time", [1.0])}).to_netcdf(tmp_path / "run.nc", engine="h5netcdf")
-    assert udkjax("report", "--from", tmp_path / "run.nc", "--out", tmp_path / "page.html") == 2
-    assert "no data of a report" in capsys.readouterr().err
-    assert not (tmp_path / "page.html").exists()
-
-
 def test_check_names_the_redundant_row(capsys):
     assert udkjax("check", PARALLELOGRAM) == 0
     shown = " ".join(capsys.readouterr().out.split())

@@ -1,7 +1,9 @@
 """`udkjax report`."""
 
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -55,26 +57,34 @@ def report(
     if not -180 < start < 0 or start == -90:
         refuse(f"--start {start:g}: between -180 and 0 degrees the links swing without becoming collinear; at -90 they hang")
 
-    from udkjax.show.report import write
-    from udkjax.study.cases import FULL, QUICK
-    from udkjax.study.paper import study
     from udkjax.study.progress import reporting
-    from udkjax.study.record import read, save
 
+    cases, page, record, study = (_module(name) for name in ("cases", "page", "record", "study"))
     if from_file:
         try:
-            data = read(from_file)
+            data = record.read(from_file)
         except (OSError, ValueError) as problem:
             refuse(f"cannot read {from_file}: {problem}")
     else:
         with reporting(None, 1.0, "report") as report_progress:
             tell = lambda what, part: report_progress(part, what)  # noqa: E731
-            data = study(QUICK if quick else FULL, start, seed, tell=tell)
+            data = study.study(cases.QUICK if quick else cases.FULL, start, seed, tell=tell)
     target.parent.mkdir(exist_ok=True)
     files = [target]
     if not from_file:
         files.insert(0, target.with_suffix(".nc"))
-        save(data, files[0])
-    write(data, target)
+        record.save(data, files[0])
+    page.write(data, target)
     verdicts = [dict(zip(VERDICT, row)) for row in zip(*(data[name].values for name in VERDICT))]
     show({"runs": verdicts, "files": files}, "\n".join(f"wrote {file}" for file in files), json)
+
+
+def _module(name: str) -> Any:
+    """Import a module of the study: of the installed package, or of a clone."""
+    package = "udkjax.paper" if find_spec("udkjax.paper") else "experiments.paper"
+    try:
+        return import_module(f"{package}.{name}")
+    except ModuleNotFoundError as error:
+        if error.name in ("experiments", "experiments.paper"):
+            refuse("the paper's study is neither installed nor in this folder: run from a clone, or install the wheel")
+        raise

@@ -3,14 +3,14 @@
 import base64
 import io
 from collections.abc import Callable
-from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
 
 from udkjax.extras import OptionalImport
-from udkjax.show import report_figures, report_tables
-from udkjax.show.report_findings import findings, growth_time, nfunc_note, psi2_note, repeat, second_choice
+
+from . import figures, tables
+from .findings import findings, growth_time, nfunc_note, psi2_note, repeat, second_choice
 
 with OptionalImport():
     from matplotlib import rc_context
@@ -18,37 +18,37 @@ with OptionalImport():
 
 FIGURES: dict[str, tuple[Callable[[Any], Figure], str, str]] = {
     "linkage": (
-        report_figures.linkage,
+        figures.linkage,
         "A coupler on three parallel links, drawn at its start and in four later poses.",
         "The five-bar parallelogram at its start, and later (fainter).",
     ),
     "figure_2": (
-        report_figures.figure_2,
+        figures.figure_2,
         "Three panels for each tolerance: the sum of squared constraint violations over time without and with Baumgarte's "
         "terms, and the error of the angles.",
         "<b>Violation and error.</b> Left and middle: the sum of squared constraint violations, the paper's figure 2; dashed: "
         "TOL². Right: the largest error of an angle against the exact solution; dashed: where a run counts as lost.",
     ),
     "singular_values": (
-        report_figures.singular_values,
+        figures.singular_values,
         "For each tolerance: the eleventh and twelfth singular value of D over time with the threshold, and the rank below.",
         "<b>Rank.</b> The twelfth singular value of D is zero on the constraint manifold and rises with the drift; where it "
         "crosses the threshold TOL (dashed) the rank jumps from 11 to 12. Without stabilization. Ranks are set apart by method.",
     ),
     "energies": (
-        report_figures.energies,
+        figures.energies,
         "For each tolerance: the angle of a link over time, and the change of the total energy.",
         "<b>Motion and energy.</b> Once the rank is 12 no degree of freedom is left, and a lost linkage comes to rest. Coloured: "
         "without stabilization; dotted: with the paper's gains (energy only); black: the defaults of udkjax.",
     ),
     "growth": (
-        report_figures.growth,
+        figures.growth,
         "Left: the twelfth singular value over time with the law's exponential growth. Right: rate of growth against gain.",
         "<b>The law of the drift.</b> Left: the drift of runs whose rank is held at 11, and the law; one constant, the level of "
         "the rounding errors, is taken from the runs. Right: the law's rate against the gain α = β; rings: measured.",
     ),
     "work": (
-        report_figures.work,
+        figures.work,
         "Error against right-hand sides and against time on logarithmic axes, coloured by integrator, marked by method.",
         "<b>Work and precision.</b> Runs over 20 s with gains of 3 1/s that keep the drift down, and, in black, with projection. "
         "Colours are integrators, marks are methods, points along a line are tolerances.",
@@ -57,19 +57,19 @@ FIGURES: dict[str, tuple[Callable[[Any], Figure], str, str]] = {
 
 
 def page(data: Any) -> str:
-    """Return the report on a dataset (udkjax.study.record) as one self-contained HTML page."""
+    """Return the report on a dataset of record.py as one self-contained HTML page."""
     pictures = {name: figure(data, name) if _drawable(data, name) else "" for name in FIGURES}
-    template = Template(files("udkjax.show").joinpath("report.html").read_text(encoding="utf-8"))
+    template = Template(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
     return template.substitute(
         findings=findings(data),
-        rules=report_tables.rules(data),
-        paper_tables=report_tables.paper_tables(data),
+        rules=tables.rules(data),
+        paper_tables=tables.paper_tables(data),
         nfunc_note=nfunc_note(data),
         psi2_note=psi2_note(data),
-        remarks=report_tables.remarks(data),
-        explained=report_tables.explained(data),
-        better=report_tables.better(data),
-        settings=report_tables.settings(data),
+        remarks=tables.remarks(data),
+        explained=tables.explained(data),
+        better=tables.better(data),
+        settings=tables.settings(data),
         repeat=repeat(data),
         growth_time=growth_time(data),
         citation=data.attrs["citation"],

@@ -1,4 +1,4 @@
-"""The pictures of the report, each drawn from its dataset (udkjax.study.record) and from nothing else."""
+"""The pictures of the report, each drawn from its dataset (record.py) and from nothing else."""
 
 import numpy as np
 

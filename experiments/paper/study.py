@@ -24,11 +24,12 @@ from udkjax.integrate.solvers import solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
 from udkjax.scene import Mechanism
 from udkjax.scene.library import parallelogram
-from udkjax.study import vode
-from udkjax.study.cases import FIRST_STEP, FULL, RANK_HELD, Case, Program, Scope, plan
 from udkjax.study.exact import exact_coordinates
 from udkjax.study.machine import cores
-from udkjax.study.record import dataset
+
+from . import vode
+from .cases import FIRST_STEP, FULL, RANK_HELD, Case, Program, Scope, plan
+from .record import dataset
 
 INSTANTS = 401  # at which each run is looked at
 START = -45.0  # degrees. Inferred: the paper does not print its initial state, and -45 fits its tables best, then -50

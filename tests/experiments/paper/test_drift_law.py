@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.study.drift_law import Swing, drift, growth_rate, swing_of
+from experiments.paper.drift_law import Swing, drift, growth_rate, swing_of
 
 OMEGA = np.sqrt(3.5 * 9.81 / 3.05)  # of the paper's linkage: 3.05 theta'' = -3.5 g cos(theta)
 

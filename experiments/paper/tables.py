@@ -6,9 +6,9 @@ from html import escape
 from math import floor, isfinite, log10
 from string import ascii_lowercase
 
-from udkjax.show.report_figures import runs, tolerances
-from udkjax.study.comparison import nearer
-from udkjax.study.published import Row
+from .comparison import nearer
+from .figures import runs, tolerances
+from .published import Row
 
 NOTHING = "–"
 GAP = "\u202f"  # a narrow space that does not break

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from experiments.paper import study as paper
+from experiments.paper.cases import FIRST_STEP, FULL, GAINS, METHODS, QUICK, RANK_HELD, SMOKE, TOLERANCES, Case, plan
 from udkjax.integrate.solvers import solver_named
-from udkjax.study import paper
-from udkjax.study.cases import FIRST_STEP, FULL, GAINS, METHODS, QUICK, RANK_HELD, SMOKE, TOLERANCES, Case, plan
 
 
 def test_the_papers_runs_are_all_planned_as_the_paper_says():

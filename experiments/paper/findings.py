@@ -5,10 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from udkjax.show.report_figures import runs, tolerances
-from udkjax.show.report_tables import count, power, scientific
-from udkjax.study.comparison import published_kind, published_time
-from udkjax.study.published import Row
+from .comparison import published_kind, published_time
+from .figures import runs, tolerances
+from .published import Row
+from .tables import count, power, scientific
 
 PAPER_END = 20.0  # s
 ROUNDING = 1e-16  # m: of a coordinate

@@ -5,7 +5,7 @@ A remark is a letter, and `REMARKS` says what it stands for. Which remark a run 
 
 import re
 
-from udkjax.study.published import TABLES, Row, Table
+from .published import TABLES, Row, Table
 
 CLOSE = 1.5  # s: losses this close are the same. A drift grows by a factor of 14 in it, which is what roundings differ by
 REMARKS = {

@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from udkjax.study.comparison import REMARKS, nearer, published_kind, published_row, published_time, remark
-from udkjax.study.published import TABLES
+from experiments.paper.comparison import REMARKS, nearer, published_kind, published_row, published_time, remark
+from experiments.paper.published import TABLES
 
-READ = json.loads((Path(__file__).parents[1] / "data" / "seed_paper_tables.json").read_text())["tables"]
+READ = json.loads((Path(__file__).parents[2] / "data" / "seed_paper_tables.json").read_text())["tables"]
 NAMES = {"LS-Householder": "Householder", "LS-MGS": "GramSchmidt"}
 
 

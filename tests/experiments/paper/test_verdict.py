@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from udkjax.study.verdict import LOST, classify, lost_at
+from experiments.paper.verdict import LOST, classify, lost_at
 
 TS = np.linspace(0.0, 20.0, 401)
 

@@ -10,12 +10,13 @@ import numpy as np
 from udkjax.integrate.assembly import State
 from udkjax.integrate.solution import versions
 from udkjax.scene import Mechanism, dumps
-from udkjax.study.cases import FIRST_STEP, GAINS, METHODS, RANK_HELD, SMALL_GAINS, Case
-from udkjax.study.comparison import REMARKS, published_row, remark
-from udkjax.study.drift_law import drift, growth_rate, swing_of
 from udkjax.study.machine import machine
-from udkjax.study.published import CITATION, TABLES
-from udkjax.study.verdict import LOST, LOST_EARLY, LOST_LATE, Verdict, classify, lost_at
+
+from .cases import FIRST_STEP, GAINS, METHODS, RANK_HELD, SMALL_GAINS, Case
+from .comparison import REMARKS, published_row, remark
+from .drift_law import drift, growth_rate, swing_of
+from .published import CITATION, TABLES
+from .verdict import LOST, LOST_EARLY, LOST_LATE, Verdict, classify, lost_at
 
 SECOND = -50.0  # degrees: the start that fits the paper's tables second best
 FORMAT = "udkjax report 1"

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from experiments.paper import vode
 from udkjax.integrate import Result
-from udkjax.study import exact_coordinates, vode
+from udkjax.study import exact_coordinates
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from udkjax.show import report, report_tables
-from udkjax.show.report_findings import findings, nfunc_note, psi2_note, repeat
-from udkjax.study.record import read, save
+from experiments.paper import page as report
+from experiments.paper import tables as report_tables
+from experiments.paper.findings import findings, nfunc_note, psi2_note, repeat
+from experiments.paper.record import read, save
 
 VOID = {"meta", "img", "br", "link"}
 
