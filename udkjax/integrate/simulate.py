@@ -154,6 +154,8 @@ def _simulate(
         ts, rtol, atol, drift_tol = (np.asarray(x) for x in (ts, rtol, atol, drift_tol))
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
     equations = equations_of(mechanism, method, baumgarte, formulation, analysis)
+    if xp is np:  # each operation of JAX on known numbers would be a program to compile
+        equations, closure, state, dt0 = jax.tree.map(_by_numpy, (equations, closure, state, dt0))
     projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, Partitioned))
     if state is None:
         assert closure is not None
@@ -192,9 +194,13 @@ def _simulate(
         ("first_step", "chosen" if dt0 is None else "given"),
         ("engine", f"diffrax: {why}" if why else "native"),
     )
-    arrays = jax.tree.map(jnp.asarray, (ts, q, v, code, time, stats, rtol, atol))
+    arrays = jax.tree.map(jnp.asarray if xp is jnp else jax.device_put, (ts, q, v, code, time, stats, rtol, atol))
     fields: Any = (*arrays, getattr(mechanism, "body_names", ()), chosen)
     return Solution(*fields), missed
+
+
+def _by_numpy(leaf: Any) -> Any:
+    return np.asarray(leaf) if eqx.is_array(leaf) else leaf
 
 
 _compiled = eqx.filter_jit(partial(_simulate, jnp))

@@ -21,7 +21,7 @@ VERSION = (0, 1)
 
 def handler(trajectory: Trajectory, name: str) -> Function:
     """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions."""
-    f, fields = Function(name, [(POINTER, "frame")], returns="ptr"), trajectory.call
+    f, fields = Function(name, [(POINTER, "frame")], returns="ptr", rare=True), trajectory.call
     inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
     frame = f.given["frame"]
 

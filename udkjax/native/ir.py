@@ -126,7 +126,7 @@ class Variable:
 class Function:
     """A function. `name` and `arguments` (pairs of base type and name) are those of its definition.
 
-    One that runs `rare`ly is made small, which takes less to compile.
+    One that runs `rare`ly is left as it is written: LLVM's optimizations would take longer than it ever runs.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class Function:
         arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{n}" for base, n in self._arguments)
         end = "ret void" if self.returns == "void" else None
         body = "\n  ".join([*self._reserved, *self._lines, *([end] if end else [])])
-        rare = (" cold minsize optsize" if self.rare else "") + (" noinline" if self.apart else "")
+        rare = " cold noinline optnone" if self.rare else " noinline" if self.apart else ""
         return f"define {self.returns} @{self.name}({arguments}){rare} {{\n  {body}\n}}\n"
 
     # --- values

@@ -37,10 +37,16 @@ def numbered(pointer: str, count: int) -> list[Place]:
 
 
 def write(
-    program: Program, name: str, width: int, pointers: Sequence[str], inputs: Sequence[Place], outputs: Sequence[Place]
+    program: Program,
+    name: str,
+    width: int,
+    pointers: Sequence[str],
+    inputs: Sequence[Place],
+    outputs: Sequence[Place],
+    rare: bool = False,
 ) -> Function:
     """A function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs."""
-    f = Function(name, [(POINTER, x) for x in pointers], width)
+    f = Function(name, [(POINTER, x) for x in pointers], width, rare=rare)
     writer = Writer(f, program)
     for s, (pointer, place) in zip(program.inputs, inputs, strict=True):
         if program.uses(s):

@@ -117,7 +117,7 @@ class Places:
 
 
 # Once a run, beside singularities, or where a piece may end.
-RARE = ("leave", "solve", "finish_members", "begin", "arrive_carefully", "accelerate_carefully")
+RARE = ("leave", "solve", "finish_members", "begin", "arrive_carefully", "accelerate_carefully", "rows", "psi_dot")
 _LANE = (  # numbers of each lane; `call` and `ways` are addresses
     *("call", "ways"),
     *(
@@ -348,7 +348,7 @@ class Trajectory:
         return wanted + (["psi_dot"] if self.cares and isinstance(self.code, Code) else [])
 
     def _write(self, program: Program, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]):
-        self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs))
+        self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs, name in RARE))
 
     def _work(self, name: str, count: int) -> list[Place]:
         return [("work", self.places[name] + k) for k in range(count)]
