@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import xarray
 
+import udkjax as udk
 from tests.command_line import udkjax
 from udkjax.cli import COMMANDS, common
 from udkjax.extras import MissingExtraError
 from udkjax.integrate import Result
+from udkjax.study.sweep.cluster import ClusterError
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PARALLELOGRAM = EXAMPLES / "parallelogram.toml"
@@ -206,6 +208,9 @@ def test_what_json_cannot_hold_is_written_as_what_it_can():
         (MissingExtraError("optax is not installed: pip install 'udkjax[identify]'"), 2, "pip install 'udkjax[identify]'"),
         (KeyboardInterrupt(), 130, "udkjax: stopped"),
         (BrokenPipeError(), 1, ""),
+        (PermissionError(13, "Permission denied", "/root/x"), 1, "Permission denied: '/root/x'"),
+        (udk.SceneError(["body.a.mass: must be > 0"]), 2, "udkjax: body.a.mass: must be > 0"),
+        (ClusterError("no worker is left"), 1, "udkjax: no worker is left"),
     ],
 )
 def test_what_is_raised_in_a_command_becomes_its_exit_code(capsys, monkeypatch, error, code, words):
@@ -218,13 +223,22 @@ def test_what_is_raised_in_a_command_becomes_its_exit_code(capsys, monkeypatch, 
     assert words in capsys.readouterr().err
 
 
-def test_a_defect_keeps_its_traceback(monkeypatch):
-    monkeypatch.setattr("udkjax.show.doctor.facts", lambda: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
+@pytest.mark.parametrize("error", [ZeroDivisionError(), ValueError("of NumPy")])
+def test_a_defect_keeps_its_traceback(monkeypatch, error):
+    def raised():
+        raise error
+
+    monkeypatch.setattr("udkjax.show.doctor.facts", raised)
+    with pytest.raises(type(error)):
         udkjax("doctor")
 
 
+def test_the_version_is_said_without_importing_anything(capsys):
+    assert udkjax("--version") == 0
+    assert capsys.readouterr().out == f"udkjax {udk.__version__}\n"
+
+
 def test_every_command_offers_json(capsys):
-    for command in {*COMMANDS} - {"sweep", "identify"}:
+    for command in {*COMMANDS} - {"identify"}:
         assert udkjax(command, "--help") == 0
         assert "--json" in capsys.readouterr().out, command

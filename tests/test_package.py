@@ -16,10 +16,11 @@ from udkjax.extras import EXTRAS
 
 ROOT = Path(udkjax.__file__).parent
 
-GROUND_FLOOR = {"deprecation", "extras"}  # every floor may import them
+GROUND_FLOOR = {"deprecation", "extras", "html"}  # every floor may import them
 BELOW = {
     "deprecation": set(),
     "extras": set(),
+    "html": set(),
     "expressions": set(),
     "pinv": {"expressions"},
     "scene": set(),

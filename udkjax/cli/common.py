@@ -17,7 +17,8 @@ A command is a function of its options that imports what it needs when it runs:
         found = compute(mech)
         show({"frequencies": found.frequencies}, table(mech.name, {...}), json)
 
-Wrong input ends with `refuse("--count 0: must be positive")`, a run that failed with `fail(...)` after `show(...)`.
+Wrong input ends with `refuse("--count 0: must be positive")`, a run that failed with `fail(...)` after `show(...)`. Errors that
+udkjax raises by itself (`SceneError`, `SimulationError`, ...) need no handling: see `exits.exit_codes`.
 """
 
 import json as json_text

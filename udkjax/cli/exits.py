@@ -43,3 +43,11 @@ def exit_codes() -> Iterator[None]:
     except BrokenPipeError:  # whoever read our output, such as `head`, has had enough
         sys.stderr.close()
         sys.exit(BAD_RUN)
+    except OSError as error:  # no such folder, no permission, no space
+        fail(error)
+    except (ValueError, RuntimeError) as error:
+        if not type(error).__module__.startswith("udkjax."):
+            raise
+        if isinstance(error, ValueError):  # of a scene, a grid, a parameter: what was given cannot be
+            refuse(error)
+        fail(error)

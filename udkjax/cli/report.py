@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from udkjax.cli.common import Json, refuse, show
+from udkjax.cli.common import Json, Quiet, refuse, show
 
 # Of each run, in the JSON.
 VERDICT = (
@@ -31,6 +31,7 @@ def report(
     start: float = -45.0,
     seed: int = 0,
     from_file: Annotated[Path | None, tyro.conf.arg(name="from", metavar="FILE.nc")] = None,
+    quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Do the paper's study again, with what would have been better, and write a page about it (HTML) with its data (NetCDF).
@@ -44,6 +45,7 @@ def report(
         start: angle of the links (degrees) from which they are released at rest.
         seed: of the starts that differ by rounding errors.
         from_file: draw the page from this file instead of running anything.
+        quiet: do not show how far it is.
         json: write the results as JSON.
     """
     target = out if out.suffix == ".html" else out / "report.html"
@@ -66,7 +68,7 @@ def report(
         except (OSError, ValueError) as problem:
             refuse(f"cannot read {from_file}: {problem}")
     else:
-        with reporting(None, 1.0, "report") as report_progress:
+        with reporting(False if quiet else None, 1.0, "report") as report_progress:
             tell = lambda what, part: report_progress(part, what)  # noqa: E731
             data = study.study(cases.QUICK if quick else cases.FULL, start, seed, tell=tell)
     target.parent.mkdir(exist_ok=True)

@@ -4,12 +4,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from udkjax.cli.common import BAD_RUN, INTERRUPTED, Scene, load, refuse
+from udkjax.cli.common import INTERRUPTED, Json, Quiet, Scene, fail, load, refuse, say, show
 
 Grid = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GRID.toml")]
 
@@ -23,7 +24,8 @@ def sweep(
     scheduler: str | None = None,
     memory: float = 1024.0,
     dry_run: bool = False,
-    quiet: bool = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Simulate a scene with all combinations of some of its numbers, tolerances and methods, or with a design over their ranges.
 
@@ -40,6 +42,7 @@ def sweep(
         memory: what the members that are computed at a time may take (MiB).
         dry_run: say how many members there are, and what they will take, from a sample; compute nothing else.
         quiet: do not show how far it is.
+        json: write the results as JSON.
     """
     if out is None and not dry_run:
         refuse("--out FOLDER is missing (or --dry-run)")
@@ -59,18 +62,27 @@ def sweep(
     limit = int(memory * 2**20)
     try:
         if dry_run:
-            _estimate(mech, arguments, limit)
+            _estimate(mech, arguments, limit, json)
             return
         assert out is not None
         with _client(engine, scheduler) as client:
-            _sweep(mech, text, arguments, out, engine=engine, client=client, memory=limit, progress=False if quiet else None)
+            _sweep(
+                mech,
+                text,
+                arguments,
+                out,
+                engine=engine,
+                client=client,
+                memory=limit,
+                progress=False if quiet else None,
+                json=json,
+            )
     except SweepError as problem:
         refuse(f"{grid}: {problem}")
     except (StoreError, ClusterError) as problem:
-        print(f"udkjax: {problem}", file=sys.stderr)
-        sys.exit(BAD_RUN)
+        fail(problem)
     except KeyboardInterrupt:
-        print(f"\nudkjax: stopped; what is finished is in {out}, and the same command goes on from there", file=sys.stderr)
+        say(f"stopped; what is finished is in {out}, and the same command goes on from there")
         sys.exit(INTERRUPTED)
 
 
@@ -87,28 +99,31 @@ def _arguments(grid: Path) -> dict[str, Any]:
         refuse(str(problem))
 
 
-def _estimate(mech: Any, arguments: dict[str, Any], memory: int) -> None:
+def _estimate(mech: Any, arguments: dict[str, Any], memory: int, json: bool) -> None:
     from udkjax.show.sweep_summary import estimate_summary
     from udkjax.study.sweep.dry_run import estimate
     from udkjax.study.sweep.plan import planned
 
     plan = planned(mech, **arguments)
-    print(estimate_summary(plan, estimate(plan, memory)))
+    found = estimate(plan, memory)
+    show(asdict(found), estimate_summary(plan, found), json)
 
 
-def _sweep(mech: Any, text: str, arguments: dict[str, Any], out: Path, **choices: Any) -> None:
+def _sweep(mech: Any, text: str, arguments: dict[str, Any], out: Path, json: bool, **choices: Any) -> None:
     import udkjax as udk
     from udkjax.show.sweep_figures import save_pictures
-    from udkjax.show.sweep_summary import sweep_summary
+    from udkjax.show.sweep_summary import sweep_results, sweep_summary
 
     begun = time.perf_counter()
     data = udk.sweep(mech, **arguments, out=out, **choices)
-    print(sweep_summary(data, time.perf_counter() - begun))
+    seconds = time.perf_counter() - begun
     data.attrs["scene"] = text
     unfinished = out / ".sweep.nc"
     data.to_netcdf(unfinished, engine="h5netcdf")
     unfinished.replace(out / "sweep.nc")
-    print(f"wrote {', '.join(['sweep.nc', *save_pictures(data, out)])} to {out}")
+    files = ["sweep.nc", *save_pictures(data, out)]
+    results = {**sweep_results(data), "seconds": seconds, "folder": out, "files": files}
+    show(results, f"{sweep_summary(data, seconds)}\nwrote {', '.join(files)} to {out}", json)
 
 
 @contextmanager

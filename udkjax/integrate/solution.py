@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from udkjax.extras import OptionalImport
+from udkjax.html import html_table
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -75,6 +76,25 @@ class Solution(eqx.Module):
     def cause(self) -> str:
         """How the run ended, in words."""
         return f"{self.result.name.replace('_', ' ')} at t = {float(self.time):.6g} s: {CAUSES[self.result]}"
+
+    def _repr_html_(self) -> str:
+        if any(isinstance(leaf, Tracer) for leaf in (self.code, self.q)):
+            return html_table("a simulation", (), [("result", "traced")])
+        codes, counts = np.unique(np.asarray(self.code), return_counts=True)
+        ended = ", ".join(
+            f"{count} {Result(int(code)).name.replace('_', ' ')}" for code, count in zip(codes, counts, strict=True)
+        )
+        ts = np.asarray(self.ts)
+        rows = {
+            "result": ended if np.ndim(self.code) else self.cause,
+            "times": f"{ts.shape[-1]}, from {ts.min():g} to {ts.max():g} s",
+            "bodies": ", ".join(self.bodies),
+            **{name.replace("_", " "): f"{int(np.sum(value)):,}" for name, value in self.stats.items()},
+            "rtol, atol": f"{np.max(np.asarray(self.rtol)):g}, {np.max(np.asarray(self.atol)):g}",
+            **{name.replace("_", " "): value for name, value in self.settings},
+        }
+        members = f" of {np.size(self.code)} members" if np.ndim(self.code) else ""
+        return html_table(f"a simulation{members}", (), list(rows.items()))
 
     def to_xarray(self, mechanism: Mechanism | None = None) -> Any:
         """Return an xarray Dataset: q and v over time, body, coordinate, with units, versions, settings, result and statistics.

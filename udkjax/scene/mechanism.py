@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND, Body, Frame
 from udkjax.scene.checks import Entry, SceneError, not_hashable, problems_of
+from udkjax.scene.description import mechanism_html
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Choice, Numbers, number
 from udkjax.scene.forces import ForceElement, Friction
@@ -153,6 +154,9 @@ class Mechanism(eqx.Module):
     @property
     def _numbers(self) -> list[Any]:
         return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
+
+    def _repr_html_(self) -> str:
+        return mechanism_html(self)
 
     def parameters(self) -> dict[str, Array]:
         """Return every number of the scene under its name, such as `body.link1.mass`; absent ones (a damping) are left out."""

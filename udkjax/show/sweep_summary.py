@@ -30,18 +30,29 @@ def estimate_summary(plan: Plan, estimate: Estimate) -> str:
     return table(f"{plan.mechanism.name or 'mechanism'}: a sweep", lines)
 
 
-def sweep_summary(data: Any, seconds: float) -> str:
-    """Describe how the members of a sweep ended, and the range of each number that was kept."""
+def sweep_results(data: Any) -> dict[str, Any]:
+    """Return how many members of a sweep ended in which way, and the range of each number that was kept."""
     codes, counts = np.unique(data[RESULT].values, return_counts=True)
-    known = {int(result): result.name.replace("_", " ") for result in Result}
-    ended = ", ".join(f"{count} {known.get(int(code), 'not computed')}" for code, count in zip(codes, counts, strict=True))
-    lines = {"members": f"{data[RESULT].size}: {ended}"}
+    known = {int(result): result.name for result in Result}
+    ranges = {}
     for name in scalars(data):
         values = data[name].values[np.isfinite(data[name].values)]
-        units = data[name].attrs.get("units", "")
-        unit = "" if units in ("", "1") else f" {units}"
         if values.size:
-            lines[name.replace("_", " ")] = f"{values.min():.4g} to {values.max():.4g}{unit}, median {np.median(values):.4g}"
+            numbers = {"least": values.min(), "largest": values.max(), "median": np.median(values)}
+            ranges[name] = {"units": data[name].attrs.get("units", ""), **numbers}
+    ended = {known.get(int(code), "not_computed"): int(count) for code, count in zip(codes, counts, strict=True)}
+    return {"members": int(data[RESULT].size), "results": ended, "ranges": ranges}
+
+
+def sweep_summary(data: Any, seconds: float) -> str:
+    """Describe how the members of a sweep ended, and the range of each number that was kept."""
+    found = sweep_results(data)
+    ended = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in found["results"].items())
+    lines = {"members": f"{found['members']}: {ended}"}
+    for name, values in found["ranges"].items():
+        unit = "" if values["units"] in ("", "1") else f" {values['units']}"
+        least, largest, median = (f"{values[key]:.4g}" for key in ("least", "largest", "median"))
+        lines[name.replace("_", " ")] = f"{least} to {largest}{unit}, median {median}"
     lines["time"] = duration(seconds)
     return table(f"{data.attrs.get('title') or 'mechanism'}: a sweep", lines)
 
