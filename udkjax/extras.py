@@ -1,5 +1,6 @@
 """Packages that only some parts need, and how to get them where they are missing."""
 
+from importlib.util import find_spec
 from types import TracebackType
 
 # The extras of pyproject.toml by the top-level modules that they bring.
@@ -33,6 +34,13 @@ class OptionalImport:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if isinstance(error, ModuleNotFoundError) and not isinstance(error, MissingExtraError) and cure(error):
             raise MissingExtraError(cure(error), name=error.name, path=error.path) from None
+
+
+def require(*packages: str) -> None:
+    """Raise `MissingExtraError` where one of these packages is missing: before work whose result needs them."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise MissingExtraError(cure(ModuleNotFoundError(name=package)), name=package)
 
 
 def cure(error: ModuleNotFoundError) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from udkjax.cli.common import Json, Scene, fail, load, refuse, show
+from udkjax.extras import require
 
 # The names of udkjax.study.choices, which cannot be imported before a command is known: it imports JAX.
 Method = Literal["auto", "elimination", "svd", "varga", "greville", "householder", "gram-schmidt"]
@@ -71,6 +72,7 @@ def simulate(
     for target in (out, plot):
         if not target.parent.is_dir():
             refuse(f"there is no folder {target.parent} to write {target.name} to")
+    require("xarray", "h5netcdf")
     mech, text = load(scene)
 
     import numpy as np

@@ -139,6 +139,7 @@ def _type_of(cls: type) -> dict[str, str]:
     return {} if cls in PLAIN.values() else {"type": type_name(cls)}
 
 
+# tomli-w writes each number of a list on a line of its own: 174 lines for the paper's linkage, where these are 75.
 def _lines(table: Mapping[str, Any]) -> list[str]:
     return [f"{key} = {_toml(value)}" for key, value in table.items()]
 

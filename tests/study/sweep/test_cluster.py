@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from udkjax.extras import MissingExtraError
 from udkjax.study.sweep import cluster
 from udkjax.study.sweep.cluster import ClusterError, dask
 from udkjax.study.sweep.plan import Chunk
@@ -135,5 +136,5 @@ def test_without_dask_or_a_client_the_cure_is_told(monkeypatch):
         with pytest.raises(ClusterError, match=r"client=distributed\.Client"):
             dask()
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ClusterError, match=r"pip install 'udkjax\[dask\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'udkjax\[dask\]'"):
         dask()

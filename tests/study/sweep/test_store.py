@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from udkjax.study.sweep import disk, locking, store
+from udkjax.study.sweep import disk, store
 from udkjax.study.sweep.plan import Chunk
 from udkjax.study.sweep.store import Memory, Store, StoreError, opened
 
@@ -133,11 +133,12 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
 
 def test_two_processes_do_not_write_the_same_sweep(tmp_path):
     code = (
-        "import runpy, sys; from pathlib import Path\n"
-        f"Lock = runpy.run_path({locking.__file__!r})['Lock']\n"
-        "lock = Lock(Path(sys.argv[1])); assert lock.take() is None; print('taken', flush=True); sys.stdin.read()"
+        "import os, sys; from filelock import FileLock; from pathlib import Path\n"
+        "lock = FileLock(Path(sys.argv[1]) / 'lock'); lock.acquire()\n"
+        "(Path(sys.argv[1]) / 'writer').write_text(f'process {os.getpid()} on this machine')\n"
+        "print('taken', flush=True); sys.stdin.read()"
     )
-    words = [sys.executable, "-c", code, str(tmp_path / "lock")]
+    words = [sys.executable, "-c", code, str(tmp_path)]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout and other.stdout.readline() == "taken\n"
         with pytest.raises(StoreError, match=f"is being written to by process {other.pid} on "):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import versions
 from udkjax.study.machine import cores
 from udkjax.study.sweep import chunk as computing
@@ -28,7 +29,7 @@ def dask(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done
     """Return the engine on the workers of a `distributed.Client`; without one, the client that was made last.
 
     Workers may come and go: what a lost one had not delivered is computed by another. Each result is handed over when it
-    arrives, and kept nowhere else. Raises `ClusterError` where dask is missing, where there is no client, where a worker has
+    arrives, and kept nowhere else. Raises `ClusterError` where there is no client, where a worker has
     other versions of the packages that decide the results, and where workers die time and again over one chunk.
     """
     distributed = _distributed()
@@ -114,8 +115,6 @@ def _deciding() -> dict[str, str]:
 
 
 def _distributed() -> Any:
-    try:
+    with OptionalImport():
         import distributed
-    except ImportError:
-        raise ClusterError("the engine 'dask' needs dask.distributed: pip install 'udkjax[dask]'") from None
     return distributed

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from udkjax.extras import OptionalImport
 from udkjax.scene.checks import quoted, shown, suggestion
 from udkjax.study.choices import CHOICES
 from udkjax.study.quantities import Angle, Length, Scaled
@@ -75,8 +76,8 @@ class _GridReader(Reader):
 
     def reference(self, given: Any) -> np.ndarray | None:
         """Coordinates (T, bodies, 3) from the file of a simulation, such as `udkjax simulate` writes."""
-        import xarray
-
+        with OptionalImport():
+            import xarray
         if not isinstance(given, str):
             return self.wrong("reference", f"must be the name of a file that udkjax simulate wrote, is {shown(given)}")
         try:

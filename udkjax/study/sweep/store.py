@@ -9,20 +9,21 @@ import dataclasses
 import hashlib
 import json
 import os
+import socket
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from udkjax.study.sweep.differences import differences
 from udkjax.study.sweep.disk import UNFINISHED, packed, unpacked, write_whole
-from udkjax.study.sweep.locking import Lock
 from udkjax.study.sweep.plan import Chunk
 
 FORMAT = 1
-MANIFEST, CHUNKS, LOCK = "sweep.json", "chunks", "lock"
+MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
 MEMBERS, KEPT = "members", "kept/"  # in a file: whom its numbers belong to, and what goes before the names of these
 
 Data = Mapping[str, np.ndarray]
@@ -80,20 +81,30 @@ class Store(Kept):
         self.folder = Path(folder)
         try:
             (self.folder / CHUNKS).mkdir(parents=True, exist_ok=True)
-            self._lock = Lock(self.folder / LOCK)
-            other = self._lock.take()
+            self._lock = FileLock(self.folder / LOCK, timeout=0)
+            self._lock.acquire()
+        except Timeout:  # an OSError, too
+            other = self._writer()
+            text = f"{self.folder} is being written to by {other}: wait for it, end it, or choose another folder"
+            raise StoreError(text) from None
         except OSError as error:
             raise StoreError(f"cannot write to the folder {self.folder}: {error.strerror or error}") from error
-        if other is not None:
-            raise StoreError(f"{self.folder} is being written to by {other}: wait for it, end it, or choose another folder")
         try:
+            (self.folder / WRITER).write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
             self._begin(json.loads(json.dumps({"format": FORMAT, **fingerprint})))
         except BaseException:
-            self._lock.give_back()
+            self._lock.release()
             raise
 
     def __exit__(self, *_: Any) -> None:
-        self._lock.give_back()
+        self._lock.release()
+
+    def _writer(self) -> str:
+        """Name the process that has the lock."""
+        try:
+            return (self.folder / WRITER).read_text(encoding="utf-8") or "another process"
+        except OSError:  # it has only just begun
+            return "another process"
 
     def write(self, chunk: Chunk, data: Data) -> None:
         """Write what a chunk gave, whole or not at all."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import Any
 
+from udkjax.extras import require
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep import local
 from udkjax.study.sweep.cluster import dask
@@ -61,6 +62,7 @@ def sweep(
     """
     if engine not in ENGINES:
         raise SweepError([f"engine: there is no {engine!r}; known are {', '.join(ENGINES)}"])
+    require("xarray")
     plan = planned(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
     compute = _engine(engine, client)
     with opened(out, plan.fingerprint() if out is not None else {}) as kept:
