@@ -1,0 +1,9 @@
+"""The player: motions of mechanisms, to look at in a page or a notebook, or to write as a picture or a film.
+
+`animate` and `animate_modes` make an `Animation`. What is shown is plain data (records.py) made of marks (marks.py) and packed
+tables (packing.py); player.js shows it, and pictures.py draws it.
+"""
+
+from udkjax.show.player.animation import Animation, animate, animate_modes
+
+__all__ = ["Animation", "animate", "animate_modes"]

@@ -1,0 +1,177 @@
+"""`animate`: a mechanism in motion, to look at in a notebook or a browser, or to write to a file."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.scene import Mechanism
+from udkjax.show.player.packing import unpacked
+from udkjax.show.player.page import frame, page
+from udkjax.show.player.records import mode_record, player_data, run_record
+
+FRAME_HEIGHT = 560  # px, of the player inside another page
+Poses = Float[np.ndarray, "T bodies 3"]
+
+
+class Animation:
+    """What `animate` returns. In a notebook it shows itself: as a widget where anywidget is installed, else in a frame."""
+
+    def __init__(self, mechanisms: Sequence[Mechanism], data: dict[str, Any], poses: Sequence[Poses], times: Sequence[Any]):
+        self.mechanisms, self.data, self.poses, self.times = list(mechanisms), data, list(poses), list(times)
+
+    def html(self, theme: str | None = None, autoplay: bool = False) -> str:
+        """Return one self-contained HTML page. `theme` is "light" or "dark"; by default, what the reader's system prefers."""
+        return page(self.data, {"theme": theme, "autoplay": autoplay})
+
+    def widget(self) -> Any:
+        """Return an anywidget with `time` (s) and `playing`, which follow the player and move it; needs the extra `notebook`."""
+        from udkjax.show.player.widget import PlayerWidget
+
+        return PlayerWidget(data=self.data, time=self.data["start"])
+
+    def save(self, path: str | Path, t: float | None = None, **options: Any) -> Path:
+        """Write the animation, in the format that the name ends with.
+
+        Args:
+            path: .html, the player; .gif or .mp4 (extra `video`), the motion; .svg, .png or .dxf (extra `dxf`), one pose.
+            t: time of the pose (s); by default the first.
+            options: of html, `theme` and `autoplay`; of gif and mp4, `fps` (1/s), `width` (px), `theme` and `speed` (seconds of
+                motion in one second; by default that of the player); of svg and png, `width` (px) and `theme`.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: a name that ends otherwise.
+            ImportError: a package of an extra is missing; says which.
+        """
+        from udkjax.show.player import pictures
+
+        path = Path(path)
+        kind = path.suffix.lower()
+        if kind == ".html":
+            path.write_text(self.html(**options), encoding="utf-8")
+        elif kind == ".gif":
+            pictures.save_gif(self, path, **options)
+        elif kind == ".mp4":
+            pictures.save_mp4(self, path, **options)
+        elif kind == ".svg":
+            path.write_text(pictures.svg(self, t, **options), encoding="utf-8")
+        elif kind == ".png":
+            pictures.image(self, t, **options).save(path)
+        elif kind == ".dxf":
+            pictures.save_dxf(self, path, t)
+        else:
+            raise ValueError(f"{path.name}: an animation is written as .html, .gif, .mp4, .svg, .png or .dxf")
+        return path
+
+    def pose(self, t: float | None = None) -> list[Float[np.ndarray, "bodies 3"]]:
+        """Return the coordinates at time t (s) of each run, interpolated linearly; of a mode, t is the part of a cycle."""
+        t = self.data["start"] if t is None else t
+        return [
+            np.array([[np.interp(t, ts, column) for column in body] for body in np.moveaxis(poses, 0, -1)])
+            for ts, poses in zip(self.times, self.poses, strict=True)
+        ]
+
+    def _repr_html_(self) -> str:
+        return frame(self.data, FRAME_HEIGHT)
+
+    def _repr_mimebundle_(self, **options: Any) -> Any:
+        try:
+            bundle = self.widget()._repr_mimebundle_(**options)
+        except ImportError:
+            return {"text/html": self._repr_html_(), "text/plain": repr(self)}
+        shown, metadata = bundle if isinstance(bundle, tuple) else (bundle, {})
+        return {**(shown or {}), "text/html": self._repr_html_(), "text/plain": repr(self)}, metadata
+
+    def __repr__(self) -> str:
+        runs, data = self.data["runs"], self.data
+        what = "modes" if runs[0]["mode"] else f"{data['end'] - data['start']:g} s"
+        return f'<Animation of {data["title"]!r}: {len(runs)} {"run" if len(runs) == 1 else "runs"}, {what}; save("motion.html")>'
+
+
+def animate(
+    mechanism: Mechanism | Mapping[str, Mechanism],
+    solution: Any = None,
+    *,
+    measures: Sequence[str] | Mapping[str, Any] = ("violation", "energy", "rank"),
+    reactions: bool = False,
+    traces: Sequence[str] | None = None,
+    title: str | None = None,
+) -> Animation:
+    """Show the motion of a mechanism, or several motions side by side and in step.
+
+    Args:
+        mechanism: what moved; for runs of different mechanisms, one under each run's label.
+        solution: what `simulate` returned, or anything with ts (T,), q and v (T, bodies, 3); several under their labels,
+            {"projected": one, "not stabilized": other}. By default the mechanism stands as its scene says.
+        measures: what a strip shows over time: any of "violation" (m; radians as an arc of the characteristic length), "energy"
+            and "rank", or values of your own for one run, {"torque (N m)": array}.
+        reactions: draw the forces of the joints as arrows; of redundant joints, the shares of least norm.
+        traces: joints or bodies (their centres of mass) whose paths are drawn; by default the pins that move, up to eight.
+        title: by default the mechanism's name.
+
+    Returns:
+        An `Animation`, which shows itself in a notebook; `save("motion.html")` writes it, or a .gif, .mp4, .svg, .png or .dxf.
+
+    Raises:
+        ValueError: a batch, a name that is not known, or a run without any state.
+    """
+    runs = dict(solution) if isinstance(solution, Mapping) else {"": _Still(mechanism) if solution is None else solution}
+    if not runs:
+        raise ValueError("there is no run to show")
+    found = []
+    for label, run in runs.items():
+        one = mechanism[label] if isinstance(mechanism, Mapping) else mechanism
+        if np.ndim(run.ts) != 1 or np.shape(run.q) != (len(run.ts), len(one.bodies), 3):
+            raise ValueError(
+                f"run {label!r} has q of shape {np.shape(run.q)}, not ({np.shape(run.ts)[-1]}, {len(one.bodies)}, 3): "
+                'give members of a batch one by one under labels, {"a": jax.tree.map(lambda x: x[0], batch)}'
+            )
+        found.append((one, *run_record(one, run, label, measures, reactions, traces)))
+    times = [unpacked(record["time"])[:, 0] for _, record, _ in found]
+    data = player_data(title or found[0][0].name or "mechanism", found)
+    return Animation([one for one, _, _ in found], data, [poses for _, _, poses in found], times)
+
+
+def animate_modes(
+    mechanism: Mechanism,
+    q: Any,
+    shapes: Float[Any, "modes bodies 3"],
+    frequencies: Sequence[float] | None = None,
+    labels: Sequence[str] | None = None,
+    title: str | None = None,
+) -> Animation:
+    """Show modes of vibration side by side: q + amplitude shape sin(phase), with an amplitude that one can change.
+
+    Args:
+        mechanism: what vibrates.
+        q: coordinates (bodies, 3) around which it does (m, m, rad).
+        shapes: a displacement of each body for each mode, of any size; each is scaled to a swing that one sees.
+        frequencies: Hz, said beside each.
+        labels: by default "mode 1", "mode 2", ...
+        title: by default the mechanism's name.
+
+    Raises:
+        ValueError: shapes of another shape, or one that does not move anything.
+    """
+    shapes = np.asarray(shapes, float)
+    if shapes.shape[1:] != (len(mechanism.bodies), 3) or not len(shapes):
+        raise ValueError(f"shapes has shape {shapes.shape}, not (modes, {len(mechanism.bodies)}, 3)")
+    found = []
+    for k, shape in enumerate(shapes):
+        frequency = None if frequencies is None else float(frequencies[k])
+        found.append((mechanism, *mode_record(mechanism, q, shape, frequency, labels[k] if labels else f"mode {k + 1}")))
+    data = player_data(title or mechanism.name or "mechanism", found)
+    times = [np.linspace(0.0, 1.0, len(poses)) for _, _, poses in found]
+    return Animation([mechanism] * len(shapes), data, [poses for _, _, poses in found], times)
+
+
+class _Still:
+    """A mechanism as its scene says, as a run of one instant."""
+
+    def __init__(self, mechanism: Mechanism):
+        self.ts, self.q, self.v = np.zeros(1), np.asarray(mechanism.q0)[None], np.zeros((1, len(mechanism.bodies), 3))

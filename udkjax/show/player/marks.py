@@ -1,0 +1,282 @@
+"""What is drawn of a mechanism: a list of marks, plain data that the player in the browser and the writers of pictures share.
+
+A mark is a dict with a `kind`. Places are in metres in the frame of a body, which is a number: the body's place in the
+mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How large a pin or an arrow is drawn is for who draws it.
+
+    link      body, points, closed          a bar through the points that hold a body, or a plate
+    disc      body, at, radius              a body that has no other shape: a disc of its radius of gyration
+    wheel     body, at, radius, internal    a gear's or a pinion's pitch circle
+    outline   body, points                  a cam's profile
+    rail      body, at, axis, span, slot    the line of a prismatic joint or a slot, as far as it is used (m along `axis`)
+    rack      body, at, axis, span          a rack's pitch line
+    block     body, at, axis                what slides on a rail
+    support   body, at                      what holds a pin to the ground
+    pin       body, at, name                a revolute joint or the end of a rod
+    roller    body, at                      what slides in a slot or follows a cam
+    weld      body, at                      no relative motion
+    rod       a, b                          a distance joint, between two anchors
+    spring    a, b, damper                  a spring, between two anchors
+    spiral    body, at                      a torsion spring
+    piston    a, b                          a driver of a length
+    motor     body, at                      a driver of an angle
+    friction  body, at                      friction in a revolute joint
+    force     body, at, vector, turns       a constant force, whose direction `turns` with the body or not
+    torque    body, at, sign                a constant torque
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull
+
+from udkjax.scene import (
+    GROUND,
+    Cam,
+    Distance,
+    Force,
+    Friction,
+    Gear,
+    Mechanism,
+    Prismatic,
+    Rack,
+    Revolute,
+    Slot,
+    Spring,
+    Torque,
+    TorsionSpring,
+    Weld,
+)
+
+Mark = dict[str, Any]
+Poses = Float[np.ndarray, "T bodies 3"]
+PROFILE_POINTS = 180  # of a cam's outline
+SAME_PLACE = 1e-9  # of the largest coordinate: attachments that are closer are one point
+MARGIN = 0.08  # of the length of a mechanism: how far a rail goes beyond what slides on it
+
+
+def marks(mechanism: Mechanism, poses: Poses) -> list[Mark]:
+    """Return the marks of a mechanism, the farthest first; `poses` are all those that it will be drawn in."""
+    drawing = _Drawing(mechanism, np.asarray(poses, float))
+    links = drawing.links()
+    plates = [mark for mark in links if mark.get("closed")]
+    bars = [mark for mark in links if not mark.get("closed")]
+    rings = [mark for mark in drawing.wheels if mark.get("internal")]
+    wheels = [mark for mark in drawing.wheels if not mark.get("internal")]
+    return [*rings, *drawing.rails, *plates, *wheels, *bars, *drawing.elements, *drawing.pins]
+
+
+def body_points(mechanism: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:
+    """Return the points at which joints, drivers and springs hold each body, in its own frame (m), each of them once."""
+    held: dict[str, list[tuple[float, float]]] = {body: [] for body in (*mechanism.bodies, GROUND)}
+    springs = [force for force in mechanism.forces.values() if isinstance(force, Spring)]
+    for element in (*mechanism.constraints.values(), *springs):
+        points = getattr(element, "points", None)
+        if points is None or getattr(element, "coordinate", "") == "angle":
+            continue
+        for body, (x, y) in zip(element.bodies, np.asarray(points, float).tolist()):
+            held[body].append((x, y))
+    return {body: _distinct(points) for body, points in held.items()}
+
+
+def _distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"]:
+    found: list[tuple[float, float]] = []
+    size = max((abs(c) for point in points for c in point), default=0.0)
+    for point in points:
+        if all(np.hypot(point[0] - x, point[1] - y) > SAME_PLACE * size for x, y in found):
+            found.append(point)
+    return np.array(found).reshape(-1, 2)
+
+
+class _Drawing:
+    """The marks of one mechanism, in the order in which they cover one another."""
+
+    def __init__(self, mechanism: Mechanism, poses: Poses):
+        self.mechanism, self.poses = mechanism, poses
+        self.number = {GROUND: -1, **{body: k for k, body in enumerate(mechanism.bodies)}}
+        self.points = body_points(mechanism)
+        self.size = _size(self)
+        self.rails: list[Mark] = []
+        self.wheels: list[Mark] = []
+        self.elements: list[Mark] = []
+        self.pins: list[Mark] = []
+        self.shaped: set[str] = set()  # bodies that something else than a link stands for
+        for name, joint in mechanism.joints.items():
+            self._joint(name, joint)
+        for driver in mechanism.drivers.values():
+            self._driver(driver)
+        for force in mechanism.forces.values():
+            self._force(force)
+
+    def links(self) -> list[Mark]:
+        """Return a link for each body with several points, and a disc for each that nothing else stands for."""
+        found: list[Mark] = []
+        for body, points in self.points.items():
+            if body == GROUND:
+                continue
+            k, centre = self.number[body], np.zeros((1, 2))
+            apart = len(points) == 1 and np.abs(points).max() > SAME_PLACE * self.size
+            if len(points) > 1 or apart:
+                corners, closed = corners_of(np.concatenate([points, centre]) if apart else points)
+                found.append({"kind": "link", "body": k, "points": corners.tolist(), "closed": closed})
+            if len(points) < 2 and body not in self.shaped:
+                inertia, mass = (float(getattr(self.mechanism.bodies[body], name)) for name in ("inertia", "mass"))
+                radius = min(np.sqrt(inertia / mass), self.size / 4)
+                found.append({"kind": "disc", "body": k, "at": [0.0, 0.0], "radius": radius})
+        return found
+
+    def _joint(self, name: str, joint: Any) -> None:
+        match joint:
+            case Revolute():
+                self._pin(name, self._held(joint))
+            case Weld():
+                self.elements.append({"kind": "weld", **self._held(joint)})
+            case Prismatic() | Slot():
+                self._rail(joint)
+            case Distance():
+                a, b = self._anchors(joint)
+                self.elements.append({"kind": "rod", "a": a, "b": b})
+                for k, x, y in (a, b):
+                    self._pin(name, {"body": int(k), "at": [x, y]})
+            case Gear():
+                self._gear(joint)
+            case Rack():
+                self._rack(joint)
+            case Cam():
+                angle = np.linspace(0.0, 2 * np.pi, PROFILE_POINTS, endpoint=False)
+                radius = np.asarray(jax.vmap(joint.profile)(angle))
+                rim = np.asarray(joint.points)[0] + radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+                self.wheels.append({"kind": "outline", "body": self.number[joint.bodies[0]], "points": rim.tolist()})
+                self.elements.append({"kind": "roller", **self._at(joint.bodies[1], joint.points[1])})
+                self.shaped.add(joint.bodies[0])
+            case _ if getattr(joint, "points", None) is not None and len(joint.bodies) == 2:  # a joint of the user's own
+                self._pin(name, self._held(joint))
+
+    def _pin(self, name: str, place: dict[str, Any]) -> None:
+        self.pins.append({"kind": "pin", "name": name, **place})
+        if place["body"] < 0:
+            self.rails.append({"kind": "support", **place})
+
+    def _driver(self, driver: Any) -> None:
+        if driver.coordinate == "angle":
+            self.elements.append({"kind": "motor", **self._axle(driver.bodies)})
+        elif driver.coordinate == "distance":
+            a, b = self._anchors(driver)
+            self.elements.append({"kind": "piston", "a": a, "b": b})
+
+    def _force(self, force: Any) -> None:
+        match force:
+            case Spring():
+                a, b = self._anchors(force)
+                self.elements.append({"kind": "spring", "a": a, "b": b, "damper": force.damping is not None})
+            case TorsionSpring():
+                self.elements.append({"kind": "spiral", **self._axle(force.bodies)})
+            case Friction():
+                self.elements.append({"kind": "friction", **self._axle(self.mechanism.joints[force.joint].bodies)})
+            case Force():
+                place = self._at(force.body, force.point)
+                vector = np.asarray(force.vector, float).tolist()
+                self.elements.append({"kind": "force", **place, "vector": vector, "turns": force.frame == "body"})
+            case Torque():
+                sign = 1 if float(force.value) >= 0 else -1
+                self.elements.append({"kind": "torque", **self._axle(force.bodies), "sign": sign})
+
+    def _rail(self, joint: Any) -> None:
+        one, two = joint.bodies
+        axis = float(joint.axis)
+        slot = isinstance(joint, Slot)
+        start, end = self._travel(one, joint.points[0], axis, two, joint.points[1])
+        margin = MARGIN * self.size
+        rail = {**self._at(one, joint.points[0]), "axis": axis, "span": [start - margin, end + margin], "slot": slot}
+        self.rails.append({"kind": "rail", **rail})
+        if slot:
+            self.pins.append({"kind": "roller", **self._at(two, joint.points[1])})
+        else:
+            block = {"kind": "block", **self._at(two, joint.points[1]), "axis": axis - float(joint.angle)}
+            self.elements.append(block)
+            self.shaped.add(two)
+
+    def _gear(self, joint: Gear) -> None:
+        largest = int(np.argmax(np.asarray(joint.radii)))
+        for k, (body, radius) in enumerate(zip(joint.bodies, np.asarray(joint.radii, float).tolist(), strict=True)):
+            place = self._held_by(body, joint.carrier)
+            wheel = {"kind": "wheel", **place, "radius": radius, "internal": joint.internal and k == largest}
+            if wheel not in self.wheels:
+                self.wheels.append(wheel)
+            self.shaped.add(body)
+
+    def _rack(self, joint: Rack) -> None:
+        one, two = joint.bodies
+        axis, radius = float(joint.axis), float(joint.radius)
+        frame, pinion = self._frames(one)[0], self._frames(two)[0, :2]
+        right = np.array([np.sin(axis), -np.cos(axis)])
+        at = _local(frame, pinion) + radius * right
+        start, end = self._travel(one, at, axis, two, (0.0, 0.0))
+        self.rails.append({"kind": "rack", **self._at(one, at), "axis": axis, "span": [start - radius, end + radius]})
+        self.wheels.append({"kind": "wheel", **self._at(two, (0.0, 0.0)), "radius": radius, "internal": False})
+        self.shaped.add(two)
+
+    def _travel(self, one: str, at: Any, axis: float, two: str, point: Any) -> tuple[float, float]:
+        """The least and the largest displacement (m) along an axis of body `one`, from its point `at`, of a point of `two`."""
+        frames, others = self._frames(one), self._frames(two)
+        gap = placed(point, others) - placed(at, frames)
+        direction = axis + frames[:, 2]
+        along = gap[:, 0] * np.cos(direction) + gap[:, 1] * np.sin(direction)
+        return float(along.min()), float(along.max())
+
+    def _frames(self, body: str) -> Float[np.ndarray, "T 3"]:
+        return np.zeros((len(self.poses), 3)) if body == GROUND else self.poses[:, self.number[body]]
+
+    def _at(self, body: str, point: Any) -> dict[str, Any]:
+        return {"body": self.number[body], "at": np.asarray(point, float).tolist()}
+
+    def _held(self, joint: Any) -> dict[str, Any]:
+        """Where a joint is: on the ground, if it holds something to it, else on its first body."""
+        side = 1 if joint.bodies[1] == GROUND else 0
+        return self._at(joint.bodies[side], joint.points[side])
+
+    def _anchors(self, element: Any) -> list[list[float]]:
+        points = np.asarray(element.points, float).tolist()
+        return [[self.number[body], x, y] for body, (x, y) in zip(element.bodies, points, strict=True)]
+
+    def _held_by(self, body: str, other: str) -> dict[str, Any]:
+        """Where a revolute joint holds `body` to `other`, in the frame of `body`; its origin, if none does."""
+        for joint in self.mechanism.joints.values():
+            if isinstance(joint, Revolute) and set(joint.bodies) == {body, other}:
+                return self._at(body, joint.points[joint.bodies.index(body)])
+        return self._at(body, (0.0, 0.0))
+
+    def _axle(self, bodies: Sequence[str]) -> dict[str, Any]:
+        """Where two bodies turn on each other: at their revolute joint, else at the second one's centre of mass."""
+        one, two = bodies
+        return self._held_by(one if two == GROUND else two, two if two == GROUND else one)
+
+
+def placed(point: Any, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
+    """Return where a point of a body's frame is in ground coordinates (m), for each of its coordinates x, y, angle."""
+    x, y = np.asarray(point, float)
+    cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])
+    return frames[:, :2] + np.column_stack([cos * x - sin * y, sin * x + cos * y])
+
+
+def corners_of(points: Float[np.ndarray, "points 2"]) -> tuple[Float[np.ndarray, "corners 2"], bool]:
+    """Return the ends of a bar through points that are in line, or else, and True, the corners of the plate that holds them."""
+    spread = points - points.mean(axis=0)
+    if np.linalg.matrix_rank(spread, tol=SAME_PLACE * np.abs(spread).max()) < 2:
+        return points[np.argsort(spread @ np.linalg.svd(spread, full_matrices=False)[2][0])], False
+    return points[ConvexHull(points).vertices], True
+
+
+def _local(frame: Float[np.ndarray, "3"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    """Return a place in ground coordinates in a body's frame."""
+    cos, sin = np.cos(frame[2]), np.sin(frame[2])
+    return np.array([[cos, sin], [-sin, cos]]) @ (place - frame[:2])
+
+
+def _size(drawing: _Drawing) -> float:
+    """How far the points of a mechanism are apart (m)."""
+    every = [placed(point, drawing._frames(body)[:1])[0] for body, points in drawing.points.items() for point in points]
+    every += [frame[:2] for frame in drawing.poses[0]]
+    return float(np.ptp(np.array(every), axis=0).max()) or 1.0

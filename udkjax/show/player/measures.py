@@ -1,0 +1,125 @@
+"""Numbers over time that a strip below the motion shows, and the arrows of reactions on it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.equations import analyse, energy, reactions, violation
+from udkjax.equations.scales import rank_tolerance
+from udkjax.equations.udwadia_kalaba import D
+from udkjax.scene import GROUND, Mechanism
+
+ROUNDING = 1e-17  # m, rad: below any violation; drawn in place of zero, which has no logarithm
+
+
+class Measure(NamedTuple):
+    """A number over time: its name, unit, values at the output times, and whether they are drawn over a logarithm."""
+
+    name: str
+    unit: str
+    values: Float[np.ndarray, "T"]
+    log: bool = False
+
+
+def measures_of(mechanism: Mechanism, solution: Any, wanted: Sequence[str] | Mapping[str, Any]) -> list[Measure]:
+    """Return the measures of a run: those of `MEASURES` by their names, or others as {"name" or "name (unit)": values}.
+
+    Raises:
+        ValueError: a name that is not known, or values that are not one number for each output time.
+    """
+    found: list[Measure] = []
+    given = wanted if isinstance(wanted, Mapping) else dict.fromkeys(wanted)
+    for name, values in given.items():
+        if values is None:
+            if name not in MEASURES:
+                raise ValueError(f"measure {name!r} is not known: take {', '.join(MEASURES)}, or give its values")
+            found += MEASURES[name](mechanism, solution)
+        else:
+            words, _, unit = name.partition(" (")
+            values = np.asarray(values, float)
+            if values.shape != np.shape(solution.ts):
+                raise ValueError(f"measure {name!r} has shape {values.shape}; the run has {len(solution.ts)} output times")
+            found.append(Measure(words, unit.removesuffix(")"), values))
+    return found
+
+
+def singular_values(mechanism: Mechanism, solution: Any) -> Float[np.ndarray, "T k"]:
+    """Return the singular values of D = Psi_q M^(-1/2) at each output time, the largest first (kg^(-1/2)).
+
+    Rows in radians are weighted by the characteristic length, so that all have one unit; k is the lesser of rows and coordinates.
+    """
+    weights = analyse(mechanism).scales.weights
+    if len(weights) == 0:
+        return np.zeros((len(solution.ts), 0))
+    matrices = _matrices(mechanism.bare, solution.ts, solution.q, weights)
+    finite = np.isfinite(matrices).all((1, 2))
+    found = np.full((len(matrices), min(matrices.shape[1:])), np.nan)
+    found[finite] = np.linalg.svd(matrices[finite], compute_uv=False)
+    return found
+
+
+def rank(mechanism: Mechanism, values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
+    """Return how many `singular_values` are above the package's rank tolerance times the largest; NaN where they are NaN."""
+    if values.shape[1] == 0:
+        return np.zeros(len(values))
+    count = (values > float(rank_tolerance(mechanism)) * values[:, :1]).sum(axis=1).astype(float)
+    return np.where(np.isfinite(values[:, 0]), count, np.nan)
+
+
+@eqx.filter_jit
+def _matrices(mechanism: Mechanism, ts: Any, q: Any, weights: Any) -> Any:
+    return jax.vmap(lambda t, q: D(mechanism, t, q, weights))(ts, q)
+
+
+def _violation(mechanism: Mechanism, solution: Any) -> list[Measure]:
+    psi = np.asarray(violation(mechanism, solution))
+    values = np.abs(psi) * np.asarray(analyse(mechanism).scales.weights)  # radians as an arc of the characteristic length
+    return [Measure("violation", "m", np.maximum(values.max(axis=1, initial=0.0), ROUNDING), log=True)]
+
+
+def _energy(mechanism: Mechanism, solution: Any) -> list[Measure]:
+    parts = energy(mechanism, solution)
+    total = np.asarray(parts.total)
+    return [
+        Measure("energy change", "J", total - total[0]),
+        Measure("kinetic energy", "J", np.asarray(parts.kinetic)),
+        Measure("potential energy", "J", np.asarray(parts.potential)),
+    ]
+
+
+def _rank(mechanism: Mechanism, solution: Any) -> list[Measure]:
+    values = singular_values(mechanism, solution)
+    count = rank(mechanism, values)
+    found = [Measure("rank", "", count)]
+    usual = int(np.nanmax(count, initial=0))
+    if usual:
+        least = np.maximum(values[:, usual - 1], 1e-18)
+        found.append(Measure(f"singular value {usual}", "kg^-1/2", least, log=True))
+    return found
+
+
+MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank}
+
+
+def reaction_arrows(mechanism: Mechanism, solution: Any) -> tuple[list[list[float]], Float[np.ndarray, "T joints 2"]]:
+    """Return the anchors [body, x, y] of the joints and drivers that put forces on bodies, and these forces (N, ground axes).
+
+    The force is that on the joint's second body, or, where this is the ground, on the first one. Of redundant constraints it is
+    the share of least norm.
+    """
+    loads = reactions(mechanism, solution)
+    bodies = list(mechanism.bodies)
+    anchors, forces = [], []
+    for name, constraint in mechanism.constraints.items():
+        points = getattr(constraint, "points", None)
+        if points is None or getattr(constraint, "coordinate", "") == "angle":
+            continue
+        side = 0 if constraint.bodies[1] == GROUND else 1
+        body, point = constraint.bodies[side], np.asarray(points, float)[side]
+        anchors.append([bodies.index(body), *point.tolist()])
+        forces.append(np.asarray(loads[name][body])[:, :2])
+    return anchors, np.stack(forces, axis=1) if forces else np.zeros((len(solution.ts), 0, 2))

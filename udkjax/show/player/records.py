@@ -1,0 +1,217 @@
+"""Everything that the player shows, as plain data: runs, modes, measures, arrows, and how much of the plane they take.
+
+format     1
+title      text
+unit       of the timeline: "s", or "" for modes, which go through one cycle from 0 to 1
+start, end of the timeline
+speed      at which it plays: seconds of the timeline in one second
+length     the characteristic length of the mechanism (m)
+bounds     [left, bottom, right, top] of all that is drawn (m)
+runs       a list of
+    label, note    texts
+    bodies         names
+    marks          what is drawn (marks.py)
+    traces         a list of [body, x, y] whose paths are drawn
+    time, q, v     packed (packing.py) tables of T rows: time; coordinates x, y, angle of each body; their rates times `frame`
+    frame          s, the typical time between two instants
+    mode           instead of these: {q: numbers, shape: numbers, frequency: Hz or null}
+    measures       a list of {name, unit, log, values: single precision}
+    reactions      {anchors, largest (N), force: packed table of T rows, x and y of each anchor}, or null
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.equations import analyse
+from udkjax.scene import Mechanism
+from udkjax.show.player.marks import body_points, marks, placed
+from udkjax.show.player.measures import measures_of, reaction_arrows
+from udkjax.show.player.packing import floats, packed, unpacked
+
+Record = dict[str, Any]
+PRECISION = (
+    1e-5  # of positions, in characteristic lengths, and of angles, in rad: a hundredth of a pixel on a screen of a thousand
+)
+TIME_PRECISION = 1e-9  # of the timeline
+FORCE_PRECISION = 1e-3  # of the largest force
+MOST_INSTANTS = 2400  # of one run; a longer one is thinned out evenly, and interpolated by its velocities
+MOST_TRACES = 8
+COMFORTABLE = (4.0, 40.0)  # s: how long it takes to play something at the speed that is chosen for it
+SPEEDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+CYCLE = 2.0  # s: how long one cycle of a mode takes
+SWING = 0.12  # of the characteristic length, or rad: how far a mode is shown to move
+STILL = 1e-6  # characteristic lengths: what moves less has no path
+
+
+def run_record(
+    mechanism: Mechanism,
+    solution: Any,
+    label: str,
+    measures: Sequence[str] | Mapping[str, Any],
+    with_reactions: bool,
+    traces: Sequence[str] | None,
+) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
+    """Return one run as plain data, and its poses; a run that failed is shown as far as it came."""
+    ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
+    alive = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
+    count = int(np.argmin(alive)) if not alive.all() else len(ts)
+    if count == 0:
+        raise ValueError(f"run {label!r} has no state to show" + _cause(solution, ": "))
+    shown = np.unique(np.linspace(0, count - 1, min(count, MOST_INSTANTS)).round().astype(int))
+    length = float(analyse(mechanism).length)
+    steps = np.tile([PRECISION * length, PRECISION * length, PRECISION], q.shape[1])
+    frame = float(np.median(np.diff(ts[shown]))) if len(shown) > 1 else 1.0
+    poses = q[shown]
+    record = {
+        "label": label,
+        "note": _cause(solution) if count < len(ts) else "",
+        "bodies": list(mechanism.bodies),
+        "marks": marks(mechanism, poses),
+        "traces": traced(mechanism, poses, traces, length),
+        "time": packed(ts[shown, None], TIME_PRECISION * max(np.ptp(ts), frame)),
+        "q": packed(poses.reshape(len(shown), -1), steps),
+        "v": packed(frame * v[shown].reshape(len(shown), -1), steps),
+        "frame": frame,
+        "mode": None,
+        "measures": [
+            {"name": m.name, "unit": m.unit, "log": m.log, "values": floats(m.values[shown])}
+            for m in measures_of(mechanism, solution, measures)
+        ],
+        "reactions": None,
+    }
+    if with_reactions:
+        anchors, forces = reaction_arrows(mechanism, solution)
+        forces = forces[shown]
+        largest = float(np.abs(np.nan_to_num(np.linalg.norm(forces, axis=2))).max(initial=0.0))
+        table = np.nan_to_num(forces).reshape(len(shown), -1)
+        if largest > 0:
+            record["reactions"] = {"anchors": anchors, "largest": largest, "force": packed(table, FORCE_PRECISION * largest)}
+    return record, poses
+
+
+def mode_record(
+    mechanism: Mechanism, q: Any, shape: Any, frequency: float | None, label: str
+) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
+    """Return a mode q + amplitude shape sin(phase) as plain data, its shape scaled to a swing that one sees, and its poses."""
+    q, shape = np.asarray(q, float), np.asarray(shape, float).reshape(np.shape(q))
+    length = float(analyse(mechanism).length)
+    largest = np.max(np.abs(shape) / [length, length, 1.0])
+    if not (np.isfinite(largest) and largest > 0):
+        raise ValueError(f"mode {label!r} does not move anything")
+    shape = SWING / largest * shape
+    poses = q + np.sin(np.linspace(0, 2 * np.pi, 33))[:, None, None] * shape
+    record = {
+        "label": label,
+        "note": "" if frequency is None else f"{frequency:.4g} Hz",
+        "bodies": list(mechanism.bodies),
+        "marks": marks(mechanism, poses),
+        "traces": [],
+        "frame": 1.0,
+        "mode": {"q": q.ravel().tolist(), "shape": shape.ravel().tolist(), "frequency": frequency},
+        "measures": [],
+        "reactions": None,
+    }
+    return record, poses
+
+
+def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.ndarray, "T bodies 3"]]]) -> Record:
+    """Return the data of the player for runs, or for modes."""
+    is_mode = runs[0][1]["mode"] is not None
+    ends = [(0.0, 1.0)] if is_mode else [_ends(record) for _, record, _ in runs]
+    start, end = min(first for first, _ in ends), max(last for _, last in ends)
+    boxes = np.array([_box(mechanism, record, poses) for mechanism, record, poses in runs])
+    return {
+        "format": 1,
+        "title": title,
+        "unit": "" if is_mode else "s",
+        "start": start,
+        "end": end,
+        "speed": 1 / CYCLE if is_mode else _speed(end - start),
+        "length": float(analyse(runs[0][0]).length),
+        "bounds": [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()],
+        "runs": [record for _, record, _ in runs],
+    }
+
+
+def traced(mechanism: Mechanism, poses: Any, wanted: Sequence[str] | None, length: float) -> list[list[float]]:
+    """Return the anchors whose paths are drawn: those of the joints and bodies that are named, or of the pins that move.
+
+    Raises:
+        ValueError: a name of neither a body nor a joint with points.
+    """
+    bodies = list(mechanism.bodies)
+    if wanted is not None:
+        return [_anchor(mechanism, bodies, name) for name in wanted]
+    found: list[tuple[np.ndarray, list[float]]] = []
+    for body, points in body_points(mechanism).items():
+        if body not in bodies:
+            continue
+        k = bodies.index(body)
+        for point in points.tolist() or [[0.0, 0.0]]:
+            path = placed(point, poses[:, k])
+            moves = np.ptp(path, axis=0).max() > STILL * length
+            if moves and all(np.abs(path - other).max() > STILL * length for other, _ in found):
+                found.append((path, [k, *point]))
+    found.sort(key=lambda item: -float(np.ptp(item[0], axis=0).max()))
+    return [anchor for _, anchor in found[:MOST_TRACES]]
+
+
+def _anchor(mechanism: Mechanism, bodies: list[str], name: str) -> list[float]:
+    if name in bodies:
+        return [bodies.index(name), 0.0, 0.0]
+    points = getattr(mechanism.joints.get(name), "points", None)
+    if points is None:
+        raise ValueError(f"trace {name!r}: neither a body nor a joint with points")
+    joint = mechanism.joints[name]
+    side = next(k for k, body in enumerate(joint.bodies) if body in bodies)
+    return [bodies.index(joint.bodies[side]), *np.asarray(points, float)[side].tolist()]
+
+
+def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodies 3"]) -> list[float]:
+    """The rectangle that holds everything that is drawn in any pose: left, bottom, right, top (m)."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+
+    def hold(body: int, at: Any, radius: float = 0.0) -> None:
+        nonlocal low, high
+        path = placed(at, np.zeros((1, 3)) if body < 0 else poses[:, body])
+        low, high = np.minimum(low, path.min(axis=0) - radius), np.maximum(high, path.max(axis=0) + radius)
+
+    for mark in record["marks"]:
+        if mark["kind"] in ("rail", "rack"):
+            direction = np.array([np.cos(mark["axis"]), np.sin(mark["axis"])])
+            for s in mark["span"]:
+                hold(mark["body"], np.asarray(mark["at"]) + s * direction)
+        elif "at" in mark:
+            hold(mark["body"], mark["at"], mark.get("radius", 0.0))
+        for point in mark.get("points", []):
+            hold(mark["body"], point)
+        for k, x, y in (mark[end] for end in ("a", "b") if end in mark):
+            hold(int(k), (x, y))
+    for k in range(len(mechanism.bodies)):
+        hold(k, (0.0, 0.0))
+    least = 0.1 * float(analyse(mechanism).length)  # a single bar on a line has no height
+    grow = np.maximum(0.0, least - (high - low) / 2)
+    return [*(low - grow).tolist(), *(high + grow).tolist()]
+
+
+def _ends(record: Record) -> tuple[float, float]:
+    ts = unpacked(record["time"])[:, 0]
+    return float(ts[0]), float(ts[-1])
+
+
+def _speed(duration: float) -> float:
+    """The natural speed where that is comfortable, else the nearest that is."""
+    shortest, longest = COMFORTABLE
+    if duration <= 0 or shortest <= duration <= longest:
+        return 1.0
+    if duration < shortest:
+        return max((s for s in SPEEDS if s <= 1 and duration / s >= shortest), default=SPEEDS[0])
+    return min((s for s in SPEEDS if s >= 1 and duration / s <= longest), default=SPEEDS[-1])
+
+
+def _cause(solution: Any, before: str = "") -> str:
+    cause = getattr(solution, "cause", "")
+    return f"{before}{cause}" if cause else ""
