@@ -193,7 +193,13 @@ def test_every_optional_package_has_its_extra():
     core = {re.split(r"[\[>=<]", line)[0] for line in project["dependencies"]}
     assert core.isdisjoint(EXTRAS)
     extras = {name: " ".join(lines) for name, lines in project["optional-dependencies"].items()}
-    transitive = {"distributed": "dask", "h5py": "h5netcdf", "pandas": "xarray"}  # comes with it
+    transitive = {
+        "PIL": "pillow",
+        "imageio_ffmpeg": "imageio-ffmpeg",
+        "distributed": "dask",
+        "h5py": "h5netcdf",
+        "pandas": "xarray",
+    }  # comes with it
     for package, extra in EXTRAS.items():
         assert transitive.get(package, package) in extras[extra]
 

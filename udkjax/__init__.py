@@ -79,6 +79,9 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import save as save
     from udkjax.scene import with_angle as with_angle
     from udkjax.scene import with_length as with_length
+    from udkjax.show.player import Animation as Animation
+    from udkjax.show.player import animate as animate
+    from udkjax.show.player import animate_modes as animate_modes
     from udkjax.study.identify import Candidate as Candidate
     from udkjax.study.identify import Design as Design
     from udkjax.study.identify import Estimate as Estimate
@@ -116,6 +119,7 @@ _NAMES = {
     "udkjax.study.identify": """
         identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck
         design_experiment Candidate Design""",
+    "udkjax.show.player": "animate animate_modes Animation",
     "udkjax.study.sweep": "sweep Axis Zipped Sobol LatinHypercube Random SweepError",
     "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }

@@ -5,11 +5,14 @@ from types import TracebackType
 
 # The extras of pyproject.toml by the top-level modules that they bring.
 EXTRAS = {
+    "PIL": "plot",
     "anywidget": "notebook",
     "dask": "dask",
     "distributed": "dask",
+    "ezdxf": "dxf",
     "h5netcdf": "io",
     "h5py": "io",
+    "imageio_ffmpeg": "video",
     "matplotlib": "plot",
     "optax": "identify",
     "pandas": "io",

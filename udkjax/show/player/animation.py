@@ -8,19 +8,18 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.scene import Mechanism
-from udkjax.show.player.packing import unpacked
 from udkjax.show.player.page import frame, page
-from udkjax.show.player.records import mode_record, player_data, run_record
+from udkjax.show.player.records import mode_record, motion_of, player_data, run_record
 
 FRAME_HEIGHT = 560  # px, of the player inside another page
-Poses = Float[np.ndarray, "T bodies 3"]
 
 
 class Animation:
     """What `animate` returns. In a notebook it shows itself: as a widget where anywidget is installed, else in a frame."""
 
-    def __init__(self, mechanisms: Sequence[Mechanism], data: dict[str, Any], poses: Sequence[Poses], times: Sequence[Any]):
-        self.mechanisms, self.data, self.poses, self.times = list(mechanisms), data, list(poses), list(times)
+    def __init__(self, data: dict[str, Any]):
+        self.data = data
+        self._motions = [motion_of(record) for record in data["runs"]]
 
     def html(self, theme: str | None = None, autoplay: bool = False) -> str:
         """Return one self-contained HTML page. `theme` is "light" or "dark"; by default, what the reader's system prefers."""
@@ -69,12 +68,9 @@ class Animation:
         return path
 
     def pose(self, t: float | None = None) -> list[Float[np.ndarray, "bodies 3"]]:
-        """Return the coordinates at time t (s) of each run, interpolated linearly; of a mode, t is the part of a cycle."""
-        t = self.data["start"] if t is None else t
-        return [
-            np.array([[np.interp(t, ts, column) for column in body] for body in np.moveaxis(poses, 0, -1)])
-            for ts, poses in zip(self.times, self.poses, strict=True)
-        ]
+        """Return the coordinates of each run at time t (s; of a mode, the part of a cycle), as the player shows them."""
+        t = float(self.data["start"] if t is None else t)
+        return [motion(t) for motion in self._motions]
 
     def _repr_html_(self) -> str:
         return frame(self.data, FRAME_HEIGHT)
@@ -109,7 +105,7 @@ def animate(
         solution: what `simulate` returned, or anything with ts (T,), q and v (T, bodies, 3); several under their labels,
             {"projected": one, "not stabilized": other}. By default the mechanism stands as its scene says.
         measures: what a strip shows over time: any of "violation" (m; radians as an arc of the characteristic length), "energy"
-            and "rank", or values of your own for one run, {"torque (N m)": array}.
+            and "rank", or {"torque (N m)": array} for values of your own, of several runs {"torque (N m)": {label: array}}.
         reactions: draw the forces of the joints as arrows; of redundant joints, the shares of least norm.
         traces: joints or bodies (their centres of mass) whose paths are drawn; by default the pins that move, up to eight.
         title: by default the mechanism's name.
@@ -120,21 +116,20 @@ def animate(
     Raises:
         ValueError: a batch, a name that is not known, or a run without any state.
     """
-    runs = dict(solution) if isinstance(solution, Mapping) else {"": _Still(mechanism) if solution is None else solution}
+    runs: dict[str, Any] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
     if not runs:
         raise ValueError("there is no run to show")
     found = []
     for label, run in runs.items():
-        one = mechanism[label] if isinstance(mechanism, Mapping) else mechanism
+        one: Any = mechanism[label] if isinstance(mechanism, Mapping) else mechanism
+        run = _Still(one) if run is None else run
         if np.ndim(run.ts) != 1 or np.shape(run.q) != (len(run.ts), len(one.bodies), 3):
             raise ValueError(
                 f"run {label!r} has q of shape {np.shape(run.q)}, not ({np.shape(run.ts)[-1]}, {len(one.bodies)}, 3): "
                 'give members of a batch one by one under labels, {"a": jax.tree.map(lambda x: x[0], batch)}'
             )
         found.append((one, *run_record(one, run, label, measures, reactions, traces)))
-    times = [unpacked(record["time"])[:, 0] for _, record, _ in found]
-    data = player_data(title or found[0][0].name or "mechanism", found)
-    return Animation([one for one, _, _ in found], data, [poses for _, _, poses in found], times)
+    return Animation(player_data(title or found[0][0].name or "mechanism", found))
 
 
 def animate_modes(
@@ -165,9 +160,7 @@ def animate_modes(
     for k, shape in enumerate(shapes):
         frequency = None if frequencies is None else float(frequencies[k])
         found.append((mechanism, *mode_record(mechanism, q, shape, frequency, labels[k] if labels else f"mode {k + 1}")))
-    data = player_data(title or mechanism.name or "mechanism", found)
-    times = [np.linspace(0.0, 1.0, len(poses)) for _, _, poses in found]
-    return Animation([mechanism] * len(shapes), data, [poses for _, _, poses in found], times)
+    return Animation(player_data(title or mechanism.name or "mechanism", found))
 
 
 class _Still:

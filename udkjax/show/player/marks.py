@@ -29,7 +29,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 from scipy.spatial import ConvexHull
 
 from udkjax.scene import (
@@ -57,7 +57,7 @@ SAME_PLACE = 1e-9  # of the largest coordinate: attachments that are closer are 
 MARGIN = 0.08  # of the length of a mechanism: how far a rail goes beyond what slides on it
 
 
-def marks(mechanism: Mechanism, poses: Poses) -> list[Mark]:
+def marks(mechanism: Mechanism, poses: Float[ArrayLike, "T bodies 3"]) -> list[Mark]:
     """Return the marks of a mechanism, the farthest first; `poses` are all those that it will be drawn in."""
     drawing = _Drawing(mechanism, np.asarray(poses, float))
     links = drawing.links()

@@ -25,8 +25,10 @@ class Measure(NamedTuple):
     log: bool = False
 
 
-def measures_of(mechanism: Mechanism, solution: Any, wanted: Sequence[str] | Mapping[str, Any]) -> list[Measure]:
+def measures_of(mechanism: Mechanism, solution: Any, wanted: Sequence[str] | Mapping[str, Any], label: str) -> list[Measure]:
     """Return the measures of a run: those of `MEASURES` by their names, or others as {"name" or "name (unit)": values}.
+
+    Values may be under the labels of the runs that have them.
 
     Raises:
         ValueError: a name that is not known, or values that are not one number for each output time.
@@ -38,7 +40,8 @@ def measures_of(mechanism: Mechanism, solution: Any, wanted: Sequence[str] | Map
             if name not in MEASURES:
                 raise ValueError(f"measure {name!r} is not known: take {', '.join(MEASURES)}, or give its values")
             found += MEASURES[name](mechanism, solution)
-        else:
+        elif not isinstance(values, Mapping) or label in values:
+            values = values[label] if isinstance(values, Mapping) else values
             words, _, unit = name.partition(" (")
             values = np.asarray(values, float)
             if values.shape != np.shape(solution.ts):

@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageDraw
 
+from udkjax.extras import OptionalImport
 from udkjax.show.player.sketch import THEMES, Circle, Line, Sketch, View, view_of
+
+with OptionalImport():
+    from PIL import Image, ImageDraw
 
 SMOOTH = 3  # times: a picture of pixels is drawn so much larger, and made smaller
 MOST_FRAMES = 1500  # of a film
@@ -24,12 +27,12 @@ DXF_LAYERS = {
 }  # others: by their kind
 
 
-def sketches(animation: Any, t: float | None, width: int, theme: str) -> tuple[View, list[Sketch]]:
-    """Return the view of each panel, `width` over all, and the sketch of each run at time t."""
+def sketches(animation: Any, t: float | None, width: int, theme: str, times: int = 1) -> tuple[View, list[Sketch]]:
+    """Return the view of each panel, `width` over all and so many times as large, and the sketch of each run at time t."""
     if theme not in THEMES:
         raise ValueError(f"theme {theme!r} is neither of {', '.join(THEMES)}")
     runs = animation.data["runs"]
-    view = view_of(animation.data["bounds"], width // len(runs) // 2 * 2)
+    view = view_of(animation.data["bounds"], width // len(runs), times)
     return view, [Sketch(run["marks"], pose, view, theme) for run, pose in zip(runs, animation.pose(t), strict=True)]
 
 
@@ -62,7 +65,7 @@ def _svg(shape: Line | Circle) -> str:
 
 def image(animation: Any, t: float | None = None, width: int = 640, theme: str = "light") -> Image.Image:
     """Return one pose of each run, side by side, as a picture of pixels."""
-    view, found = sketches(animation, t, SMOOTH * width, theme)
+    view, found = sketches(animation, t, width, theme, SMOOTH)
     whole = Image.new("RGB", (view.width * len(found), view.height), THEMES[theme]["back"])
     for k, sketch in enumerate(found):
         panel = Image.new("RGB", (view.width, view.height), THEMES[theme]["back"])
@@ -93,7 +96,7 @@ def _paint(draw: ImageDraw.ImageDraw, shape: Line | Circle) -> None:
 def film_times(animation: Any, fps: float, speed: float | None) -> np.ndarray:
     """Return the time on the timeline of each frame; a film that would be too long is refused."""
     data = animation.data
-    speed = data["speed"] if speed is None else speed
+    speed = float(data["speed"] if speed is None else speed)
     if not (0 < fps < np.inf and 0 < speed < np.inf):
         raise ValueError(f"fps {fps:g} and speed {speed:g} must be positive")
     count = max(1, round((data["end"] - data["start"]) / speed * fps))
@@ -119,15 +122,18 @@ def save_mp4(
     animation: Any, path: Path, fps: float = 30.0, width: int = 960, theme: str = "light", speed: float | None = None
 ) -> None:
     """Write the motion as an H.264 film; needs the extra `video` (imageio-ffmpeg)."""
-    try:
+    with OptionalImport():
         import imageio_ffmpeg
-    except ImportError as error:
-        raise ImportError("an .mp4 needs imageio-ffmpeg: pip install 'udkjax[video]'; a .gif needs nothing") from error
     frames = _frames(animation, film_times(animation, fps, speed), width, theme)
     first = next(frames)
     size = first.shape[1], first.shape[0]
     film = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, macro_block_size=2, quality=7, output_params=["-movflags", "+faststart"]
+        str(path),
+        size,
+        fps=fps,  # pyright: ignore[reportArgumentType]
+        macro_block_size=2,
+        quality=7,
+        output_params=["-movflags", "+faststart"],
     )
     film.send(None)
     film.send(first.tobytes())
@@ -143,13 +149,11 @@ def _frames(animation: Any, times: np.ndarray, width: int, theme: str) -> Iterat
 
 def save_dxf(animation: Any, path: Path, t: float | None = None) -> None:
     """Write one pose of the first run as a DXF drawing in metres, a layer for each kind of mark; needs ezdxf (extra `dxf`)."""
-    try:
-        import ezdxf
+    with OptionalImport():
         from ezdxf import units
-    except ImportError as error:
-        raise ImportError("a .dxf needs ezdxf: pip install 'udkjax[dxf]'; an .svg needs nothing") from error
+        from ezdxf.filemanagement import new
     view, found = sketches(animation, t, 1000, "light")
-    drawing = ezdxf.new("R2010", units=units.M)
+    drawing = new("R2010", units=units.M)
     space = drawing.modelspace()
     for shape in found[0].shapes:
         layer = DXF_LAYERS.get(shape.layer, f"{shape.layer}s")

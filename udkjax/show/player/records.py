@@ -19,7 +19,7 @@ runs       a list of
     reactions      {anchors, largest (N), force: packed table of T rows, x and y of each anchor}, or null
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,7 @@ def run_record(
         "mode": None,
         "measures": [
             {"name": m.name, "unit": m.unit, "log": m.log, "values": floats(m.values[shown])}
-            for m in measures_of(mechanism, solution, measures)
+            for m in measures_of(mechanism, solution, measures, label)
         ],
         "reactions": None,
     }
@@ -115,6 +115,26 @@ def mode_record(
         "reactions": None,
     }
     return record, poses
+
+
+def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]]:
+    """Return the coordinates of a run as a function of time, as the player shows them: cubic between instants, or a sine."""
+    shape = len(record["bodies"]), 3
+    if record["mode"]:
+        q, swing = (np.reshape(record["mode"][name], shape) for name in ("q", "shape"))
+        return lambda t: q + np.sin(2 * np.pi * t) * swing
+    ts, q, v = (unpacked(record[name]) for name in ("time", "q", "v"))
+
+    def at(t: float) -> Float[np.ndarray, "bodies 3"]:
+        j = int(np.clip(np.searchsorted(ts[:, 0], t, side="right"), 1, max(len(ts) - 1, 1)))
+        i, j = j - 1, min(j, len(ts) - 1)
+        h = ts[j, 0] - ts[i, 0]
+        s = float(np.clip((t - ts[i, 0]) / h, 0, 1)) if h > 0 else 0.0
+        r = 1 - s
+        ends = q[i] * r * r * (1 + 2 * s) + q[j] * s * s * (3 - 2 * s)
+        return (ends + h / record["frame"] * s * r * (v[i] * r - v[j] * s)).reshape(shape)
+
+    return at
 
 
 def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.ndarray, "T bodies 3"]]]) -> Record:

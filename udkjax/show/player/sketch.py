@@ -28,13 +28,14 @@ Points = Float[Any, "points 2"]
 
 
 class View(NamedTuple):
-    """Metres to pixels: (x + scale X, y - scale Y), in a picture of so many pixels."""
+    """Metres to pixels: (x + scale X, y - scale Y), in a picture of so many pixels; `pt` is the unit of symbols (px)."""
 
     scale: float
     x: float
     y: float
     width: int
     height: int
+    pt: float
 
 
 class Line(NamedTuple):
@@ -59,14 +60,15 @@ class Circle(NamedTuple):
     fill: str = ""
 
 
-def view_of(bounds: Sequence[float], width: int) -> View:
-    """Return the view of a picture of this width that holds `bounds` (left, bottom, right, top, in m), its height even."""
+def view_of(bounds: Sequence[float], width: int, times: int = 1) -> View:
+    """Return the view of a picture of this width that holds `bounds` (left, bottom, right, top, in m), so many times as large."""
     left, bottom, right, top = bounds
     margin = min(MARGIN, 0.12 * width)
-    scale = (width - 2 * margin) / (right - left)
-    height = int(np.clip(scale * (top - bottom) + 2 * margin, 0.25 * width, 1.25 * width)) // 2 * 2
-    scale = min(scale, (height - 2 * margin) / (top - bottom))
-    return View(scale, width / 2 - scale * (left + right) / 2, height / 2 + scale * (bottom + top) / 2, width, height)
+    height = int(np.clip((width - 2 * margin) / (right - left) * (top - bottom) + 2 * margin, 0.25 * width, 1.25 * width))
+    scale = times * min((width - 2 * margin) / (right - left), (height - 2 * margin) / (top - bottom))
+    pt = times * float(np.clip(min(width, height) / POINT, 0.75, 1.5))
+    wide, high = times * width, times * height
+    return View(scale, wide / 2 - scale * (left + right) / 2, high / 2 + scale * (bottom + top) / 2, wide, high, pt)
 
 
 def mix(one: str, two: str, t: float) -> str:
@@ -80,7 +82,7 @@ class Sketch:
 
     def __init__(self, marks: Sequence[Mark], pose: Float[np.ndarray, "bodies 3"], view: View, theme: str = "light"):
         self.pose, self.view, self.theme = pose, view, THEMES[theme]
-        self.pt = float(np.clip(min(view.width, view.height) / POINT, 0.75, 4.0))
+        self.pt = view.pt
         self.shapes: list[Line | Circle] = []
         for mark in marks:
             self.layer = mark["kind"]

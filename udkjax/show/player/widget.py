@@ -2,13 +2,12 @@
 
 from typing import Any
 
+from udkjax.extras import OptionalImport
 from udkjax.show.player.page import module
 
-try:
+with OptionalImport():
     import anywidget
     import traitlets
-except ImportError as error:
-    raise ImportError("the widget needs anywidget: pip install 'udkjax[notebook]'") from error
 
 
 class PlayerWidget(anywidget.AnyWidget):

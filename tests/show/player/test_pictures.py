@@ -1,0 +1,124 @@
+"""Pictures and films: what is drawn is where it must be."""
+
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import udkjax as udk
+from udkjax.show.player import pictures
+from udkjax.show.player.marks import marks
+from udkjax.show.player.sketch import THEMES, Sketch, view_of
+
+INK = np.array([int(THEMES["light"]["ink"][k : k + 2], 16) for k in (1, 3, 5)])
+REACH = 7  # px around a pin's centre within which its ring is
+
+
+def ring_centre(picture, place):
+    """The centroid of what has the colour of ink near a place (px): the centre of a pin."""
+    x, y = np.rint(place).astype(int)
+    rows, columns = slice(y - REACH, y + REACH + 1), slice(x - REACH, x + REACH + 1)
+    darkness = np.clip(1 - np.abs(np.asarray(picture, float)[rows, columns] - INK).max(axis=2) / 120, 0, 1)
+    assert darkness.sum() > 8, "there is no pin"
+    grid = np.mgrid[rows, columns]
+    return np.array([(darkness * grid[1]).sum(), (darkness * grid[0]).sum()]) / darkness.sum()
+
+
+@pytest.mark.parametrize("t", [0.0, 0.5125, 1.7])
+def test_pins_of_a_picture_are_where_the_closed_form_says(animation, closed_form, t):
+    view = view_of(animation.data["bounds"], 900)
+    picture = pictures.image(animation, t, 900)
+    pins = closed_form.pins(t)
+    for name in ("P", "B"):  # O is under the arrow of its motor
+        x, y = pins[name]
+        expected = np.array([view.x + view.scale * x, view.y - view.scale * y])
+        assert np.abs(ring_centre(picture, expected) - expected).max() < 1.2
+
+
+def test_an_svg_has_its_pins_at_their_places(animation, closed_form, tmp_path):
+    text = animation.save(tmp_path / "pose.svg", t=0.3, width=800).read_text()
+    view = view_of(animation.data["bounds"], 800)
+    found = re.findall(r'<circle class="pin" cx="([\d.]+)" cy="([\d.]+)"', text)
+    places = sorted(tuple(map(float, place)) for place in found)
+    expected = sorted((view.x + view.scale * x, view.y - view.scale * y) for x, y in closed_form.pins(0.3).values())
+    np.testing.assert_allclose(places, expected, atol=0.02)
+    assert text.startswith("<svg ") and "<title>slider-crank</title>" in text
+
+
+def test_texts_of_an_svg_are_texts(hostile, tmp_path):
+    text = udk.animate(hostile.mechanism, measures=()).save(tmp_path / "pose.svg").read_text()
+    assert "<script" not in text and "&lt;/script&gt;" in text
+
+
+def test_a_gif_moves_as_long_as_the_run(animation, tmp_path):
+    path = animation.save(tmp_path / "motion.gif", fps=10, width=200, speed=0.5)
+    with Image.open(path) as film:
+        frames = getattr(film, "n_frames", 1)
+        assert frames == 40 and film.info["duration"] == 100 and film.info["loop"] == 0
+        first = np.asarray(film.convert("RGB"), float)
+        film.seek(10)
+        later = np.asarray(film.convert("RGB"), float)
+    assert np.abs(first - later).max() > 50
+    with pytest.raises(ValueError, match="more than 1500: give a higher speed"):
+        animation.save(tmp_path / "motion.gif", speed=0.001)
+
+
+def test_an_mp4_is_a_film(animation, tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: pip install 'udkjax[video]'")
+    path = animation.save(tmp_path / "motion.mp4", fps=5, width=160)
+    assert path.read_bytes()[4:8] == b"ftyp" and path.stat().st_size > 1000
+
+
+def test_a_dxf_is_in_metres_in_layers(animation, closed_form, tmp_path):
+    ezdxf = pytest.importorskip("ezdxf", reason="ezdxf is not installed: pip install 'udkjax[dxf]'")
+    drawing = ezdxf.readfile(animation.save(tmp_path / "pose.dxf", t=0.3))
+    space = drawing.modelspace()
+    places = sorted((c.dxf.center.x, c.dxf.center.y) for c in space.query('CIRCLE[layer=="joints"]'))
+    np.testing.assert_allclose(places, sorted(closed_form.pins(0.3).values()), atol=2e-5)
+    assert {"links", "joints", "ground", "motors", "blocks"} <= {layer.dxf.name for layer in drawing.layers}
+
+
+def test_every_kind_of_mark_is_drawn():
+    angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    B, names = udk.Body, ("cam", "follower", "pinion", "rack", "free", "plate")
+    spots = ((0, 0), (0, 0.5), (1.5, 0.2), (1.5, 0), (2.7, 0.6), (2.6, 0))
+    mech = udk.Mechanism(
+        {name: B(1, 0.1, spot) for name, spot in zip(names, spots, strict=True)},
+        {
+            "c": udk.Cam(("cam", "follower"), [(0, 0), (0, 0)], udk.Profile(angle, 0.5 + 0.1 * np.cos(angle))),
+            "o": udk.Revolute(("ground", "cam"), [(0, 0), (0, 0)]),
+            "way": udk.Prismatic(("ground", "rack"), [(1.5, 0), (0, 0)], 0.0),
+            "slot": udk.Slot(("ground", "plate"), [(2.6, 0.2), (0, 0.2)], 0.5),
+            "rack": udk.Rack(("rack", "pinion"), 0.2, 0.0),
+            "rod": udk.Distance(("ground", "plate"), [(2.6, 0.5), (0, 0.2)]),
+            "weld": udk.Weld(("plate", "free"), [(0.1, 0.2), (0.0, -0.4)]),
+            "gear": udk.Gear(("cam", "pinion"), (0.4, 0.2)),
+        },
+        {
+            "m": udk.Driver(("ground", "cam"), "angle", udk.Polynomial([0, 2.0])),
+            "d": udk.Driver(("ground", "free"), "distance", udk.Polynomial([1.0]), [(3, 1), (0, 0)]),
+        },
+        [
+            udk.TorsionSpring(("ground", "plate"), 1.0),
+            udk.Spring(("ground", "plate"), [(3.2, 0.6), (0.1, -0.1)], 20.0, 0.5, 1.0),
+            udk.Force("plate", (3.0, 1.0), frame="body"),
+            udk.Friction("o", 0.1, 0.1),
+            udk.Torque(("ground", "pinion"), -1.0),
+        ],
+    )
+    every = marks(mech, mech.q0[None])
+    found = {mark["kind"] for mark in every}
+    methods = {name[1:] for name in vars(Sketch) if name.startswith("_") and not name.startswith("__")}
+    helpers = {"body", "anchor", "at", "edge", "fill", "line", "circle", "turned", "hatch", "rail_frame", "along", "turn", "head"}
+    assert found == methods - helpers
+    sketch = Sketch(every, np.asarray(mech.q0), view_of((-1, -1, 4, 2), 600))
+    assert {shape.layer for shape in sketch.shapes} == found
+    assert all(np.isfinite(shape.points if hasattr(shape, "points") else shape.centre).all() for shape in sketch.shapes)
+
+
+def test_wrong_names_and_themes(animation, tmp_path):
+    with pytest.raises(ValueError, match=r"motion.bmp: an animation is written as .html"):
+        animation.save(tmp_path / "motion.bmp")
+    with pytest.raises(ValueError, match="theme 'blue'"):
+        animation.save(tmp_path / "pose.png", theme="blue")

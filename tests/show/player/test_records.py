@@ -1,0 +1,222 @@
+"""What the player is given, without a browser."""
+
+import json
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax.equations.scales import rank_tolerance
+from udkjax.show.player.marks import body_points, corners_of, marks, placed
+from udkjax.show.player.measures import measures_of, rank, reaction_arrows, singular_values
+from udkjax.show.player.page import page
+from udkjax.show.player.records import PRECISION, run_record
+
+
+def kinds(animation, k=0):
+    return [mark["kind"] for mark in animation.data["runs"][k]["marks"]]
+
+
+def embedded(text):
+    """The data inside a page, as a browser reads it."""
+    (found,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
+    return json.loads(found)
+
+
+def test_poses_are_those_of_the_run_within_the_stated_precision(animation, run, slider_crank):
+    length = float(udk.analyse(slider_crank).length)
+    for k in (0, 17, 80):
+        (pose,) = animation.pose(run.ts[k])
+        error = np.abs(pose - run.q[k]) / [length, length, 1.0]
+        assert error.max() <= 0.51 * PRECISION
+
+
+def test_between_instants_poses_follow_the_velocities(animation, closed_form):
+    ts = np.linspace(0.0, 2.0, 331)
+    exact = closed_form.run(ts).q
+    found = np.array([animation.pose(t)[0] for t in ts])
+    assert np.abs(found - exact).max() < 3e-5  # cubic on 25 ms: (4 rad/s 0.025 s)^4 / 384 and half a step of precision
+
+
+def test_a_page_of_twenty_seconds_of_the_papers_linkage_is_small():
+    mech = udk.library.parallelogram()
+    sol = udk.simulate(mech, np.linspace(0, 20, 401))
+    text = udk.animate(mech, sol, measures={"angle (rad)": np.asarray(sol.q)[:, 0, 2]}).html()
+    assert len(text.encode()) < 120_000
+    assert not re.search(r"(?:src|href|@import|url\()\s*=?\s*[\"']?(?:https?:)?//", text)
+
+
+def test_marks_of_each_kind_of_joint():
+    gear = marks(udk.library.planetary_gear(), udk.library.planetary_gear().q0[None])
+    wheels = [(m["body"], m["radius"], m["internal"]) for m in gear if m["kind"] == "wheel"]
+    assert wheels[0] == (-1, pytest.approx(0.4), True)  # the ring, behind all others
+    assert sorted(wheels[1:]) == [(0, 0.2, False), (1, 0.1, False), (2, 0.1, False), (3, 0.1, False)]
+    lift = udk.library.scissor_lift()
+    found = marks(lift, lift.q0[None])
+    assert [m["kind"] for m in found].count("support") == 1 and sum(m["kind"] == "rail" for m in found) == 3
+    assert [m["slot"] for m in found if m["kind"] == "rail"] == [True, True, False]
+    crank = udk.library.slider_crank(spring=(100.0, 1.5, 3.0))
+    assert {"motor", "block", "spring", "rail"} <= {m["kind"] for m in marks(crank, crank.q0[None])}
+
+
+def test_a_rail_is_as_long_as_it_is_used(slider_crank, run):
+    (rail,) = (mark for mark in marks(slider_crank, run.q) if mark["kind"] == "rail")
+    margin = 0.08 * 2.0  # of the size of the mechanism, at its first pose
+    np.testing.assert_allclose(rail["span"], [run.q[:, 2, 0].min() - margin, run.q[:, 2, 0].max() + margin], rtol=1e-6)
+
+
+def test_a_cams_outline_is_its_profile():
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    profile = udk.Profile(angle, 0.5 + 0.1 * np.cos(angle))
+    mech = udk.Mechanism(
+        {"cam": udk.Body(1, 1), "follower": udk.Body(1, 1, (0, 0.5))},
+        {"cam": udk.Cam(("cam", "follower"), [(0.2, 0), (0, 0)], profile)},
+    )
+    (outline,) = (mark for mark in marks(mech, mech.q0[None]) if mark["kind"] == "outline")
+    x, y = np.array(outline["points"]).T
+    expected = 0.5 + 0.1 * np.cos(np.arctan2(y, x - 0.2))
+    np.testing.assert_allclose(np.hypot(x - 0.2, y), expected, atol=1e-4)  # the spline is within 1e-4 of the cosine
+
+
+def test_corners_of_plates_and_ends_of_bars():
+    inner = np.array([[0.0, 0], [2, 0], [0.5, 0.4], [0, 2]])  # the third is within the triangle of the others
+    corners, closed = corners_of(inner)
+    assert closed and sorted(map(tuple, corners)) == [(0, 0), (0, 2), (2, 0)]
+    ends, closed = corners_of(np.array([[1.0, 1], [0, 0], [3, 3]]))
+    assert not closed and abs(ends[0] - ends[-1]).tolist() == [3, 3]
+    np.testing.assert_allclose(placed((1, 0), np.array([[3.0, 4.0, np.pi / 2]])), [[3, 5]], atol=1e-15)
+
+
+def test_points_that_hold_bodies_are_named_once():
+    points = body_points(udk.library.parallelogram())
+    np.testing.assert_allclose(points["ground"], [[0, 0], [1, 0], [2, 0]])
+    assert len(points["coupler"]) == 3 and len(points["link1"]) == 2
+
+
+def test_singular_values_and_rank_of_the_papers_linkage():
+    mech = udk.library.parallelogram()
+    poses = np.stack([mech.q0, mech.q0])
+    poses[1] = np.nan
+    run = SimpleNamespace(ts=np.zeros(2), q=poses, v=0 * poses)
+    values = singular_values(mech, run)
+    assert values.shape == (2, 12) and np.isnan(values[1]).all()
+    assert values[0, 10] > 0.1 and values[0, 11] < 1e-14 < float(rank_tolerance(mech))
+    found = rank(mech, values)
+    assert found[0] == 11 and np.isnan(found[1])
+
+
+def test_measures_are_those_of_the_equations(slider_crank, run):
+    violation, change, kinetic, potential = measures_of(slider_crank, run, ("violation", "energy"), "")
+    assert violation.log and violation.values.max() < 1e-14 and (violation.unit, kinetic.unit) == ("m", "J")
+    total = np.asarray(udk.energy(slider_crank, run).total)
+    np.testing.assert_allclose(kinetic.values + potential.values, total)
+    np.testing.assert_allclose(change.values, total - total[0], atol=1e-12)
+    (own,) = measures_of(slider_crank, run, {"torque (N m)": {"a": run.ts, "b": 2 * run.ts}}, "b")
+    assert (own.name, own.unit) == ("torque", "N m") and own.values[-1] == 4.0
+    with pytest.raises(ValueError, match="'energie' is not known: take violation, energy, rank"):
+        measures_of(slider_crank, run, ("energie",), "")
+    with pytest.raises(ValueError, match="has shape"):
+        measures_of(slider_crank, run, {"torque": run.ts[:3]}, "")
+
+
+def test_arrows_are_the_reactions():
+    mech = udk.library.compound_pendulum(0.3)
+    run = SimpleNamespace(ts=np.zeros(1), q=np.asarray(mech.q0)[None], v=np.zeros((1, 1, 3)))
+    anchors, forces = reaction_arrows(mech, run)
+    (name,) = mech.joints
+    expected = udk.reactions(mech, run)[name][mech.body_names[0]][0, :2]
+    np.testing.assert_allclose(forces[0, 0], expected)
+    assert anchors[0][0] == 0 and np.linalg.norm(forces) > 1
+    arrows = udk.animate(mech, run, measures=(), reactions=True).data["runs"][0]["reactions"]
+    assert arrows["largest"] == pytest.approx(np.linalg.norm(expected))
+
+
+def test_a_run_that_failed_is_shown_as_far_as_it_came(slider_crank, run):
+    q = run.q.copy()
+    q[50:] = np.nan
+    broken = SimpleNamespace(ts=run.ts, q=q, v=run.v, cause="not finite at t = 1.25 s")
+    record, poses = run_record(slider_crank, broken, "", (), False, None)
+    assert len(poses) == record["q"]["rows"] == 50 and "1.25 s" in record["note"]
+    with pytest.raises(ValueError, match="has no state to show: not finite"):
+        run_record(slider_crank, SimpleNamespace(ts=run.ts, q=np.nan * q, v=run.v, cause=broken.cause), "", (), False, None)
+
+
+def test_long_runs_are_thinned_out_and_stay_exact(slider_crank, closed_form):
+    fine = closed_form.run(np.linspace(0, 5, 20_001))
+    animation = udk.animate(slider_crank, fine, measures=())
+    assert animation.data["runs"][0]["q"]["rows"] == 2400
+    for t in (1.2345, 4.9999):
+        np.testing.assert_allclose(animation.pose(t)[0], closed_form.run([t]).q[0], atol=2e-5)
+
+
+def test_traces_are_pins_that_move_or_those_that_are_named(slider_crank, run):
+    by_default = udk.animate(slider_crank, run, measures=()).data["runs"][0]["traces"]
+    assert len(by_default) == 2  # P on its circle and B on its line; O stands, and each is on two bodies
+    named = udk.animate(slider_crank, run, measures=(), traces=("rod", "P")).data["runs"][0]["traces"]
+    assert named == [[1, 0.0, 0.0], [0, 0.25, 0.0]]
+    with pytest.raises(ValueError, match="'Q': neither a body nor a joint"):
+        udk.animate(slider_crank, run, measures=(), traces=("Q",))
+
+
+def test_bounds_hold_every_pose(animation, run):
+    left, bottom, right, top = animation.data["bounds"]
+    assert left <= -0.499 and right >= 1.999 and bottom <= -0.499 and top >= 0.499
+    assert right - left < 3.2 and top - bottom < 1.5
+
+
+def test_several_runs_and_wrong_ones(slider_crank, run, closed_form):
+    short = closed_form.run(np.linspace(0.5, 1.0, 11))
+    data = udk.animate(slider_crank, {"long": run, "short": short}, measures=()).data
+    assert [r["label"] for r in data["runs"]] == ["long", "short"] and (data["start"], data["end"]) == (0.0, 2.0)
+    batch = SimpleNamespace(ts=run.ts, q=run.q[None], v=run.v[None])
+    with pytest.raises(ValueError, match="members of a batch one by one"):
+        udk.animate(slider_crank, batch)
+    with pytest.raises(ValueError, match="no run"):
+        udk.animate(slider_crank, {})
+
+
+def test_a_mechanism_alone_stands_as_its_scene_says(slider_crank):
+    animation = udk.animate(slider_crank, measures=())
+    np.testing.assert_allclose(animation.pose()[0], slider_crank.q0, atol=2e-5)
+    assert animation.data["start"] == animation.data["end"] == 0.0
+
+
+def test_modes_swing_about_their_pose(slider_crank):
+    q, shapes = np.asarray(slider_crank.q0), np.zeros((2, 3, 3))
+    shapes[0, 0, 2], shapes[1, 2, 0] = 7.0, -1e-3
+    animation = udk.animate_modes(slider_crank, q, shapes, [0.5, 2.0])
+    one, two = animation.pose(0.25)
+    length = float(udk.analyse(slider_crank).length)
+    np.testing.assert_allclose(one[0, 2] - q[0, 2], 0.12)  # rad
+    np.testing.assert_allclose(two[2, 0] - q[2, 0], -0.12 * length)
+    np.testing.assert_allclose(animation.pose(0.5), [q, q], atol=1e-15)
+    assert [run["note"] for run in animation.data["runs"]] == ["0.5 Hz", "2 Hz"]
+    with pytest.raises(ValueError, match="does not move anything"):
+        udk.animate_modes(slider_crank, q, 0 * shapes)
+    with pytest.raises(ValueError, match="not \\(modes, 3, 3\\)"):
+        udk.animate_modes(slider_crank, q, shapes[0])
+
+
+def test_texts_cannot_leave_their_place_in_a_page(hostile):
+    text = udk.animate(hostile.mechanism, measures=()).html()
+    assert text.count("<script") == 2 and text.count("</script>") == 2
+    assert "<img" not in text and "\u2028" not in text and "<b on" not in text
+    data = embedded(text)
+    assert data["title"] == hostile.names[0] and data["runs"][0]["bodies"] == [hostile.names[1]]
+    assert {mark["name"] for mark in data["runs"][0]["marks"] if mark["kind"] == "pin"} == set(hostile.names[2:])
+    frame = udk.animate(hostile.mechanism, measures=())._repr_html_()
+    assert frame.count("<") == 2 and frame.startswith("<iframe") and frame.endswith("</iframe>")
+
+
+def test_what_is_not_finite_is_no_json(animation):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        page(animation.data | {"speed": np.nan})
+
+
+def test_it_shows_itself(animation):
+    assert "2 s" in repr(animation)
+    bundle = animation._repr_mimebundle_()
+    data = bundle[0] if isinstance(bundle, tuple) else bundle
+    assert data["text/html"].startswith("<iframe")

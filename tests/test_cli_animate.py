@@ -1,0 +1,71 @@
+"""`udkjax animate`."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray
+
+import udkjax as udk
+from tests.command_line import udkjax
+
+SCENE = "examples/four_bar.toml"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run in a file, with a variable of its own over time."""
+    path = tmp_path_factory.mktemp("runs") / "four_bar.nc"
+    mech = udk.load(SCENE)
+    sol = udk.simulate(mech, np.linspace(0, 1, 21))
+    data = sol.to_xarray(mech)
+    data["torque"] = "time", np.sin(data["time"].values), {"units": "N m"}
+    data.to_netcdf(path, engine="h5netcdf")
+    return path
+
+
+def test_a_run_becomes_a_page(run, tmp_path, capsys):
+    out = tmp_path / "run.html"
+    assert udkjax("animate", run, "--out", out, "--measures", "torque", "--json") == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["bytes"] == out.stat().st_size < 100_000 and (printed["start"], printed["end"]) == (0, 1)
+    text = out.read_text()
+    assert '"name":"torque","unit":"N m"' in text and "<title>four-bar</title>" in text
+
+
+def test_a_run_and_a_scene_side_by_side(run, tmp_path):
+    out = tmp_path / "pose.svg"
+    assert udkjax("animate", run, SCENE, "--t1", 0.5, "--labels", "file", "scene", "--out", out, "--t", 0.25) == 0
+    left, right = out.read_text().split("<g ")[1:]
+    places = lambda text: [float(word.split('"')[1]) for word in text.split() if word.startswith(("cx", "cy"))]  # noqa: E731
+    np.testing.assert_allclose(places(left), places(right), atol=0.03)  # px
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("{run}", "--out", "x.bmp"), "--out x.bmp ends with none of .html"),
+        (("{run}", "--out", "no/where.html"), "there is no folder no"),
+        (("{run}", "{run}", "--out", "x.html"), "different labels, not four_bar, four_bar"),
+        (("{run}", "--labels", "a", "b", "--out", "x.html"), "2 --labels for 1 files"),
+        (("none.nc", "--out", "x.html"), "cannot read none.nc"),
+        (("{sweep}", "--out", "x.html"), "has no q and no time"),
+        (("{run}", "--measures", "heat", "--out", "{out}.html"), "measure 'heat' is not known"),
+        (("{run}", "--traces", "Z", "--out", "{out}.html"), "trace 'Z'"),
+        ((SCENE, "--t1", "0", "--out", "x.html"), "--t1 0 must be at least one --dt"),
+    ],
+)
+def test_wrong_input_is_refused(run, tmp_path, capsys, arguments, words):
+    sweep = tmp_path / "sweep.nc"
+    xarray.Dataset({"v": ("member", np.zeros(2))}).to_netcdf(sweep, engine="h5netcdf")
+    places = {"run": run, "sweep": sweep, "out": tmp_path / "out"}
+    assert udkjax("animate", *(word.format(**places) for word in arguments)) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_scene_of_classes_of_ones_own_is_refused(run, tmp_path, capsys):
+    path = tmp_path / "own.nc"
+    with xarray.open_dataset(run) as data:
+        data.assign_attrs(scene="# joint of a class of your own").to_netcdf(path, engine="h5netcdf")
+    assert udkjax("animate", path, "--out", tmp_path / "run.html") == 2
+    assert "use `udkjax.animate` in Python" in capsys.readouterr().err

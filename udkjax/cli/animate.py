@@ -1,0 +1,123 @@
+"""`udkjax animate`."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from udkjax.cli.common import Json, load, refuse, show
+
+KINDS = (".html", ".gif", ".mp4", ".svg", ".png", ".dxf")
+Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN.nc|SCENE.toml")]
+
+
+def animate(
+    files: Files,
+    /,
+    out: Path,
+    t1: float = 10.0,
+    dt: float = 0.02,
+    labels: tuple[str, ...] = (),
+    measures: tuple[str, ...] = ("violation", "energy", "rank"),
+    reactions: bool = False,
+    traces: tuple[str, ...] = (),
+    theme: Literal["light", "dark"] | None = None,
+    autoplay: bool = False,
+    t: float | None = None,
+    fps: float | None = None,
+    speed: float | None = None,
+    width: int | None = None,
+    json: Json = False,
+) -> None:
+    """Show a motion, or several side by side and in step, as a page to open in a browser, a film or a picture.
+
+    Args:
+        files: runs that `udkjax simulate` wrote (NetCDF), or scenes (TOML), which are simulated.
+        out: what to write: .html, a page that needs no network; .gif or .mp4, a film; .svg, .png or .dxf, one pose.
+        t1: end of the run of a scene (s).
+        dt: time between two of its instants (s).
+        labels: of the runs, where there are several; by default the files' names.
+        measures: what a strip shows over time: violation, energy, rank, or a variable over time of the file.
+        reactions: draw the forces of the joints as arrows.
+        traces: joints or bodies whose paths are drawn; by default the pins that move.
+        theme: colours; by default, on a page, what the reader's system prefers, else light.
+        autoplay: a page moves at once.
+        t: time of a pose (s); by default the start.
+        fps: frames of a film in one second.
+        speed: seconds of motion in one second of a film; by default what is comfortable to watch.
+        width: of a film or a picture (px).
+        json: write the results as JSON.
+    """
+    kind = out.suffix.lower()
+    if kind not in KINDS:
+        refuse(f"--out {out} ends with none of {', '.join(KINDS)}")
+    if not out.parent.is_dir():
+        refuse(f"there is no folder {out.parent} to write {out.name} to")
+    if not files:
+        refuse("give a run (.nc) or a scene (.toml)")
+    if not 0 < dt <= t1 < math.inf:
+        refuse(f"--t1 {t1:g} must be at least one --dt {dt:g}, which must be positive")
+    if labels and len(labels) != len(files):
+        refuse(f"{len(labels)} --labels for {len(files)} files")
+    names = list(labels or (file.stem if len(files) > 1 else "" for file in files))
+    if len(set(names)) < len(names):
+        refuse(f"runs must have different labels, not {', '.join(names)}: give --labels")
+
+    import udkjax as udk
+
+    runs = {name: _run(file, t1, dt) for name, file in zip(names, files, strict=True)}
+    film = {"fps": fps, "speed": speed} if kind in (".gif", ".mp4") else {}
+    page = {"autoplay": autoplay} if kind == ".html" else {} if kind == ".dxf" else {"width": width}
+    look = {"theme": theme} if kind != ".dxf" else {}
+    options: dict[str, Any] = {name: value for name, value in (film | page | look).items() if value is not None}
+    try:
+        found = udk.animate(
+            {name: mechanism for name, (mechanism, _, _) in runs.items()},
+            {name: run for name, (_, run, _) in runs.items()},
+            measures=_measures(measures, runs) if kind == ".html" else (),
+            reactions=reactions,
+            traces=traces or None,
+        )
+        found.save(out, t, **options)
+    except (ValueError, OSError) as problem:
+        refuse(problem)
+    size = out.stat().st_size
+    data = found.data
+    results = {"files": [out], "bytes": size, "start": data["start"], "end": data["end"], "speed": data["speed"]}
+    show(results, f"wrote {out} ({size / 1e3:.0f} kB)", json)
+
+
+def _run(file: Path, t1: float, dt: float) -> tuple[Any, Any, dict[str, Any]]:
+    """Return the mechanism of a file, its run, and further measures."""
+    if file.suffix.lower() == ".toml":
+        mechanism, _ = load(file)
+
+        import numpy as np
+
+        import udkjax as udk
+
+        run = udk.simulate(mechanism, dt * np.arange(int(t1 / dt + 1e-6) + 1), throw=False)
+        return mechanism, run, {}
+
+    from udkjax.show.player.files import read_run
+
+    try:
+        run = read_run(file)
+    except (ValueError, OSError) as problem:
+        refuse(f"cannot read {file}: {problem}" if isinstance(problem, OSError) else problem)
+    return run.mechanism, run, run.others
+
+
+def _measures(wanted: tuple[str, ...], runs: dict[str, tuple[Any, Any, dict[str, Any]]]) -> dict[str, Any]:
+    """The measures by name: those that are computed as None, and variables of the files' own for each run."""
+    found: dict[str, Any] = {}
+    for name in wanted:
+        own = {
+            label: {key: value for key, value in others.items() if key.split(" (")[0] == name}
+            for label, (_, _, others) in runs.items()
+        }
+        keys = {key for variables in own.values() for key in variables}
+        for key in keys or {name}:
+            found[key] = {label: variables[key] for label, variables in own.items() if key in variables} if keys else None
+    return found

@@ -1,0 +1,54 @@
+"""Runs that `udkjax simulate` or `Solution.to_xarray` wrote, read again to be shown."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from udkjax.extras import OptionalImport
+from udkjax.scene import Mechanism, SceneError, loads
+
+with OptionalImport():
+    import xarray
+
+
+class RunFile(NamedTuple):
+    """A run from a file, and the mechanism whose text is inside it."""
+
+    mechanism: Mechanism
+    ts: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    cause: str  # how it ended, in words
+    others: dict[str, np.ndarray]  # further numbers over time, "name (unit)": they are measures
+
+
+def read_run(path: Path) -> RunFile:
+    """Read a run (NetCDF).
+
+    Raises:
+        ValueError: the file holds no run, or no text of a scene.
+        OSError: it cannot be read.
+    """
+    with xarray.open_dataset(path, engine="h5netcdf") as data:
+        missing = [name for name in ("q", "v", "time") if name not in data.variables]
+        if missing or "scene" not in data.attrs:
+            raise ValueError(
+                f"{path} has no {' and no '.join(missing or ['text of a scene'])}: it is not a run of `udkjax simulate`"
+            )
+        try:
+            mechanism = loads(data.attrs["scene"])
+        except SceneError as error:  # classes of the user's own are not in the format
+            raise ValueError(f"{path}: its scene cannot be read, use `udkjax.animate` in Python: {error}") from error
+        if data["q"].dims != ("time", "body", "coordinate"):
+            raise ValueError(f"{path}: q is over {data['q'].dims}, not one run over time, body and coordinate")
+        if list(data["body"].values) != list(mechanism.bodies):
+            raise ValueError(f"{path}: its bodies are not those of its scene")
+        others = {_named(data[name]): np.asarray(data[name], float) for name in data.data_vars if data[name].dims == ("time",)}
+        ts, q, v = (np.asarray(data[name], float) for name in ("time", "q", "v"))
+        return RunFile(mechanism, ts, q, v, str(data.attrs.get("cause", "")), others)
+
+
+def _named(variable: Any) -> str:
+    units = variable.attrs.get("units", "")
+    return f"{variable.name} ({units})" if units not in ("", "1") else str(variable.name)
