@@ -62,7 +62,7 @@ class Fit(NamedTuple):
 
 def exact(m: Measurement) -> np.ndarray:
     """What is measured, to the last digits (T, C)."""
-    values, code = m.predictor()(m.unknowns.start, EXACT)
+    values, code = m.predictor()(m.unknowns.guess, EXACT)
     assert int(code) == 0, "the true mechanism does not move to the end"
     return np.asarray(values)
 
@@ -75,7 +75,7 @@ def record(m: Measurement, values: np.ndarray) -> udk.Record:
 def identified(m: Measurement, data: udk.Record, x0: np.ndarray) -> Fit:
     """Fit with default settings a scene that has the values `x0` in place of the true ones."""
     scene = m.with_values(x0)
-    truth, begun, cpu = m.unknowns.start, time.perf_counter(), time.process_time()
+    truth, begun, cpu = m.unknowns.guess, time.perf_counter(), time.process_time()
     try:
         found = udk.identify(scene, data, parameters=list(m.parameters), progress=False)
     except FAILURES as failure:
@@ -92,7 +92,7 @@ def by_differences(m: Measurement, predicted: Callable, data: np.ndarray, x0: np
     """The same by `scipy.optimize.least_squares` over the jitted run, in logarithms; `tight`: to the last digit."""
     from scipy.optimize import least_squares
 
-    spread, truth = data.std(0), m.unknowns.start
+    spread, truth = data.std(0), m.unknowns.guess
 
     def residuals(z):
         values, code = predicted(x0 * np.exp(z), tol)
@@ -149,7 +149,7 @@ def coverage(case: str, m: Measurement, count: int) -> dict[str, Any]:
     noise = NOISE * values.std(0)
     measured = [record(m, values + noise * random.standard_normal(values.shape)) for _ in range(count)]
     fits = [identified(m, data, x0) for data, x0 in zip(measured, m.starts(count, NEAR), strict=True)]
-    off = np.array([(fit.values - m.unknowns.start) / np.where(np.isfinite(fit.errors), fit.errors, np.nan) for fit in fits])
+    off = np.array([(fit.values - m.unknowns.guess) / np.where(np.isfinite(fit.errors), fit.errors, np.nan) for fit in fits])
     within = np.abs(off) <= SIGMAS  # not where there is no standard error
     each = {
         name: {"covered": float(one.mean()), "bias": float(np.nanmean(z)), "spread": float(np.nanstd(z))}

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import udkjax as udk
-from udkjax.study.identify.channels import channel_of, measured
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.unknowns import Unknowns, applied
+from udkjax.study.identify.channels import channel_of, measure
+from udkjax.study.identify.parameters import Unknowns, apply_values, unknowns_of
 
 LINKS = ("link1", "link2", "link3")
 CYLINDERS = ("boom cylinder", "stick cylinder", "bucket cylinder")
@@ -44,7 +43,7 @@ class Measurement(NamedTuple):
 
     def with_values(self, x: np.ndarray) -> udk.Mechanism:
         """The mechanism with other values of the parameters."""
-        return applied(self.mechanism, self.unknowns.targets, jnp.asarray(x))
+        return apply_values(self.mechanism, self.unknowns.targets, jnp.asarray(x))
 
     def predictor(self) -> Callable[[Any, Any], tuple[Any, Any]]:
         """(values, tolerance) -> channels (T, C) and how the run ended; compiled, a single run without derivatives."""
@@ -53,15 +52,15 @@ class Measurement(NamedTuple):
 
         @jax.jit
         def predicted(x, tol):
-            mechanism = applied(self.mechanism, targets, x)
+            mechanism = apply_values(self.mechanism, targets, x)
             solution = udk.simulate(mechanism, ts, rtol=tol, atol=tol, throw=False)
-            return measured(mechanism, solution, channels), solution.code
+            return measure(mechanism, solution, channels), solution.code
 
         return predicted
 
     def starts(self, count: int, spread: float, seed: int = 0) -> np.ndarray:
         """First guesses (count, P): each parameter anywhere within `spread` of its true value."""
-        truth = self.unknowns.start
+        truth = self.unknowns.guess
         return truth * np.random.default_rng(seed).uniform(1 - spread, 1 + spread, (count, len(truth)))
 
 

@@ -5,7 +5,8 @@ tolerance: its violation jumps from one pair of gains to the next, and its deriv
 out what gains do to steps. From 2 to 20 /s the drift falls, or stays, as steps shorten; with the steps held it seems to grow as
 the third power of the gains, or the sixth of large ones. So runs are by as many equal steps of Dopri8 as the tolerance asks for
 with gains of 5. That bounds the cost: the number of right-hand sides is given, and gains too large for the step, alpha h or
-beta h of the order of one, show as drift. It is smooth, and a sum of squares, which `descend` of udkjax.study.identify minimizes.
+beta h of the order of one, show as drift. It is smooth, and a sum of squares, which
+`minimize_squares` of udkjax.study.identify minimizes.
 
 Where to start: from a closed start at rest the parallelogram's motion does not excite what redundancy lets grow. The gains that
 are least then do for 4 s of motion, but not for long: by theory (see gains.py) drift grows with them. So starts are open by a
@@ -82,6 +83,7 @@ def of_scene(name: str, tolerances: Any, grid: Any, alphas: Any, betas: Any) -> 
     asked = [run["steps"][0] for run in known]
     losses = [Drift(one, int(steps), OPEN * tol) for steps, tol in zip(asked, tolerances, strict=True)]
     fits = [loss.tuned() for loss in losses]
+    evaluations = [loss.calls / len(GUESSES) for loss in losses]
     closed = Drift(one, int(asked[0]), 0.0).tuned()
     best, unheld = (np.exp([fit.z[np.argmin(fit.cost)] for fit in found]) for found in (fits, [closed]))
     gains = np.concatenate([equal, best])
@@ -101,7 +103,7 @@ def of_scene(name: str, tolerances: Any, grid: Any, alphas: Any, betas: Any) -> 
             "asked_right_hand_sides": ("tol", [run["right_hand_sides"][0] for run in known]),
             "tuned": (("tol", "guess", "of"), np.exp([fit.z for fit in fits]), {"units": "1/s"}),
             "tuned_drift": (("tol", "guess"), [np.sqrt(2 * f.cost) * d.unit for f, d in zip(fits, losses, strict=True)]),
-            "evaluations": ("tol", [fit.evaluations / len(GUESSES) for fit in fits], {"long_name": "per guess"}),
+            "evaluations": ("tol", evaluations, {"long_name": "per guess"}),
             "equal_drift": (("tol", "gains"), np.array([loss(np.log(gains)) for loss in losses])),
             "from_closed": ("of", unheld[0], {"units": "1/s", "long_name": "tuned from a closed start, at the first tolerance"}),
             "exponent": ("tol", rates(best), {"long_name": "growth rate of the drift, by theory", "units": "1/s"}),

@@ -42,7 +42,7 @@ def test_what_the_data_cannot_tell_is_said_and_all_is_written(tmp_path, capsys, 
     out = tmp_path / "found"
     assert udkjax("identify", PENDULUM, data, "--parameters", MASS, INERTIA, "--ignore", "remark", "--out", out, "--quiet") == 1
     shown = capsys.readouterr()
-    assert shown.err == ""
+    assert shown.err == "udkjax: the measurements do not show every parameter\n"
     for part in ("2 parameters from 62 numbers in 2 records", "unknown", "body.rod.mass and body.rod.inertia by a common factor"):
         assert part in shown.out
     assert {file.name for file in out.iterdir()} == FILES
@@ -56,11 +56,13 @@ def test_what_is_known_before_makes_it_known(tmp_path, capsys, data):
     out = tmp_path / "found"
     options = ["--prior", f"{MASS}=2.0,0.002", "--bounds", f"{INERTIA} = 0.2,0.9", "--noise", CHANNEL + f"={np.radians(NOISE)}"]
     arguments = ["identify", PENDULUM, data, "--parameters", MASS, "--parameters", INERTIA, "--ignore", "remark", *options]
-    assert udkjax(*arguments, "--profile", INERTIA, "--out", out) == 0
-    shown = capsys.readouterr().out
+    assert udkjax(*arguments, "--profile", INERTIA, "--out", out, "--json", "--quiet") == 0
+    printed, shown = capsys.readouterr()
     assert "every parameter is known" in shown and f"{INERTIA} is between" in shown
     assert {file.name for file in out.iterdir()} == {*FILES, "profiles.png"}
     found = json.loads((out / "estimate.json").read_text())
+    assert {Path(file).name for file in json.loads(printed)["files"]} == {*FILES, "profiles.png"}
+    assert json.loads(printed) == found | {"files": json.loads(printed)["files"]}
     inertia = found["parameters"][INERTIA]
     assert found["success"] and inertia["units"] == "kg m2"
     assert abs(inertia["value"] - TRUTH) < 4 * inertia["standard_error"] < 0.05 * TRUTH
@@ -100,14 +102,14 @@ def test_options_reach_the_identification(tmp_path, monkeypatch, data):
     arguments += ["--noise", "0.1", "--noise", "joint.D.omega=0.5", "--estimate-start", "both", "--loss", "huber", "--quiet"]
     assert udkjax(*arguments, "--starts", 3, "--tol", 1e-9, "--seed", 7) == 130
     one, two = asked["parameters"]
-    assert (one.of, one.prior, one.bounds, one.start) == (tied, (2.0, 0.5), None, None)
-    assert (two.of, two.prior, two.bounds, two.start) == (length, None, (0.5, 2.0), 0.9)
+    assert (one.of, one.prior, one.bounds, one.guess) == (tied, (2.0, 0.5), None, None)
+    assert (two.of, two.prior, two.bounds, two.guess) == (length, None, (0.5, 2.0), 0.9)
     (record,) = asked["records"]
     assert record.start.estimate == "both" and record.name == "run"
     np.testing.assert_array_equal([record.noise[name] for name in record.values], [[0.1, 0.1], [0.5, 0.5]])
-    assert {k: asked[k] for k in ("loss", "starts", "tol", "seed", "progress")} == {
+    assert {k: asked[k] for k in ("loss", "n_starts", "tol", "seed", "progress")} == {
         "loss": "huber",
-        "starts": 3,
+        "n_starts": 3,
         "tol": 1e-9,
         "seed": 7,
         "progress": False,
@@ -116,14 +118,14 @@ def test_options_reach_the_identification(tmp_path, monkeypatch, data):
 
 
 def test_choices_and_defaults_are_those_of_the_library():
-    from udkjax.study.identify import identify, losses, records
+    from udkjax.study.identify import identify, optimizer, records
 
     mine, theirs = (inspect.signature(function).parameters for function in (command, identify))
-    for name in ("loss", "starts", "tol", "seed"):
+    for name in ("loss", "n_starts", "tol", "seed"):
         assert mine[name].default == theirs[name].default
     assert get_args(Estimated) == get_args(records.Estimated)
     for name in get_args(Loss):
-        losses.loss_of(name, 1)
+        optimizer.named_loss(name, 1)
 
 
 GOOD = {"--parameters": [MASS, INERTIA], "--out": ["found"], "--ignore": ["remark"]}
@@ -147,7 +149,7 @@ GOOD = {"--parameters": [MASS, INERTIA], "--out": ["found"], "--ignore": ["remar
         ("--profile", ["body.rod.mas"], '"body.rod.mas": is not among --parameters; did you mean "body.rod.mass"?'),
         ("--noise", ["-1"], '--noise "-1": must be NUMBER or CHANNEL=NUMBER, in SI units, and positive'),
         ("--noise", ["body.rod.omega=1"], '"body.rod.omega" is measured in no record'),
-        ("--starts", ["-1"], "--starts -1: must not be negative"),
+        ("--n-starts", ["-1"], "--n-starts -1: must not be negative"),
         ("--tol", ["0"], "--tol 0: must be between 0 and 1"),
         ("--seed", ["-1"], "--seed -1: must not be negative"),
     ],

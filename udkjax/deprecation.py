@@ -2,8 +2,11 @@
 
 import warnings
 from collections.abc import Callable, Mapping
+from functools import wraps
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeVar, cast
+
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
 
 def deprecated_getattr(module: str, renamed: Mapping[str, str], stacklevel: int = 2) -> Callable[[str], Any]:
@@ -23,5 +26,47 @@ def deprecated_getattr(module: str, renamed: Mapping[str, str], stacklevel: int 
         home, _, new = renamed[name].rpartition(".")
         warnings.warn(f"{module}.{name} is now {home or module}.{new}", DeprecationWarning, stacklevel=stacklevel)
         return getattr(import_module(home or module), new)
+
+    return get
+
+
+def renamed_arguments(**renamed: str) -> Callable[[Decorated], Decorated]:
+    """Return a decorator under which old keyword arguments of a function, or of the constructor of a class, still work.
+
+    `@renamed_arguments(start="initial_state")`
+    """
+
+    def decorate(decorated: Decorated) -> Decorated:
+        function: Any = decorated.__init__ if isinstance(decorated, type) else decorated
+
+        @wraps(function)
+        def with_new_names(*args: Any, **kwargs: Any) -> Any:
+            for old in [name for name in kwargs if name in renamed]:
+                new, place = renamed[old], decorated.__name__
+                if new in kwargs:
+                    raise TypeError(f"{place}: {old} is now {new}; give only that")
+                warnings.warn(f"{place}: {old} is now {new}", DeprecationWarning, stacklevel=2)
+                kwargs[new] = kwargs.pop(old)
+            return function(*args, **kwargs)
+
+        if not isinstance(decorated, type):
+            return cast(Decorated, with_new_names)
+        decorated.__init__ = with_new_names
+        return cast(Decorated, decorated)
+
+    return decorate
+
+
+def renamed_attributes(owner: str, **renamed: str) -> Callable[[Any, str], Any]:
+    """Return a class's `__getattr__` under which old attributes of its instances still work.
+
+    `__getattr__ = renamed_attributes("Estimate", knowledge="uncertainty")`
+    """
+
+    def get(self: Any, name: str) -> Any:
+        if name not in renamed:
+            raise AttributeError(f"{owner!r} object has no attribute {name!r}")
+        warnings.warn(f"{owner}.{name} is now {owner}.{renamed[name]}", DeprecationWarning, stacklevel=2)
+        return getattr(self, renamed[name])
 
     return get

@@ -15,8 +15,8 @@ from udkjax.equations import prepare
 from udkjax.integrate.by_diffrax import derivative
 from udkjax.integrate.solution import Result
 from udkjax.pinv import Pseudoinverse
-from udkjax.study.identify.fitting import Fit, descend
-from udkjax.study.identify.problem import Evaluated
+from udkjax.study.identify.least_squares import Fit, minimize_squares
+from udkjax.study.identify.problem import Residuals
 
 SCENES = ("parallelogram", "four-bar")
 DEGREES = -45.0  # the parallelogram's start, at rest
@@ -85,18 +85,13 @@ class Drift:
         self.unit = 1.0
         self.unit = float(self(np.log([REFERENCE]))[0])
 
-    @property
-    def program(self) -> "Drift":
-        """Itself: it counts the gains that were asked for."""
-        return self
-
-    def evaluate(self, z: Any, tol: tuple[float, float], horizon: float | None = None) -> Evaluated:
+    def evaluate(self, z: Any, tol: tuple[float, float], horizon: float | None = None) -> Residuals:
         """Residuals, in root mean squares of those with the reference's gains, of gains exp(z), z (B, 2)."""
         self.calls += len(z)
         lanes = np.concatenate([z, np.repeat(z[-1:], LANES - len(z), axis=0)])
         J, r = (np.asarray(x)[: len(z)] for x in self.scene.equal(lanes, self.state, self.steps))
         unit = self.unit * np.sqrt(self.steps * r.shape[2])
-        return Evaluated(r.reshape(len(z), -1) / unit, J.reshape(len(z), -1, 2) / unit, np.full(len(z), Result.successful))
+        return Residuals(r.reshape(len(z), -1) / unit, J.reshape(len(z), -1, 2) / unit, np.full(len(z), Result.successful))
 
     def __call__(self, z: Any) -> Float[np.ndarray, "B"]:
         """Root mean squares of Psi (m, rad) with gains exp(z)."""
@@ -106,7 +101,7 @@ class Drift:
     def tuned(self) -> Fit:
         """Fits from all guesses."""
         self.calls = 0
-        return descend(self, np.log(GUESSES), (0.0, 0.0), settled=SETTLED)
+        return minimize_squares(self, np.log(GUESSES), (0.0, 0.0), settled=SETTLED)
 
     def last(self, z: Any) -> tuple[np.ndarray, np.ndarray]:
         """The length of Psi (B, 2) at the end of the run, and its derivative by the logarithm of both gains."""

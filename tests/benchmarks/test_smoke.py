@@ -74,7 +74,7 @@ def test_identification():
 def test_measurements_tell_what_is_to_be_found():
     """No parameter of the smallest case could be another one: central differences of what is measured."""
     m = measurements.linkage(end=2.0)
-    predicted, truth = m.predictor(), m.unknowns.start
+    predicted, truth = m.predictor(), m.unknowns.guess
     values = np.asarray(predicted(truth, 1e-10)[0])
     steps = 1e-3 * np.eye(len(truth))
     slopes = [(predicted(truth * np.exp(e), 1e-10)[0] - predicted(truth * np.exp(-e), 1e-10)[0]) / 2e-3 for e in steps]
@@ -86,7 +86,7 @@ def test_first_guesses_of_every_measurement_are_around_the_truth():
     assert tuple(identification.CASES) == table.IDENTIFIED
     for case in identification.CASES:
         m = identification.made(case, {})
-        starts = m.starts(50, 0.5) / m.unknowns.start
+        starts = m.starts(50, 0.5) / m.unknowns.guess
         assert 3 <= starts.shape[1] <= 8 and 0.5 <= starts.min() < 0.55 and 1.45 < starts.max() <= 1.5
         assert len(m.ts) == round(m.end * m.rate) + 1
 

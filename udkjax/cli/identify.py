@@ -1,18 +1,17 @@
 """`udkjax identify`."""
 
 import hashlib
-import math
-import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from udkjax.cli.common import BAD_RUN, INTERRUPTED, Scene, load, refuse
+from udkjax.cli.common import Json, Quiet, Scene, fail, load, plain, refuse, show
 
 if TYPE_CHECKING:
     from udkjax import Estimate
-    from udkjax.study.identify.profile import Profile
+    from udkjax.study.identify.profile_likelihood import ProfileLikelihood
 
 # The names of udkjax.study.identify, which cannot be imported before a command is known: it imports JAX.
 Loss = Literal["least_squares", "huber"]
@@ -41,23 +40,24 @@ def identify(
     guess: Guesses = (),
     bounds: Bounds = (),
     prior: Priors = (),
-    estimate_start: Estimated = "nothing",
+    estimate_initial_state: Annotated[Estimated, tyro.conf.arg(aliases=["--estimate-start"])] = "nothing",
     ignore: Names = (),
     loss: Loss = "least_squares",
-    starts: int = 15,
+    n_starts: Annotated[int, tyro.conf.arg(aliases=["--starts"])] = 15,
     tol: float = 1e-11,
     seed: int = 0,
     profile: Names = (),
-    quiet: bool = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
-    """Find numbers of a scene from measured motion: values, standard errors, and what the measurements cannot tell.
+    """Find numbers of a scene from measured motion: values, standard errors, and what the measurements do not show.
 
     Columns of the data are `time` and channels, such as `body.crank.angle [deg]`, `body.rod(0.5, 0).x [mm]`, `joint.A.fx` or
     `driver.motor.load`; empty cells are gaps, a column `record` tells runs apart, and each file is a run of its own.
 
     The folder gets the scene with the values in (identified.toml), the figures (estimate.json, estimate.csv), what was measured
     and what the mechanism shows (fit.nc), and pictures. The exit code is 1 where the fit does not settle or the measurements do
-    not tell every parameter, which is said by name; all is written all the same.
+    not show every parameter, which is named; all is written all the same.
 
     Args:
         scene: the mechanism, with first guesses.
@@ -68,14 +68,15 @@ def identify(
         guess: a first guess other than the scene's value.
         bounds: what a parameter stays between.
         prior: what was known of a parameter before.
-        estimate_start: what of the state in which each run begins is to be found too.
+        estimate_initial_state: what of the state in which each run begins is to be found too.
         ignore: columns of the data that are not to be read.
         loss: huber lets single wrong numbers count less.
-        starts: how many more first guesses may be tried.
+        n_starts: how many more first guesses may be tried.
         tol: tolerance of the integration.
         seed: of the first guesses.
         profile: parameters whose confidence intervals are to be found by profile likelihood, which needs no linear model.
         quiet: do not show how far it is.
+        json: write the results as JSON, as in estimate.json.
     """
     if out.exists() and not out.is_dir():
         refuse(f"--out {out} is no folder")
@@ -84,54 +85,50 @@ def identify(
     mech, text = load(scene)
 
     import udkjax as udk
-    from udkjax.cli.identify_texts import Texts
+    from udkjax.cli.identify_options import IdentifyOptions
 
-    settings = {"loss": loss, "starts": starts, "tol": tol, "seed": seed}
-    asked = Texts(mech, parameters, {"start": guess, "bounds": bounds, "prior": prior})
-    asked.check(settings)
-    records = asked.records(data, noise, ignore, estimate_start)
-    profiled = asked.profiled(profile)
-    if asked.problems:
-        refuse(str(udk.IdentificationError(asked.problems)))
+    settings = {"loss": loss, "n_starts": n_starts, "tol": tol, "seed": seed}
+    options = IdentifyOptions(mech, parameters, {"guess": guess, "bounds": bounds, "prior": prior})
+    options.check(settings)
+    records = options.records(data, noise, ignore, estimate_initial_state)
+    profiled = options.profiled(profile)
+    if options.problems:
+        refuse(udk.IdentificationError(options.problems))
     try:
-        estimate = udk.identify(mech, records, asked.parameters, progress=False if quiet else None, **settings)
+        estimate = udk.identify(mech, records, options.parameters, progress=False if quiet else None, **settings)
         profiles = [estimate.profile(name) for name in profiled]
     except (udk.IdentificationError, udk.AssemblyError) as problem:
-        refuse(str(problem))
-    except KeyboardInterrupt:
-        print("\nudkjax: stopped; nothing was written", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        refuse(problem)
     several = {"parameters": parameters, "noise": noise, "guess": guess, "bounds": bounds, "prior": prior, "ignore": ignore}
-    options = {name: [item for group in groups for item in group] for name, groups in several.items()}
-    facts = {
-        "settings": {**options, "estimate_start": estimate_start, **settings},
-        "intervals": {found.name: [end if math.isfinite(end) else None for end in found.interval] for found in profiles},
+    given = {name: [item for group in groups for item in group] for name, groups in several.items()}
+    results = estimate.to_dict() | {
+        "settings": {**given, "estimate_initial_state": estimate_initial_state, **settings},
+        "intervals": {found.name: found.interval for found in profiles},
         "data": [{"file": str(file), "sha256": hashlib.sha256(file.read_bytes()).hexdigest()} for file in data],
         "scene_file": str(scene),
         "scene": text,
     }
-    print("\n".join([str(estimate), *(found.text for found in profiles)]))
-    print(f"wrote {', '.join(_written(estimate, profiles, facts, out))} to {out}")
+    files = _write(estimate, profiles, results, out)
+    lines = [str(estimate), *(found.text for found in profiles), f"wrote {', '.join(files)} to {out}"]
+    show(results | {"files": [out / name for name in files]}, "\n".join(lines), json)
     if not estimate.success:
-        sys.exit(BAD_RUN)
+        fail("the fit has not settled" if not estimate.converged else "the measurements do not show every parameter")
 
 
-def _written(estimate: "Estimate", profiles: list["Profile"], facts: dict[str, Any], out: Path) -> list[str]:
+def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], results: Mapping[str, Any], out: Path) -> list[str]:
     """Write everything, and return the names of the files."""
     import csv
     import json
 
     import udkjax as udk
     from udkjax.show.identify_figures import save_pictures
-    from udkjax.study.identify.held import with_profiles
-    from udkjax.study.identify.results import Row, rows
+    from udkjax.study.identify.estimate import Row
 
     out.mkdir(exist_ok=True)
     udk.save(estimate.mechanism, out / "identified.toml")
-    (out / "estimate.json").write_text(json.dumps({**estimate.to_dict(), **facts}, indent=1) + "\n", encoding="utf-8")
+    (out / "estimate.json").write_text(json.dumps(plain(results), indent=1) + "\n", encoding="utf-8")
     with (out / "estimate.csv").open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows([Row._fields, *rows(estimate)])
-    found = estimate.to_xarray()
-    found = with_profiles(found, estimate, profiles) if profiles else found
-    found.to_netcdf(out / "fit.nc", engine="h5netcdf")
-    return ["identified.toml", "estimate.json", "estimate.csv", "fit.nc", *save_pictures(found, out)]
+        csv.writer(file).writerows([Row._fields, *estimate.rows()])
+    dataset = estimate.to_xarray(profiles)
+    dataset.to_netcdf(out / "fit.nc", engine="h5netcdf")
+    return ["identified.toml", "estimate.json", "estimate.csv", "fit.nc", *save_pictures(dataset, out)]

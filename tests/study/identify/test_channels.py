@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.identify.channels import Quantity, channel_of, channels_of, measured
+from udkjax.study.identify.channels import Quantity, channel_of, channels_of, measure
 
 OMEGA, STEP = 4.0, 1e-3
 TIMES = 0.3 + STEP * np.arange(-6, 7)
@@ -49,7 +49,7 @@ def crank():
     motion = Motion(jnp.asarray(TIMES), *jax.jit(jax.vmap(state))(TIMES))
     spin = Quantity("spin", lambda mech, solution: mech.bodies["rod"].inertia * solution.v[:, 1, 2], "N m s")
     channels = (*(channel_of(mech, text) for text in [*channels_of(mech), *POINTS, *LOADS, *DISTANCES]), spin)
-    program = jax.jit(lambda mech, motion: measured(mech, motion, channels))
+    program = jax.jit(lambda mech, motion: measure(mech, motion, channels))
     values = np.asarray(program(mech, motion)).T
     return Measured(mech, motion, channels, dict(zip([c.name for c in channels], values, strict=True)), program)
 
@@ -96,7 +96,7 @@ def test_names_may_hold_what_separates_them():
     )
     found = [channel_of(mech, f"body.{name}.x") for name in bodies]
     assert [c.bodies for c in found] == [(name,) for name in bodies]
-    assert channel_of(mech, "body.left arm (old)(1, 2).x").spots == ((1.0, 2.0),)
+    assert channel_of(mech, "body.left arm (old)(1, 2).x").points == ((1.0, 2.0),)
     assert channel_of(mech, "joint.a.arm.x.fx").bodies == ("arm.x",) and channel_of(mech, "joint.a.b.angle").owner == "a.b"
     assert channel_of(mech, "distance.arm.x(0, 0).left arm (old)(1, 1)").bodies == ("arm.x", "left arm (old)")
     assert channel_of(mech, "driver.push.load").units == "N"
@@ -195,7 +195,7 @@ def test_states_that_are_not_numbers_stay_so_and_harm_no_other(crank):
 def test_what_only_looks_at_states_solves_nothing(crank):
     for text, solves in (("joint.P.omega", False), ("joint.P.alpha", True)):
         channels = (channel_of(crank.mechanism, text),)
-        traced = jax.make_jaxpr(lambda motion, channels=channels: measured(crank.mechanism, motion, channels))(crank.motion)
+        traced = jax.make_jaxpr(lambda motion, channels=channels: measure(crank.mechanism, motion, channels))(crank.motion)
         assert ("svd" in str(traced)) == solves
 
 
@@ -209,7 +209,7 @@ def linkage():
     def values(x):
         there = udk.library.parallelogram(x[0], x[1], x[2], x[3], gravity=x[4])
         motion = Motion(jnp.zeros(2), jnp.stack([there.q0, spare]), jnp.stack([there.v0, spare]))
-        return measured(there, motion, channels)
+        return measure(there, motion, channels)
 
     def both(x):
         along = jax.vmap(lambda e: jax.jvp(values, (x,), (e,)), out_axes=(None, -1))

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from udkjax.study.identify.directions import connected, listed, null_space, ratio, reduced, row_space
+from udkjax.study.identify.directions import connected, echelon, null_space, row_space
+from udkjax.study.identify.messages import listed, ratio
 
 
 def test_spaces_of_rows():
     matrix = np.array([[2.0, -4.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [2.0, -4.0, 0.0, 3.0]])
     np.testing.assert_allclose(row_space(matrix, 1e-9), [[1.0, -2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]], atol=1e-12)
-    np.testing.assert_allclose(reduced(null_space(matrix, 1e-9)), [[1.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(echelon(null_space(matrix, 1e-9)), [[1.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], atol=1e-12)
     assert connected(row_space(matrix, 1e-9)) == [[0, 1], [3]]
     assert connected(np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, 0.0]])) == [[0, 1, 2, 3]]
 

@@ -6,8 +6,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.scene.reshaping import length_of
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.unknowns import applied
+from udkjax.study.identify.parameters import apply_values, unknowns_of
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +15,7 @@ def linkage():
 
 
 def _values(mechanism, unknowns, x):
-    return applied(mechanism, unknowns.targets, jnp.asarray(x)).parameters()
+    return apply_values(mechanism, unknowns.targets, jnp.asarray(x)).parameters()
 
 
 def test_a_number_of_the_scene(linkage):
@@ -30,7 +29,7 @@ def test_a_number_of_the_scene(linkage):
 def test_an_array_is_as_many_parameters_as_it_has_entries(linkage):
     u = unknowns_of(linkage, ["joint.A1.points"])
     assert u.names == tuple(f"joint.A1.points[{i}][{j}]" for i in range(2) for j in range(2))
-    assert np.allclose(_values(linkage, u, u.start)["joint.A1.points"], linkage.joints["A1"].points)
+    assert np.allclose(_values(linkage, u, u.guess)["joint.A1.points"], linkage.joints["A1"].points)
 
 
 @pytest.mark.parametrize(
@@ -43,8 +42,8 @@ def test_an_array_is_as_many_parameters_as_it_has_entries(linkage):
 )
 def test_the_length_of_several_links(linkage, text):
     u = unknowns_of(linkage, text)
-    assert u.units == ("m",) and u.kinds == ("positive",) and u.start == pytest.approx([1.0])
-    longer = applied(linkage, u.targets, jnp.array([1.2]))
+    assert u.units == ("m",) and u.kinds == ("positive",) and u.guess == pytest.approx([1.0])
+    longer = apply_values(linkage, u.targets, jnp.array([1.2]))
     assert [float(length_of(longer, body)) for body in ("link1", "link2", "link3")] == pytest.approx([1.2] * 3)
     assert u.targets == unknowns_of(linkage, [udk.length("link1", "link2", "link3")]).targets
 
@@ -61,7 +60,7 @@ def test_a_function_with_a_start(linkage):
     def denser(mechanism, factor):
         return mechanism.with_parameters({"body.coupler.mass": factor * 2.0, "body.coupler.inertia": factor * 0.5})
 
-    u = unknowns_of(linkage, [udk.Parameter(denser, start=1.0, bounds=(0.1, 9.0))])
+    u = unknowns_of(linkage, [udk.Parameter(denser, guess=1.0, bounds=(0.1, 9.0))])
     assert u.names == ("denser",) and u.kinds == ("bounded",)
     assert _values(linkage, u, [2.0])["body.coupler.inertia"] == 1.0
 
@@ -83,21 +82,21 @@ def kinds(linkage):
 
 def test_unknowns_begin_at_zero_and_are_read_back(kinds):
     assert kinds.kinds == ("positive", "bounded", "free", "free")
-    assert kinds.values(np.zeros(4)) == pytest.approx(kinds.start)
+    assert kinds.values(np.zeros(4)) == pytest.approx(kinds.guess)
     z = np.random.default_rng(0).normal(size=(5, 4))
-    assert kinds.unknowns(kinds.values(z)) == pytest.approx(z)
+    assert kinds.z_of(kinds.values(z)) == pytest.approx(z)
 
 
 def test_slopes_against_differences(kinds):
     z, h = np.random.default_rng(1).normal(size=(7, 4)), 1e-6
     differences = (kinds.values(z + h) - kinds.values(z - h)) / (2 * h)
-    assert kinds.slopes(z) == pytest.approx(differences, rel=1e-8)
+    assert kinds.dx_dz(z) == pytest.approx(differences, rel=1e-8)
 
 
 def test_what_values_may_be(kinds):
     far = kinds.values(np.array([[-50.0, -50.0, 0.0, 0.0], [50.0, 50.0, 0.0, 0.0]]))
     assert (far[:, 0] > 0).all() and far[:, 1] == pytest.approx([0.5, 4.0])
-    assert kinds.at_bounds(far[1]) == ("body.link2.mass",) and kinds.at_bounds(kinds.start) == ()
+    assert kinds.at_bounds(far[1]) == ("body.link2.mass",) and kinds.at_bounds(kinds.guess) == ()
 
 
 def test_every_mistake_is_told(linkage):
@@ -116,7 +115,7 @@ def test_every_mistake_is_told(linkage):
     with pytest.raises(udk.IdentificationError) as error:
         unknowns_of(linkage, wrong)
     told = "\n".join(error.value.problems)
-    for part in ('"body.link1.maß"', "link9", "another kind", "bounds", "deviation", "must be > 0", "start=", "tie them"):
+    for part in ('"body.link1.maß"', "link9", "another kind", "bounds", "deviation", "must be > 0", "guess=", "tie them"):
         assert part in told, part
     with pytest.raises(udk.IdentificationError, match="none to identify"):
         unknowns_of(linkage, [])

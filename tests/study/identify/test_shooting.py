@@ -7,13 +7,13 @@ import pytest
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
-from udkjax.study.identify.fitting import descend
-from udkjax.study.identify.identify import identify
+from udkjax.study.identify.identification import identify
+from udkjax.study.identify.optimizer import minimize
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import Record
-from udkjax.study.identify.search import explains, growing, search
-from udkjax.study.identify.shooting import Shooting, cut, shoot
+from udkjax.study.identify.search import explains, fit_growing_parts, search
+from udkjax.study.identify.shooting import MultipleShooting, cut_records, fit_pieces
 
 TOL = 1e-10, 1e-10
 NOISE = 1e-3
@@ -28,11 +28,11 @@ def problem(measured):
 
 @pytest.fixture(scope="module")
 def pieces(problem):
-    return Shooting(problem, np.zeros(problem.K), TOL, samples=6)
+    return MultipleShooting(problem, np.zeros(problem.K), TOL, samples=6)
 
 
 def test_each_number_is_in_one_piece(problem, pieces):
-    parts = cut(problem, 12)
+    parts = cut_records(problem, 12)
     assert parts == pieces.pieces and len(parts) == 5
     assert parts[0].first == 0 and parts[-1].end == len(TS) - 1
     assert all(one.end == two.first for one, two in pairwise(parts))
@@ -49,7 +49,7 @@ def test_derivatives(pieces):
     by_differences = (r[: pieces.K] - r[pieces.K :]).T / (2.0 * h)
     J = pieces.evaluate(z[None], TOL).J[0]
     assert np.abs(J - by_differences).max() < 1e-5 * np.abs(J).max()
-    assert J.shape == (len(TS) + pieces.more, pieces.K)
+    assert J.shape == (len(TS) + pieces.extra_rows, pieces.K)
 
 
 def test_a_first_guess_follows_what_was_measured(pieces):
@@ -60,10 +60,10 @@ def test_a_first_guess_follows_what_was_measured(pieces):
 
 
 def test_the_fit_is_that_of_the_whole_record(problem):
-    pieces, fit = shoot(problem, np.zeros(problem.K), TOL, samples=6)
-    assert fit.settled[0] and explains(pieces, fit, TOL, None)
+    pieces, fit = fit_pieces(problem, np.zeros(problem.K), TOL, samples=6)
+    assert fit.settled[0] and explains(pieces, fit, TOL)
     assert pieces.gaps(fit.z, TOL)[0] < 1e-7
-    whole = descend(problem, fit.z[:, :2], TOL, near=True)
+    whole = minimize(problem, fit.z[:, :2], TOL, undamped=True)
     assert np.abs(fit.z[0, :2] - whole.z[0]).max() < 1e-5
     assert np.all(np.abs(problem.unknowns.values(fit.z[0, :2]) / [0.375, 0.2] - 1.0) < 0.02)
     # Errors of the integration, 1e-9, count in defects, which weigh 1e7.
@@ -96,11 +96,11 @@ def test_chaos():
         first = truth.with_parameters({names[0]: factors[0], names[2]: values[2] * factors[2]})
         first = udk.with_length(first, "upper", factors[1])
         whole = Problem(first, unknowns_of(first, names), [record])
-        along = growing(whole, np.zeros((1, 3)), TOL, lambda text: None)
+        along = fit_growing_parts(whole, np.zeros((1, 3)), TOL, lambda text: None)
         assert along.cost[0] > 1e3 * q.size  # half of it would be noise
         estimate = identify(first, record, names, progress=False)
-        assert estimate.ways[-1] == "records in pieces" and isinstance(estimate.problem, Shooting)
+        assert estimate.ways[-1] == "records in pieces" and isinstance(estimate.problem, MultipleShooting)
         assert estimate.success
-        errors = estimate.knowledge.standard_errors
+        errors = estimate.uncertainty.standard_errors
         assert np.all(errors < 1e-3 * np.abs(values)) and np.all(np.abs(estimate.values - values) < 4.0 * errors)
-        assert estimate.knowledge.chi2 / estimate.knowledge.degrees_of_freedom == pytest.approx(1.0, abs=0.15)
+        assert estimate.uncertainty.chi2 / estimate.uncertainty.degrees_of_freedom == pytest.approx(1.0, abs=0.15)

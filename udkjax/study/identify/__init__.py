@@ -1,15 +1,26 @@
-"""Identification: parameters of mechanisms, found from measured motion."""
+"""Identification: parameters of mechanisms, found from measured motion.
 
-from udkjax.study.identify.agreement import GradientCheck as GradientCheck
+records, tables, record_reader, unit_conversion    measurements, whatever they come as
+channels                                           what can be measured of a motion
+parameters, initial_states                         what is to be found
+prediction, problem, shooting                      what would be measured, and how far it is from what was
+build_problem, loop_consistency                    whether all of these fit together
+least_squares, optimizer, search                   minimization, from guesses that lead to the minimum
+uncertainty, directions, profile_likelihood        how well the parameters are known
+gradient_check, numerical_differences              whether derivatives are right
+identification, estimate, experiment_design        what users call, and what they get
+"""
+
 from udkjax.study.identify.channels import Quantity as Quantity
-from udkjax.study.identify.errors import IdentificationError as IdentificationError
 from udkjax.study.identify.estimate import Estimate as Estimate
-from udkjax.study.identify.experiment import Candidate as Candidate
-from udkjax.study.identify.experiment import Design as Design
-from udkjax.study.identify.experiment import design_experiment as design_experiment
-from udkjax.study.identify.identify import identify as identify
+from udkjax.study.identify.experiment_design import Candidate as Candidate
+from udkjax.study.identify.experiment_design import Design as Design
+from udkjax.study.identify.experiment_design import design_experiment as design_experiment
+from udkjax.study.identify.gradient_check import GradientCheck as GradientCheck
+from udkjax.study.identify.gradient_check import check_gradients as check_gradients
+from udkjax.study.identify.identification import identify as identify
+from udkjax.study.identify.messages import IdentificationError as IdentificationError
 from udkjax.study.identify.parameters import Parameter as Parameter
 from udkjax.study.identify.parameters import length as length
 from udkjax.study.identify.records import Record as Record
 from udkjax.study.identify.records import Start as Start
-from udkjax.study.identify.trust import check_gradients as check_gradients

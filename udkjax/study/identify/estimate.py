@@ -1,137 +1,110 @@
-"""What an identification returns: the values, how well they are known, what the records cannot tell, and how it was found."""
+"""What an identification returns: the values, how well they are known, what the records do not show, and how it was found."""
 
+import html
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from udkjax.deprecation import renamed_attributes
+from udkjax.extras import OptionalImport
 from udkjax.integrate.assembly import State, assemble
-from udkjax.integrate.solution import versions
+from udkjax.integrate.solution import scene_text, versions
+from udkjax.scene.checks import quoted, suggestion
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.identify.agreement import GradientCheck
-from udkjax.study.identify.fitting import Fit
-from udkjax.study.identify.held import profile_of
-from udkjax.study.identify.knowledge import Knowledge, Values, knowledge
-from udkjax.study.identify.losses import Loss
+from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
+from udkjax.study.identify.least_squares import Loss
+from udkjax.study.identify.messages import IdentificationError, aligned, counted, listed
+from udkjax.study.identify.parameters import apply_values
+from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.profile import LEVEL, Profile
-from udkjax.study.identify.results import dataset, labels, text
-from udkjax.study.identify.search import Found
-from udkjax.study.identify.shooting import Shooting
-from udkjax.study.identify.unknowns import applied
-from udkjax.study.identify.whiteness import Whiteness, whiteness
+from udkjax.study.identify.profile_likelihood import (
+    CONFIDENCE,
+    ProfileLikelihood,
+    estimated_noise,
+    profile_likelihood,
+    quantile,
+)
+from udkjax.study.identify.records import labels
+from udkjax.study.identify.uncertainty import Uncertainty, Whiteness
 
-ROUNDING = 1e-8  # of what a channel shows: residuals below it are errors of the integration, which are not noise and need not be
+if TYPE_CHECKING:
+    import xarray
+
+FORMAT = "udkjax identification 1"  # of the dataset
+MOST_DIGITS = 12  # of a number in a table
+
+
+class Row(NamedTuple):
+    """A number that was found: a parameter, or by how much an initial state was moved."""
+
+    parameter: str
+    value: float
+    standard_error: float
+    units: str
+    first_guess: float
+    note: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimate:
-    """Values of parameters that were identified, and what there is to know of them.
+    """Values of parameters that were identified, and how well they are known. `print` shows a table.
 
-    `success` says that the fit has settled and that the records tell every parameter; `message` says what there is to say.
-    `print` shows a table.
+    Attributes:
+        names: of the P parameters; `units` are theirs.
+        values: found for them, in these units.
+        uncertainty: standard errors, correlations, and what the records do not show.
+        at_bounds: parameters that are at one of their bounds.
+        initial_state_values: of each unknown of an initial state by how much it was moved, and its standard error.
+        predicted, residuals, noise: for each record, by channel, at its times (T,): what the mechanism shows; measured minus
+            predicted; and standard deviations, given or estimated.
+        whiteness: of the residuals of each record's channels, where they are more than rounding.
+        converged: whether the fit has settled.
+        agreeing: how many first guesses led here, out of `guesses`.
+        ways: what was tried to find the fit.
+        history: cost and Gauss-Newton step, evaluation by evaluation of the best fit.
+        evaluations: of a record, each with its derivatives.
+        seconds: that the identification took.
+        tol: tolerances of the integration.
+        z: all K unknowns of the `problem` that was fitted, by the least squares of `loss`.
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Float[np.ndarray, "P"]
-    knowledge: Knowledge
+    uncertainty: Uncertainty
     at_bounds: tuple[str, ...]
-    start_values: Mapping[str, tuple[float, float]]  # of what was estimated of them: the change, and its standard error
-    predicted: tuple[Mapping[str, np.ndarray], ...]  # of each record, by channel, at its times
-    residuals: tuple[Mapping[str, np.ndarray], ...]  # measured - predicted, in the channel's units
-    noise: tuple[Mapping[str, np.ndarray], ...]  # standard deviation, given or estimated
-    whiteness: Mapping[tuple[int, str], Whiteness]  # of each record's channels, where anything is left but rounding
+    initial_state_values: Mapping[str, tuple[float, float]]
+    predicted: tuple[Mapping[str, np.ndarray], ...]
+    residuals: tuple[Mapping[str, np.ndarray], ...]
+    noise: tuple[Mapping[str, np.ndarray], ...]
+    whiteness: Mapping[tuple[int, str], Whiteness]
     converged: bool
-    agreeing: int  # first guesses that led here, out of
+    agreeing: int
     guesses: int
     ways: tuple[str, ...]
-    history: tuple[tuple[float, float], ...]  # cost and Gauss-Newton step, evaluation by evaluation of the best fit
-    evaluations: int  # of a record, each with its derivatives
+    history: tuple[tuple[float, float], ...]
+    evaluations: int
     seconds: float
-    tol: tuple[float, float]
+    tol: Tolerances
     z: Float[np.ndarray, "K"]
-    problem: Problem | Shooting
+    problem: Problem
     loss: Loss
 
-    @classmethod
-    def of(
-        cls,
-        fit: Fit,
-        found: Found,
-        history: list,
-        tol: tuple[float, float],
-        loss: Loss,
-        seconds: float,
-    ) -> "Estimate":
-        """What a fit has found."""
-        problem = found.problem
-        unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z[0]
-        x = unknowns.values(z[:P])
-        plain = problem.evaluate(fit.z, tol)
-        counted = plain if loss is None else loss(plain)
-        groups = groups_of(problem)
-        values = Values(
-            problem.all_names,
-            problem.all_units,
-            np.concatenate([x, z[P:]]),
-            np.concatenate([unknowns.slopes(z[:P]), np.ones(problem.K - P)]),
-            (*unknowns.kinds, *["free"] * (problem.K - P)),
-        )
-        known = knowledge(counted.J[0], counted.r[0], values, groups, P, priors=len(problem.priors))
-        every = (
-            knowledge(counted.J[0], counted.r[0], values, groups, priors=len(problem.priors)).standard_errors
-            if problem.K > P
-            else known.standard_errors
-        )
-        scale = np.append(known.noise, 1.0)[groups]
-        rows = len(problem.where)
-        sigma = problem.sigma * scale[:rows]
-        left = -plain.r[0, :rows] * problem.sigma
-        tables = [_by_record(problem, part) for part in (problem.y[problem.there] - left, left, sigma)]
-        white = {}
-        for places in problem.series():
-            record, _, channel = problem.where[places[0]]
-            ts = problem.ts[record, problem.where[places, 1]]
-            if np.abs(left[places]).max() > ROUNDING * problem.spread[channel]:
-                seen = (counted.r[0, :rows] / scale[:rows])[places]
-                white[int(record), problem.names[channel]] = whiteness(ts, seen, known.projection[places])
-        return cls(
-            names=unknowns.names,
-            units=unknowns.units,
-            values=x,
-            knowledge=known,
-            at_bounds=unknowns.at_bounds(x),
-            start_values={
-                name: (float(z[P + k]), float(every[P + k]))
-                for k, name in enumerate(name for start in problem.starts for name in start.names)
-            },
-            predicted=tables[0],
-            residuals=tables[1],
-            noise=tables[2],
-            whiteness=white,
-            converged=bool(fit.settled[0]),
-            agreeing=found.agreeing,
-            guesses=found.guesses,
-            ways=found.ways,
-            history=tuple(history),
-            evaluations=problem.program.calls,
-            seconds=seconds,
-            tol=tol,
-            z=z,
-            problem=problem,
-            loss=loss,
-        )
+    __getattr__ = renamed_attributes(
+        "Estimate", knowledge="uncertainty", start_values="initial_state_values", starts="initial_states"
+    )
 
     @cached_property
     def mechanism(self) -> Mechanism:
         """The mechanism with the values in."""
-        return applied(self.problem.mechanism, self.problem.unknowns.targets, jnp.asarray(self.values))
+        return apply_values(self.problem.mechanism, self.problem.unknowns.targets, jnp.asarray(self.values))
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -140,90 +113,225 @@ class Estimate:
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """One standard error of each value, by name; inf where the records do not tell it."""
-        return dict(zip(self.names, self.knowledge.standard_errors.tolist(), strict=True))
+        """One standard error of each value, by name; inf where the records do not show it."""
+        return dict(zip(self.names, self.uncertainty.standard_errors.tolist(), strict=True))
 
     @cached_property
-    def starts(self) -> tuple[State, ...]:
+    def initial_states(self) -> tuple[State, ...]:
         """The states that the records began with, closed."""
         problem, found = self.problem, []
         members = problem.members(self.z[None])
         for k, record in enumerate(problem.records):
-            q, v = problem.program.guess(members, k)
-            mine = self.mechanism.with_parameters(record.conditions) if record.conditions else self.mechanism
-            found.append(assemble(mine, record.t0, State(q, v), throw=False))
+            own = self.mechanism.with_parameters(record.conditions) if record.conditions else self.mechanism
+            found.append(assemble(own, record.t0, problem.predictor.guess(members, k), throw=False))
         return tuple(found)
 
     @property
     def success(self) -> bool:
-        """Whether the fit has settled, and the records tell every parameter."""
-        return self.converged and not self.knowledge.dead and not self.knowledge.flat
+        """Whether the fit has settled, and the records show every parameter."""
+        return self.converged and not self.uncertainty.dead and not self.uncertainty.flat
 
     @property
     def message(self) -> str:
         """What there is to say of the estimate, one sentence a line."""
+        records = self.problem.records
+        prefixes = [f"{label}, " for label in labels(records)] if len(records) > 1 else [""]
         lines = [] if self.converged else ["the fit has not settled: these are the best values that were found"]
-        lines += self.knowledge.texts
+        lines += self.uncertainty.messages
         lines += [f"{name} is at one of its bounds" for name in self.at_bounds]
-        lines += [found.text(self._where(*key)) for key, found in self.whiteness.items() if not found.white]
+        lines += [found.text(prefixes[k] + channel) for (k, channel), found in self.whiteness.items() if not found.white]
         if self.guesses > 1 and self.agreeing == 1:
             lines.append(f"only one of {self.guesses} first guesses led here: there may be a better minimum")
         return "\n".join(lines) or "every parameter is known from the records"
 
-    def _where(self, record: int, channel: str) -> str:
-        records = self.problem.records
-        return channel if len(records) == 1 else f"{labels(records)[record]}, {channel}"
+    def profile(self, name: str, level: float = CONFIDENCE) -> ProfileLikelihood:
+        """Compute the profile likelihood of a parameter: its confidence interval without a linear model.
+
+        Args:
+            name: of a parameter, as in `names`. It is fixed at values beside the estimate, and all others are fitted anew.
+            level: of confidence.
+
+        Raises:
+            IdentificationError: no such parameter was identified.
+        """
+        if name not in self.names:
+            raise IdentificationError([f"{quoted(name)} was not identified{suggestion(name, self.names)}"])
+        return profile_likelihood(self.problem, self.problem.unknowns, self.z, self.tol, self.loss, self.uncertainty, name, level)
+
+    def check_gradients(self) -> GradientCheck:
+        """Compare the derivatives at the estimate with differences: see `udkjax.check_gradients`."""
+        return compare_gradients(self.problem, self.z, self.tol)
+
+    # --- as a table
+
+    def rows(self) -> list[Row]:
+        """Return what was found, in the order in which it was asked for; then what was found of initial states."""
+        found = [
+            Row(name, float(value), float(error), units, float(first), self._note(name))
+            for name, value, error, units, first in zip(
+                self.names, self.values, self.uncertainty.standard_errors, self.units, self.problem.unknowns.guess, strict=True
+            )
+        ]
+        units = dict(zip(self.problem.all_names, self.problem.all_units, strict=True))
+        for name, (change, error) in self.initial_state_values.items():
+            found.append(Row(name, change, error, units[name], 0.0, "added to the guess of the start"))
+        return found
+
+    def _note(self, name: str) -> str:
+        known, found = self.uncertainty, []
+        if name in known.dead:
+            found.append("shows in nothing that was measured")
+        if any(name in flat.names for flat in known.flat):
+            found.append(
+                "cannot be told from others" if any(len(f.names) > 1 for f in known.flat if name in f.names) else "unknown"
+            )
+        if name in known.poor:
+            found.append("poorly known")
+        if name in self.at_bounds:
+            found.append("at a bound")
+        return ", ".join(found)
+
+    def _cells(self) -> list[tuple[str, ...]]:
+        cells = [("parameter", "value", "standard error", "unit", "first guess", "")]
+        for row in self.rows():
+            error = "unknown" if not math.isfinite(row.standard_error) else f"{row.standard_error:.2g}"
+            value = rounded(row.value, row.standard_error)
+            cells.append((row.parameter, value, error, row.units, f"{row.first_guess:.6g}", row.note))
+        return cells
+
+    def _head(self) -> str:
+        problem, title = self.problem, self.mechanism.name or "mechanism"
+        numbers, records = counted(len(problem.index), "number"), counted(len(problem.records), "record")
+        return f"{title}: {counted(len(self.names), 'parameter')} from {numbers} in {records}"
+
+    def _facts(self) -> dict[str, str]:
+        problem, known = self.problem, self.uncertainty
+        ended = "settled" if self.converged else "not settled"
+        agreed = f", {self.agreeing} of {self.guesses} first guesses led here" if self.guesses > 1 else ""
+        facts = {"fit": f"{ended} after {counted(self.evaluations, 'evaluation')} in {self.seconds:.1f} s{agreed}"}
+        if problem.noise_given.any():
+            facts["chi^2"] = f"{known.chi2:.4g} with {known.degrees_of_freedom} degrees of freedom"
+        if not problem.noise_given.all():
+            found = []
+            for c, channel in enumerate(problem.channels):
+                own = (problem.index[:, 2] == c) & ~problem.noise_given
+                if own.any():
+                    sigma = np.nanmedian(self.noise[int(problem.index[np.argmax(own), 0])][channel.name])
+                    found.append(f"{channel.name} {sigma:.3g} {channel.units}".rstrip())
+            facts["noise, estimated"] = listed(found)
+        return facts
 
     def __str__(self) -> str:
-        return text(self)
+        facts = self._facts()
+        width = max(map(len, facts))
+        lines = [self._head(), *aligned(self._cells()), *(f"  {name:<{width}}  {text}" for name, text in facts.items())]
+        return "\n".join([*lines, self.message])
+
+    def _repr_html_(self) -> str:
+        header, *cells = self._cells()
+        row = lambda tag, texts: f"<tr>{''.join(f'<{tag}>{html.escape(text)}</{tag}>' for text in texts)}</tr>"  # noqa: E731
+        facts = "".join(f"<br>{html.escape(f'{name}: {text}')}" for name, text in self._facts().items())
+        message = "<br>".join(map(html.escape, self.message.splitlines()))
+        table = f"<table>{row('th', header)}{''.join(row('td', texts) for texts in cells)}</table>"
+        return f"<p>{html.escape(self._head())}</p>{table}<p>{message}{facts}</p>"
 
     def __repr__(self) -> str:
         return f"Estimate({', '.join(f'{name}: {value:.6g}' for name, value in self.parameters.items())})"
 
-    def profile(self, name: str, level: float = LEVEL) -> Profile:
-        """Return the profile likelihood of a parameter: its confidence interval at this level, without a linear model.
+    # --- as data
 
-        It is held at values beside the estimate, and all others are fitted anew. Raises `IdentificationError`.
+    def to_xarray(self, profiles: Sequence[ProfileLikelihood] = (), level: float = CONFIDENCE) -> "xarray.Dataset":
+        """Return what was measured, what the mechanism shows, and what is known of the parameters.
+
+        Args:
+            profiles: profile likelihoods that are to be in it.
+            level: of confidence, of their intervals.
+
+        Returns:
+            A dataset with `measured`, `predicted`, `residual` (the one minus the other) and `noise` along record, sample and
+            channel, at `time` (record, sample), s; not a number where nothing was measured. `correlated` is the probability that
+            white noise leaves residuals as correlated as these. `cost` and `change` (the largest change of an unknown by the next
+            step) are those of each trial. With profiles, `rise` is twice the cost above the least over the noise, at values of
+            each, and `interval` is where it is below the `limit` of the confidence level.
         """
-        return profile_of(self, name, level=level)
-
-    def check_gradients(self) -> GradientCheck:
-        """Compare the derivatives at the estimate with differences: see `udkjax.check_gradients`."""
-        from udkjax.study.identify.trust import compare
-
-        return compare(self.problem, self.z, self.tol)
-
-    def to_xarray(self) -> Any:
-        """Return an xarray Dataset: what was measured, what the mechanism shows, and what is known of the parameters."""
-        return dataset(self)
+        with OptionalImport():
+            import xarray
+        problem, known = self.problem, self.uncertainty
+        records, names = problem.records, problem.channel_names
+        shape = len(records), max(len(record.times) for record in records), len(names)
+        time = np.full(shape[:2], np.nan)
+        parts = {name: np.full(shape, np.nan) for name in ("measured", "predicted", "residual", "noise")}
+        white = np.full((shape[0], shape[2]), np.nan)
+        for k, record in enumerate(records):
+            time[k, : len(record.times)] = record.times
+            for channel, predicted in self.predicted[k].items():
+                place = k, slice(len(record.times)), names.index(channel)
+                residual = self.residuals[k][channel]
+                columns = predicted + residual, predicted, residual, self.noise[k][channel]
+                for part, values in zip(parts.values(), columns, strict=True):
+                    part[place] = values
+                if (k, channel) in self.whiteness:
+                    white[k, place[2]] = self.whiteness[k, channel].p
+        cost, change = np.array(self.history, float).reshape(-1, 2).T
+        P = "parameter"
+        data = {
+            **{name: (("record", "sample", "channel"), values) for name, values in parts.items()},
+            "correlated": (("record", "channel"), white),
+            "first_guess": (P, problem.unknowns.guess),
+            "value": (P, self.values),
+            "standard_error": (P, known.standard_errors),
+            "correlation": ((P, "other_parameter"), known.correlation),
+            "cost": ("trial", cost),
+            "change": ("trial", change),
+        }
+        coords = {
+            "record": labels(records),
+            "time": (("record", "sample"), time, {"units": "s"}),
+            "channel": list(names),
+            "channel_units": ("channel", [channel.units for channel in problem.channels]),
+            P: list(self.names),
+            "parameter_units": (P, list(self.units)),
+        }
+        attributes = {
+            "title": self.mechanism.name,
+            "format": FORMAT,
+            "success": int(self.success),
+            "message": self.message,
+            "tolerance": self.tol[0],
+            **{f"version_{name}": value for name, value in versions().items()},
+            "scene": scene_text(self.mechanism),
+        }
+        found = xarray.Dataset(data, coords, attributes)
+        return found.merge(profiles_dataset(profiles, self.parameters, known, level)) if profiles else found
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures as plain numbers and texts, as a JSON file has them."""
-        known = self.knowledge
+        """Return the figures as plain numbers and texts, as a JSON file has them."""
+        known = self.uncertainty
         return {
             "success": self.success,
             "converged": self.converged,
             "message": self.message,
             "parameters": {
-                name: {"value": value, "standard_error": _plain(error), "units": units}
+                name: {"value": value, "standard_error": _json_number(error), "units": units}
                 for name, value, error, units in zip(
                     self.names, self.values.tolist(), known.standard_errors, self.units, strict=True
                 )
             },
-            "correlation": [[_plain(x) for x in row] for row in known.correlation],
+            "correlation": [[_json_number(x) for x in row] for row in known.correlation],
             "unknown": {"dead": list(known.dead), "flat": [direction.text for direction in known.flat]},
             "at_bounds": list(self.at_bounds),
             "starts": {
-                name: {"change": _plain(x), "standard_error": _plain(error)} for name, (x, error) in self.start_values.items()
+                name: {"change": _json_number(x), "standard_error": _json_number(error)}
+                for name, (x, error) in self.initial_state_values.items()
             },
             "chi2": known.chi2,
             "degrees_of_freedom": known.degrees_of_freedom,
             "noise": [
-                {channel: _plain(np.median(sigma[np.isfinite(sigma)])) for channel, sigma in table.items()}
+                {channel: _json_number(np.median(sigma[np.isfinite(sigma)])) for channel, sigma in table.items()}
                 for table in self.noise
             ],
             "whiteness": [
-                {"record": record, "channel": channel, "p": _plain(found.p)}
+                {"record": record, "channel": channel, "p": _json_number(found.p)}
                 for (record, channel), found in self.whiteness.items()
             ],
             "guesses": self.guesses,
@@ -236,30 +344,42 @@ class Estimate:
         }
 
     def to_json(self) -> str:
-        """The same as text."""
+        """Return the same as text."""
         return json.dumps(self.to_dict(), indent=1)
 
 
-def _plain(x: Any) -> float | None:
+def profiles_dataset(
+    profiles: Sequence[ProfileLikelihood], values: Mapping[str, float], uncertainty: Uncertainty, level: float = CONFIDENCE
+) -> "xarray.Dataset":
+    """Return profile likelihoods of parameters with these values as a dataset: see `Estimate.to_xarray`."""
+    with OptionalImport():
+        import xarray
+    noise, freedom = estimated_noise(uncertainty)
+    parts = np.full((2, len(profiles), max(len(found.values) for found in profiles)), np.nan)
+    for k, found in enumerate(profiles):
+        own = np.argmin(np.abs(found.values - values[found.name]))
+        parts[:, k, : len(found.values)] = found.values, 2.0 * (found.costs - found.costs[own]) / noise**2
+    along = "profile", "point"
+    data = {
+        "profile_value": (along, parts[0]),
+        "rise": (along, parts[1]),
+        "interval": (
+            ("profile", "end"),
+            np.array([found.interval for found in profiles]),
+            {"level": level, "limit": quantile(level, freedom)},
+        ),
+    }
+    return xarray.Dataset(data, {"profile": [found.name for found in profiles], "end": ["low", "high"]})
+
+
+def rounded(value: float, error: float) -> str:
+    """Return a value with as many digits as its standard error allows, and one more."""
+    if not (math.isfinite(error) and error > 0 and value):
+        return f"{value:.6g}"
+    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(error)) + 2
+    return f"{value:#.{min(max(digits, 2), MOST_DIGITS)}g}".rstrip(".")
+
+
+def _json_number(x: float) -> float | None:
     """A number as JSON knows it: what is not finite is null."""
     return float(x) if np.isfinite(x) else None
-
-
-def groups_of(problem: Problem | Shooting) -> np.ndarray:
-    """Of each residual, which noise it shares that is to be estimated: that of its channel; -1 where it is known."""
-    unknown = np.where(problem.known, -1, problem.where[:, 2])
-    _, group = np.unique(unknown, return_inverse=True)
-    group = group - 1 if problem.known.any() else group
-    return np.concatenate([group, np.full(problem.more, -1)])
-
-
-def _by_record(problem: Problem | Shooting, rows: np.ndarray) -> tuple[dict[str, np.ndarray], ...]:
-    """Numbers of all residuals as tables: of each record, its channels at its times."""
-    full = np.full(problem.y.shape, np.nan)
-    full[problem.there] = rows
-    found = []
-    for k, record in enumerate(problem.records):
-        first = 0 if record.t0 == record.times[0] else 1
-        part = full[k, first : first + len(record.times)]
-        found.append({name: part[:, c] for c, name in enumerate(problem.names) if np.isfinite(part[:, c]).any()})
-    return tuple(found)

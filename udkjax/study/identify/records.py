@@ -2,26 +2,32 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
+from udkjax.deprecation import renamed_arguments
 from udkjax.integrate.assembly import State
 from udkjax.scene.checks import quoted
 from udkjax.study.identify.channels import Quantity
-from udkjax.study.identify.errors import IdentificationError
+from udkjax.study.identify.messages import IdentificationError
 
 Estimated = Literal["nothing", "position", "velocity", "both"]
+Key: TypeAlias = str | Quantity  # channels go by their names, a user's own by itself
+Noise: TypeAlias = Mapping[Any, ArrayLike | None] | float | None  # standard deviations by channel, or of all channels
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
     """The state that a record begins with: what is known of it, and what of it is to be estimated.
 
-    `state` is the guess that is closed (default: the scene's own). Of what is estimated, "position" or "velocity" or "both", the
-    unknowns are as many coordinates or rates as the mechanism has degrees of freedom there. Starts of one `name` are tied: they
-    are the same state, estimated from all of their records.
+    Attributes:
+        state: the guess that is closed; by default the scene's own.
+        estimate: what of it is to be estimated. The unknowns are as many coordinates ("position") or rates ("velocity") as the
+            mechanism has degrees of freedom there.
+        name: starts of one name are tied: they are the same state, estimated from all of their records.
     """
 
     state: State | None = None
@@ -32,47 +38,47 @@ class Start:
         if self.estimate not in get_args(Estimated):
             raise IdentificationError([f"Start: estimate must be one of {', '.join(get_args(Estimated))}, is {self.estimate!r}"])
 
-    @property
-    def position(self) -> bool:
-        """Whether the position is estimated."""
-        return self.estimate in ("position", "both")
-
-    @property
-    def velocity(self) -> bool:
-        """Whether the velocity is estimated."""
-        return self.estimate in ("velocity", "both")
-
 
 class Record:
-    """What was measured at some times (T,), s: `values` maps channels to arrays (T,), not a number where nothing was measured.
+    """What was measured at some times, and the state that the motion began with.
 
-    Channels are named as in `udkjax.study.identify.channels` ("body.crank.angle"), or `Quantity`s of the user's own. `noise` is
-    the standard deviation of all channels, or maps channels to their own, a number or (T,); where it is not given, it is
-    estimated from what the fit leaves. The motion begins at `t0` (s; by default at the first time) with `start`. `conditions`
-    maps names of parameters to values that they are known to have had in this record: a payload, the amplitude of a driver.
+    Args:
+        times: increasing (T,), s.
+        values: arrays (T,) by channel, not a number where nothing was measured. Channels are named as in
+            `udkjax.study.identify.channels` ("body.crank.angle"), or `Quantity`s of the user's own.
+        noise: standard deviation of all channels, or of each by channel, a number or (T,). Where it is not given, it is estimated
+            from the residuals of the fit.
+        initial_state: the `State` or `Start` at t0; by default the scene's own.
+        t0: when the motion begins (s); by default at the first time.
+        conditions: values, by name of a parameter, that are known to have held in this record: a payload, a driver's amplitude.
+        name: what messages call it.
 
-    Raises `IdentificationError`, which lists every mistake.
+    Raises:
+        IdentificationError: with every mistake.
     """
 
+    @renamed_arguments(start="initial_state")
     def __init__(
         self,
         times: ArrayLike | Sequence[float],
-        values: Mapping[Any, Any],
-        noise: Mapping[Any, Any] | float | None = None,
-        start: Start | State | None = None,
+        values: Mapping[Any, ArrayLike],
+        noise: Noise = None,
+        initial_state: Start | State | None = None,
         t0: float | None = None,
-        conditions: Mapping[str, Any] | None = None,
+        conditions: Mapping[str, ArrayLike] | None = None,
         name: str = "",
     ):
         problems: list[str] = []
         self.name = name
         self.times: Float[np.ndarray, "T"] = _numbers("time", times, None, problems)
         self._check_times(t0, problems)
-        self.values = {_key(c): _numbers(str(c), v, self.times.shape, problems) for c, v in values.items()}
+        self.values: dict[Key, np.ndarray] = {
+            key_of(c): _numbers(str(c), v, self.times.shape, problems) for c, v in values.items()
+        }
         self.t0 = float(self.times[0]) if t0 is None and self.times.size else float(t0 or 0.0)
         self.noise = self._noise(noise, problems)
-        self.start = start if isinstance(start, Start) else Start(start)
-        self.conditions = dict(conditions or {})
+        self.start = initial_state if isinstance(initial_state, Start) else Start(initial_state)
+        self.conditions = {name: np.asarray(value, float) for name, value in (conditions or {}).items()}
         if not self.values:
             problems.append("nothing was measured: there is no channel")
         for channel, value in self.values.items():
@@ -83,15 +89,15 @@ class Record:
                     f"{quoted(str(channel))}: entry {int(np.flatnonzero(np.isinf(value))[0])} is infinite; a gap is nan"
                 )
         if problems:
-            raise IdentificationError([self.where + problem for problem in problems])
+            raise IdentificationError([self.place + problem for problem in problems])
 
     @property
-    def where(self) -> str:
+    def place(self) -> str:
         """What messages about it begin with."""
         return f"record {quoted(self.name)}: " if self.name else ""
 
-    def starting(self, start: Start) -> "Record":
-        """The same with another start."""
+    def with_start(self, start: Start) -> "Record":
+        """Return the same record with another start."""
         return Record(self.times, self.values, self.noise, start, self.t0, self.conditions, self.name)
 
     def __repr__(self) -> str:
@@ -108,31 +114,37 @@ class Record:
         elif t0 is not None and not t0 <= self.times[0]:
             problems.append(f"t0: the motion begins at {t0} s, after the first time measured, {self.times[0]} s")
 
-    def _noise(self, given: Any, problems: list[str]) -> dict[Any, Float[np.ndarray, "T"] | None]:
-        mapped = {_key(c): s for c, s in given.items()} if isinstance(given, Mapping) else dict.fromkeys(self.values, given)
-        found: dict[str, Any] = dict.fromkeys(self.values)
-        for channel, sigma in mapped.items():
+    def _noise(self, given: Noise, problems: list[str]) -> dict[Key, Float[np.ndarray, "T"] | None]:
+        by_channel = {key_of(c): s for c, s in given.items()} if isinstance(given, Mapping) else dict.fromkeys(self.values, given)
+        found: dict[Key, np.ndarray | None] = dict.fromkeys(self.values)
+        for channel, sigma in by_channel.items():
             if channel not in self.values:
                 problems.append(f"noise: {quoted(str(channel))} is not among the channels")
             elif sigma is not None:
                 sigma = np.asarray(sigma, float)
                 sigma = sigma if sigma.ndim else np.full(self.times.shape, sigma)
                 shapes = self.times.shape, sigma.shape
-                of = sigma[np.isfinite(self.values[channel])] if sigma.shape == self.times.shape else sigma
+                used = sigma[np.isfinite(self.values[channel])] if sigma.shape == self.times.shape else sigma
                 if sigma.shape != self.times.shape:
                     problems.append(f"noise of {quoted(str(channel))}: must be a number or of shape {shapes[0]}, is {shapes[1]}")
-                elif not (np.isfinite(of).all() and (of > 0).all()):
+                elif not (np.isfinite(used).all() and (used > 0).all()):
                     problems.append(f"noise of {quoted(str(channel))}: a standard deviation must be a finite number > 0")
                 found[channel] = sigma
         return found
 
 
-def _key(channel: Any) -> Any:
-    """Channels that are named go by their names, a user's own by itself."""
-    return channel if isinstance(channel, Quantity) else str(channel)
+def labels(records: Sequence[Record]) -> list[str]:
+    """Return the names of records; those without a name, or with one that another has too, are numbered."""
+    names = [record.name for record in records]
+    return [name if name and names.count(name) == 1 else f"{name or 'record'} {k + 1}" for k, name in enumerate(names)]
 
 
-def _numbers(name: str, given: Any, shape: tuple[int, ...] | None, problems: list[str]) -> np.ndarray:
+def key_of(channel: object) -> Key:
+    """Return what a channel goes by in a record: its name, or itself if it is the user's own."""
+    return channel if isinstance(channel, Quantity) else str(getattr(channel, "name", channel))
+
+
+def _numbers(name: str, given: ArrayLike | Sequence[float], shape: tuple[int, ...] | None, problems: list[str]) -> np.ndarray:
     try:
         found = np.asarray(given, float)
     except (TypeError, ValueError):

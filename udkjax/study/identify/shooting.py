@@ -1,12 +1,13 @@
-"""Multiple shooting: records in pieces, each with a start of its own, that are held together while they are fitted.
+"""Multiple shooting: records in pieces, each with an initial state of its own, that are held together while they are fitted.
 
 Along a chaotic record errors grow like exp(lambda t), so what a whole record says of a parameter has as many minima as it has
-digits. A piece that is shorter than 1 / lambda has one. With s_p the start of piece p, and F_p where it leads, the fit is of
+digits. A piece that is shorter than 1 / lambda has one. With s_p the state that piece p begins with, and F_p where it
+leads, the fit is of
 
     sum r_p(z, s_p)^2 + w^2 sum (F_p(z, s_p) - s_{p+1})^2,
 
 whose w grows from where pieces go their own ways to where they are one motion up to the errors of its integration. The first
-start is that of the record; of each other one as many positions and rates are unknown as the mechanism has degrees of freedom.
+state is that of the record; of each other one as many positions and rates are unknown as the mechanism has degrees of freedom.
 H. G. Bock, Recent advances in parameter identification techniques for ODE, 1983; the growing weight: H. Voss, J. Timmer and
 J. Kurths, Nonlinear dynamical system identification from uncertain and indirect measurements, 2004.
 """
@@ -14,28 +15,34 @@ J. Kurths, Nonlinear dynamical system identification from uncertain and indirect
 import copy
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from udkjax.integrate.assembly import State
-from udkjax.study.identify.fitting import Fit, descend
-from udkjax.study.identify.problem import Evaluated, Problem
-from udkjax.study.identify.program import Members, Predicted, Program
+from udkjax.study.identify.initial_states import unknowns_of_state
+from udkjax.study.identify.least_squares import (
+    COARSE_STEP,
+    FEW_STEPS,
+    FINE_STEP,
+    SOME_STEPS,
+    STEPS,
+    Fit,
+    Loss,
+    minimize_squares,
+)
+from udkjax.study.identify.optimizer import Method, minimize
+from udkjax.study.identify.prediction import Members, Prediction, Predictor, Tolerances
+from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals
 from udkjax.study.identify.records import Record, Start
-from udkjax.study.identify.starts import start_unknowns
 
-SAMPLES = 3.0  # residuals of a piece, per unknown of its start
-PIECES = 60  # of all records at most: the algebra is that of dense matrices
-KEPT = 1e-2  # of the best known direction of a start: what its piece tells worse than this stays as the piece before leads to
-ALONE = 15, 1e-3  # steps for the start of one piece, and the change at which they are enough
-LEAST = 1e-3  # of the largest: how little a coordinate is taken to move in a piece
-# Of a defect, over how far coordinates move in a piece, where residuals are over how far their channels move.
+MOST_PIECES = 60  # of all records: the algebra is that of dense matrices
+CONTINUED = 1e-2  # of the largest singular value: what a piece shows less of its initial state stays as the piece before leads to
+LEAST_MOTION = 1e-3  # of the largest: how little a coordinate is taken to move in a piece
+# w of defects over how far coordinates move in a piece, where residuals are over how far their channels move.
 WEIGHTS = tuple(10.0**k for k in range(-2, 5))
-ON_THE_WAY = 30, 1e-3  # steps with one weight, and the change of an unknown at which they are enough
-END = 60, 1e-7  # the same with the last
 
 
 class Piece(NamedTuple):
@@ -46,203 +53,203 @@ class Piece(NamedTuple):
     end: int
 
 
-class Shooting:
-    """A problem in pieces. Its residuals, records and noise are those of the whole problem, in the same order; defects follow.
+class MultipleShooting(Problem):
+    """A problem in pieces. Its first residuals are those of the whole problem, in the same order; defects follow.
 
-    The unknowns z are those of the whole problem, then those of the starts of pieces, in m, rad and s.
+    The unknowns z are those of the whole problem, then those of the initial states of pieces, in m, rad and s.
+
+    Attributes:
+        whole: the problem that is cut.
+        weight: w of the defects, over how far coordinates move in a piece.
+        pieces: N parts of records; `following` are those that another leads to.
+        guess: the first guess (K,): pieces along the records.
     """
 
-    def __init__(self, whole: Problem, z: Float[np.ndarray, "K"], tol: tuple[float, float], samples: float = SAMPLES):
-        """Cut the records, and find starts of all pieces along them with the unknowns z of the whole problem."""
+    def __init__(self, whole: Problem, z: Float[np.ndarray, "K"], tol: Tolerances, samples: float = RESIDUALS_PER_UNKNOWN):
+        """Cut the records, and find initial states of all pieces along them with the unknowns z of the whole problem."""
+        vars(self).update(vars(whole))
         self.whole, self.weight = whole, WEIGHTS[0]
-        free = start_unknowns(whole.mechanism, whole.unknowns, _begun(whole.records[0]), "start")
+        free = unknowns_of_state(whole.mechanism, whole.unknowns, _with_free_state(whole.records[0]), "start")
         n, self.S = free.basis.shape[1:]
-        self.names_of_starts, self.units_of_starts = free.names, free.units
-        self.pieces = cut(whole, max(samples * self.S, len(whole.where) / PIECES))
-        self.times, self.piece, self.time = _tables(whole, self.pieces)
-        self.program = Program(whole.mechanism, whole.unknowns.targets, whole.channels, whole.program.settings, ends=True)
+        self.pieces = cut_records(whole, max(samples * self.S, len(whole.index) / MOST_PIECES))
+        self.times, self.piece, self.time = _piece_tables(whole, self.pieces)
+        self.predictor = Predictor(whole.mechanism, whole.unknowns.targets, whole.channels, whole.predictor.settings, ends=True)
         N = len(self.pieces)
-        self.led = np.array([p for p, piece in enumerate(self.pieces) if piece.first], int)  # by the pieces before them
+        self.following = np.array([p for p, piece in enumerate(self.pieces) if piece.first], int)
+        self.constrained = len(self.following) * self.S
+        self.K, self.extra_rows = whole.K + self.constrained, whole.extra_rows + self.constrained
         self.columns = np.full((N, self.S), -1)
-        self.columns[self.led] = whole.K + np.arange(len(self.led) * self.S).reshape(-1, self.S)
-        self.K = whole.K + len(self.led) * self.S
+        self.columns[self.following] = whole.K + np.arange(self.constrained).reshape(-1, self.S)
+        self.more_names = tuple(f"piece {p + 1}: {name}" for p in self.following for name in free.names)
+        self.more_units = free.units * len(self.following)
         self.q, self.v = np.zeros((2, N, n // 3, 3))
         self.bases, self.inverse = np.zeros((N, 2, n, self.S)), np.zeros((N, self.S, 2 * n))
         members = whole.members(z[None])
         self.conditions = jax.tree.map(lambda leaf: leaf[[piece.record for piece in self.pieces]], members.conditions)
         for p, piece in enumerate(self.pieces):
             if not piece.first:
-                self._begin(p, members)
-        self.guess, self.scale = self._along(z, tol)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.__dict__["whole"], name)
+                self._begin_with_record(p, members)
+        self.guess, self.scale = self._guess_along(z, tol)
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """The names of all unknowns."""
-        nodes = (f"piece {p + 1}: {name}" for p in self.led for name in self.names_of_starts)
-        return (*self.whole.all_names, *nodes)
+        """Names of all K unknowns."""
+        return (*self.whole.all_names, *self.more_names)
 
     @property
     def all_units(self) -> tuple[str, ...]:
-        """The units of all unknowns."""
-        return (*self.whole.all_units, *self.units_of_starts * len(self.led))
-
-    @property
-    def more(self) -> int:
-        """Rows that are not of what was measured: of priors and of continuity."""
-        return self.whole.more + len(self.led) * self.S
-
-    @property
-    def tied(self) -> int:
-        """Unknowns that continuity decides about."""
-        return len(self.led) * self.S
+        """Units of all K unknowns."""
+        return (*self.whole.all_units, *self.more_units)
 
     def members(self, z: Float[np.ndarray, "B K"], horizon: float | None = None) -> Members:
-        """Members of the whole problem: what the records are like from their beginning on."""
+        """Return members of the whole problem: the records from their beginning on."""
         return self.whole.members(z[:, : self.whole.K], horizon)
 
-    def _begin(self, p: int, members: Members) -> None:
-        """The first piece of a record begins as the record does."""
-        k, mech = self.pieces[p].record, self.mechanism
-        self.q[p], self.v[p] = (mech.q0, mech.v0) if members.q is None else (members.q[k], members.v[k])
-        columns = self.whole.columns[k]
-        if columns is not None:
-            at, start = columns
-            own = len(start.names)
-            self.columns[p, :own], self.bases[p, ..., :own] = at + np.arange(own), start.basis
-
-    def _place(self, p: int, state: np.ndarray, x: np.ndarray) -> None:
-        """Let a piece begin at a closed state (2, n), of which it is to move away."""
-        record = _begun(self.records[self.pieces[p].record], State(*state.reshape(2, -1, 3)), self.times[p, 0])
-        start = start_unknowns(self.mechanism, dataclasses.replace(self.unknowns, start=x), record, "start")
-        self.bases[p], self.inverse[p] = start.basis, np.linalg.pinv(start.basis.reshape(-1, self.S))
-        self.q[p], self.v[p] = state.reshape(2, -1, 3)
-        for _ in range(2):  # what the values of parameters will move the guess by is taken off before
-            q, v = self.program.guess(self.members_of(np.array([p]), x[None], np.zeros((1, self.S))), 0)
-            self.q[p] += state[0].reshape(-1, 3) - q
-            self.v[p] += state[1].reshape(-1, 3) - v
-
     def members_of(self, pieces: np.ndarray, x: np.ndarray, shift: np.ndarray) -> Members:
+        """Return the members of some pieces, with parameters x (M, P) and shifts of their initial states (M, S)."""
         conditions = jax.tree.map(lambda leaf: leaf[pieces], self.conditions)
         return Members(x, shift, self.times[pieces], self.q[pieces], self.v[pieces], self.bases[pieces], conditions)
 
-    def _along(self, z: np.ndarray, tol: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-        """Starts of the pieces, one after another: where the piece before leads to, moved to fit what was measured in its own.
+    def _begin_with_record(self, p: int, members: Members) -> None:
+        """Let the first piece of a record begin as the record does."""
+        k, mech = self.pieces[p].record, self.mechanism
+        self.q[p], self.v[p] = (mech.q0, mech.v0) if members.q is None or members.v is None else (members.q[k], members.v[k])
+        S = self.whole.columns.shape[1]
+        self.columns[p, :S], self.bases[p, ..., :S] = self.whole.columns[k], self.whole.bases[k]
 
-        Also how far the coordinates move in a piece (S,).
+    def _begin_at(self, p: int, state: np.ndarray, x: np.ndarray) -> None:
+        """Let a piece begin beside a closed state (2, n)."""
+        record = _with_free_state(self.records[self.pieces[p].record], State(*state.reshape(2, -1, 3)), self.times[p, 0])
+        basis = unknowns_of_state(self.mechanism, dataclasses.replace(self.unknowns, guess=x), record, "start").basis
+        self.bases[p], self.inverse[p] = basis, np.linalg.pinv(basis.reshape(-1, self.S))
+        self.q[p], self.v[p] = state.reshape(2, -1, 3)
+        for _ in range(2):  # what the values of parameters will move the guess by is taken off before
+            found = self.predictor.guess(self.members_of(np.array([p]), x[None], np.zeros((1, self.S))), 0)
+            self.q[p] += state[0].reshape(-1, 3) - found.q
+            self.v[p] += state[1].reshape(-1, 3) - found.v
+
+    def _guess_along(self, z: np.ndarray, tol: Tolerances) -> tuple[np.ndarray, np.ndarray]:
+        """Find initial states of the pieces one after another, and how far the coordinates move in a piece (S,).
+
+        Each begins where the piece before leads to, moved to fit what was measured in its own.
         """
         P = len(self.unknowns.names)
         x = self.unknowns.values(z[:P])
         found, moved = np.concatenate([z, np.zeros(self.K - len(z))]), []
-        ends: Any = None
+        ends = np.zeros((2, 2, 0))
         for p, piece in enumerate(self.pieces):
-            one = _One(self, p, x, tol)
+            state = _InitialStateOfPiece(self, p, x)
             columns = self.columns[p]
             if piece.first:
-                self._place(p, ends[1], x)  # the piece before is of the same record
-                fit = descend(one, np.zeros((1, self.S)), tol, None, *ALONE)
+                self._begin_at(p, ends[1], x)  # the piece before is of the same record
+                fit = minimize_squares(state, np.zeros((1, self.S)), tol, None, FEW_STEPS, COARSE_STEP)
                 found[columns] = np.where(np.isfinite(fit.cost[0]), fit.z[0], 0.0)
-            ends = one.predicted(np.where(columns < 0, 0.0, found[columns])[None]).end
-            ends = np.asarray(ends)[0]
+            ends = np.asarray(state.predict(np.where(columns < 0, 0.0, found[columns])[None], tol).ends)[0]
             if not np.isfinite(ends).all():
-                raise Lost
+                raise PieceFailed
             if piece.first:
                 moved.append(self.inverse[p] @ (ends[1] - ends[0]).ravel())
         size = np.sqrt(np.mean(np.square(moved), axis=0)) if moved else np.ones(self.S)
-        return found, np.maximum(size, LEAST * size.max(initial=0.0))
+        return found, np.maximum(size, LEAST_MOTION * size.max(initial=0.0))
 
-    def evaluate(self, z: Float[np.ndarray, "B K"], tol: tuple[float, float], horizon: float | None = None) -> Evaluated:
-        """Residuals and Jacobian: of all records, of priors, and of continuity, (F_p - s_{p+1}) / scale * weight."""
+    def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
+        """Compute residuals and Jacobian: of all records, of priors, and of continuity, (F_p - s_{p+1}) / scale * weight."""
         sets, P, N = len(z), len(self.unknowns.names), len(self.pieces)
         x = np.repeat(self.unknowns.values(z[:, :P]), N, axis=0)
         shift = np.where(self.columns < 0, 0.0, z[:, self.columns])
-        found = self.program(self.members_of(np.tile(np.arange(N), sets), x, shift.reshape(sets * N, self.S)), tol)
-        parts: Any = found.y, found.slope, found.end, found.end_slope
-        y, slope, end, end_slope = (part.reshape(sets, N, *part.shape[1:]) for part in parts)
-        at = self.piece, self.time, self.where[:, 2]
-        rows = (y[:, *at] - self.y[self.there]) / self.sigma
-        by = slope[:, *at] / self.sigma[:, None]
-        before, weight = self.led - 1, self._held / self.scale
-        gap = (end[:, before, 1] - end[:, self.led, 0]).reshape(sets, len(self.led), -1)
-        defects = np.einsum("psn,bpn->bps", self.inverse[self.led], gap) * weight
-        along = []
-        for sign, pieces, which in ((1.0, before, 1), (-1.0, self.led, 0)):
-            flat = end_slope[:, pieces, which].reshape(sets, len(self.led), -1, P + self.S)
-            by_both = sign * weight[:, None] * np.einsum("psn,bpnk->bpsk", self.inverse[self.led], flat)
-            along.append(self._spread(by_both.reshape(sets, -1, P + self.S), np.repeat(pieces, self.S), z))
-        J = self._spread(by, self.piece, z)
-        r, J = self.whole.with_priors(z[:, : self.whole.K], rows, J)
+        found = self.predictor(self.members_of(np.tile(np.arange(N), sets), x, shift.reshape(sets * N, self.S)), tol)
+        parts = map(np.asarray, (found.y, found.dy, found.ends, found.d_ends))
+        y, dy, ends, d_ends = (part.reshape(sets, N, *part.shape[1:]) for part in parts)
+        at = self.piece, self.time, self.index[:, 2]
+        rows = (y[:, *at] - self.y[self.present]) / self.sigma
+        by = dy[:, *at] / self.sigma[:, None]
+        before, weight = self.following - 1, self._defect_weight / self.scale
+        gap = (ends[:, before, 1] - ends[:, self.following, 0]).reshape(sets, len(self.following), -1)
+        defects = np.einsum("psn,bpn->bps", self.inverse[self.following], gap) * weight
+        J_defects = 0.0
+        for sign, pieces, which in ((1.0, before, 1), (-1.0, self.following, 0)):
+            flat = d_ends[:, pieces, which].reshape(sets, len(self.following), -1, P + self.S)
+            by_both = sign * weight[:, None] * np.einsum("psn,bpnk->bpsk", self.inverse[self.following], flat)
+            J_defects = J_defects + self.by_unknowns(by_both.reshape(sets, -1, P + self.S), np.repeat(pieces, self.S), z)
+        J = self.by_unknowns(by, self.piece, z)
+        r, J = self.with_priors(z, rows, J)
         code = found.code.reshape(sets, N).max(1)
-        return Evaluated(np.concatenate([r, defects.reshape(sets, -1)], 1), np.concatenate([J, along[0] + along[1]], 1), code)
-
-    def _spread(self, by: np.ndarray, piece: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Derivatives by x and by the start of the piece of each row, (B, R, P + S), as those by z: (B, R, K)."""
-        sets, P = len(z), len(self.unknowns.names)
-        J = np.zeros((*by.shape[:2], self.K + 1))  # the last column takes what is no unknown
-        np.put_along_axis(J, np.broadcast_to(self.columns[piece] % (self.K + 1), (sets, len(piece), self.S)), by[..., P:], 2)
-        J[..., :P] = by[..., :P] * self.unknowns.slopes(z[:, :P])[:, None]
-        return J[..., : self.K]
+        return Residuals(np.concatenate([r, defects.reshape(sets, -1)], 1), np.concatenate([J, J_defects], 1), code)
 
     @property
-    def _held(self) -> float:
-        """The weight of defects in standard deviations."""
-        return float(self.weight / np.median(self.sigma / self.spread[self.where[:, 2]]))
+    def _defect_weight(self) -> float:
+        """The weight of defects over the scale of coordinates, where residuals are in standard deviations."""
+        return float(self.weight / np.median(self.sigma / self.channel_scale[self.index[:, 2]]))
 
-    def gaps(self, z: np.ndarray, tol: tuple[float, float]) -> np.ndarray:
-        """Defects (B,): the largest, over how far coordinates move in a piece."""
-        r = self.evaluate(z, tol).r[:, len(self.where) + self.whole.more :]
-        return np.abs(r).max(1, initial=0.0) / self._held
+    def gaps(self, z: np.ndarray, tol: Tolerances) -> np.ndarray:
+        """Return the largest defect (B,), over how far coordinates move in a piece."""
+        r = self.evaluate(z, tol).r[:, len(self.index) + self.whole.extra_rows :]
+        return np.abs(r).max(1, initial=0.0) / self._defect_weight
 
 
-class Lost(Exception):
+class PieceFailed(Exception):
     """A piece could not be computed with the first guess: it says nothing of where the next begins."""
 
 
-class _One:
-    """The start of one piece, alone: what was measured in it, and its being near to where the piece before leads to."""
+class _InitialStateOfPiece:
+    """The initial state of one piece as a problem: what was measured in it, and being near to where the piece before leads to."""
 
-    def __init__(self, shooting: Shooting, p: int, x: np.ndarray, tol: tuple[float, float]):
-        self.shooting, self.p, self.x, self.tol = shooting, p, x, tol
-        self.program, self.kept = shooting.program, None
+    def __init__(self, shooting: MultipleShooting, p: int, x: np.ndarray):
+        self.shooting, self.p, self.x = shooting, p, x
+        self.damping: float | None = None
         self.rows = np.flatnonzero(shooting.piece == p)
 
-    def predicted(self, shift: Float[np.ndarray, "B S"]) -> Predicted:
+    def predict(self, shift: Float[np.ndarray, "B S"], tol: Tolerances) -> Prediction:
+        """Predict the piece."""
         members = self.shooting.members_of(np.full(len(shift), self.p), np.tile(self.x, (len(shift), 1)), shift)
-        return self.program(members, self.tol)
+        return self.shooting.predictor(members, tol)
 
-    def evaluate(self, z: Float[np.ndarray, "B S"], tol: tuple[float, float], horizon: float | None = None) -> Evaluated:
-        shooting, rows, P = self.shooting, self.rows, len(self.x)
-        found = self.predicted(z)
-        at, sigma = (shooting.time[rows], shooting.where[rows, 2]), shooting.sigma[rows]
-        r = (found.y[:, *at] - shooting.y[shooting.there][rows]) / sigma
-        J = found.slope[:, *at, P:] / sigma[:, None]
-        if self.kept is None:
-            self.kept = KEPT * np.linalg.norm(J[0], 2)
-        S = shooting.S
-        kept = np.broadcast_to(self.kept * np.eye(S), (len(z), S, S))
-        return Evaluated(np.concatenate([r, self.kept * z], 1), np.concatenate([J, kept], 1), found.code)
+    def evaluate(self, z: Float[np.ndarray, "B S"], tol: Tolerances, horizon: float | None = None) -> Residuals:
+        """Compute residuals and their Jacobian."""
+        shooting, rows, P, S = self.shooting, self.rows, len(self.x), self.shooting.S
+        found = self.predict(z, tol)
+        at, sigma = (shooting.time[rows], shooting.index[rows, 2]), shooting.sigma[rows]
+        r = (found.y[:, *at] - shooting.y[shooting.present][rows]) / sigma
+        J = found.dy[:, *at, P:] / sigma[:, None]
+        if self.damping is None:
+            self.damping = float(CONTINUED * np.linalg.norm(J[0], 2))
+        damped = np.broadcast_to(self.damping * np.eye(S), (len(z), S, S))
+        return Residuals(np.concatenate([r, self.damping * z], 1), np.concatenate([J, damped], 1), found.code)
 
 
-def shoot(
+def fit_pieces(
     problem: Problem,
     z: Float[np.ndarray, "K"],
-    tol: tuple[float, float],
-    samples: float = SAMPLES,
-    tell: Callable[[str], None] = lambda text: None,
-    **choices: Any,
-) -> tuple[Shooting, Fit]:
-    """Fit the records in pieces of at least `samples` residuals per unknown of a start, from unknowns z of the problem."""
-    shooting = Shooting(problem, z, tol, samples)
-    fit, history = Fit(shooting.guess[None], np.full(1, np.inf), np.zeros(1, bool), 0, []), []
+    tol: Tolerances,
+    samples: float = RESIDUALS_PER_UNKNOWN,
+    report: Callable[[str], None] = lambda text: None,
+    method: Method = None,
+    loss: Loss = None,
+) -> tuple[MultipleShooting, Fit]:
+    """Fit the records in pieces, from unknowns z of the problem.
+
+    Args:
+        problem: the whole problem.
+        z: first guess (K,).
+        tol: tolerances of the integration.
+        samples: residuals of a piece at least, per unknown of its initial state.
+        report, method, loss: see `minimize_squares`.
+
+    Returns:
+        The problem in pieces, and the fit of its unknowns.
+
+    Raises:
+        PieceFailed: along the first guess.
+    """
+    shooting = MultipleShooting(problem, z, tol, samples)
+    fit, history = Fit(shooting.guess[None], np.full(1, np.inf), np.zeros(1, bool), []), []
     for weight in WEIGHTS:
         shooting.weight = weight
-        say = lambda text, w=weight: tell(f"pieces held together by {w:.0e}: {text}")  # noqa: E731
-        limits = END if weight == WEIGHTS[-1] else ON_THE_WAY
+        say = lambda text, w=weight: report(f"pieces held together by {w:.0e}: {text}")  # noqa: E731
+        steps, settled = (STEPS, FINE_STEP) if weight == WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
         # From one weight to the next the Gauss-Newton step is right, but for a few: these take damped ones.
-        for near in (False,) if weight == WEIGHTS[0] else (True, False):
-            fit = descend(shooting, fit.z, tol, None, *limits, near=near, tell=say, **choices)
+        for undamped in (False,) if weight == WEIGHTS[0] else (True, False):
+            fit = minimize(shooting, fit.z, tol, None, steps, settled, undamped, method, loss, say)
             history += fit.history
             if fit.settled[0]:
                 break
@@ -251,11 +258,11 @@ def shoot(
     return shooting, fit._replace(history=history)
 
 
-def cut(problem: Problem, least: float) -> tuple[Piece, ...]:
-    """The records in pieces of at least as many residuals."""
+def cut_records(problem: Problem, least: float) -> tuple[Piece, ...]:
+    """Cut the records into pieces of at least as many residuals."""
     found = []
     for k in range(len(problem.records)):
-        numbers = problem.there[k].sum(1)
+        numbers = problem.present[k].sum(1)
         last, first, count = int(np.flatnonzero(numbers)[-1]), 0, 0
         left = numbers.sum()
         for i in range(1, last):
@@ -268,10 +275,10 @@ def cut(problem: Problem, least: float) -> tuple[Piece, ...]:
     return tuple(found)
 
 
-def _tables(problem: Problem, pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times of all pieces, of one length and with that of the next start as their last; the piece and time of each residual."""
+def _piece_tables(problem: Problem, pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times of all pieces, padded, the last where the next piece begins; and the piece and time of each residual."""
     length = max(piece.end - piece.first for piece in pieces) + 1
-    record, time, _ = problem.where.T
+    record, time, _ = problem.index.T
     ts, which, at = [], np.zeros(len(record), int), np.zeros(len(record), int)
     for p, piece in enumerate(pieces):
         own = problem.ts[piece.record, piece.first : piece.end + 1]
@@ -282,8 +289,8 @@ def _tables(problem: Problem, pieces: Sequence[Piece]) -> tuple[np.ndarray, np.n
     return np.stack(ts), which, at
 
 
-def _begun(record: Record, state: State | None = None, t0: float | None = None) -> Record:
-    """A record with all of its start to be estimated, from a state at another time."""
+def _with_free_state(record: Record, state: State | None = None, t0: float | None = None) -> Record:
+    """Return a record whose whole initial state is to be estimated, from a state at another time."""
     record = copy.copy(record)
     record.start = Start(record.start.state if state is None else state, "both")
     record.t0 = record.t0 if t0 is None else t0

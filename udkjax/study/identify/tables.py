@@ -1,38 +1,47 @@
-"""Tables of measurements as they come: columns under their headings, nothing interpreted."""
+"""Tables of measurements from CSV files, pandas, xarray and mappings: columns under their headings, nothing interpreted.
+
+Files are read by the standard library: messages name the line of each mistake, which `pandas.read_csv` does not.
+"""
 
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from udkjax.scene.checks import quoted
+from udkjax.scene.checks import quoted, shown, suggestion
 
-TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"
+if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tables
+    import pandas
+    import xarray
+
+TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings, and what follows that of a channel
 _DELIMITERS = (";", "\t", ",")
+# Coordinates of what `Solution.to_xarray` writes, as channels of bodies.
+_STATES = {"q": {"x": "x", "y": "y", "angle": "angle"}, "v": {"x": "vx", "y": "vy", "angle": "omega"}}
 
 
 class Column(NamedTuple):
-    """The values under one heading, numbers or text, and the units that they are said to be in."""
+    """The values under one heading, numbers or text, and their units if the heading names some."""
 
-    values: Any
+    values: Sequence[Any] | np.ndarray
     units: str | None
 
 
 class Table(NamedTuple):
-    """Columns by their names; where they come from, and what their rows are called there, both as in messages."""
+    """Columns by their names; `source` and `rows` are what messages call the table and its rows."""
 
     source: str
     columns: Mapping[str, Column]
     rows: Sequence[str]
-    name: str = ""  # of the record that it is, if it is one
-    gaps: bool = False  # whether rows at the ends in which nothing was measured belong to other records
+    name: str = ""  # of the record, where the table holds one
+    padded: bool = False  # whether rows at the ends in which nothing was measured are there for longer records
 
 
-def of_csv(path: Path, problems: list[str]) -> Iterator[Table]:
-    """A file with a header, after comments if there are any, and rows of cells."""
+def read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
+    """Iterate over the table of a CSV file: a header, after lines of comments if there are any, and rows of cells."""
     lines = path.read_text(encoding="utf-8-sig").splitlines()
     first = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
     if first is None:
@@ -40,12 +49,12 @@ def of_csv(path: Path, problems: list[str]) -> Iterator[Table]:
         return
     delimiter = next((d for d in _DELIMITERS if d in lines[first]), ",")
     reader = csv.reader(lines[first:], delimiter=delimiter, skipinitialspace=True)
-    header, rows, places = _joined(_trimmed(next(reader)), delimiter), [], []
+    header, rows, places = _joined_points(_without_empty_end(next(reader)), delimiter), [], []
     for cells in reader:
         if not any(cell.strip() for cell in cells):
             continue
         line = f"line {first + reader.line_num}"
-        cells = cells[: max(len(header), len(_trimmed(cells)))]
+        cells = cells[: max(len(header), len(_without_empty_end(cells)))]
         if len(cells) == len(header):
             rows.append(cells)
             places.append(line)
@@ -53,16 +62,16 @@ def of_csv(path: Path, problems: list[str]) -> Iterator[Table]:
             problems.append(f"{path}, {line}: has {len(cells)} cells, the header has {len(header)}")
     columns = list(zip(header, zip(*rows, strict=True) if rows else [()] * len(header), strict=True))
     named = [(name, cells) for name, cells in columns if name.strip() or any(cell.strip() for cell in cells)]
-    yield of_columns(str(path), named, problems, places, path.stem)
+    yield table_of_columns(str(path), named, problems, places, path.stem)
 
 
-def _trimmed(cells: list[str]) -> list[str]:
-    """Cells without those that are empty at the end: spreadsheets write such."""
+def _without_empty_end(cells: list[str]) -> list[str]:
+    """Cut off empty cells at the end of a row: spreadsheets write such."""
     return cells[: max((k + 1 for k, cell in enumerate(cells) if cell.strip()), default=0)]
 
 
-def _joined(cells: Sequence[str], delimiter: str) -> list[str]:
-    """Headings with the commas of points, `body.rod(0.5, 0).x`, that were not put in quotes."""
+def _joined_points(cells: Sequence[str], delimiter: str) -> list[str]:
+    """Join headings that were split at the comma of a point, as in `body.rod(0.5, 0).x` without quotes."""
     found: list[str] = []
     for cell in cells:
         if found and found[-1].count("(") > found[-1].count(")"):
@@ -72,23 +81,23 @@ def _joined(cells: Sequence[str], delimiter: str) -> list[str]:
     return found
 
 
-def of_frame(data: Any, source: str, problems: list[str]) -> Table:
-    """A pandas DataFrame; its index is the time if it is called so."""
+def table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) -> Table:
+    """Return the table of a pandas DataFrame; its index is a column if it is called a time or a record."""
     columns = [(str(name), _values(data.iloc[:, k])) for k, name in enumerate(data.columns)]
     if data.index.name is not None and _heading(str(data.index.name))[0] in (*TIME, RECORD):
         columns.insert(0, (str(data.index.name), data.index.to_numpy()))
-    return of_columns(source, columns, problems)
+    return table_of_columns(source, columns, problems)
 
 
-def _values(column: Any) -> np.ndarray:
-    """The values of a pandas Series; numbers that are missing are not a number."""
+def _values(column: "pandas.Series") -> np.ndarray:
+    """The values of a pandas Series; missing numbers become nan."""
     return column.to_numpy(float, na_value=np.nan) if column.dtype.kind in "iuf" else column.to_numpy()
 
 
-def of_columns(
+def table_of_columns(
     source: str, given: Sequence[tuple[str, Any]], problems: list[str], rows: Sequence[str] | None = None, name: str = ""
 ) -> Table:
-    """A table of columns whose headings may tell their units."""
+    """Return the table of columns whose headings may name their units."""
     columns: dict[str, Column] = {}
     for text, values in given:
         heading, units = _heading(text)
@@ -98,14 +107,14 @@ def of_columns(
         else:
             columns[heading] = Column(np.asarray(values) if hasattr(values, "dtype") else values, units)
     if rows is None:
-        sizes = [len(c.values) for c in columns.values() if not _single(c.values)]
+        sizes = [len(c.values) for c in columns.values() if not _is_scalar(c.values)]
         rows = [f"entry {k}" for k in range(max(sizes, default=0))]
-    columns = {h: c._replace(values=[c.values] * len(rows)) if _single(c.values) else c for h, c in columns.items()}
+    columns = {h: c._replace(values=[c.values] * len(rows)) if _is_scalar(c.values) else c for h, c in columns.items()}
     return Table(source, columns, rows, name)
 
 
-def _single(values: Any) -> bool:
-    """Whether it is one value, of all rows."""
+def _is_scalar(values: Any) -> bool:
+    """Whether this is one value for all rows."""
     return isinstance(values, str) or not hasattr(values, "__len__") or getattr(values, "shape", None) == ()
 
 
@@ -113,3 +122,52 @@ def _heading(text: str) -> tuple[str, str | None]:
     """Split `body.link1.angle [deg]` into a name and its units."""
     match = re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", text.strip())
     return (match[1].strip(), match[2].strip() or None) if match else (text.strip(), None)
+
+
+# --- xarray
+
+
+def read_dataset(
+    data: "xarray.Dataset", bodies: Sequence[str], source: str, problems: list[str], name: str = ""
+) -> Iterator[Table]:
+    """Iterate over the tables of an xarray Dataset: one for each of its records."""
+    if RECORD not in data.dims:
+        yield _read_record(data, bodies, source, problems, name)
+        return
+    for k in range(data.sizes[RECORD]):
+        label = str(data[RECORD].values[k]) if RECORD in data.coords else str(k)
+        one = data.isel({RECORD: k}).drop_vars(RECORD, errors="ignore")
+        found: list[str] = []
+        yield _read_record(one, bodies, source, found, label)._replace(padded=True)
+        problems += [problem for problem in found if problem not in problems]
+
+
+def _read_record(data: "xarray.Dataset", bodies: Sequence[str], source: str, problems: list[str], name: str) -> Table:
+    time = next((t for t in TIME if t in data.variables and data[t].ndim == 1), None)
+    if time is None:
+        problems.append(f"{source}: there is no coordinate {quoted(TIME[0])}")
+        return Table(source, {}, [], name)
+    dims, count = data[time].dims, data[time].size
+    columns = {time: Column(data[time].values, data[time].attrs.get("units"))}
+    for key, variable in data.data_vars.items():
+        if key in _STATES and set(variable.dims) == {*dims, "body", "coordinate"}:
+            columns |= _state_columns(str(key), variable.transpose(*dims, "body", "coordinate"), bodies, source, problems)
+        elif variable.dims in ((), dims):
+            columns[str(key)] = Column(np.broadcast_to(variable.values, count), variable.attrs.get("units"))
+        else:
+            problems.append(f"{source}, {quoted(str(key))}: must be along {quoted(time)}, is along {shown(list(variable.dims))}")
+    return Table(source, columns, [f"entry {k}" for k in range(count)], name)
+
+
+def _state_columns(
+    key: str, values: "xarray.DataArray", bodies: Sequence[str], source: str, problems: list[str]
+) -> dict[str, Column]:
+    """Return coordinates or velocities of bodies as columns."""
+    found = {}
+    for i, body in enumerate(map(str, values["body"].values)):
+        if body not in bodies:
+            problems.append(f"{source}, {quoted(key)}: no body named {quoted(body)}{suggestion(body, bodies)}")
+            continue
+        for k, coordinate in enumerate(map(str, values["coordinate"].values)):
+            found[f"body.{body}.{_STATES[key].get(coordinate, coordinate)}"] = Column(values.values[:, i, k], None)
+    return found

@@ -5,11 +5,11 @@ import pytest
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
-from udkjax.study.identify import program
-from udkjax.study.identify.identify import identify
+from udkjax.study.identify import prediction
+from udkjax.study.identify.identification import identify
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.search import beside, horizons
+from udkjax.study.identify.search import horizons, sample_guesses
 
 TRUE = {"body.rod.inertia": 0.375, "force.spring.damping": 0.2}
 
@@ -42,7 +42,7 @@ def test_a_long_record_from_far_away():
     truth = pendulum(damping=0.005)
     data = {"time": ts, ANGLE: swing(truth, ts)}
     first = pendulum(0.75, 0.01)
-    estimate = found(first, data, starts=0)
+    estimate = found(first, data, n_starts=0)
     assert estimate.ways == ("whole records", "growing records")
     assert abs(estimate.values[0] / 0.375 - 1.0) < 1e-8 and abs(estimate.values[1] / 0.005 - 1.0) < 1e-8
 
@@ -52,12 +52,12 @@ def test_gaps_are_left_out(measured):
     angle[7:30:2] = np.nan
     estimate = found(pendulum(0.5, 0.1), {"time": TS, ANGLE: angle})
     assert off(estimate) < 1e-9 and np.isnan(estimate.residuals[0][ANGLE]).sum() == 12
-    assert estimate.knowledge.degrees_of_freedom == pytest.approx(len(TS) - 12 - 2)
+    assert estimate.uncertainty.degrees_of_freedom == pytest.approx(len(TS) - 12 - 2)
 
 
 def test_several_guesses_in_one_call(measured):
     guesses = [[0.3, 0.1], [0.5, 0.3], [0.2, 0.4]]
-    estimate = found(pendulum(5.0, 2.0), {"time": TS, ANGLE: measured[1]}, starts=guesses)
+    estimate = found(pendulum(5.0, 2.0), {"time": TS, ANGLE: measured[1]}, guesses=guesses)
     assert off(estimate) < 1e-9 and estimate.guesses == 4 and estimate.agreeing >= 3
 
 
@@ -82,7 +82,7 @@ def test_noise_that_is_given_and_noise_that_is_estimated(measured):
     assert given.noise[0][ANGLE] == pytest.approx([sigma] * len(TS))
     assert estimated.noise[0][ANGLE][0] == pytest.approx(sigma, rel=0.3)
     ratio = estimated.noise[0][ANGLE][0] / sigma
-    assert estimated.knowledge.standard_errors == pytest.approx(ratio * given.knowledge.standard_errors, rel=1e-6)
+    assert estimated.uncertainty.standard_errors == pytest.approx(ratio * given.uncertainty.standard_errors, rel=1e-6)
 
 
 def test_wrong_numbers_count_less_by_huber(measured):
@@ -94,7 +94,7 @@ def test_wrong_numbers_count_less_by_huber(measured):
 
 
 def test_what_the_mechanism_lacks_is_told(measured):
-    estimate = found(measured[0], {"time": TS, ANGLE: measured[1] + 0.02 * np.sin(2.0 * TS)}, starts=0)
+    estimate = found(measured[0], {"time": TS, ANGLE: measured[1] + 0.02 * np.sin(2.0 * TS)}, n_starts=0)
     assert "not noise" in estimate.message
 
 
@@ -123,7 +123,7 @@ def test_a_common_factor_of_masses_is_not_known(measured):
     first = mech.with_parameters({names[0]: 1.4, names[1]: 0.2})
     estimate = found(first, data, names)
     assert not estimate.success and "common factor" in estimate.message and all(name in estimate.message for name in names)
-    assert np.isinf(estimate.knowledge.standard_errors).all()
+    assert np.isinf(estimate.uncertainty.standard_errors).all()
     true = [float(mech.parameters()[name]) for name in names]
     assert estimate.values[1] / estimate.values[0] == pytest.approx(true[1] / true[0], rel=1e-8)
     known = found(first, data, [udk.Parameter(names[0], prior=(2.0, 0.1)), names[1]])
@@ -140,7 +140,7 @@ def two_records(measured):
     """A record from an estimated start, and a shorter one from the scene's with another spring."""
     stiffer = measured[0].with_parameters({"force.spring.stiffness": 4.0})
     records = [
-        udk.Record(TS[3:], {ANGLE: measured[1][3:]}, noise=0.01, t0=0.0, start=udk.Start(estimate="both")),
+        udk.Record(TS[3:], {ANGLE: measured[1][3:]}, noise=0.01, t0=0.0, initial_state=udk.Start(estimate="both")),
         udk.Record(TS[:9], {ANGLE: swing(stiffer)[:9]}, noise=0.02, conditions={"force.spring.stiffness": 4.0}),
     ]
     return Problem(measured[0], unknowns_of(measured[0], NAMES), records)
@@ -165,7 +165,7 @@ def test_jacobian_against_differences(two_records):
 def test_a_part_of_the_records(two_records):
     z, tol = np.full((1, 4), 0.1), (1e-10, 1e-10)
     whole, part = two_records.evaluate(z, tol), two_records.evaluate(z, tol, horizon=0.4)
-    early = two_records.ts[tuple(two_records.where[:, :2].T)] <= 0.4 * np.array([TS[-1], TS[8]])[two_records.where[:, 0]]
+    early = two_records.ts[tuple(two_records.index[:, :2].T)] <= 0.4 * np.array([TS[-1], TS[8]])[two_records.index[:, 0]]
     assert 0 < early.sum() < len(early)
     assert part.r[0, early] == pytest.approx(whole.r[0, early], abs=1e-6) and (part.r[0, ~early] == 0.0).all()
     parts = horizons(two_records)
@@ -174,11 +174,11 @@ def test_a_part_of_the_records(two_records):
 
 def test_guesses_beside_the_first():
     u = unknowns_of(pendulum(), [NAMES[0], udk.Parameter(NAMES[1], bounds=(0.1, 0.6)), "body.rod.angle"])
-    x = u.values(beside(u, np.zeros(3), 16, 0))
+    x = u.values(sample_guesses(u, np.zeros(3), 16, 0))
     low, high = x.min(0), x.max(0)
-    assert (np.abs(x[:, [0, 2]] - u.start[[0, 2]]) <= 0.5 * np.abs(u.start[[0, 2]])).all()
+    assert (np.abs(x[:, [0, 2]] - u.guess[[0, 2]]) <= 0.5 * np.abs(u.guess[[0, 2]])).all()
     assert 0.1 < low[1] < 0.15 and 0.5 < high[1] < 0.6
-    assert (x == u.values(beside(u, np.zeros(3), 16, 0))).all()
+    assert (x == u.values(sample_guesses(u, np.zeros(3), 16, 0))).all()
 
 
 # --- bad input
@@ -195,9 +195,9 @@ def test_every_mistake_is_told(measured):
     ("choices", "told"),
     [
         ({"loss": "cauchy"}, "huber"),
-        ({"starts": -1}, "from 0 on"),
-        ({"starts": [[1.0]]}, r"\(B, 2\)"),
-        ({"starts": [[-1.0, 1.0]]}, "not positive"),
+        ({"n_starts": -1}, "from 0 on"),
+        ({"guesses": [[1.0]]}, r"\(B, 2\)"),
+        ({"guesses": [[-1.0, 1.0]]}, "not positive"),
         ({"rtol": 1e-3}, "rtol"),
     ],
 )
@@ -226,7 +226,7 @@ def test_a_mechanism_that_cannot_be_closed_at_all():
 def test_members_in_lanes_are_those_one_by_one(two_records, monkeypatch):
     z = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 4))
     single = two_records.evaluate(z, (1e-10, 1e-10))
-    monkeypatch.setattr(program, "MANY", 1)
+    monkeypatch.setattr(prediction, "LANES_FROM", 1)
     lanes = two_records.evaluate(z, (1e-10, 1e-10))
     assert np.abs(lanes.r - single.r).max() < 1e-6 and np.abs(lanes.J - single.J).max() < 1e-4
 
@@ -240,7 +240,7 @@ def test_through_a_singular_configuration():
     names = ["length(link1, link2, link3)", "body.link1.mass = body.link2.mass = body.link3.mass"]
     first = udk.with_length(mech, ["link1", "link2", "link3"], 1.3)
     alone = found(first, data, names)
-    assert not alone.success and len(alone.knowledge.flat) == 1  # angles tell one number, the period
+    assert not alone.success and len(alone.uncertainty.flat) == 1  # angles tell one number, the period
     data["body.coupler.x"] = np.asarray(solution.q)[:, 3, 0]
     estimate = found(first, data, names)
     assert estimate.values == pytest.approx([1.0, 1.0], rel=1e-8)
@@ -261,6 +261,6 @@ def test_a_first_guess_that_cannot_be_closed():
 def test_a_start_for_all_records(measured):
     data = {"time": TS, ANGLE: measured[1]}
     turned = pendulum(0.5, 0.1, angle=1.1)
-    estimate = found(turned, data, start="position")
-    assert off(estimate) < 1e-9 and [name.endswith("body.rod.angle") for name in estimate.start_values] == [True]
-    assert float(estimate.starts[0].q[0, 2]) == pytest.approx(measured[1][0], abs=1e-10)
+    estimate = found(turned, data, initial_state="position")
+    assert off(estimate) < 1e-9 and [name.endswith("body.rod.angle") for name in estimate.initial_state_values] == [True]
+    assert float(estimate.initial_states[0].q[0, 2]) == pytest.approx(measured[1][0], abs=1e-10)

@@ -1,4 +1,4 @@
-"""What is asked of `udkjax identify`, from texts: everything that is wrong with them is told at once."""
+"""Options of `udkjax identify` as parameters and records: everything that is wrong with them is listed at once."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -9,42 +9,43 @@ from udkjax.scene import Mechanism
 from udkjax.scene.checks import quoted, suggestion
 from udkjax.study.identify import IdentificationError, Parameter, Record, Start
 from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.reading import records_of
+from udkjax.study.identify.record_reader import records_of
+from udkjax.study.identify.records import Estimated
 
 Groups = Iterable[Iterable[str]]
 Found = TypeVar("Found")
 
 
-class Texts:
-    """Parameters as texts, and what is said of them in `options`, by the names that `Parameter` has for it.
+class IdentifyOptions:
+    """Parameters by name, with texts such as NAME=VALUE for the arguments of `Parameter` that `options` names.
 
-    What is wrong becomes one of `problems`.
+    Every mistake becomes one of `problems`.
     """
 
     def __init__(self, mechanism: Mechanism, parameters: Groups, options: Mapping[str, Groups]):
         self.mechanism, self.problems = mechanism, []
         self.names: tuple[str, ...] = ()
         names = [name for group in parameters for name in group]
-        said: dict[str, dict[str, Any]] = {name: {} for name in names}
+        given: dict[str, dict[str, Any]] = {name: {} for name in names}
         for option, groups in options.items():
             for text in (text for group in groups for text in group):
-                self._add(said, option, text)
-        self.parameters = [Parameter(name, **said[name]) for name in names]
+                self._add(given, option, text)
+        self.parameters = [Parameter(name, **given[name]) for name in names]
         if not names:
             self.problems.append("--parameters: name at least one, such as body.link1.mass")
 
     def check(self, settings: Mapping[str, Any]) -> None:
-        """Look whether there are such parameters, and whether settings make sense."""
+        """Check that there are such parameters, and that settings make sense."""
         if self.parameters:
             self.names = self._tried(lambda: unknowns_of(self.mechanism, self.parameters).names, ())
-        if settings["starts"] < 0:
-            self.problems.append(f"--starts {settings['starts']}: must not be negative")
+        if settings["n_starts"] < 0:
+            self.problems.append(f"--n-starts {settings['n_starts']}: must not be negative")
         if not 0 < settings["tol"] < 1:
             self.problems.append(f"--tol {settings['tol']:g}: must be between 0 and 1")
         if settings["seed"] < 0:
             self.problems.append(f"--seed {settings['seed']}: must not be negative")
 
-    def records(self, data: Sequence[Path], noise: Groups, ignore: Groups, start: Any) -> list[Record]:
+    def records(self, data: Sequence[Path], noise: Groups, ignore: Groups, start: Estimated) -> list[Record]:
         """Read the data."""
         if not data:
             self.problems.append("name a file of measurements, .csv or .nc, after the scene")
@@ -53,7 +54,7 @@ class Texts:
         left_out = [name for group in ignore for name in group]
         found = self._tried(lambda: records_of(self.mechanism, list(data), by_channel, left_out), ())
         found = self._tried(lambda: records_of(self.mechanism, found, everywhere), ()) if found else ()
-        return [record.starting(Start(estimate=start)) for record in found]
+        return [record.with_start(Start(estimate=start)) for record in found]
 
     def profiled(self, groups: Groups) -> list[str]:
         """The names of parameters, as the estimate has them, that are called by all of their names or one of them."""
@@ -83,24 +84,24 @@ class Texts:
                 everywhere = sigma[0]
         return everywhere, by_channel
 
-    def _add(self, said: dict[str, dict[str, Any]], option: str, text: str) -> None:
-        """Note what is said of a parameter, which may be called by any of the names that are tied in it."""
-        place = f"--{'guess' if option == 'start' else option} {quoted(text)}"
+    def _add(self, given: dict[str, dict[str, Any]], option: str, text: str) -> None:
+        """Note what is given of a parameter, which may be called by any of the names that are tied in it."""
+        place = f"--{option} {quoted(text)}"
         name, _, numbers = text.rpartition("=")
-        of = {_plain(part): whole for whole in said for part in (whole, *whole.split("="))}.get(_plain(name))
-        values = _numbers(numbers, 1 if option == "start" else 2)
+        of = {_plain(part): whole for whole in given for part in (whole, *whole.split("="))}.get(_plain(name))
+        values = _numbers(numbers, 1 if option == "guess" else 2)
         if not name or values is None:
-            form = {"start": "NAME=VALUE", "bounds": "NAME=LOW,HIGH", "prior": "NAME=MEAN,DEVIATION"}[option]
+            form = {"guess": "NAME=VALUE", "bounds": "NAME=LOW,HIGH", "prior": "NAME=MEAN,DEVIATION"}[option]
             self.problems.append(f"{place}: must be {form}, in SI units")
         elif of is None:
-            near = suggestion(name.strip(), [part.strip() for whole in said for part in (whole, *whole.split("="))])
+            near = suggestion(name.strip(), [part.strip() for whole in given for part in (whole, *whole.split("="))])
             self.problems.append(f"{place}: {quoted(name.strip())} is not among --parameters{near}")
-        elif option in said[of]:
+        elif option in given[of]:
             self.problems.append(f"{place}: is there twice for {quoted(of)}")
         elif option == "bounds" and not values[0] < values[1]:
             self.problems.append(f"{place}: the lower bound must be below the upper one")
         else:
-            said[of][option] = values[0] if option == "start" else tuple(values)
+            given[of][option] = values[0] if option == "guess" else tuple(values)
 
     def _tried(self, read: Callable[[], Found], otherwise: Found) -> Found:
         try:

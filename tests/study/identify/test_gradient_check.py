@@ -7,12 +7,12 @@ import pytest
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
 from udkjax.integrate.solution import Result
-from udkjax.study.identify.identify import identify
+from udkjax.study.identify.build_problem import build_problem
+from udkjax.study.identify.gradient_check import compare_gradients
+from udkjax.study.identify.identification import identify
 from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.posing import posed
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.shooting import Shooting
-from udkjax.study.identify.trust import compare
+from udkjax.study.identify.shooting import MultipleShooting
 
 DATA = {"time": TS, ANGLE: np.zeros(len(TS))}
 FIRST = 0.5, 0.15
@@ -44,7 +44,7 @@ def test_errors_of_the_derivatives_themselves_are_measured():
     mech = pendulum(*FIRST)
     problem = Problem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
     off = problem.evaluate(np.zeros((1, 2)), (1e-7, 1e-7)).J[0] - exact()
-    assert check.own[:, 0] == pytest.approx(np.sqrt(np.mean((check.directions @ off.T) ** 2, 1)), rel=0.05)
+    assert check.derivative_error[:, 0] == pytest.approx(np.sqrt(np.mean((check.directions @ off.T) ** 2, 1)), rel=0.05)
 
 
 def test_at_an_estimate_nothing_is_compiled(measured, compilations):
@@ -100,18 +100,18 @@ QUANTITIES = [
 @pytest.fixture(scope="module")
 def wrong_problem():
     mech = pendulum(*FIRST)
-    parameters = [udk.Parameter(_inertia, "mine", start=FIRST[0], transform="positive"), NAMES[1]]
+    parameters = [udk.Parameter(_inertia, "mine", guess=FIRST[0], transform="positive"), NAMES[1]]
     return Problem(mech, unknowns_of(mech, parameters), [udk.Record(TS, dict.fromkeys([ANGLE, *QUANTITIES], DATA[ANGLE]))])
 
 
 def test_wrong_derivatives_are_found(wrong_problem):
-    check = compare(wrong_problem, np.zeros(2), (1e-11, 1e-11))
+    check = compare_gradients(wrong_problem, np.zeros(2), (1e-11, 1e-11))
     assert not check.ok and [name for _, name in check.series] == [ANGLE, "wrong", "still", "made up", "no number"]
     assert (
         check.agrees.tolist()
         == [[False, False, True, False, False], [True, False, True, False, False]] + [[False, False, True, False, False]] * 3
     )
-    inertia = check.differs[0, 0] / check.size[0, 0]
+    inertia = check.discrepancy[0, 0] / check.size[0, 0]
     assert inertia[2:5] == pytest.approx([1e-5] * 3, rel=1e-2)
     for s, time, factor in ((1, 17, 1.01), (4, 5, np.nan)):
         place = check.places[1][s]
@@ -125,7 +125,7 @@ def test_what_is_wrong_is_told_with_its_place(wrong_problem, monkeypatch):
     """Of the series that agrees worst: here of two."""
     series = wrong_problem.series()[:2]
     monkeypatch.setattr(wrong_problem, "series", lambda: series)
-    check = compare(wrong_problem, np.zeros(2), (1e-11, 1e-11))
+    check = compare_gradients(wrong_problem, np.zeros(2), (1e-11, 1e-11))
     lines = str(check).splitlines()
     assert lines[1].split()[1:3] == ["worst", "in"] and all(line.endswith("DIFFERS") for line in lines[2:7])
     assert lines[3].split()[:2] == [NAMES[1], "wrong"]
@@ -133,7 +133,7 @@ def test_what_is_wrong_is_told_with_its_place(wrong_problem, monkeypatch):
 
 
 def test_what_is_below_the_floor_is_not_said_to_be_wrong(wrong_problem):
-    check = compare(wrong_problem, np.zeros(2), (1e-4, 1e-4))
+    check = compare_gradients(wrong_problem, np.zeros(2), (1e-4, 1e-4))
     assert check.agrees[:, 0].all() and (check.floor > 2e-5 * check.size)[:, 0].all()
 
 
@@ -160,19 +160,19 @@ def failing(monkeypatch):
 
 
 def test_steps_that_fail_are_left_out(failing):
-    check = compare(failing(1e-3), np.zeros(2), (1e-10, 1e-10))
-    assert check.ok and (check.step < 1e-3).all() and np.isnan(check.differs[:, :, check.steps > 1e-3]).all()
+    check = compare_gradients(failing(1e-3), np.zeros(2), (1e-10, 1e-10))
+    assert check.ok and (check.step < 1e-3).all() and np.isnan(check.discrepancy[:, :, check.steps > 1e-3]).all()
 
 
 def test_where_all_steps_fail_nothing_is_claimed(failing):
-    check = compare(failing(1e-8), np.zeros(2), (1e-10, 1e-10))
+    check = compare_gradients(failing(1e-8), np.zeros(2), (1e-10, 1e-10))
     assert not check.ok and check.message.startswith("all directions: cannot") and "to their end" in check.message
     assert "not known" in str(check)
 
 
 def test_where_the_motion_fails_there_is_nothing_to_check(failing):
     with pytest.raises(udk.IdentificationError, match="no derivatives to be checked"):
-        compare(failing(-1.0), np.zeros(2), (1e-10, 1e-10))
+        compare_gradients(failing(-1.0), np.zeros(2), (1e-10, 1e-10))
 
 
 def test_mistakes_are_those_of_an_identification():
@@ -202,9 +202,9 @@ def test_along_chaotic_motion_nothing_is_claimed_but_of_pieces():
     for end, ok in ((3.0, True), (20.0, False)):
         ts = np.linspace(0.0, end, 200)
         angle = np.asarray(udk.simulate(mech, ts, rtol=1e-11, atol=1e-11).q)[:, 1, 2]
-        problem = posed(mech, {"time": ts, "body.lower.angle": angle}, ["body.lower.mass", "body.upper.inertia"], {})
-        check = compare(problem, np.zeros(2), tol)
+        problem = build_problem(mech, {"time": ts, "body.lower.angle": angle}, ["body.lower.mass", "body.upper.inertia"], {})
+        check = compare_gradients(problem, np.zeros(2), tol)
         assert check.ok is ok and (ok or "do not settle" in check.message), str(check)
-    shooting = Shooting(problem, np.zeros(2), (1e-9, 1e-9))  # pyright: ignore[reportPossiblyUnboundVariable]
-    check = compare(shooting, shooting.guess, tol)
+    shooting = MultipleShooting(problem, np.zeros(2), (1e-9, 1e-9))  # pyright: ignore[reportPossiblyUnboundVariable]
+    check = compare_gradients(shooting, shooting.guess, tol)
     assert check.ok and len(check.names) == 2 + 3 and (check.floor < 1e-6 * check.size).all(), str(check)

@@ -2,11 +2,14 @@
 
 from types import SimpleNamespace
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from udkjax.study.identify.results import labels, rounded, rows, text
+import udkjax as udk
+from udkjax.study.identify.estimate import Estimate, rounded
+from udkjax.study.identify.records import Record, labels
 
 
 @pytest.mark.parametrize(
@@ -29,7 +32,7 @@ def test_values_are_said_as_far_as_they_are_known(value, error, said):
 
 
 def test_records_without_a_name_of_their_own_are_numbered():
-    assert labels([SimpleNamespace(name=name) for name in ("push", "", "push", "pull", "")]) == [
+    assert labels([Record([0.0], {"y": [0.0]}, name=name) for name in ("push", "", "push", "pull", "")]) == [
         "push 1",
         "record 2",
         "push 3",
@@ -39,49 +42,58 @@ def test_records_without_a_name_of_their_own_are_numbered():
 
 
 @pytest.fixture
-def estimate() -> Any:
+def estimate() -> Estimate:
     """Four parameters, of which one does not show, and two only together; and a start."""
     names = ("a", "b", "c", "d")
     channels = [SimpleNamespace(name=f"y{k}", units="rad") for k in range(8)]
-    where = np.array([[0, t, c] for t in range(5) for c in range(8)])
-    problem = SimpleNamespace(
-        unknowns=SimpleNamespace(start=np.array([1.0, 2.0, 3.0, 4.0])),
+    index = np.array([[0, t, c] for t in range(5) for c in range(8)])
+    problem: Any = SimpleNamespace(
+        unknowns=SimpleNamespace(guess=np.array([1.0, 2.0, 3.0, 4.0])),
         all_names=(*names, "start: angle"),
         all_units=("kg", "kg", "m", "1", "rad"),
         channels=channels,
         records=[SimpleNamespace(name="run")],
-        where=where,
-        known=where[:, 2] == 0,
+        index=index,
+        noise_given=index[:, 2] == 0,
     )
-    known = SimpleNamespace(
+    known: Any = SimpleNamespace(
         standard_errors=np.array([np.inf, np.inf, np.inf, 2.5]),
         dead=("c",),
         flat=(SimpleNamespace(names=("a", "b")),),
         poor=("d",),
+        messages=("a & b",),
         chi2=39.5,
         degrees_of_freedom=35,
     )
-    return SimpleNamespace(
-        mechanism=SimpleNamespace(name="linkage"),
+    found = Estimate(
         names=names,
         units=("kg", "kg", "m", "1"),
         values=np.array([1.5, 2.5, 3.0, 4.5]),
-        knowledge=known,
-        problem=problem,
+        uncertainty=known,
         at_bounds=("d",),
-        start_values={"start: angle": (0.1, 0.01)},
+        initial_state_values={"start: angle": (0.1, 0.01)},
+        predicted=(),
+        residuals=(),
         noise=({channel.name: np.array([np.nan, 0.02, 0.02]) for channel in channels},),
+        whiteness={},
         converged=False,
         agreeing=3,
         guesses=16,
+        ways=(),
+        history=(),
         evaluations=1,
         seconds=2.0,
-        message="what is to be said",
+        tol=(1e-9, 1e-9),
+        z=np.zeros(5),
+        problem=problem,
+        loss=None,
     )
+    vars(found)["mechanism"] = SimpleNamespace(name="<linkage>")
+    return found
 
 
 def test_each_row_says_what_is_wrong_with_it(estimate):
-    found = rows(estimate)
+    found = estimate.rows()
     assert [row.note for row in found] == [
         "cannot be told from others",
         "cannot be told from others",
@@ -94,14 +106,38 @@ def test_each_row_says_what_is_wrong_with_it(estimate):
 
 
 def test_the_text_says_how_the_fit_ended_and_what_the_noise_was(estimate):
-    lines = text(estimate).splitlines()
-    assert lines[0] == "linkage: 4 parameters from 40 numbers in 1 record"
+    lines = str(estimate).splitlines()
+    assert lines[0] == "<linkage>: 4 parameters from 40 numbers in 1 record"
     assert lines[2].split() == "a 1.5 unknown kg 1 cannot be told from others".split()
     assert lines[5].split() == "d 4.5 2.5 1 4 poorly known, at a bound".split()
-    assert [len(line) - len(line.lstrip()) for line in lines[1:-1]] == [2] * 9
+    assert [len(line) - len(line.lstrip()) for line in lines[1:-3]] == [2] * 9
     assert lines[7:] == [
         "  fit               not settled after 1 evaluation in 2.0 s, 3 of 16 first guesses led here",
         "  chi^2             39.5 with 35 degrees of freedom",
-        "  noise, estimated  " + ", ".join(f"y{k} 0.02 rad" for k in range(1, 7)) + ", and 1 more",
-        "what is to be said",
+        "  noise, estimated  " + ", ".join(f"y{k} 0.02 rad" for k in range(1, 7)) + " and y7 0.02 rad",
+        "the fit has not settled: these are the best values that were found",
+        "a & b",
+        "d is at one of its bounds",
     ]
+
+
+def test_a_notebook_shows_the_same_as_a_table(estimate):
+    root = ElementTree.fromstring(f"<div>{estimate._repr_html_()}</div>".replace("<br>", "<br/>"))
+    texts = [[cell.text or "" for cell in row] for row in root.iter("tr")]
+    assert texts[0][:3] == ["parameter", "value", "standard error"] and len(texts) == 6
+    assert texts[4] == ["d", "4.5", "2.5", "1", "4", "poorly known, at a bound"]
+    said = "".join(root.itertext())
+    assert "<linkage>: 4 parameters" in said and "a & b" in said and "chi^2: 39.5 with 35 degrees of freedom" in said
+
+
+@pytest.mark.parametrize(("old", "new"), [("knowledge", "uncertainty"), ("start_values", "initial_state_values")])
+def test_old_attributes_work_with_a_warning(estimate, old, new):
+    with pytest.warns(DeprecationWarning, match=f"Estimate.{old} is now Estimate.{new}"):
+        assert getattr(estimate, old) is getattr(estimate, new)
+    with pytest.raises(AttributeError):
+        estimate.nothing  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_name_that_was_not_identified_has_no_profile(estimate):
+    with pytest.raises(udk.IdentificationError, match='"aa" was not identified'):
+        estimate.profile("aa")

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from udkjax.study.identify.knowledge import Values, direction, knowledge
+from udkjax.study.identify.directions import UnknownValues, describe
+from udkjax.study.identify.uncertainty import estimate_uncertainty, whiteness_of
 
 RNG = np.random.default_rng
 
 
 def positive(*names, x=None, units="kg"):
     x = np.ones(len(names)) if x is None else np.array(x, float)
-    return Values(names, [units] * len(names), x, x, ["positive"] * len(names))
+    return UnknownValues(names, [units] * len(names), x, x, ["positive"] * len(names))
 
 
 def problem(R=60, K=3, seed=0, noise=1.0):
@@ -25,21 +26,21 @@ def problem(R=60, K=3, seed=0, noise=1.0):
 def test_standard_errors_are_those_of_linear_regression():
     J, r = problem()
     x = np.array([2.0, 0.5, 30.0])
-    known = knowledge(J, r, positive("a", "b", "c", x=x))
+    known = estimate_uncertainty(J, r, positive("a", "b", "c", x=x))
     covariance = np.outer(x, x) * np.linalg.inv(J.T @ J)
     assert_allclose(known.covariance, covariance, rtol=1e-10)
     assert_allclose(known.standard_errors, np.sqrt(np.diag(covariance)), rtol=1e-10)
     errors = np.sqrt(np.diag(covariance))
     assert_allclose(known.correlation, covariance / np.outer(errors, errors), rtol=1e-10)
     assert_allclose(known.chi2, r @ r)
-    assert known.degrees_of_freedom == 57 and known.dead == known.flat == () and known.texts == ()
+    assert known.degrees_of_freedom == 57 and known.dead == known.flat == () and known.messages == ()
     # The directions are those of J: J^T J = V S^2 V^T.
     assert_allclose(known.directions.T * known.singular**2 @ known.directions, J.T @ J, rtol=1e-9)
 
 
 def test_noise_that_is_not_known_is_estimated():
     J, r = problem(noise=7.0)
-    known = knowledge(J, r, positive("a", "b", "c"), known_noise=False)
+    known = estimate_uncertainty(J, r, positive("a", "b", "c"), noise_group=np.zeros(len(r), int))
     s2 = r @ r / (60 - 3)
     assert_allclose(known.noise, [np.sqrt(s2)])
     assert_allclose(known.covariance, s2 * np.linalg.inv(J.T @ J), rtol=1e-9)
@@ -48,8 +49,8 @@ def test_noise_that_is_not_known_is_estimated():
 
 def test_exact_data_have_no_noise():
     J, _ = problem()
-    known = knowledge(J, np.zeros(60), positive("a", "b", "c"), known_noise=False)
-    assert np.all(known.standard_errors < 1e-14) and known.texts == ()
+    known = estimate_uncertainty(J, np.zeros(60), positive("a", "b", "c"), noise_group=np.zeros(60, int))
+    assert np.all(known.standard_errors < 1e-14) and known.messages == ()
 
 
 def test_each_group_has_its_own_noise_and_priors_have_theirs():
@@ -63,10 +64,10 @@ def test_each_group_has_its_own_noise_and_priors_have_theirs():
         e = true[group] * random.standard_normal(81)
         weighted = J / true[group][:, None]
         z = np.linalg.lstsq(weighted, -e / true[group], rcond=None)[0]
-        known = knowledge(J, e + J @ z, positive(*"abcd"), known_noise=group)
+        known = estimate_uncertainty(J, e + J @ z, positive(*"abcd"), noise_group=group)
         found.append(known.noise**2)
     assert_allclose(np.mean(found, axis=0), true[:2] ** 2, rtol=0.04)  # the mean of 300 of 25 degrees of freedom: 1.6 %
-    assert_allclose(known.standard_errors, knowledge(weighted, e, positive(*"abcd")).standard_errors, rtol=0.5)
+    assert_allclose(known.standard_errors, estimate_uncertainty(weighted, e, positive(*"abcd")).standard_errors, rtol=0.5)
 
 
 def test_errors_are_as_large_as_the_standard_errors_say():
@@ -76,90 +77,90 @@ def test_errors_are_as_large_as_the_standard_errors_say():
     for _ in range(400):
         e = random.standard_normal(40)
         z = np.linalg.lstsq(J, e, rcond=None)[0]
-        known = knowledge(J, e - J @ z, positive("a", "b"))
+        known = estimate_uncertainty(J, e - J @ z, positive("a", "b"))
         hits += np.count_nonzero(np.abs(z) < 1.96 * known.standard_errors)
     assert abs(hits / 800 - 0.95) < 0.025  # three standard deviations
 
 
 def test_unknowns_of_starts_are_eliminated():
     J, r = problem(K=5)
-    known = knowledge(J, r, positive(*"abcde"), parameters=2)
+    known = estimate_uncertainty(J, r, positive(*"abcde"), parameters=2)
     A, B, D = J[:, :2].T @ J[:, :2], J[:, :2].T @ J[:, 2:], J[:, 2:].T @ J[:, 2:]
     assert_allclose(known.covariance, np.linalg.inv(A - B @ np.linalg.solve(D, B.T)), rtol=1e-9)
     assert known.names == ("a", "b") and known.degrees_of_freedom == 55
-    assert np.all(known.standard_errors > knowledge(J[:, :2], r, positive("a", "b")).standard_errors)
+    assert np.all(known.standard_errors > estimate_uncertainty(J[:, :2], r, positive("a", "b")).standard_errors)
 
 
 def test_a_common_factor_is_found_and_said():
     """J (1, 1, 0) = 0 up to the errors of derivatives: of two masses their ratio is known; the third is as if one were fixed."""
     J, r = problem()
     J[:, 1] = -J[:, 0] + 1e-9 * RNG(3).standard_normal(60)
-    known = knowledge(J, r, positive("body.link1.mass", "body.coupler.mass", "c", x=[1.0, 4.0, 2.0]))
+    known = estimate_uncertainty(J, r, positive("body.link1.mass", "body.coupler.mass", "c", x=[1.0, 4.0, 2.0]))
     (flat,) = known.flat
     assert flat.text == "body.link1.mass and body.coupler.mass by a common factor"
     assert_allclose(flat.coefficients, [1.0, 1.0], rtol=1e-6)
-    fixed = knowledge(J[:, 1:], r, positive("b", "c", x=[4.0, 2.0]))
+    fixed = estimate_uncertainty(J[:, 1:], r, positive("b", "c", x=[4.0, 2.0]))
     assert_allclose(known.standard_errors, [np.inf, np.inf, fixed.standard_errors[1]], rtol=1e-6)
     assert np.isinf(known.covariance[0, 0]) and np.isnan(known.covariance[0, 2]) and np.isnan(known.correlation[1, 2])
     assert_allclose(known.covariance[2, 2], fixed.covariance[1, 1], rtol=1e-6)
     assert known.degrees_of_freedom == 58 and known.correlated == () and known.poor == ()
-    assert known.texts == (f"no measured quantity shows {flat.text}: fix one of them, give one a prior, or measure more",)
+    assert known.messages == (f"no measured quantity shows {flat.text}: fix one of them, give one a prior, or measure more",)
 
 
 def test_two_flat_directions_are_told_apart():
     J, r = problem(K=6)
     J[:, 1], J[:, 4] = -2.0 * J[:, 0], 0.53 * J[:, 3]
     names = ("body.a.mass", "body.b.inertia", "c", "d", "e", "f")
-    first, second = knowledge(J, r, positive(*names)).flat
+    first, second = estimate_uncertainty(J, r, positive(*names)).flat
     assert first.text == "body.a.mass +1 % with body.b.inertia +0.5 %"
     assert second.text == "d -0.53 % with e +1 %"
     assert first.names == names[:2] and second.names == ("d", "e")
 
 
 def test_directions_in_words():
-    values = Values(
+    values = UnknownValues(
         ["m", "x", "k", "b"], ["kg", "m", "", "s"], np.array([2.0, 0.3, 5.0, 4.0]), np.array([2.0, 0.5, 5.0, 1.0]), []
     )
     values = values._replace(kinds=["positive", "free", "positive", "bounded"])
-    assert direction(values, np.array([2.0, 1.0, 0.0, 0.0])).text == "m +1 % with x +0.0025 m"
-    assert direction(values, np.array([1.0, 0.0, 0.0, 4.0])).text == "m and b by a common factor"  # 4 dz of 1 s is all of 4 s
-    assert direction(values, np.array([0.0, 2.0, 0.0, 0.0])).text == "x +0.005 m"
-    assert direction(values, np.array([1.0, 0.0, -0.5, 0.02])).text == "m +1 % with k -0.5 % and b +0.005 %"
+    assert describe(values, np.array([2.0, 1.0, 0.0, 0.0])).text == "m +1 % with x +0.0025 m"
+    assert describe(values, np.array([1.0, 0.0, 0.0, 4.0])).text == "m and b by a common factor"  # 4 dz of 1 s is all of 4 s
+    assert describe(values, np.array([0.0, 2.0, 0.0, 0.0])).text == "x +0.005 m"
+    assert describe(values, np.array([1.0, 0.0, -0.5, 0.02])).text == "m +1 % with k -0.5 % and b +0.005 %"
 
 
 def test_what_nothing_depends_on_is_named():
     J, r = problem(K=4)
     J[:, 2] = 1e-12
-    known = knowledge(J, r, positive(*"abcd"), parameters=3)
+    known = estimate_uncertainty(J, r, positive(*"abcd"), parameters=3)
     assert known.dead == ("c",) and known.flat == () and np.isinf(known.standard_errors[2])
-    rest = knowledge(np.delete(J, 2, 1), r, positive(*"abd"), parameters=2)
+    rest = estimate_uncertainty(np.delete(J, 2, 1), r, positive(*"abd"), parameters=2)
     assert_allclose(known.standard_errors[:2], rest.standard_errors)
-    assert known.texts == ("no measured quantity depends on c: leave out what does not show, or measure what does",)
-    nothing = knowledge(np.zeros((5, 2)), np.ones(5), positive("a", "b"))
+    assert known.messages == ("no measured quantity depends on c: leave out what does not show, or measure what does",)
+    nothing = estimate_uncertainty(np.zeros((5, 2)), np.ones(5), positive("a", "b"))
     assert nothing.dead == ("a", "b") and np.isinf(nothing.standard_errors).all()
 
 
 @pytest.mark.parametrize("R", [2, 3])
 def test_too_few_residuals(R):
     J = RNG(4).standard_normal((R, 3))
-    known = knowledge(J, np.zeros(R), positive(*"abc"), known_noise=False)
+    known = estimate_uncertainty(J, np.zeros(R), positive(*"abc"), noise_group=np.zeros(R, int))
     assert np.isnan(known.noise).all() and not np.isfinite(known.standard_errors).any()
-    assert any("nothing from which to estimate the noise" in text for text in known.texts)
+    assert any("nothing from which to estimate the noise" in text for text in known.messages)
     assert len(known.flat) == 3 - R
-    given = knowledge(J, np.zeros(R), positive(*"abc"))
+    given = estimate_uncertainty(J, np.zeros(R), positive(*"abc"))
     assert np.isfinite(given.standard_errors).all() == (R == 3)
 
 
 def test_poorly_known_parameters_are_named_with_their_numbers():
     J = np.diag([100.0, 1.25, 4.0, 1.0])
     kinds = ["positive", "positive", "free", "bounded"]
-    values = Values(
+    values = UnknownValues(
         ["a", "b", "c", "d"], ["kg", "kg m2", "m", ""], np.array([2.0, 3.0, 0.0, 8.0]), np.array([2.0, 3.0, 0.1, 6.0]), kinds
     )
-    known = knowledge(J, np.zeros(4), values)
+    known = estimate_uncertainty(J, np.zeros(4), values)
     assert_allclose(known.standard_errors, [0.02, 2.4, 0.025, 6.0])
     assert known.poor == ("b", "d")
-    assert known.texts == (
+    assert known.messages == (
         "b is poorly known: 3 kg m2 with a standard error of 2.4 kg m2 (80 %)",
         "d is poorly known: 8 with a standard error of 6 (75 %)",
     )
@@ -168,14 +169,86 @@ def test_poorly_known_parameters_are_named_with_their_numbers():
 def test_parameters_hardly_known_apart_are_named():
     J, r = problem(K=2)
     J[:, 1] = J[:, 0] + 0.1 * J[:, 1] / np.linalg.norm(J[:, 1]) * np.linalg.norm(J[:, 0])
-    known = knowledge(J, r, positive("a", "b"))
+    known = estimate_uncertainty(J, r, positive("a", "b"))
     ((one, other, rho),) = known.correlated
     assert (one, other) == ("a", "b") and -1.0 < rho < -0.98
-    assert known.texts == (f"a and b are hardly known apart: their errors have the correlation {rho:.4f}",)
+    assert known.messages == (f"a and b are hardly known apart: their errors have the correlation {rho:.4f}",)
 
 
 @pytest.mark.parametrize(("noise", "said"), [(1.0, ""), (2.0, "times as large as the noise given"), (0.5, "are only")])
 def test_noise_that_is_not_as_given_is_noticed(noise, said):
     J, r = problem(R=200, noise=noise)
-    texts = knowledge(J, r, positive(*"abc")).texts
+    texts = estimate_uncertainty(J, r, positive(*"abc")).messages
     assert bool(texts) == bool(said) and all(said in text and "197 degrees of freedom" in text for text in texts)
+
+
+# --- whiteness of residuals
+
+
+SEEDS = 300
+
+
+def left(kind, samples, unknowns, correlation, seed):
+    """Times, residuals of a fit of cosines to noise, and what the fit took away. `correlation` is that of regular neighbours."""
+    random = np.random.default_rng(seed)
+    t = np.sort(random.uniform(0.0, 10.0, samples)) if kind == "irregular" else np.linspace(0.0, 10.0, samples)
+    if kind == "gaps":
+        t = np.delete(t, [*range(samples // 3, samples // 2), *random.integers(0, samples // 3, samples // 20)])
+    e = random.standard_normal(len(t))
+    for i in range(1, len(t)):
+        a = correlation ** ((t[i] - t[i - 1]) / (10.0 / samples)) if correlation else 0.0
+        e[i] = a * e[i - 1] + np.sqrt(1.0 - a * a) * e[i]
+    U = np.linalg.qr(np.cos(np.pi * np.outer(t, np.arange(unknowns)) / 10.0))[0]
+    return t, e - U @ (U.T @ e), U
+
+
+@pytest.mark.parametrize("kind", ["regular", "gaps", "irregular"])
+def test_white_noise_is_told_as_often_as_it_should_be(kind):
+    p = np.array([whiteness_of(*left(kind, 100, 5, 0.0, seed)).p for seed in range(SEEDS)])
+    for level in (0.05, 0.3):
+        assert abs(np.mean(p < level) - level) < 3.0 * np.sqrt(level * (1 - level) / SEEDS)
+    assert np.mean(p < 1e-3) < 0.02
+
+
+def test_what_a_fit_takes_away_is_allowed_for():
+    """Ten unknowns make neighbours of white noise differ: without the hat matrix that looks like a correlation."""
+    with_it, without = [], []
+    for seed in range(SEEDS):
+        t, e, U = left("regular", 100, 10, 0.0, seed)
+        with_it.append(whiteness_of(t, e, U).p < 0.05)
+        without.append(whiteness_of(t, e).p < 0.05)
+    assert np.mean(without) > 0.2 and np.mean(with_it) < 0.09
+
+
+@pytest.mark.parametrize("kind", ["regular", "gaps", "irregular"])
+def test_coloured_noise_is_noticed(kind):
+    found = [whiteness_of(*left(kind, 300, 5, 0.6, seed)) for seed in range(50)]
+    assert np.mean([not w.white for w in found]) > 0.9
+    w = found[0]
+    assert 0.3 < w.lag1 < 0.75
+    text = w.text('"body.a.angle" in record "one"')
+    assert text.startswith('residuals of "body.a.angle" in record "one" are not noise: neighbours have the correlation 0.')
+    assert f"for {w.samples} samples" in text
+
+
+def test_the_correlation_of_neighbours():
+    t, e, _ = left("regular", 20000, 1, 0.6, 0)
+    assert abs(whiteness_of(t, e).lag1 - 0.6) < 0.02
+    # Neighbours on the two sides of a gap are no neighbours.
+    w = whiteness_of(np.concatenate([np.arange(50.0), 1000.0 + np.arange(50.0)]), np.repeat([1.0, -1.0], 50))
+    assert w.lag1 == pytest.approx(1.0) and not w.white
+
+
+def test_an_offset_and_a_wave_are_no_noise():
+    t, random = np.linspace(0.0, 5.0, 200), np.random.default_rng(5)
+    for more in (0.8, 0.8 * np.sin(3.0 * t)):
+        assert not whiteness_of(t, random.standard_normal(200) + more).white
+
+
+def test_few_samples_say_nothing():
+    for n in (0, 1, 2, 5, 15):
+        w = whiteness_of(np.arange(float(n)), np.ones(n))
+        assert np.isnan(w.p) and w.white and w.text("it") == "" and w.samples == n
+    values = np.where(np.arange(60) % 2, np.nan, 1.0)
+    assert whiteness_of(np.arange(60.0), values).samples == 30
+    assert np.isnan(whiteness_of(np.arange(60.0), np.zeros(60)).p)

@@ -1,58 +1,72 @@
 """Which parameters may move: those that leave the loops of an overconstrained mechanism closed.
 
-Rows of Psi that depend on each other hold on a part of all parameters only: three cranks carry one coupler as long as they are
-equal. With N the left null space of Psi_q at a closed position, a change dp of parameters is legal to first order if and only if
+Rows of Psi that depend on each other hold for some values of all parameters only: three cranks carry one coupler as long as they
+are equal. With N the left null space of Psi_q at a closed position, a change dp of parameters keeps it closed to first order if
 
     N^T (dPsi/dp) dp = 0        with dPsi/dp at fixed q
 
-at that position; it has to be so at all of them. To first order is not enough: cranks of l + d, l and l - d satisfy it, and miss
-each other by distances of second order. So what is legal to first order is moved by a finite step and closed again: the rank must
-still be what it was. All of it is NumPy on the graph's programs; without redundant rows there is nothing to do.
+at that position, and only then; it has to be so at all of them. To first order is not enough: cranks of l + d, l and l - d
+satisfy it, and miss each other by distances of second order. So what is closed to first order is moved by a finite step and
+closed again: the rank must still be what it was. All of it is NumPy on the programs of the rows; without redundant rows there is
+nothing to do.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
+from scipy.sparse import csr_array
 
 from udkjax.equations.analysis import analyse
-from udkjax.equations.redundancy import ORDINARY, chosen_rows, positions_of, rows_of
+from udkjax.equations.redundancy import ORDINARY, KinematicRows, chosen_rows, positions_of, rows_of
+from udkjax.equations.sparse_rows import SparseRows
 from udkjax.scene.checks import quoted
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.identify.directions import COEFFICIENT, connected, listed, null_space, ratio, reduced, row_space
+from udkjax.study.identify.directions import COEFFICIENT, connected, echelon, null_space, row_space
+from udkjax.study.identify.messages import listed, ratio
 
 # Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions
 # that are closed to 1e-11 leave 5e-12 of it; a parameter that opens a loop leaves a tenth or more.
-ALONG = 1e-6
-DIFFERENCE = 1e-5  # of a parameter's value: the step of the central differences
+DEPENDENT = 1e-6
+DIFFERENCE_STEP = 1e-5  # of a parameter's value: the step of the central differences
 # Of a parameter's size, which is its value, or less where that changes a row by more than the row's own size: the step after
 # which a mechanism must close again. What opens to second order does so by 1e-4 of the size, ten million times what is left of
-# closing (closing.CLOSED).
-STEP = 1e-2
-SMALL = 1e-5  # of the size by effect: a value as small as this, such as that of a coordinate, counts as zero
-FEW = 4  # positions that are closed again
+# closing (`closing.CLOSED`).
+CLOSING_STEP = 1e-2
+SMALL_VALUE = 1e-5  # of the size by effect: a value as small as this, such as that of a coordinate, counts as zero
+MOST_POSITIONS = 4  # positions that are closed again
 
 
-def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], x: Numbers, names: Sequence[str]) -> list[str]:
-    """Return what is wrong with moving these parameters each by itself, around the values x; nothing if all of it is legal.
+def loop_problems(
+    mechanism: Mechanism, apply: Callable[[Mechanism, Array], Mechanism], x: Numbers, names: Sequence[str]
+) -> list[str]:
+    """Return what is wrong with moving parameters each by itself; nothing if loops stay closed whatever they are.
 
-    `apply(mechanism, x)` puts the values x (P,) in; it is pure, and x may be traced. A message names the constraints that close
-    the loop, the parameters that would open it, and the ties that keep it closed.
+    Args:
+        mechanism: a mechanism that closes.
+        apply: assigns values (P,) to it; pure, and the values may be traced.
+        x: the values (P,) around which they are to move.
+        names: what messages call the parameters.
+
+    Returns:
+        Messages: the constraints that close a loop, the parameters that would open it, and the ties that keep it closed.
     """
     redundant = analyse(mechanism).redundant_rows
     if redundant == () or not names:
         return []
     placed = jax.jit(lambda x: apply(mechanism, x).bare)  # traced, so that no step of differences is refused for its sign
     x = np.asarray(x, float)
-    steps = DIFFERENCE * np.where(x != 0.0, np.abs(x), min(_spread(placed(x)), 1.0))
-    moving = [i for i, step in enumerate(np.diag(steps)) if _constraints(placed(x + step)) != _constraints(placed(x - step))]
-    if not moving:  # masses, forces
+    steps = DIFFERENCE_STEP * np.where(x != 0.0, np.abs(x), min(_size(placed(x)), 1.0))
+    moving = [
+        i for i, step in enumerate(np.diag(steps)) if _constraint_bytes(placed(x + step)) != _constraint_bytes(placed(x - step))
+    ]
+    if not moving:  # only masses, forces
         return []
     names = [names[i] for i in moving]
     at = np.eye(len(x))[moving]
-    loops = Loops(mechanism, lambda change: placed(x + change @ at), x[moving], steps[moving])
+    loops = RedundantLoops(mechanism, lambda change: placed(x + change @ at), x[moving], steps[moving])
     if redundant and loops.redundant < len(redundant):
         return [
             f"the first guesses of {listed(names)} open a loop that closes with the scene's own values: it has more "
@@ -61,17 +75,17 @@ def illegal(mechanism: Mechanism, apply: Callable[[Mechanism, Any], Mechanism], 
     return loops.problems(names) if loops.redundant else []
 
 
-def _spread(mechanism: Mechanism) -> float:
-    """How far its bodies are apart (m); 1 where there is one."""
+def _size(mechanism: Mechanism) -> float:
+    """Return how far its bodies are apart (m); 1 where there is one."""
     return float(np.ptp(np.asarray(mechanism.q0, float)[:, :2], axis=0).max()) or 1.0
 
 
-def _constraints(mechanism: Mechanism) -> list[bytes]:
-    """All numbers of its joints and drivers."""
+def _constraint_bytes(mechanism: Mechanism) -> list[bytes]:
+    """Return all numbers of its joints and drivers."""
     return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(list(mechanism.constraints.values()))]
 
 
-class Loops:
+class RedundantLoops:
     """The positions of a mechanism with redundant rows, and what parameters do to these rows there.
 
     `changed` maps changes (P,) of the parameters, whose values are x, to mechanisms; `steps` (P,) are those of differences.
@@ -89,11 +103,11 @@ class Loops:
         self._drivers = mechanism.driver_names
         self._positions = [p for p in found if p.smallest > ORDINARY] or found
         self._names = [name for name, _ in rows.names]
-        self._left_out = list(chosen_rows(rows, found))
-        self._measure(rows, steps, _spread(here))
+        self._redundant_rows = list(chosen_rows(rows, found))
+        self._measure(rows, steps, _size(here))
 
-    def _measure(self, rows: Any, steps: np.ndarray, spread: float):
-        """What each parameter does to Psi, and how much of it no motion makes up for."""
+    def _measure(self, rows: KinematicRows | SparseRows, steps: np.ndarray, size: float):
+        """Differentiate Psi by each parameter, and project on what no motion makes up for."""
         at = [rows.at(p.t, p.q) for p in self._positions]
         columns = []
         for step in np.diag(steps):
@@ -102,24 +116,24 @@ class Loops:
             columns.append(np.array(moved) / (2 * step.sum()))
         slope = np.stack(columns, -1)  # (positions, rows, P)
         # The natural size of a row: the longest arm at which it turns a body, which is 1 for rows of angles.
-        arms = np.max([length * np.abs(dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in at], axis=0)
-        most = np.abs(slope / np.where(arms > 0.0, arms, spread)[:, None]).max((0, 1))
+        arms = np.max([length * np.abs(_dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in at], axis=0)
+        most = np.abs(slope / np.where(arms > 0.0, arms, size)[:, None]).max((0, 1))
         by_effect = 1.0 / np.where(most > 0.0, most, np.inf)
         own = np.abs(self.x)
-        self._size = np.where(own < SMALL * by_effect, by_effect, np.minimum(own, by_effect))
+        self._size = np.where(own < SMALL_VALUE * by_effect, by_effect, np.minimum(own, by_effect))
         effect = slope / np.array([length for _, length, _ in at])[:, :, None]
         total = np.sqrt((effect**2).sum((0, 1)) / len(effect))
         self._unit = 1.0 / np.where(total > 0, total, 1.0)  # of each parameter, in which it has an effect of one
         self._effect = effect * self._unit
-        null_spaces = [dense(p.null_space) for p in self._positions]
-        self._along = np.concatenate([N.T @ e for N, e in zip(null_spaces, self._effect, strict=True)])
-        # One combination of rows for each row left out: that row as the others make it up.
-        self._circuits = np.array([N @ np.linalg.inv(N[self._left_out]) for N in null_spaces])
+        null_spaces = [_dense(p.null_space) for p in self._positions]
+        self._unclosed = np.concatenate([N.T @ e for N, e in zip(null_spaces, self._effect, strict=True)])
+        # One combination of rows for each redundant row: that row as the others make it up.
+        self._circuits = np.array([N @ np.linalg.inv(N[self._redundant_rows]) for N in null_spaces])
 
     def problems(self, names: Sequence[str]) -> list[str]:
         """One message for each set of parameters that depend on each other."""
         found = []
-        relations = row_space(self._along, ALONG)
+        relations = row_space(self._unclosed, DEPENDENT)
         sets = connected(relations)
         free = sorted(set(range(len(self.x))) - {i for members in sets for i in members})
         if free and not self._closes(np.eye(len(self.x))[free]):
@@ -127,10 +141,10 @@ class Loops:
             for part in connected(row_space(null_space(ties, COEFFICIENT), COEFFICIENT)):
                 members = [free[i] for i in part]
                 inside = [i for i in range(len(ties)) if np.any(ties[i, part])]
-                found.append(self._problem(names, members, ties[np.ix_(inside, part)]))
+                found.append(self._message(names, members, ties[np.ix_(inside, part)]))
         for members in sets:
-            ties = self._ties(members, null_space(self._along[:, members], ALONG))
-            found.append(self._problem(names, members, ties))
+            ties = self._ties(members, null_space(self._unclosed[:, members], DEPENDENT))
+            found.append(self._message(names, members, ties))
         return found
 
     def _closes(self, directions: np.ndarray) -> bool:
@@ -138,9 +152,9 @@ class Loops:
         if not len(directions):
             return True
         step = np.random.default_rng(1).uniform(0.5, 1.0, len(directions)) @ directions
-        step = step * STEP / np.max(np.abs(step * self._unit) / self._size) * self._unit
+        step = step * CLOSING_STEP / np.max(np.abs(step * self._unit) / self._size) * self._unit
         rows = self._rows(step)
-        every = max(1, len(self._positions) // FEW)
+        every = max(1, len(self._positions) // MOST_POSITIONS)
         for p in self._positions[::every]:
             with np.errstate(all="ignore"):
                 closed = rows.close(p.t, p.q)
@@ -148,12 +162,12 @@ class Loops:
                 return False
         return True
 
-    def _ties(self, members: Sequence[int], legal: np.ndarray) -> np.ndarray:
-        """Directions (ties, members) in which these parameters may move, the simplest first, of what is legal to first order."""
+    def _ties(self, members: Sequence[int], closed: np.ndarray) -> np.ndarray:
+        """Return directions (ties, members) in which parameters may move, the simplest first, of those closed to first order."""
         chosen = np.zeros((0, len(members)))
-        for candidate in self._candidates(members, legal):
+        for candidate in self._candidates(members, closed):
             size = np.linalg.norm(candidate)
-            outside = candidate - legal.T @ (legal @ candidate)
+            outside = candidate - closed.T @ (closed @ candidate)
             if np.linalg.norm(outside) > COEFFICIENT * size:
                 continue
             trial = np.vstack([chosen, candidate / size])
@@ -163,12 +177,12 @@ class Loops:
             every[:, members] = trial
             if self._closes(every):
                 chosen = trial
-            if len(chosen) == len(legal):
+            if len(chosen) == len(closed):
                 break
         return chosen
 
-    def _candidates(self, members: Sequence[int], legal: np.ndarray) -> Iterator[np.ndarray]:
-        """Each by itself, two by the same amount or factor, all by the same amount or factor, whatever else is legal."""
+    def _candidates(self, members: Sequence[int], closed: np.ndarray) -> Iterator[np.ndarray]:
+        """Iterate over each by itself, two and all by the same amount or factor, and whatever else is closed to first order."""
         x, unit, n = self.x[members], self._unit[members], len(members)
         each = np.eye(n)
         yield from each
@@ -176,9 +190,9 @@ class Loops:
             for i in range(n):
                 yield from ((each[i] + each[j]) * together / unit for j in range(i) if together[i] and together[j])
         yield from (together / unit for together in (x, np.ones(n)) if np.any(together))
-        yield from reduced(legal)
+        yield from echelon(closed)
 
-    def _problem(self, names: Sequence[str], members: Sequence[int], ties: np.ndarray) -> str:
+    def _message(self, names: Sequence[str], members: Sequence[int], ties: np.ndarray) -> str:
         ties = np.where(np.abs(ties) > COEFFICIENT, ties, 0.0)
         ties = ties[np.count_nonzero(ties, axis=1) > 1] * self._unit[members]
         own, x = [names[i] for i in members], self.x[members]
@@ -186,22 +200,22 @@ class Loops:
         stuck = [name for name, tied in zip(own, np.any(ties, axis=0), strict=True) if not tied]
         if len(own) == 1:
             return (
-                f"{who} cannot move by itself: {self._loop(members)} that only holds for the value that it has; "
+                f"{who} cannot move by itself: {self._loop_text(members)} that only holds for the value that it has; "
                 "leave it fixed, or tie it to what has to move with it"
             )
         if not len(ties):
             return (
-                f"{who} cannot move, each by itself or together: {self._loop(members)} that only holds for the values that they "
-                "have; leave them fixed"
+                f"{who} cannot move, each by itself or together: {self._loop_text(members)} that only holds for the values "
+                "that they have; leave them fixed"
             )
-        condition = ", for ".join(tie(own, x, u) for u in ties)
+        condition = ", for ".join(tie_text(own, x, u) for u in ties)
         leave = f"tie them, and leave {listed(stuck)} fixed" if stuck else "tie them, or leave them fixed"
-        return f"{who} cannot move each by itself: {self._loop(members)} that only holds for {condition}; {leave}"
+        return f"{who} cannot move each by itself: {self._loop_text(members)} that only holds for {condition}; {leave}"
 
-    def _loop(self, members: Sequence[int]) -> str:
-        """The constraints that close what these parameters would open."""
+    def _loop_text(self, members: Sequence[int]) -> str:
+        """Name the constraints that close what these parameters would open."""
         opened = np.einsum("srk,srm->skm", self._circuits, self._effect[:, :, members])
-        part_of = np.abs(opened).max((0, 2)) > ALONG
+        part_of = np.abs(opened).max((0, 2)) > DEPENDENT
         circuits = self._circuits[:, :, part_of if part_of.any() else slice(None)]
         involved = np.abs(circuits).max((0, 2)) > COEFFICIENT
         constraints = list(dict.fromkeys(name for name, there in zip(self._names, involved, strict=True) if there))
@@ -209,13 +223,12 @@ class Loops:
         return f"{what} {listed([quoted(name) for name in constraints])} close a loop"
 
 
-def dense(matrix: Any) -> np.ndarray:
-    """A matrix that may be sparse."""
-    return matrix.toarray() if hasattr(matrix, "toarray") else matrix
+def _dense(matrix: np.ndarray | csr_array) -> np.ndarray:
+    return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
 
-def tie(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:
-    """Say how parameters with the values x have to move together, where u are their changes."""
+def tie_text(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:
+    """Return how parameters with the values x have to move together, where u are their changes."""
     there = np.flatnonzero(u).tolist()
     names, x, u = [names[i] for i in there], x[there], u[there]
     same = np.allclose(u, u[0], rtol=1e-3)

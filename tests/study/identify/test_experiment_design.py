@@ -5,7 +5,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.scene.drivers import Sine
-from udkjax.study.identify.experiment import Candidate, design_experiment
+from udkjax.study.identify.experiment_design import Candidate, design_experiment
 from udkjax.study.identify.records import Start
 
 NAMES = ("body.lower.inertia", "force.damper.damping")
@@ -109,8 +109,8 @@ def test_an_estimate_counts_as_made(candidates):
     data = udk.Record(TS, {CHANNEL: q}, NOISE, released(ANGLES[1]), conditions={AMPLITUDE: 0.0})
     estimate = udk.identify(scene(), data, NAMES, progress=False)
     found = design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, given=estimate)
-    assert found.standard_errors[0] == pytest.approx(estimate.knowledge.standard_errors, rel=1e-5)
-    assert found.standard_errors[1] == pytest.approx(estimate.knowledge.standard_errors / np.sqrt(2.0), rel=0.02)
+    assert found.standard_errors[0] == pytest.approx(estimate.uncertainty.standard_errors, rel=1e-5)
+    assert found.standard_errors[1] == pytest.approx(estimate.uncertainty.standard_errors / np.sqrt(2.0), rel=0.02)
     assert found.order[-1] == 0
 
 

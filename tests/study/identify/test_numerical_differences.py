@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from udkjax.study.identify.differences import STEPS, differences, sizes
+from udkjax.study.identify.numerical_differences import DIFFERENCE_STEPS, differences, sizes
 
 TS = np.linspace(0.5, 3.0, 40)
 SERIES = [np.arange(25), np.arange(25, 40)]
@@ -16,7 +16,7 @@ def seen(h):
 
 
 def ladder(function):
-    return np.stack([function(STEPS), function(-STEPS)], axis=1)
+    return np.stack([function(DIFFERENCE_STEPS), function(-DIFFERENCE_STEPS)], axis=1)
 
 
 def chosen(found):
@@ -38,7 +38,7 @@ def test_of_a_smooth_function_they_are_as_exact_as_rounding_lets_them_be():
 def test_noise_is_told_before_they_are_compared(level, kind):
     """Errors that are other ones at each step, as where step control decides otherwise; and such as move with the parameter."""
     random = np.random.default_rng(0)
-    errors = level * random.standard_normal((len(STEPS), 2, len(TS)))
+    errors = level * random.standard_normal((len(DIFFERENCE_STEPS), 2, len(TS)))
     if kind == "moving":
         errors = ladder(lambda h: level * np.sin(TS + 30.0 * h[:, None]))
     y = ladder(seen)
@@ -72,7 +72,7 @@ def test_a_jump_has_no_derivative():
 
 def test_what_moves_by_rounding_only_is_no_derivative():
     random = np.random.default_rng(1)
-    errors = 1e-16 * random.standard_normal((len(STEPS), 2, len(TS)))
+    errors = 1e-16 * random.standard_normal((len(DIFFERENCE_STEPS), 2, len(TS)))
     y = 1.0 + errors
     found = differences(y, errors, SERIES)
     errors = found.noise + found.truncation

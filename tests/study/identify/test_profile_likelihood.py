@@ -1,11 +1,17 @@
 """Profile likelihoods, against linear regression and curves that are known."""
 
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from udkjax.study.identify.profile import profile
+from udkjax.study.identify.estimate import profiles_dataset
+from udkjax.study.identify.problem import Residuals
+from udkjax.study.identify.profile_likelihood import WithFixedParameter, profile_likelihood, trace_profile
 
 
 def linear(J, r0):
@@ -43,7 +49,7 @@ def regression():
 def test_of_a_linear_model_it_is_the_standard_error(regression, k, guess):
     J, r0, z, cost, errors = regression
     fit, count = linear(J, r0)
-    found = profile(fit, k, z, cost, guess * errors[k], name="a", units="kg")
+    found = trace_profile(fit, k, z, cost, guess * errors[k], name="a", units="kg")
     assert_allclose(found.interval, z[k] + np.array([-1.0, 1.0]) * 1.959964 * errors[k], rtol=2e-3)
     assert np.all(np.diff(found.values) > 0) and found.best == np.searchsorted(found.values, z[k])
     assert_allclose(found.costs - cost, 0.5 * ((found.values - z[k]) / errors[k]) ** 2, atol=1e-9 * max(found.costs))
@@ -57,7 +63,7 @@ def test_other_levels_and_noise_that_was_estimated(regression):
     fit, _ = linear(J, r0)
     s = np.sqrt(2 * cost / 37)
     t = stats.t.ppf(0.95, 37)
-    found = profile(fit, 1, z, cost, errors[1], level=0.9, noise=s, degrees_of_freedom=37)
+    found = trace_profile(fit, 1, z, cost, errors[1], level=0.9, noise=s, degrees_of_freedom=37)
     assert_allclose(found.interval, z[1] + np.array([-t, t]) * s * errors[1], rtol=2e-3)
 
 
@@ -65,7 +71,7 @@ def test_a_flat_direction_is_open():
     """Two unknowns of which their sum is known: whatever one is, the other makes up for it."""
     J = np.array([[1.0, 1.0], [2.0, 2.0]])
     fit, count = linear(J, np.array([0.1, -0.05]))
-    found = profile(fit, 0, np.zeros(2), 0.00625, 1.0, value=lambda z: 3.0 * np.exp(z), name="a", units="kg")
+    found = trace_profile(fit, 0, np.zeros(2), 0.00625, 1.0, value=lambda z: 3.0 * np.exp(z), name="a", units="kg")
     assert found.interval == (-np.inf, np.inf) and len(count) < 20
     assert found.text == (
         "a is not known: no lower end as far as 6.183e-09 kg (the end of what was looked at), "
@@ -75,7 +81,7 @@ def test_a_flat_direction_is_open():
 
 def test_one_end_may_be_open():
     """A friction that is hardly there: in its logarithm the curve falls off to a level below the quantile."""
-    found = profile(
+    found = trace_profile(
         curve(lambda z: 1.0 * (np.exp(z) - 1.0) ** 2), 0, np.zeros(1), 0.0, 0.5, value=np.exp, name="b", units="N s/m"
     )
     end = 1.0 + np.sqrt(stats.chi2.ppf(0.95, 1) / 2)
@@ -86,7 +92,7 @@ def test_one_end_may_be_open():
 
 
 def test_it_may_be_longer_on_one_side():
-    found = profile(curve(lambda z: 50.0 * (np.exp(z) - 1.0) ** 2), 0, np.zeros(1), 0.0, 0.1)
+    found = trace_profile(curve(lambda z: 50.0 * (np.exp(z) - 1.0) ** 2), 0, np.zeros(1), 0.0, 0.1)
     half = np.sqrt(stats.chi2.ppf(0.95, 1)) / 10.0
     assert_allclose(found.interval, np.log([1.0 - half, 1.0 + half]), rtol=2e-3)
 
@@ -95,14 +101,14 @@ def test_it_ends_before_what_cannot_be_fitted():
     def cost(z):
         return z**2 if z < 0.7 else np.nan
 
-    found = profile(curve(cost), 0, np.zeros(1), 0.0, 1.0)
+    found = trace_profile(curve(cost), 0, np.zeros(1), 0.0, 1.0)
     assert_allclose(found.interval[0], -np.sqrt(stats.chi2.ppf(0.95, 1) / 2), rtol=2e-3)
     assert found.interval[1] == np.inf and np.isfinite(found.costs).all()
     assert 0.69 < found.values[-1] < 0.7 and found.text.endswith("(no fit was found beyond)")
 
 
 def test_few_steps_leave_it_open():
-    found = profile(curve(lambda z: 1e-6 * z**2), 0, np.zeros(1), 0.0, 1e-3, steps=5)
+    found = trace_profile(curve(lambda z: 1e-6 * z**2), 0, np.zeros(1), 0.0, 1e-3, steps=5)
     assert found.interval == (-np.inf, np.inf) and "(not in 5 steps)" in found.text and len(found.values) == 11
 
 
@@ -112,12 +118,76 @@ def test_a_better_fit_on_the_way_is_said():
     def cost(z):
         return 4.0 * z**2 * (z - 1.0) ** 2 - 0.2 * z**2
 
-    found = profile(curve(cost), 0, np.zeros(1), 0.0, 0.3, name="a", units="m")
+    found = trace_profile(curve(cost), 0, np.zeros(1), 0.0, 0.3, name="a", units="m")
     assert found.costs[found.best] < -0.1 and 0.8 < found.values[found.best] < 1.3
     assert found.text.endswith(f"a better fit was met at {found.values[found.best]:.6g} m: identify again from there")
 
 
 def test_curves_that_jump_and_estimates_at_a_bound():
-    found = profile(curve(lambda z: z**2 if z < 0.7 else 50.0), 0, np.zeros(1), 0.0, 1.0, bounds=(0.0, 9.0))
+    found = trace_profile(curve(lambda z: z**2 if z < 0.7 else 50.0), 0, np.zeros(1), 0.0, 1.0, bounds=(0.0, 9.0))
     assert found.interval[0] == -np.inf and found.values[0] == 0.0  # nothing to walk on that side
     assert 0.69 < found.interval[1] < 0.7
+
+
+# --- of problems
+
+OFFSET, SCALE = np.array([2.0, -1.0]), np.array([0.5, 3.0])
+
+
+class Linear:
+    """r = r0 + J z; the last unknown is that of a start."""
+
+    def __init__(self, K: int = 3):
+        random = np.random.default_rng(0)
+        self.J, self.r0 = random.normal(size=(40, K)), random.normal(size=40)
+        P = min(K, 2)
+        self.unknowns: Any = SimpleNamespace(
+            names=("a", "b")[:P],
+            units=("kg", "m"),
+            values=lambda z: OFFSET[:P] + SCALE[:P] * z,
+            dx_dz=lambda z: SCALE[:P],
+        )
+
+    def evaluate(self, z, tol, horizon=None):
+        assert tol == (1e-9, 1e-9) and horizon is None
+        return Residuals(self.r0 + z @ self.J.T, np.tile(self.J, (len(z), 1, 1)), np.zeros(len(z), int))
+
+
+def fitted(problem, noise=()):
+    """The estimate of a linear model: its uncertainty, and a function that makes profiles."""
+    z = np.linalg.lstsq(problem.J, -problem.r0, rcond=None)[0]
+    s = noise[0] if noise else 1.0
+    errors = np.sqrt(np.diag(np.linalg.inv(problem.J.T @ problem.J)))[:2] * SCALE[: len(z)] * s
+    known: Any = SimpleNamespace(standard_errors=errors, noise=np.array(noise), degrees_of_freedom=37)
+    values = dict(zip(problem.unknowns.names, problem.unknowns.values(z[:2]), strict=True))
+    return known, values, partial(profile_likelihood, problem, problem.unknowns, z, (1e-9, 1e-9), None, known)
+
+
+def test_one_unknown_is_fixed():
+    problem = Linear()
+    fixed = WithFixedParameter(problem, 1, 0.7)
+    z = np.array([[1.0, -1.0], [0.0, 2.0]])
+    assert_allclose(fixed.insert(z), [[1.0, 0.7, -1.0], [0.0, 0.7, 2.0]])
+    found = fixed.evaluate(z, (1e-9, 1e-9))
+    assert_allclose(found.r, problem.r0 + fixed.insert(z) @ problem.J.T)
+    assert_allclose(found.J[1], problem.J[:, [0, 2]])
+
+
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_of_a_linear_problem_the_interval_is_that_of_the_standard_error(name):
+    known, values, profile = fitted(Linear())
+    found = profile(name)
+    error = known.standard_errors["ab".index(name)]
+    assert_allclose(found.interval, values[name] + 1.959964 * error * np.array([-1, 1]), rtol=2e-3)
+    assert found.text.startswith(f"{name} is between")
+
+
+def test_noise_that_was_estimated_and_a_single_unknown():
+    known, values, profile = fitted(Linear(1), (0.8,))
+    found = profile("a", level=0.9)
+    half = 1.687094 * known.standard_errors[0]  # of Student's t with 37 degrees of freedom
+    assert_allclose(found.interval, values["a"] + half * np.array([-1, 1]), rtol=2e-3)
+    data = profiles_dataset([found], values, known, 0.9)
+    assert_allclose(data["interval"].attrs["limit"], 1.687094**2, rtol=1e-6)
+    x = (data["profile_value"][0] - values["a"]) / known.standard_errors[0]
+    assert_allclose(data["rise"][0], x**2, atol=1e-8)

@@ -1,4 +1,4 @@
-"""Units in which data may be written, and what they are in SI units."""
+"""Units in which data may be written, and their size in SI units."""
 
 import math
 import re
@@ -30,7 +30,7 @@ _SIZES = {
 }
 _UNITS = {name: _Unit(size, dimension) for dimension, sizes in _SIZES.items() for name, size in sizes.items()}
 _GRAVITY = _Unit(9.80665, _ACCELERATION)  # what "g" is to an accelerometer; else it is a gram
-_SPELLED = {
+_SPELLINGS = {
     "°": "deg",
     "²": "2",
     "³": "3",
@@ -40,7 +40,7 @@ _SPELLED = {
     "**": "^",
     "*": " ",
 }
-_IN_WORDS = {
+_WORDS = {
     **dict.fromkeys(("degree", "degrees"), "deg"),
     **dict.fromkeys(("radian", "radians"), "rad"),
     **dict.fromkeys(("second", "seconds", "sec"), "s"),
@@ -60,10 +60,16 @@ _USUAL = (
 )
 
 
-def factor(units: str, wanted: str) -> float:
-    """Return what numbers in `units` are multiplied by to be in `wanted`, SI units. Raises ValueError: unknown, or unfitting.
+def conversion_factor(units: str, wanted: str) -> float:
+    """Return the factor that converts numbers in `units` into `wanted`, which are SI units.
 
-    Products are written with a space, powers as m/s2 or m/s^2. "g" is a gram, and where an acceleration is wanted 9.80665 m/s2.
+    Args:
+        units: products written with a space, powers as m/s2 or m/s^2. "g" is a gram, and where
+            an acceleration is wanted 9.80665 m/s2.
+        wanted: the units of a channel.
+
+    Raises:
+        ValueError: `units` are unknown, or of another dimension.
     """
     if units.split() == wanted.split():
         return 1.0
@@ -78,11 +84,11 @@ def factor(units: str, wanted: str) -> float:
 def _read(text: str) -> _Unit:
     """Read a product of powers of units; a slash divides by the one that follows."""
     plain = text
-    for spelled, meant in _SPELLED.items():
-        plain = plain.replace(spelled, meant)
+    for spelling, usual in _SPELLINGS.items():
+        plain = plain.replace(spelling, usual)
     found = _UNITS["1"]
     for slash, name, power in re.findall(r"(/?)\s*([^\W\d]+|1)\^?(-?\d+)?|\S", plain):
-        name = _IN_WORDS.get(name, name)
+        name = _WORDS.get(name, name)
         if name not in _UNITS:
             raise ValueError(f"{quoted(text)} is no unit known here: they are made of {', '.join(_UNITS)}")
         found = found.times(_UNITS[name], int(power or 1) * (-1 if slash else 1))

@@ -10,10 +10,10 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.study.identify.channels import Quantity
-from udkjax.study.identify.errors import IdentificationError
-from udkjax.study.identify.reading import records_of
+from udkjax.study.identify.messages import IdentificationError
+from udkjax.study.identify.record_reader import records_of
 from udkjax.study.identify.records import Record, Start
-from udkjax.study.identify.units import factor
+from udkjax.study.identify.unit_conversion import conversion_factor
 
 DEG = math.pi / 180
 
@@ -300,7 +300,7 @@ def test_what_a_solution_writes_can_be_measured(mech):
     ],
 )
 def test_units_are_told_as_people_write_them(units, wanted, expected):
-    assert_allclose(factor(units, wanted), expected, rtol=1e-15)
+    assert_allclose(conversion_factor(units, wanted), expected, rtol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -316,4 +316,4 @@ def test_units_are_told_as_people_write_them(units, wanted, expected):
 )
 def test_units_that_do_not_fit_are_refused(units, wanted, problem):
     with pytest.raises(ValueError, match=problem):
-        factor(units, wanted)
+        conversion_factor(units, wanted)

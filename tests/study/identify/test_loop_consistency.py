@@ -7,8 +7,8 @@ import pytest
 import udkjax as udk
 from udkjax.equations.redundancy import rows_of
 from udkjax.scene.joints import Gear, Revolute
-from udkjax.study.identify import legality
-from udkjax.study.identify.legality import illegal, tie
+from udkjax.study.identify import loop_consistency
+from udkjax.study.identify.loop_consistency import loop_problems, tie_text
 
 
 def lengths(*groups):
@@ -28,7 +28,7 @@ def numbers(*names):
 
 def asked(mechanism, *names):
     """What is wrong with moving some numbers of a scene."""
-    return illegal(mechanism, numbers(*names), [entry(mechanism.parameters(), name) for name in names], names)
+    return loop_problems(mechanism, numbers(*names), [entry(mechanism.parameters(), name) for name in names], names)
 
 
 def entry(values, name):
@@ -45,21 +45,21 @@ ALL = 'joints "A1", "A2", "A3", "B1", "B2" and "B3" close a loop'
 
 
 def test_three_cranks_must_stay_equal(linkage):
-    (problem,) = illegal(linkage, lengths("link1", "link2", "link3"), [1.0, 1.0, 1.0], ["a", "b", "c"])
+    (problem,) = loop_problems(linkage, lengths("link1", "link2", "link3"), [1.0, 1.0, 1.0], ["a", "b", "c"])
     assert problem == f"a, b and c cannot move each by itself: {ALL} that only holds for a = b = c; tie them, or leave them fixed"
 
 
 def test_sparse_arithmetic_says_the_same(linkage, monkeypatch):
     choices = [lengths("link1", "link2", "link3"), lengths(("link1", "link2", "link3"))]
-    plain = [illegal(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(choices, (3, 1), strict=True)]
-    monkeypatch.setattr(legality, "rows_of", lambda mechanism: rows_of(mechanism, large=True))
-    assert [illegal(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(choices, (3, 1), strict=True)] == plain
+    plain = [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(choices, (3, 1), strict=True)]
+    monkeypatch.setattr(loop_consistency, "rows_of", lambda mechanism: rows_of(mechanism, large=True))
+    assert [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(choices, (3, 1), strict=True)] == plain
     assert len(plain[0]) == 1 and plain[1] == []
 
 
 @pytest.mark.parametrize("groups", [(("link1", "link2"), "link3"), (("link1", "link3"), "link2")])
 def test_two_tied_and_one_free_are_refused(linkage, groups):
-    (problem,) = illegal(linkage, lengths(*groups), [1.0, 1.0], ["two", "one"])
+    (problem,) = loop_problems(linkage, lengths(*groups), [1.0, 1.0], ["two", "one"])
     assert "two and one cannot move each by itself" in problem and "only holds for two = one; tie them" in problem
 
 
@@ -68,22 +68,22 @@ def test_all_three_tied_are_legal_and_so_are_masses(linkage):
         mechanism = udk.with_length(mechanism, ("link1", "link2", "link3"), x[0])
         return mechanism.with_parameters({"body.link1.mass": x[1], "body.coupler.inertia": x[2], "gravity": x[3:]})
 
-    assert illegal(linkage, apply, [1.0, 3.0, 0.3, 0.0, -9.81], ["l", "m", "I", "gx", "gy"]) == []
+    assert loop_problems(linkage, apply, [1.0, 3.0, 0.3, 0.0, -9.81], ["l", "m", "I", "gx", "gy"]) == []
 
 
 def test_of_masses_nothing_is_looked_at(linkage, monkeypatch):
-    monkeypatch.setattr(legality, "positions_of", None)
+    monkeypatch.setattr(loop_consistency, "positions_of", None)
     assert asked(linkage, "body.link1.mass", "gravity[1]") == []
 
 
 def test_one_crank_alone_is_refused(linkage):
-    (problem,) = illegal(linkage, lengths("link2"), [1.0], ["length(link2)"])
+    (problem,) = loop_problems(linkage, lengths("link2"), [1.0], ["length(link2)"])
     assert problem.startswith("length(link2) cannot move by itself: joints")
     assert problem.endswith("leave it fixed, or tie it to what has to move with it")
 
 
 def test_first_guesses_that_open_a_loop_are_refused(linkage):
-    (problem,) = illegal(linkage, lengths("link1", "link2", "link3"), [1.0, 1.2, 1.0], ["a", "b", "c"])
+    (problem,) = loop_problems(linkage, lengths("link1", "link2", "link3"), [1.0, 1.2, 1.0], ["a", "b", "c"])
     assert problem.startswith("the first guesses of a, b and c open a loop")
 
 
@@ -94,8 +94,8 @@ def test_legal_to_first_order_is_not_enough(linkage):
         return lengths("link1", "link3")(mechanism, [1.0 + x[0], 1.0 - x[0]])
 
     for name in ("link1", "link3"):
-        assert illegal(linkage, lengths(name), [1.0], ["one of them"])
-    (problem,) = illegal(linkage, apply, [0.0], ["d"])
+        assert loop_problems(linkage, lengths(name), [1.0], ["one of them"])
+    (problem,) = loop_problems(linkage, apply, [0.0], ["d"])
     assert problem.startswith("d cannot move by itself")
     # A pin beside its crank's line: longer by the square of the distance.
     (problem,) = asked(linkage, "joint.A1.points[1][1]")
@@ -127,17 +127,17 @@ def test_a_tie_that_is_legal_at_one_position_only_is_refused(monkeypatch):
         mechanism = lengths("link0", "link1", "link2")(mechanism, cranks)
         return mechanism.with_parameters({f"joint.B{i}.points[0]": (1.0 + x[0]) * arm for i, arm in enumerate(arms)})
 
-    (problem,) = illegal(mechanism, apply, [0.0], ["larger"])
+    (problem,) = loop_problems(mechanism, apply, [0.0], ["larger"])
     assert "larger cannot move by itself" in problem
-    monkeypatch.setattr(legality.Loops, "_closes", lambda *_: True)
-    assert illegal(mechanism, apply, [0.0], ["larger"]) == [problem]
-    monkeypatch.setattr(legality, "positions_of", lambda rows, q: [rows.close(0.0, q)])
-    assert illegal(mechanism, apply, [0.0], ["larger"]) == []
+    monkeypatch.setattr(loop_consistency.RedundantLoops, "_closes", lambda *_: True)
+    assert loop_problems(mechanism, apply, [0.0], ["larger"]) == [problem]
+    monkeypatch.setattr(loop_consistency, "positions_of", lambda rows, q: [rows.close(0.0, q)])
+    assert loop_problems(mechanism, apply, [0.0], ["larger"]) == []
 
 
 def test_cranks_under_a_triangle_must_stay_equal():
     mechanism, _, _ = triangle()
-    (problem,) = illegal(mechanism, lengths("link0", "link1", "link2"), [1.0] * 3, ["a", "b", "c"])
+    (problem,) = loop_problems(mechanism, lengths("link0", "link1", "link2"), [1.0] * 3, ["a", "b", "c"])
     assert "only holds for a = b = c" in problem
 
 
@@ -167,9 +167,9 @@ def test_gears_on_two_axles_keep_their_ratio():
 def test_bars_of_a_scissor_lift_stay_equal_in_pairs():
     lift = udk.library.scissor_lift(1)
     names = ("rising0", "falling0")
-    (problem,) = illegal(lift, lengths(*names), [1.0, 1.0], names)
+    (problem,) = loop_problems(lift, lengths(*names), [1.0, 1.0], names)
     assert "only holds for rising0 = falling0" in problem and '"guide"' in problem
-    assert illegal(lift, lengths(names), [1.0], ["both"]) == []
+    assert loop_problems(lift, lengths(names), [1.0], ["both"]) == []
 
 
 def test_loops_of_which_none_is_overconstrained_move_freely(compilations):
@@ -177,8 +177,8 @@ def test_loops_of_which_none_is_overconstrained_move_freely(compilations):
     bars = udk.library.n_four_bar(3)
     assert udk.analyse(bars).redundant_rows == ()
     apply = lengths("link0", "link1", "coupler2")
-    assert compilations(lambda: illegal(bars, apply, [1.0, 1.0, 1.0], ["a", "b", "c"])) == []
-    assert illegal(bars, apply, [1.0, 1.0, 1.0], ["a", "b", "c"]) == []
+    assert compilations(lambda: loop_problems(bars, apply, [1.0, 1.0, 1.0], ["a", "b", "c"])) == []
+    assert loop_problems(bars, apply, [1.0, 1.0, 1.0], ["a", "b", "c"]) == []
 
 
 def test_loops_side_by_side_are_told_apart(linkage):
@@ -197,7 +197,7 @@ def test_loops_side_by_side_are_told_apart(linkage):
         half = {f"joint.{pin}{n}.points[1][0]": end * x[i] for i, n in enumerate(cranks) for pin, end in ends.items()}
         return mechanism.with_parameters(half)
 
-    problems = illegal(both, apply, [1.0] * 6, cranks)
+    problems = loop_problems(both, apply, [1.0] * 6, cranks)
     assert len(problems) == 2
     for k, problem in enumerate(problems):
         assert f"only holds for 1/{k} = 2/{k} = 3/{k};" in problem
@@ -206,7 +206,7 @@ def test_loops_side_by_side_are_told_apart(linkage):
 
 def test_texts_of_ties():
     names = ["a", "b", "c"]
-    assert tie(names, np.array([2.0, 2.0, 1.0]), np.array([1.0, 1.0, 0.0])) == "a = b"
-    assert tie(names, np.array([1.0, 2.0, 0.5]), np.array([2.0, 4.0, 1.0])) == "a, b and c in proportion 1 : 2 : 0.5"
-    assert tie(names, np.array([0.0, 2.0, 0.5]), np.array([3.0, 3.0, 3.0])) == "a, b and c changing by the same amount"
-    assert tie(names, np.array([0.0, 2.0, 0.5]), np.array([2.0, -1.0, 0.0])) == "a and b changing in proportion 1 : -0.5"
+    assert tie_text(names, np.array([2.0, 2.0, 1.0]), np.array([1.0, 1.0, 0.0])) == "a = b"
+    assert tie_text(names, np.array([1.0, 2.0, 0.5]), np.array([2.0, 4.0, 1.0])) == "a, b and c in proportion 1 : 2 : 0.5"
+    assert tie_text(names, np.array([0.0, 2.0, 0.5]), np.array([3.0, 3.0, 3.0])) == "a, b and c changing by the same amount"
+    assert tie_text(names, np.array([0.0, 2.0, 0.5]), np.array([2.0, -1.0, 0.0])) == "a and b changing in proportion 1 : -0.5"

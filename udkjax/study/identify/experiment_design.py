@@ -1,0 +1,238 @@
+"""Which experiment to make next: what records that are not measured yet would show of parameters.
+
+With J the derivatives of what would be measured, each divided by the standard deviation of its noise, a candidate adds J^T J to
+the information M that there is: M^-1 is the covariance of an estimate, to first order in the noise. What is not asked for
+(initial states that are estimated too, other parameters) is eliminated: what is left of J is its part that they cannot make up
+for. The best candidate has the largest det M (criterion "D"), the smallest trace M^-1 ("A"), or the largest least eigenvalue of M
+("E"), in the dimensionless unknowns of `udkjax.study.identify.parameters`. F. Pukelsheim, Optimal Design of Experiments, 2006.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from udkjax.deprecation import renamed_arguments, renamed_attributes
+from udkjax.integrate.assembly import State
+from udkjax.scene.checks import suggestion
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.build_problem import build_problem
+from udkjax.study.identify.directions import INVISIBLE, PART
+from udkjax.study.identify.estimate import Estimate
+from udkjax.study.identify.messages import IdentificationError
+from udkjax.study.identify.parameters import Asked
+from udkjax.study.identify.prediction import MEDIUM, Tolerances
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.records import Key, Noise, Record, Start
+
+Criterion = Literal["D", "A", "E"]
+
+
+@renamed_arguments(start="initial_state")
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An experiment that may be made: what of the scene is different in it (`conditions`, by name), and how it begins."""
+
+    conditions: Mapping[str, ArrayLike] = field(default_factory=dict)
+    initial_state: Start | State | None = None
+    name: str = ""
+
+    __getattr__ = renamed_attributes("Candidate", start="initial_state")
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """What N candidates would show of P parameters; each alone, with what was known before.
+
+    Attributes:
+        criterion: by which they were ranked.
+        names: of the parameters.
+        candidates: their names.
+        scores: of the criterion, the larger the better: log det M, -trace M^-1, or the least eigenvalue; -inf, or 0, where a
+            direction is not known.
+        standard_errors: in the units of the parameters, inf where a candidate does not show one.
+        order: the candidates, the best first.
+        chosen: those to be made together, the most useful first.
+        together: standard errors after the first of them, the first two, and so on.
+    """
+
+    criterion: Criterion
+    names: tuple[str, ...]
+    candidates: tuple[str, ...]
+    scores: Float[np.ndarray, "N"]
+    standard_errors: Float[np.ndarray, "N P"]
+    order: tuple[int, ...]
+    chosen: tuple[int, ...]
+    together: Float[np.ndarray, "n P"]
+
+    @property
+    def best(self) -> int:
+        """The candidate that shows most."""
+        return self.order[0]
+
+    def __str__(self) -> str:
+        rows = [f"{'':24}{f'{self.criterion}':>12}" + "".join(f"{name[-24:]:>26}" for name in self.names)]
+        for k in self.order:
+            errors = "".join(f"{error:26.3g}" for error in self.standard_errors[k])
+            rows.append(f"{self.candidates[k][:24]:24}{self.scores[k]:12.4g}{errors}")
+        return "\n".join(rows)
+
+
+def design_experiment(
+    mechanism: Mechanism,
+    candidates: Sequence[Candidate | Mapping[str, ArrayLike] | Start | State],
+    parameters: Asked,
+    channels: Sequence[Key],
+    ts: ArrayLike,
+    noise: Noise,
+    criterion: Criterion = "D",
+    pick: int = 1,
+    of: Sequence[str] | None = None,
+    given: Estimate | None = None,
+    tol: float = MEDIUM,
+    **settings: Any,
+) -> Design:
+    """Rank experiments by what they would show of parameters, and pick some to be made together.
+
+    Args:
+        mechanism: with values of the parameters, at which the experiments are predicted.
+        candidates: each a `Candidate`, the conditions of one (a driver's amplitude and frequency by name), or its initial state.
+        parameters: that are to be identified, as for `identify`; their priors count.
+        channels: that would be measured in each.
+        ts: times (T,) of the measurements, s.
+        noise: standard deviation, of all channels or by channel.
+        criterion: "D", the largest det M; "A", the smallest trace M^-1; "E", the largest least eigenvalue of M.
+        pick: how many are chosen one after another, each to the best together with those before.
+        of: names of the parameters that matter; by default all.
+        given: an estimate whose values the parameters have, and whose records count as made.
+        tol: tolerance of the integration.
+        settings: of `simulate`.
+
+    Returns:
+        The ranking; a candidate that cannot be simulated shows nothing.
+
+    Raises:
+        IdentificationError: with every mistake.
+    """
+    made = [_candidate(candidate, k) for k, candidate in enumerate(candidates)]
+    problems = [] if made else ["candidates: there is none"]
+    if criterion not in get_args(Criterion):
+        problems.append(f"criterion must be one of {', '.join(get_args(Criterion))}, is {criterion!r}")
+    if not 1 <= pick <= max(len(made), 1):
+        problems.append(f"pick must be from 1 to {len(made)}, the number of candidates, is {pick}")
+    if problems:
+        raise IdentificationError(problems)
+    ts = np.asarray(ts, float)
+    records = [
+        Record(
+            ts,
+            {channel: np.zeros(ts.shape) for channel in channels},
+            noise,
+            c.initial_state,
+            conditions=c.conditions,
+            name=c.name,
+        )
+        for c in made
+    ]
+    problem = build_problem(mechanism if given is None else given.mechanism, records, parameters, settings)
+    names = problem.unknowns.names
+    wanted = _wanted(names, of)
+    before = _prior_information(problem, given)
+    dx_dz = problem.unknowns.dx_dz(np.zeros(len(names)))[wanted]
+    roots = _information_of_records(problem, (tol, tol))
+    floor = INVISIBLE * np.linalg.norm(np.concatenate([before, *roots]), 2)
+
+    def evaluate(which: Sequence[int]) -> tuple[tuple[int, float], np.ndarray]:
+        every = np.concatenate([before, *(roots[k] for k in which)])
+        return _score(_eliminate(every, np.setdiff1d(np.arange(len(names)), wanted), floor), criterion, floor)
+
+    alone = [evaluate([k]) for k in range(len(made))]
+    chosen: list[int] = []
+    while len(chosen) < pick:
+        left = [k for k in range(len(made)) if k not in chosen]
+        chosen.append(max(left, key=lambda k: evaluate([*chosen, k])[0]))
+    full = len(wanted)
+    nothing = 0.0 if criterion == "E" else -np.inf
+    return Design(
+        criterion,
+        tuple(names[k] for k in wanted),
+        tuple(c.name for c in made),
+        np.array([score if rank == full else nothing for (rank, score), _ in alone]),
+        np.stack([errors * dx_dz for _, errors in alone]),
+        tuple(sorted(range(len(made)), key=lambda k: alone[k][0], reverse=True)),
+        tuple(chosen),
+        np.stack([evaluate(chosen[: n + 1])[1] * dx_dz for n in range(pick)]),
+    )
+
+
+def _candidate(given: Candidate | Mapping[str, ArrayLike] | Start | State, k: int) -> Candidate:
+    found = given if isinstance(given, Candidate) else None
+    if isinstance(given, Mapping):
+        found = Candidate(given, name=", ".join(f"{name} = {value}" for name, value in given.items()))
+    elif isinstance(given, Start | State):
+        found = Candidate(initial_state=given)
+    if found is None:
+        raise IdentificationError([f"candidate {k + 1}: must be a Candidate, conditions or a start, is {type(given).__name__}"])
+    return found if found.name else Candidate(found.conditions, found.initial_state, f"candidate {k + 1}")
+
+
+def _wanted(names: Sequence[str], of: Sequence[str] | None) -> np.ndarray:
+    asked = names if of is None else [of] if isinstance(of, str) else of
+    problems = [f"of: {name} is not among the parameters{suggestion(name, names)}" for name in asked if name not in names]
+    if problems or not asked:
+        raise IdentificationError(problems or ["of: names no parameter"])
+    return np.array([names.index(name) for name in asked])
+
+
+def _information_of_records(problem: Problem, tol: Tolerances) -> list[np.ndarray]:
+    """Return for each record rows J (., P) whose J^T J is its information; none for one that cannot be computed."""
+    P = len(problem.unknowns.names)
+    J = problem.evaluate(np.zeros((1, problem.K)), tol).J[0, : len(problem.index)]
+    found = []
+    for k in range(len(problem.records)):
+        own = J[problem.index[:, 0] == k]
+        fine = np.isfinite(own).all()
+        found.append(_eliminate(own, np.arange(P, problem.K), INVISIBLE * np.linalg.norm(own, 2)) if fine else np.zeros((0, P)))
+    return found
+
+
+def _prior_information(problem: Problem, given: Estimate | None) -> np.ndarray:
+    """Return rows J whose J^T J is known already: from the records of an estimate, and from priors."""
+    u = problem.unknowns
+    which = problem.priors
+    priors = np.zeros((len(which), len(u.names)))
+    priors[np.arange(len(which)), which] = u.dx_dz(np.zeros(len(u.names)))[which] / u.sigma[which]
+    if given is None:
+        return priors
+    if given.names != u.names:
+        raise IdentificationError([f"given: is an estimate of {', '.join(given.names)}, not of {', '.join(u.names)}"])
+    P, old = len(u.names), given.problem.unknowns
+    scale = np.append(given.uncertainty.noise, 1.0)[given.problem.noise_groups()]
+    J = given.problem.evaluate(given.z[None], given.tol).J[0] / scale[:, None]
+    rows = _eliminate(J, np.arange(P, given.problem.K), INVISIBLE * np.linalg.norm(J, 2))
+    same = u.dx_dz(np.zeros(P)) / old.dx_dz(given.z[:P])  # unknowns are measured from other first guesses
+    return rows * same  # the priors of the estimate are among its rows
+
+
+def _eliminate(J: np.ndarray, columns: np.ndarray, floor: float) -> np.ndarray:
+    """Return the other columns of J, less what these columns can make up for."""
+    rest = np.delete(J, columns, axis=1)
+    if not len(columns) or not len(J):
+        return rest
+    u, s, _ = np.linalg.svd(J[:, columns], full_matrices=False)
+    u = u[:, s > floor]
+    return rest - u @ (u.T @ rest)
+
+
+def _score(rows: np.ndarray, criterion: Criterion, floor: float) -> tuple[tuple[int, float], np.ndarray]:
+    """Return how many directions are known and how well; and the standard errors of the unknowns."""
+    K = rows.shape[1]
+    _, s, vt = np.linalg.svd(np.concatenate([rows, np.zeros((K, K))]))
+    known = s > floor
+    s, lost = s[known], np.any(np.abs(vt[~known]) > PART, axis=0)
+    value = {"D": 2.0 * np.log(s).sum(), "A": -np.sum(s**-2.0), "E": float(np.min(s, initial=np.inf) ** 2) if len(s) else 0.0}
+    errors = np.sqrt(np.sum((vt[known] / s[:, None]) ** 2, axis=0))
+    return (int(known.sum()), float(value[criterion])), np.where(lost, np.inf, errors)

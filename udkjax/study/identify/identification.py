@@ -1,0 +1,245 @@
+"""Identify: from a mechanism, records and the names of parameters to an estimate."""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypedDict
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from udkjax.deprecation import renamed_arguments
+from udkjax.integrate.solution import CAUSES, Result
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.build_problem import build_problem
+from udkjax.study.identify.directions import UnknownValues
+from udkjax.study.identify.estimate import Estimate
+from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History, Loss
+from udkjax.study.identify.messages import IdentificationError
+from udkjax.study.identify.optimizer import Method, Optimizer, UserLoss, choose_method, minimize, named_loss
+from udkjax.study.identify.parameters import Asked
+from udkjax.study.identify.prediction import LOOSE, TIGHT, Tolerances
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.records import Estimated, Noise, Start
+from udkjax.study.identify.search import N_STARTS, Report, SearchResult, Strategy, search
+from udkjax.study.identify.uncertainty import Whiteness, estimate_uncertainty, whiteness_of
+from udkjax.study.progress import ProgressOption, reporting
+
+if TYPE_CHECKING:
+    from udkjax.study.identify.record_reader import Data
+
+REWEIGHTED = 2  # fits, each with the noise that the one before left
+LEAST_NOISE = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike
+SAME_WEIGHTS = 1.05  # ratio of weights, compared with each other, that moves no estimate by what counts beside its error
+ROUNDING = 1e-8  # of what a channel shows: smaller residuals are errors of the integration, which need not be noise
+
+
+class Choices(TypedDict):
+    """How all fits of an identification are made."""
+
+    method: Method
+    loss: Loss
+    report: Report
+
+
+@renamed_arguments(start="initial_state", starts="n_starts")
+def identify(
+    mechanism: Mechanism,
+    data: "Data",
+    parameters: Asked,
+    *,
+    noise: Noise = None,
+    initial_state: Start | Estimated | None = None,
+    n_starts: int = N_STARTS,
+    guesses: ArrayLike | None = None,
+    loss: str | UserLoss = "least_squares",
+    optimizer: Optimizer = None,
+    strategy: Strategy = "auto",
+    tol: float = TIGHT,
+    seed: int = 0,
+    ignore: Sequence[str] = (),
+    progress: ProgressOption = None,
+    **settings: Any,
+) -> Estimate:
+    """Find the values of parameters with which a mechanism moves as was measured.
+
+    With y what was measured and yhat(z) what the mechanism shows, sum ((yhat(z) - y) / sigma)^2 is minimized by
+    Levenberg-Marquardt with exact forward derivatives, through the closure of all loops. Where the first guess does not lead to a
+    fit that explains the records, it is looked for along growing parts of them, and from other guesses; where these do not lead
+    to one either, as along chaotic motion, the records are cut into pieces that are held together.
+
+    Args:
+        mechanism: the scene, with first guesses.
+        data: a `Record`, a mapping of times ("time") and channels, a table of pandas or a dataset of xarray, the path of a CSV or
+            NetCDF file, or a sequence of these: records, each with an initial state of its own.
+        parameters: names of numbers of the scene, `length`s, ties in text (`body.a.mass = body.b.mass`), or `Parameter`s with
+            bounds and priors.
+        noise: standard deviation, in SI units, of all channels or of each by channel; where none is given it is estimated from
+            the residuals of the fit.
+        initial_state: the `Start` of every record, or what of it is to be estimated ("position", "velocity", "both"); by default
+            the records' own, and for those of tables the scene's.
+        n_starts: how many more first guesses may be tried; 0: none.
+        guesses: first guesses (B, P) to try besides the first, in place of `n_starts`.
+        loss: "least_squares"; "huber", for which single wrong numbers count less; or a function of the weighted residuals (R,) by
+            JAX (standard errors stay those of squares).
+        optimizer: another least-squares solver of optimistix, or any optimizer of optax.
+        strategy: "pieces" cuts the records into pieces at once; "auto": only where nothing else leads to a fit.
+        tol: tolerance of the integration at the end, relative and absolute.
+        seed: of further first guesses.
+        ignore: columns of tables that are not read.
+        progress: None or "auto" shows a line after two seconds, True at once, False none; a callable gets each `Progress`.
+        settings: further ones of `simulate`.
+
+    Returns:
+        The estimate. What the records do not show is no error: `Estimate.success` is false, and `Estimate.message` names it.
+
+    Raises:
+        IdentificationError: with every mistake; also where a parameter would open a loop that has more constraints than it needs.
+    """
+    begun = time.perf_counter()
+    if not isinstance(n_starts, int | np.integer):  # as `starts` was, before there were `guesses`
+        n_starts, guesses = 0, n_starts
+    problem = build_problem(mechanism, data, parameters, settings, noise, ignore, seed, strategy, initial_state, tol)
+    first = _first_guesses(problem, n_starts, guesses)
+    residual_loss = None if callable(loss) else named_loss(loss, len(problem.index))
+    method = choose_method(optimizer, loss)
+    with reporting(progress, None, "identify") as report:
+        say: Report = lambda text: report(report.state.done + 1, text)  # noqa: E731
+        choices = Choices(method=method, loss=residual_loss, report=say)
+        found = search(problem, first, (tol, tol), 0 if guesses is not None else n_starts, seed, strategy=strategy, **choices)
+        _require_finite(problem, found)
+        fit, history = _refit(found, (tol, tol), choices)
+    return _estimate_of(fit, found, history, (tol, tol), residual_loss, time.perf_counter() - begun)
+
+
+def _first_guesses(problem: Problem, n_starts: int, guesses: ArrayLike | None) -> Float[np.ndarray, "B K"]:
+    """Return first guesses of all unknowns."""
+    first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
+    if n_starts < 0:
+        raise IdentificationError([f"n_starts: must be a number of guesses from 0 on, is {n_starts}"])
+    if guesses is None:
+        return first
+    given = np.asarray(guesses, float)
+    if given.ndim != 2 or given.shape[1] != P or not np.isfinite(given).all():
+        raise IdentificationError(
+            [f"guesses: must be of shape (B, {P}), one finite value a parameter; is of shape {given.shape}"]
+        )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = problem.unknowns.z_of(given)
+    if not np.isfinite(z).all():
+        wrong = problem.unknowns.names[int(np.argmax(~np.isfinite(z).all(0)))]
+        raise IdentificationError([f"guesses: one of {wrong} is not between its bounds, or not positive"])
+    return np.concatenate([first, np.concatenate([z, np.zeros((len(z), problem.K - P))], 1)])
+
+
+def _require_finite(problem: Problem, found: SearchResult) -> None:
+    if not np.isfinite(found.fit.cost).any():
+        code = problem.evaluate(found.fit.z, (LOOSE, LOOSE)).code[0]
+        raise IdentificationError([f"no first guess could be simulated along the records: {CAUSES[Result(int(code))]}"])
+
+
+# --- the end of a fit
+
+
+def _refit(found: SearchResult, tol: Tolerances, choices: Choices) -> tuple[Fit, History]:
+    """Fit to the end, each channel weighted by the noise that it has turned out to have."""
+    problem = found.problem
+    end = partial(_polish, problem, tol=tol, choices=choices)
+    fit = end(found.fit.z)
+    history = [*found.history, *fit.history]
+    unknown = np.unique(problem.index[~problem.noise_given, 2])
+    for _ in range(REWEIGHTED if len(unknown) + problem.noise_given.any() > 1 else 0):
+        if not reweigh(problem, fit.z, tol, choices["loss"], LEAST_NOISE):
+            break
+        fit = end(fit.z)
+        history += fit.history
+    return fit, history
+
+
+def _polish(problem: Problem, z: np.ndarray, tol: Tolerances, choices: Choices) -> Fit:
+    """Fit from beside a minimum; with damped steps where other weights have moved it far along what hardly shows."""
+    near = minimize(problem, z, tol, steps=FEW_STEPS, undamped=True, **choices)
+    if near.settled[0] or near.history[-1][1] <= LOOSE_STEP:
+        return near
+    fit = minimize(problem, near.z, tol, **choices)
+    return fit._replace(history=near.history + fit.history)
+
+
+def reweigh(problem: Problem, z: Float[np.ndarray, "1 K"], tol: Tolerances, loss: Loss, least: float = 0.0) -> bool:
+    """Take what a fit leaves of each channel as its noise, where that is not known, and `least` of what the channel shows.
+
+    Returns:
+        Whether residuals weigh otherwise now, compared with each other.
+    """
+    before = problem.sigma.copy()
+    found = problem.evaluate(z, tol)
+    found = found if loss is None else loss(found)
+    rows = len(problem.index)
+    left = found.r[0, :rows] * problem.sigma
+    for c in range(len(problem.channels)):
+        own = (problem.index[:, 2] == c) & ~problem.noise_given
+        if own.any():
+            # Unknowns take their part of each channel's freedom.
+            freedom = own.sum() * (1.0 - (problem.K - problem.constrained) / rows)
+            size = np.sqrt(left[own] @ left[own] / max(freedom, 1.0))
+            problem.sigma[own] = max(size, max(least, np.finfo(float).tiny ** 0.25) * problem.channel_scale[c])
+    ratio = problem.sigma / before
+    return bool(ratio.max() > SAME_WEIGHTS * ratio.min()) or loss is not None or bool(len(problem.priors))
+
+
+def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerances, loss: Loss, seconds: float) -> Estimate:
+    """Return the estimate of a fit."""
+    problem = found.problem
+    unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z[0]
+    x = unknowns.values(z[:P])
+    plain = problem.evaluate(fit.z, tol)
+    weighted = plain if loss is None else loss(plain)
+    groups = problem.noise_groups()
+    values = UnknownValues(
+        problem.all_names,
+        problem.all_units,
+        np.concatenate([x, z[P:]]),
+        np.concatenate([unknowns.dx_dz(z[:P]), np.ones(problem.K - P)]),
+        (*unknowns.kinds, *["free"] * (problem.K - P)),
+    )
+    uncertainty, of_all = (
+        estimate_uncertainty(weighted.J[0], weighted.r[0], values, groups, count, len(problem.priors)) for count in (P, problem.K)
+    )
+    scale = np.append(uncertainty.noise, 1.0)[groups]
+    rows = len(problem.index)
+    sigma = problem.sigma * scale[:rows]
+    left = -plain.r[0, :rows] * problem.sigma
+    white: dict[tuple[int, str], Whiteness] = {}
+    for places in problem.series():
+        record, _, channel = problem.index[places[0]]
+        if np.abs(left[places]).max() > ROUNDING * problem.channel_scale[channel]:
+            times = problem.ts[record, problem.index[places, 1]]
+            seen = (weighted.r[0, :rows] / scale[:rows])[places]
+            white[int(record), problem.channel_names[channel]] = whiteness_of(times, seen, uncertainty.projection[places])
+    return Estimate(
+        names=unknowns.names,
+        units=unknowns.units,
+        values=x,
+        uncertainty=uncertainty,
+        at_bounds=unknowns.at_bounds(x),
+        initial_state_values={
+            name: (float(z[P + k]), float(of_all.standard_errors[P + k]))
+            for k, name in enumerate(name for state in problem.initial_states for name in state.names)
+        },
+        predicted=problem.by_record(problem.y[problem.present] - left),
+        residuals=problem.by_record(left),
+        noise=problem.by_record(sigma),
+        whiteness=white,
+        converged=bool(fit.settled[0]),
+        agreeing=found.agreeing,
+        guesses=found.guesses,
+        ways=found.ways,
+        history=tuple(history),
+        evaluations=problem.predictor.evaluations,
+        seconds=seconds,
+        tol=tol,
+        z=z,
+        problem=problem,
+        loss=loss,
+    )

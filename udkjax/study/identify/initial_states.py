@@ -1,0 +1,118 @@
+"""The unknowns of a fit that are initial states of records: coordinates and rates that parametrize the closed states."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from udkjax.equations.redundancy import rows_of
+from udkjax.integrate.assembly import State, assemble
+from udkjax.scene.checks import SceneError, quoted
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.messages import IdentificationError
+from udkjax.study.identify.parameters import Unknowns, apply_values
+from udkjax.study.identify.records import Record, Start
+
+COORDINATES, RATES = (("x", "m"), ("y", "m"), ("angle", "rad")), (("vx", "m/s"), ("vy", "m/s"), ("omega", "rad/s"))
+READABLE = 1e-3  # of the largest: how much of a free motion the coordinates that are taken as its unknowns must show at least
+
+
+class InitialStateUnknowns(NamedTuple):
+    """The unknowns of one initial state, which tied records share: how each of the S changes q and v (n,) of its guess."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    basis: Float[np.ndarray, "2 n S"]
+
+
+def initial_state_unknowns(
+    mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record]
+) -> tuple[tuple[InitialStateUnknowns, ...], Int[np.ndarray, "records S"], Float[np.ndarray, "records 2 n S"]]:
+    """Return the unknowns of all initial states; where in z those of each record are (-1: none), and what they change."""
+    found: list[InitialStateUnknowns] = []
+    of_record: list[tuple[int, InitialStateUnknowns] | None] = []
+    tied: dict[str, tuple[Start, tuple[int, InitialStateUnknowns]]] = {}
+    at, problems = len(unknowns.names), []
+    for k, record in enumerate(records):
+        start = record.start
+        if start.estimate == "nothing":
+            of_record.append(None)
+            continue
+        if start.name and start.name in tied:
+            first, own = tied[start.name]
+            if first.estimate != start.estimate or (first.state is not start.state and not _same(first.state, start.state)):
+                problems.append(
+                    f"{record.place}start {quoted(start.name)} is another one in an earlier record: give one Start to both"
+                )
+            of_record.append(own)
+            continue
+        label = start.name or record.name or (f"record {k + 1}" if len(records) > 1 else "start")
+        own = at, unknowns_of_state(mechanism, unknowns, record, label)
+        found.append(own[1])
+        of_record.append(own)
+        at += len(own[1].names)
+        if start.name:
+            tied[start.name] = start, own
+    if problems:
+        raise IdentificationError(problems)
+    S = max((len(state.names) for state in found), default=0)
+    columns, bases = np.full((len(records), S), -1), np.zeros((len(records), 2, 3 * len(mechanism.body_names), S))
+    for k, own in enumerate(of_record):
+        if own is not None:
+            at, state = own
+            count = len(state.names)
+            columns[k, :count], bases[k, ..., :count] = at + np.arange(count), state.basis
+    return tuple(found), columns, bases
+
+
+def _same(one: State | None, two: State | None) -> bool:
+    return one is not None and two is not None and np.array_equal(one.q, two.q) and np.array_equal(one.v, two.v)
+
+
+def unknowns_of_state(mechanism: Mechanism, unknowns: Unknowns, record: Record, label: str) -> InitialStateUnknowns:
+    """Choose coordinates that parametrize the closed states beside the guess: angles where they do."""
+    mech = mechanism.with_parameters(record.conditions) if record.conditions else mechanism
+    try:
+        mech = apply_values(mech, unknowns.targets, unknowns.guess)
+        state = assemble(mech, record.t0, record.start.state)
+    except SceneError as problem:
+        raise IdentificationError([f"{record.place}{problem}"]) from None
+    rows = rows_of(mech)
+    q = np.asarray(state.q, float).ravel()
+    free = np.eye(len(q))
+    if rows.count:
+        position: Any = rows.close(record.t0, q)
+        free = rows.metric[:, None] * position.vt[position.rank :].T
+    chosen = _independent_rows(free)
+    basis = free @ np.linalg.inv(free[chosen])
+    names: list[str] = []
+    units: list[str] = []
+    parts = []
+    nothing = np.zeros_like(basis)
+    for what, fields, part in (
+        ("position", COORDINATES, np.stack([basis, nothing])),
+        ("velocity", RATES, np.stack([nothing, basis])),
+    ):
+        if record.start.estimate in (what, "both"):
+            names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3][0]}" for k in chosen]
+            units += [fields[k % 3][1] for k in chosen]
+            parts.append(part)
+    return InitialStateUnknowns(tuple(names), tuple(units), np.concatenate(parts, axis=2))
+
+
+def _independent_rows(free: np.ndarray) -> list[int]:
+    """Choose as many rows as there are columns, far from dependent on each other: of angles alone if possible."""
+    for rows in (np.arange(2, len(free), 3), np.arange(len(free))):
+        left, chosen = free / np.linalg.norm(free, 2), []
+        for _ in range(free.shape[1]):
+            sizes = np.linalg.norm(left[rows], axis=1)
+            k = int(rows[np.argmax(sizes)])
+            if sizes.max() < READABLE:
+                break
+            chosen.append(k)
+            unit = left[k] / np.linalg.norm(left[k])
+            left = left - np.outer(left @ unit, unit)
+        else:
+            return sorted(chosen)
+    return sorted(chosen)

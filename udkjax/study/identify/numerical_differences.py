@@ -1,0 +1,83 @@
+"""Differences of motions by their parameters, and how far off they are."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+STEP_RATIO = 4.0  # from one step of differences to the next
+DIFFERENCE_STEPS = 0.1 * STEP_RATIO ** -np.arange(10.0)  # of dimensionless unknowns: 0.1 to 4e-7
+RICHARDSON = STEP_RATIO**2
+NEXT_STEPS = 2  # smaller steps whose truncation does not count beside that of one; two, since one may be near by chance
+TOO_LARGE = 0.5  # of a difference: where smaller steps say otherwise by more, a step is too large
+
+
+class Differences(NamedTuple):
+    """Differences R(h) at all steps but the last two, and their errors in each of S series; nan: not known."""
+
+    steps: Float[np.ndarray, "H"]
+    values: Float[np.ndarray, "H R"]
+    noise: Float[np.ndarray, "H S"]
+    truncation: Float[np.ndarray, "H S"]
+    largest: Float[np.ndarray, "S"]  # size of what was seen
+
+
+def differences(
+    y: Float[np.ndarray, "L 2 R"],
+    errors: Float[np.ndarray, "L 2 R"],
+    series: Sequence[np.ndarray],
+    steps: np.ndarray = DIFFERENCE_STEPS,
+) -> Differences:
+    """Compute central differences, extrapolated to fourth order, and their errors, root mean squares over each of some series.
+
+        D(h) = (y(h) - y(-h)) / 2h,      R(h) = (16 D(h/4) - D(h)) / 15
+
+    They are off by two errors, neither of which needs a derivative to compare with:
+
+        noise        |e(h) - e(-h)| / 2h, of what the integration leaves. Such errors e are not like rounding: where step control
+                     takes other steps they jump, and in between they move with the parameters, so that differences settle at
+                     ever smaller h, on a wrong value. So e is measured at each step, by the same run at another tolerance, not
+                     guessed from how rough y is (as by J. J. More and S. M. Wild, Estimating computational noise, 2011).
+        truncation   ~ h^4: by how much smaller steps say otherwise, beyond their own errors; where these hide it, what is
+                     expected from larger steps. Steps at which that is much of the whole are too large to tell anything.
+
+    Args:
+        y: what is seen at +-steps; not a number where a run has failed, which leaves its step out.
+        errors: of y.
+        series: which values belong together.
+        steps: from each to the next smaller by `STEP_RATIO`.
+
+    Source: L. F. Richardson, The approximate arithmetical solution by finite differences of physical problems, 1911.
+    """
+    h = steps[:, None]
+    D = (y[:, 0] - y[:, 1]) / (2 * h)
+    R = (RICHARDSON * D[1:] - D[:-1]) / (RICHARDSON - 1)
+    rounding = np.finfo(float).eps * sizes(y[:, 0], series)
+    jumps = sizes(errors[:, 0] - errors[:, 1], series) / 2 + rounding
+    # No smaller than at smaller steps, where it is only by chance.
+    off = np.fmax.accumulate(jumps[::-1])[::-1] / h
+    noise = (RICHARDSON * off[1:] + off[:-1]) / (RICHARDSON - 1)
+    noise = np.where(np.isfinite(sizes(R, series)), noise, np.nan)
+    largest = np.fmax.reduce(sizes(y, series), axis=(0, 1))
+    return Differences(steps[:-2], R[:-1], noise[:-1], _truncation(R, noise, series), largest)
+
+
+def _truncation(R: np.ndarray, noise: np.ndarray, series: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the truncation at all steps but the last."""
+    count = len(R) - 1
+    found = np.full((count, len(series)), np.nan)
+    for k in reversed(range(count)):
+        near = [sizes(R[k] - R[j], series) - noise[j] for j in range(k + 1, min(k + NEXT_STEPS, count) + 1)]
+        far = [sizes(R[k] - R[j], series) - noise[j] - found[j] for j in range(k + 1 + NEXT_STEPS, count)]
+        excess = np.stack([*near, *far])
+        found[k] = np.fmax.reduce(np.where(np.isfinite(excess), np.maximum(excess, 0.0), np.nan))
+    for k in range(1, count):
+        found[k] = np.where(found[k] < found[k - 1] / STEP_RATIO**4, found[k - 1] / STEP_RATIO**4, found[k])
+    whole = sizes(R, series)
+    return np.where(found > TOO_LARGE * np.fmax(whole[:-1], whole[1:]), np.nan, found)
+
+
+def sizes(values: Float[np.ndarray, "... R"], series: Sequence[np.ndarray]) -> Float[np.ndarray, "... S"]:
+    """Return the root mean square of values in each of some series."""
+    return np.stack([np.sqrt(np.mean(values[..., places] ** 2, -1)) for places in series], -1)

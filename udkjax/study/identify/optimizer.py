@@ -1,0 +1,235 @@
+"""Methods and losses of a fit: least squares, plain or robust, and losses of the user's own by optimizers of scipy or optax."""
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, Union, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import scipy.optimize
+from jaxtyping import Array, Float
+
+from udkjax.extras import OptionalImport
+from udkjax.study.identify.directions import INVISIBLE
+from udkjax.study.identify.least_squares import EXACT_STEP, FINE_STEP, STEPS, Fit, History, LeastSquares, Loss, minimize_squares
+from udkjax.study.identify.messages import IdentificationError
+from udkjax.study.identify.prediction import Tolerances
+from udkjax.study.identify.problem import Residuals
+
+if TYPE_CHECKING:  # needed only for fits by its optimizers
+    import optax
+
+GRADIENT_STEPS = 2000  # at most, of an optimizer that knows no curvature
+FAILED_COST = 100.0  # times the first cost: what is taken for the cost where nothing can be computed
+HUBER = 1.345  # standard deviations: of noise that is Gaussian after all, estimates lose a twentieth of their precision
+
+UserLoss: TypeAlias = Callable[[Array], Array]
+Optimizer: TypeAlias = Union[optimistix.AbstractLeastSquaresSolver, "optax.GradientTransformation", None]
+
+
+class GradientMethod(NamedTuple):
+    """An optimizer of optax (None: L-BFGS of scipy), and the loss that it minimizes: rho(r) of the residuals (None: r.r / 2)."""
+
+    optimizer: "optax.GradientTransformation | None"
+    loss: UserLoss | None = None
+
+
+Method: TypeAlias = optimistix.AbstractLeastSquaresSolver | GradientMethod | None
+
+
+def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> Method:
+    """Return the method for an optimizer and a loss; a loss of the user's own is minimized by L-BFGS unless told otherwise.
+
+    Raises:
+        IdentificationError: the optimizer cannot minimize such a loss.
+    """
+    own_loss = loss if callable(loss) else None
+    if hasattr(optimizer, "init") and hasattr(optimizer, "update"):
+        return GradientMethod(cast("optax.GradientTransformation", optimizer), own_loss)
+    if own_loss is None:
+        return cast(optimistix.AbstractLeastSquaresSolver | None, optimizer)
+    if optimizer is not None:
+        raise IdentificationError(["optimizer: a loss of your own is no sum of squares; give an optimizer of optax, or none"])
+    return GradientMethod(None, own_loss)
+
+
+def minimize(
+    problem: LeastSquares,
+    z: Float[np.ndarray, "B K"],
+    tol: Tolerances,
+    horizon: float | None = None,
+    steps: int = STEPS,
+    settled: float = EXACT_STEP,
+    undamped: bool = False,
+    method: Method = None,
+    loss: Loss = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> Fit:
+    """Minimize from several first guesses by a method: see `minimize_squares`, whose arguments these are."""
+    if isinstance(method, GradientMethod):
+        return minimize_by_gradient(method, problem, z, tol, horizon, settled=settled, transform=loss, report=report)
+    return minimize_squares(problem, z, tol, horizon, steps, settled, undamped, method, loss, report)
+
+
+# --- losses
+
+
+def named_loss(name: str, residuals: int) -> Loss:
+    """Return the loss of a name, for the first `residuals` of a problem: priors are not outliers. None: squares."""
+    if name == "least_squares":
+        return None
+    if name == "huber":
+        return partial(huber, residuals=residuals)
+    raise IdentificationError([f"loss must be 'least_squares' or 'huber', is {name!r}"])
+
+
+def huber(found: Residuals, residuals: int, c: float = HUBER) -> Residuals:
+    """Return s = sign(r) sqrt(rho(r)) and its Jacobian ds/dr J, whose sum of squares is that of Huber's rho.
+
+    rho(r) = r^2 up to |r| = c, and 2 c |r| - c^2 beyond; the gradient of its sum is exact.
+
+    Source: P. J. Huber, Robust estimation of a location parameter, 1964.
+    """
+    r = found.r[:, :residuals]
+    size = np.abs(r)
+    outside = size > c
+    root = np.sqrt(np.where(outside, 2.0 * c * size - c**2, 1.0))
+    s, slope = np.where(outside, np.sign(r) * root, r), np.where(outside, c / root, 1.0)
+    rest = found.r[:, residuals:], found.J[:, residuals:]
+    return Residuals(
+        np.concatenate([s, rest[0]], 1), np.concatenate([slope[..., None] * found.J[:, :residuals], rest[1]], 1), found.code
+    )
+
+
+# --- gradients
+
+
+class _LossPoint(NamedTuple):
+    """Value and gradient (K,) of a loss, and the largest entry of the Gauss-Newton step."""
+
+    value: float
+    gradient: np.ndarray
+    step: float
+
+
+def minimize_by_gradient(
+    method: GradientMethod,
+    problem: LeastSquares,
+    z: Float[np.ndarray, "B K"],
+    tol: Tolerances,
+    horizon: float | None = None,
+    steps: int = GRADIENT_STEPS,
+    settled: float = FINE_STEP,
+    transform: Loss = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> Fit:
+    """Minimize a loss rho(r) by an optimizer that knows its gradient J^T d rho / dr, from guesses one after another.
+
+    A fit has settled where (J^T J)^-1 J^T d rho / dr is small, but no smaller than first-order methods come. Derivatives are
+    taken forward here too: in reverse mode a gradient costs a fifth of it with 20 unknowns, but takes 20 to 40 s to compile.
+
+    Args: see `minimize`; `transform` is its `loss`.
+    """
+    settled = max(settled, FINE_STEP)
+    walks = [_LossAlongWalk(problem, tol, horizon, method.loss or _half_square, transform, settled, report) for _ in z]
+    step_on = _walk_by_scipy if method.optimizer is None else partial(_walk_by_optax, method.optimizer)
+    for first, walk in zip(z, walks, strict=True):
+        step_on(walk, first, steps)
+    best = min(walks, key=lambda walk: walk.best.value)
+    return Fit(
+        np.array([walk.best_z for walk in walks]),
+        np.array([walk.best.value for walk in walks]),
+        np.array([walk.best.step <= settled for walk in walks]),
+        best.history,
+    )
+
+
+def _walk_by_scipy(walk: "_LossAlongWalk", first: np.ndarray, steps: int) -> None:
+    def after_step(_) -> None:
+        if walk.after_step():
+            raise StopIteration
+
+    if np.isfinite(walk(first).value):
+        options = {"maxiter": steps, "maxfun": 20 * steps, "ftol": 0.0, "gtol": 0.0}
+        scipy.optimize.minimize(lambda z: walk(z)[:2], first, jac=True, method="L-BFGS-B", callback=after_step, options=options)
+
+
+def _walk_by_optax(given: "optax.GradientTransformation", walk: "_LossAlongWalk", first: np.ndarray, steps: int) -> None:
+    with OptionalImport():
+        import optax
+    optimizer = optax.with_extra_args_support(given)
+    at, state = jnp.asarray(first), optimizer.init(jnp.asarray(first))
+    for _ in range(steps):
+        point = walk(np.asarray(at))
+        if walk.after_step():
+            return
+        known = {"value": jnp.asarray(point.value), "grad": jnp.asarray(point.gradient), "value_fn": walk.differentiable}
+        with jax.disable_jit():  # a line search then asks for numbers, not for a program that could be compiled
+            change, state = optimizer.update(known["grad"], state, at, **known)
+        at = optax.apply_updates(at, change)
+
+
+class _LossAlongWalk:
+    """A loss and its gradient at the points of one walk: it stores the best, and the last few, for line searches that repeat."""
+
+    def __init__(
+        self,
+        problem: LeastSquares,
+        tol: Tolerances,
+        horizon: float | None,
+        rho: UserLoss,
+        transform: Loss,
+        settled: float,
+        report: Callable[[str], None],
+    ):
+        self.problem, self.tol, self.horizon, self.transform = problem, tol, horizon, transform
+        self.settled, self.report = settled, report
+        self.value_and_slope = jax.value_and_grad(rho)
+        self.worst = np.inf
+        self.best, self.best_z = _LossPoint(np.inf, np.zeros(0), np.inf), np.zeros(0)
+        self.history: History = []
+        self._at = lru_cache(maxsize=8)(self._computed)
+
+        @jax.custom_vjp
+        def differentiable(z):
+            return jnp.asarray(self(np.asarray(z)).value)
+
+        def forward(z):
+            point = self(np.asarray(z))
+            return jnp.asarray(point.value), jnp.asarray(point.gradient)
+
+        differentiable.defvjp(forward, lambda gradient, bar: (bar * gradient,))
+        self.differentiable = differentiable
+
+    def __call__(self, z: np.ndarray) -> _LossPoint:
+        point = self._at(tuple(z.tolist()))
+        if point.value < self.best.value or not self.best_z.size:
+            self.best, self.best_z = point, np.array(z)
+        return point
+
+    def after_step(self) -> bool:
+        """Note how far the walk is; return whether it has ended."""
+        self.history.append((self.best.value, self.best.step))
+        self.report(f"step {len(self.history)}, cost {self.best.value:.4g}")
+        return self.best.step <= self.settled or not np.isfinite(self.best.value)
+
+    @jax.disable_jit(False)
+    def _computed(self, z: tuple[float, ...]) -> _LossPoint:
+        found = self.problem.evaluate(np.array([z]), self.tol, self.horizon)
+        found = found if self.transform is None else self.transform(found)
+        if not found.ok[0]:
+            return _LossPoint(self.worst, np.zeros(len(z)), np.inf)
+        value, slope = self.value_and_slope(jnp.asarray(found.r[0]))
+        if not np.isfinite(self.worst):
+            self.worst = FAILED_COST * (abs(float(value)) + 1.0)
+        gradient = found.J[0].T @ np.asarray(slope)
+        _, s, vt = np.linalg.svd(found.J[0], full_matrices=False)
+        shows = s > INVISIBLE * s.max(initial=0.0)
+        step = vt[shows].T @ (vt[shows] @ gradient / s[shows] ** 2)
+        return _LossPoint(float(value), gradient, float(np.abs(step).max(initial=0.0)))
+
+
+def _half_square(r: Array) -> Array:
+    return 0.5 * jnp.sum(r**2)

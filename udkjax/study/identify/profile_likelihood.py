@@ -1,0 +1,275 @@
+"""The profile likelihood of one unknown: how far it can go while all others make up for it.
+
+With C(z) = r.r / 2 and one unknown z_k fixed, the others fitted anew, the curve
+
+    psi = +-(2 (C(z_k) - C_min) / s^2)^(1/2)
+
+is a straight line for a linear model, psi = (z_k - estimate) / standard error. All z_k with psi^2 below the quantile of chi^2
+with one degree of freedom are a confidence interval that needs no linear model: it may be longer on one side, and it may be open.
+(Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.)
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+import scipy.stats
+from jaxtyping import Float
+
+from udkjax.study.identify.least_squares import FINE_STEP, LeastSquares, Loss, minimize_squares
+from udkjax.study.identify.parameters import FAR, Unknowns
+from udkjax.study.identify.prediction import Tolerances
+from udkjax.study.identify.problem import Residuals
+from udkjax.study.identify.uncertainty import Uncertainty
+
+CONFIDENCE = 0.95
+STEPS_TO_END = 4.0  # from the estimate to the end of the interval, where the curve is a straight line
+UNKNOWN_ERROR = 0.5  # of a dimensionless unknown: taken for a standard error that is not known
+STRETCH, SHRINK = 2.0, 0.1  # by how much a step may be longer than the one before, and by how much shorter
+AT_END = 1e-3  # of psi at the end of the interval: near enough to it
+MOST_FITS = 30  # to one side
+BETTER_FIT = 1e-6  # of the rise: costs that are lower than the estimate's by this are not rounding, nor a fit's last digits
+
+_AT_BOUND = "the end of what was looked at"
+
+FitOthers: TypeAlias = Callable[[int, float, np.ndarray], tuple[np.ndarray, float]]
+
+
+class ProfileLikelihood(NamedTuple):
+    """The curve of one unknown, from its smallest value to its largest, and the confidence interval."""
+
+    name: str
+    values: Float[np.ndarray, "N"]  # x
+    costs: Float[np.ndarray, "N"]  # r.r / 2
+    z: Float[np.ndarray, "N K"]  # all unknowns
+    interval: tuple[float, float]  # an end is infinite where the curve does not rise as far
+    best: int  # the index of the lowest cost: not the estimate's where a better fit was met
+    text: str
+
+
+class _Side(NamedTuple):
+    """One side of a profile: fixed values z_k, all unknowns, costs; where the interval ends; why it is open, or nothing."""
+
+    fixed: list[float]
+    z: list[np.ndarray]
+    costs: list[float]
+    end: float
+    open: str
+
+
+class WithFixedParameter:
+    """A problem in all unknowns but one, which has a value."""
+
+    def __init__(self, problem: LeastSquares, index: int, value: float):
+        self.problem, self.index, self.value = problem, index, value
+
+    def insert(self, z: Float[np.ndarray, "... K-1"]) -> Float[np.ndarray, "... K"]:
+        """Return all unknowns."""
+        return np.insert(z, self.index, self.value, axis=-1)
+
+    def evaluate(self, z: Float[np.ndarray, "B K-1"], tol: Tolerances, horizon: float | None = None) -> Residuals:
+        """Compute residuals, and their Jacobian by the others."""
+        found = self.problem.evaluate(self.insert(z), tol, horizon)
+        return found._replace(J=np.delete(found.J, self.index, axis=2))
+
+
+def profile_likelihood(
+    problem: LeastSquares,
+    unknowns: Unknowns,
+    z: Float[np.ndarray, "K"],
+    tol: Tolerances,
+    loss: Loss,
+    uncertainty: Uncertainty,
+    name: str,
+    level: float = CONFIDENCE,
+) -> ProfileLikelihood:
+    """Compute the profile likelihood of a parameter at an estimate z of a problem: the others are fitted anew beside it.
+
+    Args:
+        problem: that was fitted.
+        unknowns: its parameters.
+        z: the estimate.
+        tol: tolerances of the integration.
+        loss: that was minimized.
+        uncertainty: of the estimate.
+        name: of the parameter.
+        level: of confidence.
+    """
+    k, P = unknowns.names.index(name), len(unknowns.names)
+
+    def fit(index: int, fixed: float, z0: np.ndarray) -> tuple[np.ndarray, float]:
+        rest = WithFixedParameter(problem, index, fixed)
+        others = np.delete(z0, index)
+        if others.size:
+            found = minimize_squares(rest, others[None], tol, settled=FINE_STEP, loss=loss)
+            return rest.insert(found.z[0]), float(found.cost[0])
+        residuals = rest.evaluate(others[None], tol)
+        return z0, cost_of(residuals, loss) if residuals.ok[0] else np.inf
+
+    def value(fixed: float) -> float:
+        every = z[:P].copy()
+        every[k] = fixed
+        return float(unknowns.values(every)[k])
+
+    noise, freedom = estimated_noise(uncertainty)
+    return trace_profile(
+        fit,
+        k,
+        z,
+        cost_of(problem.evaluate(z[None], tol), loss),
+        float(uncertainty.standard_errors[k] / abs(unknowns.dx_dz(z[:P])[k])),
+        level=level,
+        noise=noise,
+        degrees_of_freedom=freedom,
+        value=value,
+        name=name,
+        units=unknowns.units[k],
+    )
+
+
+def cost_of(found: Residuals, loss: Loss) -> float:
+    """Return r.r / 2 of the first set of unknowns."""
+    r = (found if loss is None else loss(found)).r[0]
+    return float(0.5 * r @ r)
+
+
+def estimated_noise(uncertainty: Uncertainty) -> tuple[float, float | None]:
+    """Return the noise over what residuals are divided by, and degrees of freedom where it was estimated.
+
+    Where several channels have a noise of their own, residuals were divided by it, and the factors are 1 but for the last digits.
+    """
+    scales = uncertainty.noise
+    return (float(scales.mean()), uncertainty.degrees_of_freedom) if scales.size else (1.0, None)
+
+
+# --- the curve
+
+
+def trace_profile(
+    fit: FitOthers,
+    index: int,
+    z: Float[np.ndarray, "K"],
+    cost: float,
+    step: float,
+    *,
+    level: float = CONFIDENCE,
+    noise: float = 1.0,
+    degrees_of_freedom: float | None = None,
+    bounds: tuple[float, float] = (-FAR, FAR),
+    value: Callable[[float], float] = lambda z: z,
+    name: str = "z",
+    units: str = "",
+    steps: int = MOST_FITS,
+) -> ProfileLikelihood:
+    """Walk from an estimate z of the cost r.r / 2 both ways along the unknown `index`, to the ends of its confidence interval.
+
+    Args:
+        fit: (index, value, z0) -> (z, cost) minimizes the cost over all other unknowns from z0 on; a cost that is not finite is a
+            failure, before which the walk ends.
+        index: of the unknown.
+        z: the estimate (K,).
+        cost: of the estimate.
+        step: a first guess of the standard error of z_k; steps adapt.
+        level: of confidence.
+        noise: where it was estimated, how many times larger it is than what residuals were divided by.
+        degrees_of_freedom: where the noise was estimated, those that it leaves: the quantile is then that of F.
+        bounds: of z_k.
+        value: x of z_k, which increases.
+        name, units: of the parameter, in texts.
+        steps: fits at most, to one side.
+    """
+    limit = quantile(level, degrees_of_freedom)
+    rise = limit * noise**2
+    ways = []
+    for sign, bound in zip((-1.0, 1.0), bounds, strict=True):
+        length = min(np.sqrt(limit) * (step if 0 < step < np.inf else UNKNOWN_ERROR), abs(bound - z[index]))
+        ways.append(_walk(fit, index, np.asarray(z, float), cost, sign * length, bound, rise, steps))
+    low, high = ways
+    fixed = np.array([*low.fixed[::-1], z[index], *high.fixed])
+    costs = np.array([*low.costs[::-1], cost, *high.costs])
+    every = np.array([*low.z[::-1], z, *high.z])
+    values = np.array([value(x) for x in fixed])
+    ends = -np.inf if low.open else value(low.end), np.inf if high.open else value(high.end)
+    best = int(np.argmin(costs))
+    better = costs[best] < cost - BETTER_FIT * rise
+    text = _text(name, units, level, ends, (low, high), value)
+    if better:
+        text += f"; a better fit was met at {values[best]:.6g}{f' {units}' if units else ''}: identify again from there"
+    return ProfileLikelihood(name, values, costs, every, ends, best if better else len(low.fixed), text)
+
+
+def quantile(level: float, degrees_of_freedom: float | None) -> float:
+    """Return psi^2 at the ends of the interval: of chi^2 with one degree of freedom; of F, where the noise was estimated."""
+    law = scipy.stats.chi2(1) if degrees_of_freedom is None else scipy.stats.f(1, degrees_of_freedom)
+    return float(law.ppf(level))
+
+
+def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, bound: float, rise: float, steps: int) -> _Side:
+    """One side: steps that raise psi by equal parts; where one went past the end, between the two points beside it."""
+    end, sign = np.sqrt(rise), np.sign(step)
+    inside: tuple[np.ndarray, float] = z, 0.0  # the last point within the interval, and its psi
+    before, outside = None, None  # the point within before that one; the nearest beyond
+    found: list[tuple[np.ndarray, float]] = []
+    reason = f"not in {steps} steps"
+    step = step / STEPS_TO_END
+    if sign == 0.0:
+        return _Side([], [], [], z[index], _AT_BOUND)
+    for _ in range(steps):
+        current, psi = inside
+        if outside is not None:
+            far, beyond = outside
+            step = (far[index] - current[index]) * (max((end - psi) / (beyond - psi), SHRINK) if np.isfinite(beyond) else 0.5)
+        fixed = sign * min(sign * (current[index] + step), sign * bound)
+        part = 0.0 if before is None else (fixed - current[index]) / (current[index] - before[index])
+        guess = current + part * (current - before) if before is not None else current.copy()
+        guess[index] = fixed
+        narrow = outside is not None and abs(fixed - current[index]) <= AT_END * abs(fixed - z[index])
+        trial, value = fit(index, float(fixed), guess)
+        if not np.isfinite(value):
+            outside, reason = (guess, np.inf), "no fit was found beyond"
+            if narrow:
+                break
+            continue
+        found.append((trial, value))
+        reached = np.sqrt(max(2.0 * (value - cost), 0.0))
+        if abs(reached - end) <= AT_END * end:
+            inside, reason = (trial, reached), ""
+            break
+        if reached > end:
+            outside, reason = (trial, reached), "" if narrow else f"not in {steps} steps"
+            if narrow:  # it jumps
+                break
+            continue
+        slope = (reached - psi) / abs(fixed - current[index])
+        # Where the curve falls there may be another minimum: no longer steps there.
+        wanted = abs(step) if slope < 0.0 else min(end / STEPS_TO_END, end - reached) / max(slope, 1e-300)
+        step = sign * np.clip(wanted, SHRINK * abs(step), STRETCH * abs(step))
+        before, inside = current, (trial, reached)
+        if fixed == bound:
+            reason = _AT_BOUND
+            break
+    found.sort(key=lambda point: sign * point[0][index])
+    return _Side(
+        [float(p[index]) for p, _ in found], [p for p, _ in found], [c for _, c in found], float(inside[0][index]), reason
+    )
+
+
+def _text(name: str, units: str, level: float, ends: tuple[float, float], sides: tuple[_Side, _Side], value: Callable) -> str:
+    """Return the interval in words, with how far was looked where it is open."""
+    unit = f" {units}" if units else ""
+    if np.isfinite(ends).all():
+        low, high = (f"{end:.{_digits(ends)}g}" for end in ends)
+        return f"{name} is between {low} and {high}{unit} ({100 * level:g} %)"
+    known = [f"{word} {end:.4g}{unit}" for word, end in zip(("above", "below"), ends, strict=True) if np.isfinite(end)]
+    looked = [
+        f"no {which} end as far as {value(side.end):.4g}{unit} ({side.open})"
+        for which, side in zip(("lower", "upper"), sides, strict=True)
+        if side.open
+    ]
+    return f"{name} {f'is {known[0]} ({100 * level:g} %)' if known else 'is not known'}: {', '.join(looked)}"
+
+
+def _digits(ends: tuple[float, float]) -> int:
+    """Return the digits that tell the ends of an interval apart."""
+    size, width = max(map(abs, ends)), ends[1] - ends[0]
+    return max(4, 2 + int(np.ceil(np.log10(size / width)))) if width > 0 else 4

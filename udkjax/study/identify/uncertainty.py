@@ -1,0 +1,299 @@
+"""How well the unknowns are known from measured motion, which of them do not show in it at all, and whether residuals are noise.
+
+With r the residuals (R,) divided by the standard deviations of the noise, and J = dr/dz (R, K), the Fisher information is J^T J,
+and the covariance of the unknowns z its inverse; both from the singular values of J = U S V^T. A direction of z whose singular
+value is as small as the errors of J does not show in what was measured. Nothing is known of a parameter that takes part in one;
+of the others, what the pseudoinverse says. Unknowns that nobody asked for, such as those of initial states, are columns of J like
+all others: leaving them out of the covariance afterwards is the Schur complement.
+
+Where the noise of some residuals is not known, it is estimated from them, s^2 = chi^2 / (R - gamma), with gamma the number of
+unknowns that these residuals determine (MacKay, Neural Computation 4 (1992) 415): all K of them where there is nothing else.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.stats
+from jaxtyping import Float, Int
+
+from udkjax.study.identify.directions import INVISIBLE, Direction, UnknownValues, describe, null_space, simplest_basis
+from udkjax.study.identify.messages import listed
+
+POOR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
+CORRELATED = 0.98  # of two parameters: their difference is known ten times worse than their sum
+IMPROBABLE = 1e-3  # probability of what was seen if noise is white and as given: below it, it is said not to be so
+LEAST_NOISE = 1e-15  # of what residuals were divided by: noise below it is rounding
+NOISE_ITERATIONS, EQUAL = 50, 1e-10  # of the noise and what is determined with such noise, in turn, until both stay
+LAGS = 5  # at most; a model that lacks something leaves long waves, which show at the first of them
+PAIRS_PER_LAG = 4  # at least: with fewer there is nothing to be said
+NO_GAP = 1.5  # times the usual distance in time of k samples: pairs farther apart have a gap between them
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """How well P parameters are known.
+
+    Attributes:
+        values: all K unknowns at the estimate.
+        standard_errors: of the parameters, in their units; inf where a parameter is not known.
+        covariance: of the parameters, not a number where one is not known.
+        correlation: of their errors.
+        singular: singular values of J over all unknowns z.
+        directions: right singular vectors of J.
+        dead: parameters on which no measured quantity depends.
+        flat: further directions that no measured quantity shows.
+        chi2: sum of squares of residuals divided by their noise, given or estimated.
+        degrees_of_freedom: residuals minus directions that they show.
+        noise: for each group of residuals whose noise was estimated, how many times larger it is than what they were divided by.
+        projection: U, the part of the residuals that the fit removes.
+    """
+
+    values: UnknownValues
+    standard_errors: Float[np.ndarray, "P"]
+    covariance: Float[np.ndarray, "P P"]
+    correlation: Float[np.ndarray, "P P"]
+    singular: Float[np.ndarray, "D"]
+    directions: Float[np.ndarray, "D K"]
+    dead: tuple[str, ...]
+    flat: tuple[Direction, ...]
+    chi2: float
+    degrees_of_freedom: int
+    noise: Float[np.ndarray, "G"]
+    projection: Float[np.ndarray, "R D"]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self.values.names[: len(self.standard_errors)])
+
+    @property
+    def poor(self) -> tuple[str, ...]:
+        """Names of parameters whose standard error is more than half of their value."""
+        errors = enumerate(self.standard_errors)
+        return tuple(self.values.names[k] for k, error in errors if POOR * self.values.typical(k) < error < np.inf)
+
+    @property
+    def correlated(self) -> tuple[tuple[str, str, float], ...]:
+        """Pairs of parameters that are hardly known apart, and their correlation."""
+        with np.errstate(invalid="ignore"):
+            pairs = np.argwhere(np.triu(np.abs(self.correlation) > CORRELATED, 1))
+        return tuple((self.names[i], self.names[j], float(self.correlation[i, j])) for i, j in pairs)
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """What is to be known before the numbers are used, one sentence each; nothing where all is well."""
+        return tuple(_sentences(self))
+
+
+def estimate_uncertainty(
+    J: Float[np.ndarray, "R K"],
+    r: Float[np.ndarray, "R"],
+    values: UnknownValues,
+    noise_group: Int[np.ndarray, "R"] | None = None,
+    parameters: int | None = None,
+    priors: int = 0,
+) -> Uncertainty:
+    """Compute how well unknowns are known: covariance (J^T J)^-1, and the directions that J does not show.
+
+    Args:
+        J: derivatives of the weighted residuals by the unknowns z.
+        r: the weighted residuals.
+        values: the unknowns.
+        noise_group: for each residual the group (0, 1, ...) whose common noise is to be estimated, or -1 where it is known; by
+            default all noise is known.
+        parameters: how many of the unknowns, from the first on, are asked for; by default all.
+        priors: how many of the last rows are those of priors: what only they show is as known as they say, however much better
+            other directions are measured.
+    """
+    K = len(values.names)
+    P = K if parameters is None else parameters
+    size, before = np.linalg.norm(J, axis=0), J[len(J) - priors :]
+    alive = np.flatnonzero((size > INVISIBLE * size.max(initial=0.0)) | np.any(before != 0.0, axis=0))
+    group = np.full(len(r), -1) if noise_group is None else np.asarray(noise_group, int)
+    noise = _noise_scales(J[:, alive], r, group)
+    scale = np.append(noise, 1.0)[group]
+    known = np.isfinite(scale).all()
+    u, sigma, vt = np.linalg.svd(J[:, alive] / (scale[:, None] if known else 1.0), full_matrices=False)
+    shown = sigma > INVISIBLE * sigma.max(initial=0.0)
+    sigma, vt, u, shown = _with_priors(before[:, alive], sigma, vt, u, shown)
+    x, dx_dz = (np.asarray(part, float)[alive] for part in (values.x, values.dx_dz))
+    free = simplest_basis(null_space(vt[shown], 0.5), x, dx_dz, [values.kinds[k] for k in alive.tolist()])
+    directions, flats = (_expanded(rows, alive, K) for rows in (vt, free))
+    lost = np.any(flats != 0.0, axis=0)
+    lost[np.setdiff1d(np.arange(K), alive)] = True
+    root = directions[shown].T / sigma[shown] * np.asarray(values.dx_dz)[:, None]  # (K, D)
+    covariance = (root @ root.T)[:P, :P] * (1.0 if known else np.nan)
+    errors = np.where(lost[:P], np.inf, np.sqrt(np.diag(covariance)))
+    covariance[lost[:P]] = covariance[:, lost[:P]] = np.nan
+    correlation = covariance / np.outer(errors, errors)
+    np.fill_diagonal(correlation, 1.0)
+    np.fill_diagonal(covariance, errors**2)
+    return Uncertainty(
+        values=values,
+        standard_errors=errors,
+        covariance=covariance,
+        correlation=correlation,
+        singular=sigma,
+        directions=directions,
+        dead=tuple(values.names[k] for k in range(P) if k not in alive),
+        flat=tuple(describe(values, row) for row in flats),
+        chi2=float(np.sum((r / scale) ** 2)),
+        degrees_of_freedom=len(r) - int(shown.sum()),
+        noise=noise,
+        projection=u[:, shown],
+    )
+
+
+def _with_priors(
+    before: np.ndarray, sigma: np.ndarray, vt: np.ndarray, u: np.ndarray, shown: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Add to the singular values and vectors those that no measurement shows, but priors do: by their own size."""
+    none = null_space(vt[shown], 0.5)
+    if not len(none) or not len(before):
+        return sigma, vt, u, shown
+    _, own, w = np.linalg.svd(before @ none.T, full_matrices=False)
+    some = own > INVISIBLE * np.linalg.norm(before, axis=1).max(initial=0.0)
+    rows = np.concatenate([np.zeros((len(u) - len(before), int(some.sum()))), (before @ none.T @ w[some].T) / own[some]])
+    sigma, vt = np.concatenate([sigma[shown], own[some]]), np.concatenate([vt[shown], w[some] @ none])
+    return sigma, vt, np.concatenate([u[:, shown], rows], axis=1), np.ones(len(sigma), bool)
+
+
+def _expanded(rows: np.ndarray, columns: np.ndarray, count: int) -> np.ndarray:
+    whole = np.zeros((len(rows), count))
+    whole[:, columns] = rows
+    return whole
+
+
+def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Return the factor s of each group of residuals; nan where it has no more residuals than it determines unknowns."""
+    groups = [np.flatnonzero(group == g) for g in range(group.max(initial=-1) + 1)]
+    sums, counts = np.array([r[g] @ r[g] for g in groups]), np.array([len(g) for g in groups], float)
+    # R of QR stands for the rows of a group: all that is asked of them is J^T J.
+    parts = [np.linalg.qr(J[g], mode="r") for g in (*groups, np.flatnonzero(group < 0))]
+    s2 = sums / np.maximum(counts, 1.0)
+    for _ in range(NOISE_ITERATIONS if groups else 0):
+        scaled = [part / s for part, s in zip(parts, [*np.sqrt(np.where(s2 > 0, s2, 1.0)), 1.0], strict=True)]
+        u, sigma, _ = np.linalg.svd(np.concatenate(scaled), full_matrices=False)
+        leverage = np.sum(u[:, sigma > INVISIBLE * sigma.max(initial=0.0)] ** 2, axis=1)
+        ends = np.cumsum([len(part) for part in parts])[:-1]
+        determined = np.array([part.sum() for part in np.split(leverage, ends)[: len(groups)]])
+        left = counts - determined
+        before, s2 = s2, np.where(left > EQUAL * counts, sums / np.where(left > 0, left, 1.0), np.nan)
+        if np.isnan(s2).any() or np.all(np.abs(s2 - before) <= EQUAL * s2):
+            break
+    return np.maximum(np.sqrt(s2), LEAST_NOISE)
+
+
+# --- words
+
+
+def _sentences(known: Uncertainty) -> Iterator[str]:
+    values = known.values
+    if known.dead:
+        yield f"no measured quantity depends on {listed(known.dead)}: leave out what does not show, or measure what does"
+    for flat in known.flat:
+        one = "fix one of them, give one a prior, or measure more" if len(flat.names) > 1 else "fix it, or measure more"
+        yield f"no measured quantity shows {flat.text}: {one}"
+    if not np.isfinite(known.noise).all():
+        yield (
+            f"{known.projection.shape[0]} residuals leave nothing from which to estimate the noise: standard errors are not "
+            "known; give the noise, or more data"
+        )
+    for name in known.poor:
+        k = list(values.names).index(name)
+        error, unit = known.standard_errors[k], f" {values.units[k]}".rstrip()
+        percent = f" ({100 * error / abs(values.x[k]):.0f} %)" if values.x[k] else ""
+        yield f"{name} is poorly known: {values.x[k]:.4g}{unit} with a standard error of {error:.2g}{unit}{percent}"
+    for one, other, rho in known.correlated:
+        yield f"{one} and {other} are hardly known apart: their errors have the correlation {rho:.4f}"
+    if not known.noise.size and known.degrees_of_freedom > 0:
+        yield from _noise_sentence(known.chi2, known.degrees_of_freedom)
+
+
+def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
+    """Say so where residuals are not as large as the noise that was given."""
+    ratio = np.sqrt(chi2 / freedom)
+    numbers = f"chi^2 = {chi2:.4g} with {freedom} degrees of freedom"
+    if scipy.stats.chi2.sf(chi2, freedom) < IMPROBABLE:
+        yield (
+            f"residuals are {ratio:.3g} times as large as the noise given ({numbers}): the model leaves something out, or the "
+            "noise is larger; standard errors are those of the noise given"
+        )
+    elif scipy.stats.chi2.cdf(chi2, freedom) < IMPROBABLE:
+        yield (
+            f"residuals are only {ratio:.3g} times as large as the noise given ({numbers}): the noise is smaller, or its samples "
+            "are not independent; standard errors are those of the noise given"
+        )
+
+
+# --- whiteness
+
+
+class Whiteness(NamedTuple):
+    """Whether the residuals of a channel are white noise."""
+
+    lag1: float  # correlation of neighbours
+    statistic: float  # Q
+    lags: int
+    p: float  # probability that white noise has such a Q; not a number where there are too few residuals
+    samples: int
+
+    @property
+    def white(self) -> bool:
+        """Whether nothing speaks against white noise."""
+        return not self.p < IMPROBABLE
+
+    def text(self, channel: str) -> str:
+        """Return a sentence about the residuals; nothing where they are white."""
+        if self.white:
+            return ""
+        return (
+            f"residuals of {channel} are not noise: neighbours have the correlation {self.lag1:.2f} (probability {self.p:.1g} "
+            f"for {self.samples} samples of white noise): the model leaves something out, or the noise is "
+            "coloured; standard errors are too small"
+        )
+
+
+def whiteness_of(
+    times: Float[np.ndarray, "N"], residuals: Float[np.ndarray, "N"], projection: Float[np.ndarray, "N D"] | None = None
+) -> Whiteness:
+    """Test the residuals of one channel of one record for correlation in time.
+
+    For lags k = 1, 2, ... and residuals e, over pairs of samples without a gap between them,
+
+        z_k = sum (e_i e_(i+k) + s^2 H_(i, i+k)) / (sum e_i^2 e_(i+k)^2)^(1/2),        Q = sum z_k^2,
+
+    which white noise makes chi^2 with as many degrees of freedom as there are lags, with whatever variances and spacing.
+    H = U U^T is the hat matrix of the fit: -s^2 H is the covariance that fitting leaves in the residuals of white noise.
+
+    Args:
+        times: increasing, s; samples may be irregular and have gaps.
+        residuals: not a number where nothing was measured.
+        projection: the rows of U of these residuals: see `Uncertainty`.
+
+    Source: Lobato, Nankervis & Savin, International Economic Review 42 (2001) 187.
+    """
+    there = np.isfinite(residuals)
+    t, e = np.asarray(times, float)[there], np.asarray(residuals, float)[there]
+    U = np.zeros((len(e), 0)) if projection is None else np.asarray(projection, float)[there]
+    left = len(e) - float(np.sum(U**2))
+    square = float(e @ e)
+    if len(e) < 3 or left <= 0 or square == 0.0:
+        return Whiteness(np.nan, np.nan, 0, np.nan, len(e))
+    variance, usual = square / left, float(np.median(np.diff(t)))
+    z, lag1 = [], np.nan
+    for k in range(1, LAGS + 1):
+        pairs = np.flatnonzero(t[k:] - t[:-k] <= NO_GAP * k * usual)
+        if len(pairs) < PAIRS_PER_LAG * LAGS:
+            break
+        products = e[pairs] * e[pairs + k]
+        expected = -variance * np.sum(U[pairs] * U[pairs + k])
+        z.append((products.sum() - expected) / np.sqrt(np.sum(products**2)))
+        if k == 1:
+            lag1 = float(products.sum() / np.sqrt(np.sum(e[pairs] ** 2) * np.sum(e[pairs + 1] ** 2)))
+    if not z:
+        return Whiteness(lag1, np.nan, 0, np.nan, len(e))
+    Q = float(np.sum(np.square(z)))
+    return Whiteness(lag1, Q, len(z), float(scipy.stats.chi2.sf(Q, len(z))), len(e))
