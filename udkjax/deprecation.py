@@ -42,7 +42,7 @@ def renamed_arguments(**renamed: str) -> Callable[[Decorated], Decorated]:
         @wraps(function)
         def with_new_names(*args: Any, **kwargs: Any) -> Any:
             for old in [name for name in kwargs if name in renamed]:
-                new, place = renamed[old], decorated.__name__
+                new, place = renamed[old], decorated.__qualname__.removesuffix(".__init__")
                 if new in kwargs:
                     raise TypeError(f"{place}: {old} is now {new}; give only that")
                 warnings.warn(f"{place}: {old} is now {new}", DeprecationWarning, stacklevel=2)

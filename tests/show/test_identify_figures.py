@@ -95,8 +95,8 @@ def test_what_is_left_is_held_against_the_noise():
 
 
 def test_of_many_channels_those_are_shown_that_look_least_like_noise(monkeypatch):
-    monkeypatch.setattr(fit_figures, "ROWS", 2)
-    monkeypatch.setattr(fit_figures, "PANELS", 4)
+    monkeypatch.setattr(fit_figures, "MOST_CHANNELS", 2)
+    monkeypatch.setattr(fit_figures, "MOST_PANELS", 4)
     data = made(channels=5)
     data["correlated"][0, 3], data["correlated"][1, 1] = 1e-6, 1e-9
     found = pictures(data)
@@ -121,7 +121,7 @@ def test_what_is_not_known_has_no_correlation_and_no_bar():
 def test_a_cost_that_rises_begins_another_fit():
     cost, change = shown(pictures(made())["convergence"])
     assert [list(line.get_xdata()) for line in cost.lines] == [[1, 2, 3], [4, 5]]
-    assert [list(line.get_ydata()) for line in change.lines] == [[1.0, 0.1, identify_figures.ROUNDING], [0.2, 1e-9]]
+    assert [list(line.get_ydata()) for line in change.lines] == [[1.0, 0.1, identify_figures.ZERO_DRAWN], [0.2, 1e-9]]
 
 
 def test_profiles_are_drawn_beside_what_the_standard_error_says():

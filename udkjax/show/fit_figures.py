@@ -1,7 +1,7 @@
 """Pictures of measurements beside what a mechanism shows, and of what the one leaves of the other."""
 
 from itertools import product
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,14 +14,17 @@ with OptionalImport():
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-PANELS = 24  # of the picture of the fit, each a channel of a record; those beyond are only in the dataset
-COLUMNS = 3
-ROWS = 8  # of the picture of residuals, each a channel: those that look least like noise
-NAMED = 7  # records that are told apart by colours
-BINS = 40  # at most, of a distribution
-LAGS = 30  # at most, of an autocorrelation
-DEVIATIONS = 4.0  # standard deviations of noise that a distribution shows
-PAIRS = 4  # samples per lag at least
+if TYPE_CHECKING:
+    import xarray
+
+MOST_PANELS = 24  # of the picture of the fit, each a channel of a record; those beyond are only in the dataset
+MOST_COLUMNS = 3  # of panels side by side
+MOST_CHANNELS = 8  # of the picture of residuals, each a channel: those that look least like noise
+MOST_COLOURS = 7  # records that are told apart by colours
+MOST_BINS = 40  # at most, of a distribution
+MOST_LAGS = 30  # at most, of an autocorrelation
+NOISE_RANGE = 4.0  # standard deviations of noise that a distribution shows
+SAMPLES_PER_LAG = 4  # samples per lag at least
 
 
 class Series(NamedTuple):
@@ -37,7 +40,7 @@ class Series(NamedTuple):
     noise: Float[np.ndarray, "N"]
 
 
-def series(data: Any) -> list[Series]:
+def series(data: "xarray.Dataset") -> list[Series]:
     """All channels of all records, in this order; those that a record does not have are left out."""
     found = []
     for c, r in product(range(data.sizes["channel"]), range(data.sizes["record"])):
@@ -49,7 +52,7 @@ def series(data: Any) -> list[Series]:
     return found
 
 
-def fit(data: Any) -> Figure:
+def fit(data: "xarray.Dataset") -> Figure:
     """Draw what was measured as points, and what the mechanism shows as lines."""
     every, records = series(data), data.sizes["record"]
     columns, panels = _panels(data, every)
@@ -74,52 +77,52 @@ def fit(data: Any) -> Figure:
     return figure
 
 
-def _panels(data: Any, every: list[Series]) -> tuple[int, dict[int, Series]]:
+def _panels(data: "xarray.Dataset", every: list[Series]) -> tuple[int, dict[int, Series]]:
     """How many columns of panels there are, and the place of each series that is shown: a few records stand side by side."""
     records, channels = list(data["record"].values), list(data["channel"].values)
-    columns, places = min(COLUMNS, -(-len(every) // 4)), list(range(len(every)))
-    if 1 < len(records) <= COLUMNS:
+    columns, places = min(MOST_COLUMNS, -(-len(every) // 4)), list(range(len(every)))
+    if 1 < len(records) <= MOST_COLUMNS:
         columns, places = len(records), [channels.index(one.channel) * len(records) + records.index(one.record) for one in every]
-    return columns, {place: one for place, one in zip(places, every, strict=True) if place < PANELS}
+    return columns, {place: one for place, one in zip(places, every, strict=True) if place < MOST_PANELS}
 
 
-def residuals(data: Any) -> Figure:
+def residuals(data: "xarray.Dataset") -> Figure:
     """Draw what is left of each channel: over time, its distribution beside that of the noise, and its correlation in time."""
     every = series(data)
     channels = _least_white(data)
-    shown = channels[:ROWS]
+    shown = channels[:MOST_CHANNELS]
     records = {str(name): k for k, name in enumerate(data["record"].values)}
     figure = Figure(figsize=(11, 1.1 + 2.0 * len(shown)), layout="constrained")
     grid = figure.subplots(len(shown), 3, squeeze=False, width_ratios=(3, 1, 1.2))
     for (over_time, spread, correlated), channel in zip(grid, shown, strict=True):
-        mine = [one for one in every if one.channel == channel]
-        for one in mine:
-            colour = COLOURS[records[one.record] % len(COLOURS)] if len(mine) <= NAMED else COLOURS[0]
+        own = [one for one in every if one.channel == channel]
+        for one in own:
+            colour = COLOURS[records[one.record] % len(COLOURS)] if len(own) <= MOST_COLOURS else COLOURS[0]
             _over_time(over_time, one, colour)
-        _distribution(spread, mine)
-        _autocorrelation(correlated, mine)
+        _distribution(spread, own)
+        _autocorrelation(correlated, own)
         over_time.set_title(channel, fontsize="small", loc="left")
-        over_time.set_ylabel(mine[0].units)
+        over_time.set_ylabel(own[0].units)
         spread.sharey(over_time)
         spread.tick_params(labelleft=False)
     for axes, words in zip(grid[-1], ("time (s)", "density", "lag (samples)"), strict=True):
         axes.set_xlabel(words)
     for axes, words in zip(grid[0, 1:], ("distribution", "autocorrelation"), strict=True):
         axes.set_title(words, fontsize="small", loc="left")
-    if 1 < len(records) <= NAMED:
+    if 1 < len(records) <= MOST_COLOURS:
         _key(figure, grid[0, 0])
-    few = f"the {ROWS} of {len(channels)} channels that look least like noise" if len(channels) > ROWS else ""
+    few = f"the {MOST_CHANNELS} of {len(channels)} channels that look least like noise" if len(channels) > MOST_CHANNELS else ""
     title(figure, data, "measured minus predicted; grey: two standard deviations of the noise", few)
     return figure
 
 
-def _least_white(data: Any) -> list[str]:
+def _least_white(data: "xarray.Dataset") -> list[str]:
     """The channels: as they are, or, where there are too many, those that look least like noise."""
     names = [str(name) for name in data["channel"].values]
-    if len(names) <= ROWS:
+    if len(names) <= MOST_CHANNELS:
         return names
     doubt = np.nan_to_num(data["correlated"].transpose("record", "channel").values, nan=1.0).min(0)
-    kept = set(np.argsort(doubt, kind="stable")[:ROWS])
+    kept = set(np.argsort(doubt, kind="stable")[:MOST_CHANNELS])
     return [name for k, name in enumerate(names) if k in kept] + [name for k, name in enumerate(names) if k not in kept]
 
 
@@ -131,17 +134,17 @@ def _over_time(axes: Axes, one: Series, colour: str) -> None:
     plain(axes)
 
 
-def _distribution(axes: Axes, mine: list[Series]) -> None:
+def _distribution(axes: Axes, own: list[Series]) -> None:
     """A histogram of all records, and the density of Gaussian noise of the size that it is taken to have."""
-    left = np.concatenate([one.residual for one in mine])
-    noise = np.concatenate([one.noise for one in mine])
+    left = np.concatenate([one.residual for one in own])
+    noise = np.concatenate([one.noise for one in own])
     if np.ptp(left) > 0:
-        count = int(np.clip(np.sqrt(len(left)), 5, BINS))
+        count = int(np.clip(np.sqrt(len(left)), 5, MOST_BINS))
         axes.hist(left, count, density=True, orientation="horizontal", color=COLOURS[4], alpha=0.7, lw=0)
     sizes = noise[np.isfinite(noise) & (noise > 0)]
     if sizes.size:
-        levels = np.unique(np.quantile(sizes, np.linspace(0, 1, BINS)))  # of noise that differs from sample to sample
-        y = DEVIATIONS * sizes.max() * np.linspace(-1, 1, 201)
+        levels = np.unique(np.quantile(sizes, np.linspace(0, 1, MOST_BINS)))  # of noise that differs from sample to sample
+        y = NOISE_RANGE * sizes.max() * np.linspace(-1, 1, 201)
         density = np.exp(-0.5 * (y[:, None] / levels) ** 2) / (np.sqrt(2 * np.pi) * levels)
         axes.plot(density.mean(1), y, color="black", lw=1)
     axes.locator_params(axis="x", nbins=3)
@@ -149,11 +152,11 @@ def _distribution(axes: Axes, mine: list[Series]) -> None:
     plain(axes)
 
 
-def _autocorrelation(axes: Axes, mine: list[Series]) -> None:
+def _autocorrelation(axes: Axes, own: list[Series]) -> None:
     """That of the residuals divided by the noise, of all records, and the band in which 19 of 20 values of white noise are."""
-    parts = [one.residual / np.where(one.noise > 0, one.noise, 1.0) for one in mine]
+    parts = [one.residual / np.where(one.noise > 0, one.noise, 1.0) for one in own]
     parts = [part for part in parts if np.isfinite(part).all()]
-    count = min(LAGS, max((len(part) for part in parts), default=0) // PAIRS)
+    count = min(MOST_LAGS, max((len(part) for part in parts), default=0) // SAMPLES_PER_LAG)
     power = sum(float(part @ part) for part in parts)
     if count and power > 0:
         lags = np.arange(1, count + 1)
@@ -169,15 +172,17 @@ def _autocorrelation(axes: Axes, mine: list[Series]) -> None:
 
 def _key(figure: Figure, axes: Axes) -> None:
     """Name the curves of all panels by those of one."""
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=NAMED, fontsize="small", frameon=False)
+    figure.legend(
+        *axes.get_legend_handles_labels(), loc="outside lower center", ncols=MOST_COLOURS, fontsize="small", frameon=False
+    )
 
 
-def _unit(one: Any) -> str:
+def _unit(one: "xarray.Dataset") -> str:
     units = str(one["channel_units"].values)
     return "" if units == "1" else units
 
 
-def title(figure: Figure, data: Any, words: str, remark: str = "") -> None:
+def title(figure: Figure, data: "xarray.Dataset", words: str, remark: str = "") -> None:
     """Say above a figure which mechanism it is of, and what it shows."""
     figure.suptitle(f"{data.attrs.get('title') or 'mechanism'}: {words}" + (f"\n({remark})" if remark else ""), fontsize="medium")
 

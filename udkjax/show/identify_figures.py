@@ -1,7 +1,8 @@
 """Pictures of an identification, from its dataset alone: the fit, what it leaves, what is known, and how it settled."""
 
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,35 +16,38 @@ with OptionalImport():
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-WRITTEN = 14  # parameters up to which correlations are written as numbers too
-WORST = 1e3  # percent: standard errors that are larger are drawn as this
-ROUNDING = 1e-18  # what is zero is drawn as this where an axis is logarithmic
+if TYPE_CHECKING:
+    import xarray
+
+MOST_WRITTEN = 14  # parameters up to which correlations are written as numbers too
+LARGEST_ERROR = 1e3  # percent: standard errors that are larger are drawn as this
+ZERO_DRAWN = 1e-18  # what is zero is drawn as this where an axis is logarithmic
 
 
-def pictures(data: Any) -> dict[str, Figure]:
+def pictures(data: "xarray.Dataset") -> dict[str, Figure]:
     """Draw what `Estimate.to_xarray` returns, with profile likelihoods or without."""
     found = {"fit": fit(data), "residuals": residuals(data), "convergence": convergence(data)}
     found |= {"correlation": correlation(data)} if data.sizes["parameter"] > 1 else {}
     return found | ({"profiles": profiles(data)} if "profile" in data else {})
 
 
-def save_pictures(data: Any, folder: Any) -> Iterator[str]:
+def save_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
     """Write each picture to the folder, and iterate over the names of the files."""
     for name, figure in pictures(data).items():
         figure.savefig(folder / f"{name}.png", dpi=150)
         yield f"{name}.png"
 
 
-def correlation(data: Any) -> Figure:
+def correlation(data: "xarray.Dataset") -> Figure:
     """Draw the correlations of the parameters' errors, and how large these are; grey: what the records do not tell."""
     names = [_short(str(name)) for name in data["parameter"].values]
     values, count = data["correlation"].values, len(names)
-    size = 0.42 if count <= WRITTEN else 0.26
+    size = 0.42 if count <= MOST_WRITTEN else 0.26
     figure = Figure(figsize=(4.5 + 0.055 * max(map(len, names)) + size * count, 1.9 + size * count), layout="constrained")
     matrix, errors = figure.subplots(1, 2, width_ratios=(size * count, 1.6))
     matrix.set_facecolor("0.75")
     drawn = matrix.imshow(np.ma.masked_invalid(values), cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
-    if count <= WRITTEN:
+    if count <= MOST_WRITTEN:
         for i, j in np.argwhere(np.isfinite(values)):
             colour = "white" if abs(values[i, j]) > 0.6 else "black"
             matrix.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=6.5, color=colour)
@@ -58,13 +62,13 @@ def correlation(data: Any) -> Figure:
     return figure
 
 
-def _errors(axes: Axes, data: Any) -> None:
+def _errors(axes: Axes, data: "xarray.Dataset") -> None:
     """Standard errors as a part of the values; of those that are not known, none."""
     error, value = data["standard_error"].values, np.abs(data["value"].values)
     with np.errstate(divide="ignore", invalid="ignore"):
-        percent = np.where(np.isfinite(error), np.clip(100 * error / value, ROUNDING, WORST), np.nan)
+        percent = np.where(np.isfinite(error), np.clip(100 * error / value, ZERO_DRAWN, LARGEST_ERROR), np.nan)
     place, known = np.arange(len(error)), np.isfinite(percent)
-    low = np.nanmin(percent, initial=WORST) / 10 if known.any() else 1.0
+    low = np.nanmin(percent, initial=LARGEST_ERROR) / 10 if known.any() else 1.0
     axes.barh(place[known], percent[known] - low, left=low, height=0.6, color=COLOURS[0])
     axes.set_xscale("log")
     axes.set_xlim(low, max(10 * low, 3 * np.nanmax(percent, initial=low)))
@@ -75,7 +79,7 @@ def _errors(axes: Axes, data: Any) -> None:
     plain(axes)
 
 
-def convergence(data: Any) -> Figure:
+def convergence(data: "xarray.Dataset") -> Figure:
     """Draw the cost of each trial, and by how much the next step would change an unknown.
 
     Within a fit the cost never rises. Where it does, another one begins: of a longer part of the records, from another guess, or
@@ -89,7 +93,7 @@ def convergence(data: Any) -> Figure:
     for axes, name in zip(panels, words, strict=True):
         values = data[name].values
         for one in fits:
-            axes.semilogy(one, np.maximum(values[one - 1], ROUNDING), "o-", ms=3, lw=1, color=COLOURS[0])
+            axes.semilogy(one, np.maximum(values[one - 1], ZERO_DRAWN), "o-", ms=3, lw=1, color=COLOURS[0])
         axes.set_ylabel(words[name])
         plain(axes)
     panels[-1].set_xlabel("trial")

@@ -1,28 +1,30 @@
 """Pictures of profile likelihoods: how far a parameter can go while all others make up for it."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from udkjax.extras import OptionalImport
-from udkjax.show.fit_figures import plain, title
+from udkjax.show.fit_figures import MOST_COLUMNS, plain, title
 from udkjax.show.plots import COLOURS
 
 with OptionalImport():
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLUMNS = 3
-FAR = 3.0  # times the limit: what is higher is not drawn
+if TYPE_CHECKING:
+    import xarray
+
+HIGHEST = 3.0  # times the limit: what is higher is not drawn
 
 
-def profiles(data: Any) -> Figure:
-    """Draw the curves of a dataset `with_profiles`, what the standard error says of them, and the confidence intervals.
+def profiles(data: "xarray.Dataset") -> Figure:
+    """Draw the curves of a dataset with profiles, what the standard error says of them, and the confidence intervals.
 
     The rise of the cost C is 2 (C - C_min) / s^2: of a linear model, the square of the distance in standard errors.
     """
     names = [str(name) for name in data["profile"].values]
-    columns = min(COLUMNS, len(names))
+    columns = min(MOST_COLUMNS, len(names))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(0.6 + 4.0 * columns, 1.1 + 2.7 * rows), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
@@ -37,7 +39,7 @@ def profiles(data: Any) -> Figure:
     return figure
 
 
-def _profile(axes: Axes, data: Any, name: str) -> None:
+def _profile(axes: Axes, data: "xarray.Dataset", name: str) -> None:
     one, known, limit = data.sel(profile=name), data.sel(parameter=name), data["interval"].attrs["limit"]
     x, rise = (part[np.isfinite(part)] for part in (one["profile_value"].values, one["rise"].values))
     value, error = float(known["value"]), float(known["standard_error"])
@@ -48,7 +50,7 @@ def _profile(axes: Axes, data: Any, name: str) -> None:
         line = np.linspace(left, right, 101)
         axes.plot(line, ((line - value) / error) ** 2, "--", lw=1, color=COLOURS[1], label="from the standard error")
     axes.axhline(limit, color="0.5", lw=0.8)
-    axes.set_ylim(min(0.0, 1.1 * rise.min()) - 0.03 * limit, max(1.25 * limit, min(1.1 * rise.max(), FAR * limit)))
+    axes.set_ylim(min(0.0, 1.1 * rise.min()) - 0.03 * limit, max(1.25 * limit, min(1.1 * rise.max(), HIGHEST * limit)))
     axes.set_title(name, fontsize="small", loc="left")
     units = str(known["parameter_units"].values)
     axes.set_xlabel("" if units == "1" else units)
