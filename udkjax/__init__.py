@@ -23,6 +23,9 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.equations import analyse as analyse
     from udkjax.equations import energy as energy
     from udkjax.equations import reactions as reactions
+    from udkjax.equations import singular_values as singular_values
+    from udkjax.equations import unique_reactions as unique_reactions
+    from udkjax.equations import uniqueness as uniqueness
     from udkjax.equations import violation as violation
     from udkjax.integrate import BDF as BDF
     from udkjax.integrate import Adams as Adams
@@ -115,6 +118,7 @@ _NAMES = {
     "udkjax.integrate.assembly": "AssemblyError State assemble check",
     "udkjax.equations": """
         ConstrainedSystem Baumgarte Analysis analyse accelerations violation energy reactions
+        unique_reactions uniqueness singular_values
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
     "udkjax.study.identify": """
         identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck

@@ -6,6 +6,9 @@ from udkjax.equations.constraints import gamma as gamma
 from udkjax.equations.constraints import psi as psi
 from udkjax.equations.constraints import psi_dot as psi_dot
 from udkjax.equations.constraints import psi_q as psi_q
+from udkjax.equations.determinacy import Uniqueness as Uniqueness
+from udkjax.equations.determinacy import singular_values as singular_values
+from udkjax.equations.determinacy import uniqueness as uniqueness
 from udkjax.equations.formulations import Augmented as Augmented
 from udkjax.equations.formulations import Formulation as Formulation
 from udkjax.equations.formulations import NullSpaceQR as NullSpaceQR
@@ -20,8 +23,9 @@ from udkjax.equations.quantities import Energy as Energy
 from udkjax.equations.quantities import accelerations as accelerations
 from udkjax.equations.quantities import energy as energy
 from udkjax.equations.quantities import equations_of as equations_of
-from udkjax.equations.quantities import reactions as reactions
 from udkjax.equations.quantities import violation as violation
+from udkjax.equations.reactions import reactions as reactions
+from udkjax.equations.reactions import unique_reactions as unique_reactions
 from udkjax.equations.textbook import TextbookEquations as TextbookEquations
 from udkjax.equations.textbook import prepare as prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte as Baumgarte

@@ -1,4 +1,4 @@
-"""What one asks of a motion: accelerations, multipliers, reactions, energies, violations."""
+"""What one asks of a motion: accelerations, multipliers, energies, violations."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,7 +15,6 @@ from udkjax.equations.motion import Motion
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
-from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -82,28 +81,6 @@ def energy(mechanism: Mechanism, solution: Any) -> Energy:
     return _along(mechanism, solution, _energy)
 
 
-def reactions(
-    mechanism: Mechanism,
-    solution: Any,
-    method: Pseudoinverse | None = None,
-    stabilization: Baumgarte | None = None,
-) -> dict[str, dict[str, Float[Array, "T 3"]]]:
-    """Return what each joint and driver does to each body that it holds, by their names: `reactions(mech, sol)["A"]["link1"]`.
-
-    The load (T, 3) is force x, force y (N, ground axes) and torque about the centre of mass (N m): -Psi_q^T lambda of the
-    constraint's rows. Of redundant constraints it is the share of minimum norm; the accelerations do not depend on it.
-    `method` (default `SVD`) decides the rank; give the run's `Baumgarte` to include what it adds.
-    """
-    by_row = _along(mechanism, solution, _loads, SVD() if method is None else method, stabilization)
-    row_names = [name for name, _ in analyse(mechanism).row_names]
-    result: dict[str, dict[str, Array]] = {}
-    for name, element in mechanism.constraints.items():
-        load = by_row[:, [k for k, n in enumerate(row_names) if n == name]].sum(1)
-        places = {body: mechanism.body_names.index(body) for body in mechanism.frames_of(element) if body != GROUND}
-        result[name] = {body: load[:, 3 * k : 3 * k + 3] for body, k in places.items()}
-    return result
-
-
 # Functions of their own: what is compiled for one call serves the next.
 
 
@@ -120,12 +97,6 @@ def _psi(equations: Any, t: Any, q: Any, v: Any) -> Array:
 
 def _energy(equations: Any, t: Any, q: Any, v: Any) -> Energy:
     return Energy(*equations.energy(t, q, v))
-
-
-def _loads(equations: Any, t: Any, q: Any, v: Any) -> Array:
-    """-Psi_q^T lambda, row by row."""
-    multipliers = equations.multipliers(t, q, v)
-    return -jnp.asarray(equations.jacobian(t, q)) * multipliers[:, None]
 
 
 def _along(mechanism: Any, solution: Any, quantity: Callable, method: Any = None, baumgarte: Any = None) -> Any:

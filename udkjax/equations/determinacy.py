@@ -1,0 +1,95 @@
+"""Which multipliers equilibrium alone decides (Wojtyra 2009), and the rank of the constraints in the scene's own units.
+
+lambda and lambda + N y give the same M a + Psi_q^T lambda = F for every y, where N spans the null space of Psi_q^T. So a number
+c^T lambda is the same for all of them, that is unique, if and only if c^T N = 0; of one multiplier, if its row of N is zero.
+
+Rank and null space are those of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...) (`Scales`): lengths in units
+of the characteristic one, angles in radians, each row in units of what moves it. Masses have no part in it. All functions are
+pure, and may be mapped over states (`jax.vmap`); without an `analysis` the scales are those of the mechanism.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from udkjax.equations import constraints
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.constraints import State
+from udkjax.equations.scales import Scales
+from udkjax.scene.mechanism import Mechanism
+
+# Relative to the largest singular value. At a singular configuration a residual of rounding, 1e-16, is a displacement of its
+# root, 1e-8, and so is the singular value that should vanish there: a hundred times that.
+RANK_TOL = 1e-6
+# The length of a row of N, whose columns are orthonormal: rounding leaves 1e-15 / RANK_TOL at most.
+UNIQUE_TOL = 1e-6
+
+
+class Uniqueness(NamedTuple):
+    """Which multipliers are unique, how far from it the others are, and the rank that was decided on the way."""
+
+    unique: Bool[Array, "m"]
+    share: Float[
+        Array, "m"
+    ]  # the length of each row of N, 0 (unique) to 1 (any number will do)
+    rank: Int[Array, ""]
+
+
+class LeftNullSpace(NamedTuple):
+    """N of the scaled rows, its columns orthonormal, (m, m): the columns beyond the nullity are zero."""
+
+    basis: Float[Array, "m m"]
+    rank: Int[Array, ""]
+
+
+def scaled_jacobian(mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None) -> Float[Array, "m n"]:
+    """Return J = diag(1 / rows) Psi_q diag(L, L, 1, ...), without a unit, at time t (s) and coordinates q."""
+    scales = _scales(mechanism, analysis)
+    return constraints.psi_q(mechanism, t, q) * scales.coordinates(3 * len(mechanism.body_names)) / scales.rows[:, None]
+
+
+def singular_values(mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None) -> Float[Array, "k"]:
+    """Return the singular values of J, largest first: min(m, n) numbers."""
+    J = scaled_jacobian(mechanism, t, q, analysis)
+    return jnp.linalg.svd(J, compute_uv=False) if J.size else jnp.zeros(0)
+
+
+def left_null_space(
+    mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None, rank_tol: ArrayLike = RANK_TOL
+) -> LeftNullSpace:
+    """Return N, J^T N = 0, its columns orthonormal; singular values up to `rank_tol` times the largest count as zero."""
+    J = scaled_jacobian(mechanism, t, q, analysis)
+    rows, columns = J.shape
+    if not J.size:
+        return LeftNullSpace(jnp.eye(rows), jnp.zeros((), int))
+    u, sigma, _ = jnp.linalg.svd(jnp.pad(J, ((0, 0), (0, max(0, rows - columns)))), full_matrices=False)
+    zero = sigma <= rank_tol * sigma[0]
+    return LeftNullSpace(jnp.where(zero, u, 0.0), rows - zero.sum())
+
+
+def uniqueness(
+    mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None, rank_tol: ArrayLike = RANK_TOL
+) -> Uniqueness:
+    """Tell for each row of Psi whether its multiplier is unique: whether its row of N is zero.
+
+    Args:
+        mechanism: its numbers may be traced.
+        t: time (s).
+        q: coordinates of a closed position, (bodies, 3) or flat.
+        analysis: that of `analyse`, for its scales; by default made here.
+        rank_tol: singular values of J up to so much of the largest count as zero.
+
+    Returns:
+        `Uniqueness`, one entry for each row: joints in their order, then drivers.
+
+    Source:
+        M. Wojtyra, Joint reactions in rigid body mechanisms with dependent constraints, Mech. Mach. Theory 44 (2009) 2265-2278.
+    """
+    basis, rank = left_null_space(mechanism, t, q, analysis, rank_tol)
+    share = jnp.linalg.norm(basis, axis=1)
+    return Uniqueness(share <= UNIQUE_TOL, share, rank)
+
+
+def _scales(mechanism: Mechanism, analysis: Analysis | None) -> Scales:
+    return (analyse(mechanism) if analysis is None else analysis).scales

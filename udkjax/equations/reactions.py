@@ -1,0 +1,221 @@
+"""What joints do to the bodies that they hold: -Psi_q^T lambda, in the axes, about the point and by the split that one asks for.
+
+Of redundant constraints only some components are decided by equilibrium (determinacy.py). How the others are shared takes an
+assumption: by default the least norm, each row in units of its scale; or, with the compliances c of joints (m/N, rad/(N m)),
+the least elastic energy,
+
+    minimize sum(c_i lambda_i^2) / 2  over all lambda with M a + Psi_q^T lambda = F,
+
+what bodies that are stiff beside their joints do. With mu = lambda / w in units of the rows, P = I - D D^+ the projector on the
+null space of D^T, and K = diag(w c w), the minimum over mu + P z is at z = -(P K P)^+ P K mu. Joints of no compliance carry what
+the others leave; what is still open among these alone is shared by the least norm.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.analysis import analyse
+from udkjax.equations.constraints import psi_q
+from udkjax.equations.determinacy import RANK_TOL, UNIQUE_TOL, left_null_space
+from udkjax.equations.textbook import prepare
+from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.bodies import GROUND, Frame, Point, between
+from udkjax.scene.checks import quoted, suggestion
+from udkjax.scene.drivers import Driver
+from udkjax.scene.joints import Constraint, Distance, Prismatic, Rack, Revolute, Slot
+from udkjax.scene.mechanism import Mechanism
+
+Axes = Literal["ground", "body", "joint"]
+About = Literal["centre", "joint"]
+ByBody = dict[str, dict[str, Any]]  # of a joint or driver, of a body
+
+# Of P K P relative to its largest eigenvalue: joints that are stiffer than the softest by more count as rigid.
+STIFFEST = 1e-10
+
+
+def reactions(
+    mechanism: Mechanism,
+    solution: Any,
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
+    frame: Axes = "ground",
+    about: About = "centre",
+    compliances: Mapping[str, ArrayLike] | None = None,
+) -> dict[str, dict[str, Float[Array, "T 3"]]]:
+    """Return what each joint and driver does to each body that it holds, by their names: `reactions(mech, sol)["A"]["link1"]`.
+
+    Args:
+        mechanism: the mechanism.
+        solution: anything with ts (T,), q and v (T, bodies, 3).
+        method: decides the rank; by default `SVD`.
+        stabilization: the run's `Baumgarte`, to include what it adds.
+        frame: the axes of the force. "ground"; "body": those of the body that is loaded; "joint": along x the `axis` of a
+            prismatic joint, slot or rack, or the line of a distance; of all others the axes of the last body that they hold.
+        about: the point of the torque: the "centre" of mass, or the "joint": the pin that two bodies share (in a slot or a
+            prismatic joint body 2's point), each body's own of a distance; without points the centre of mass.
+        compliances: of joints by their names, one number a row (m/N for rows in metres, rad/(N m) for rows in radians), or one
+            for both of a revolute. Redundant forces are shared with the least elastic energy; a joint without one is rigid.
+
+    Returns:
+        The load (T, 3): force x, force y (N) and torque (N m), -Psi_q^T lambda of the constraint's rows. Of redundant constraints
+        it is one of many, the others differ in what `unique_reactions` says; the accelerations do not depend on it.
+
+    Raises:
+        ValueError: a compliance of a joint that does not exist, negative, or not one for each row.
+    """
+    soft = None if compliances is None else _compliance_rows(mechanism, compliances)
+    analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
+    by_row = _loads_by_row(mechanism.bare, analysis, *states, method, stabilization, soft)
+    return _by_body(mechanism, states[1], by_row, lambda part: part.sum(0), frame, about)
+
+
+def unique_reactions(
+    mechanism: Mechanism, solution: Any, frame: Axes = "ground", about: About = "centre", rank_tol: ArrayLike = RANK_TOL
+) -> dict[str, dict[str, Bool[Array, "T 3"]]]:
+    """Tell which components of `reactions` equilibrium alone decides, whatever their split.
+
+    A component is c^T lambda; it is unique if c^T N = 0, N the null space of Psi_q^T. Arguments are those of `reactions`;
+    `rank_tol` is that of `uniqueness`.
+    """
+    analysis, (ts, q, _) = analyse(mechanism), _states(solution)
+    Psi_q, N = _null_spaces(mechanism.bare, analysis, ts, q, jnp.asarray(rank_tol))
+    rows = [name for name, _ in analysis.row_names]
+    unit = jnp.stack([1.0, 1.0, analysis.length])  # of a force, and of a torque in forces
+
+    def unique(part: Array, N: Array) -> Array:
+        """Of a component's map c (rows, T, 3) and the rows (T, rows, m) of N that it has: whether c^T N = 0."""
+        size = jnp.max(jnp.linalg.norm(part, axis=0) / unit, axis=-1, keepdims=True)
+        return jnp.linalg.norm(jnp.einsum("rtc,trk->tck", part, N), axis=-1) <= UNIQUE_TOL * unit * size
+
+    found = _by_body(mechanism, q, Psi_q / analysis.scales.rows[:, None], lambda part: part, frame, about)
+    return {
+        name: {body: unique(part, N[:, [k for k, n in enumerate(rows) if n == name]]) for body, part in loads.items()}
+        for name, loads in found.items()
+    }
+
+
+def _by_body(mechanism: Mechanism, q: Array, by_row: Float[Array, "T m n"], total: Any, frame: Axes, about: About) -> ByBody:
+    """Split what rows do to coordinates by joints and bodies, (rows, T, 3) each, in other axes and about another point."""
+    if frame not in ("ground", "body", "joint") or about not in ("centre", "joint"):
+        raise ValueError(f'frame is "ground", "body" or "joint", not {frame!r}; about is "centre" or "joint", not {about!r}')
+    places = {name: k for k, name in enumerate(mechanism.body_names)}
+    seen = {name: _frame(q, place) for name, place in places.items()} | {GROUND: Frame(0.0, 0.0, 0.0, 1.0, 0.0)}
+    row_names, found = [name for name, _ in analyse(mechanism).row_names], {}
+    for name, element in mechanism.constraints.items():
+        own = np.array([k for k, owner in enumerate(row_names) if owner == name])
+        bodies = mechanism.frames_of(element)
+        frames = [seen[body] for body in bodies]
+        axes = _joint_angle(element, frames) if frame == "joint" else 0.0
+        found[name] = {}
+        for k, body in enumerate(bodies):
+            if body == GROUND:
+                continue
+            load = total(jnp.moveaxis(by_row[:, own, 3 * places[body] : 3 * places[body] + 3], 1, 0))
+            point = _joint_point(element, k, frames) if about == "joint" else None
+            angle = frames[k].angle if frame == "body" else axes
+            found[name][body] = load if point is None and frame == "ground" else _seen_from(load, frames[k], point, angle)
+    return found
+
+
+def _seen_from(load: Float[Array, "... 3"], body: Frame, point: Point | None, angle: Any) -> Float[Array, "... 3"]:
+    """A load about a centre of mass, in ground axes, about another point and in axes at an `angle` (rad) to these."""
+    fx, fy, torque = load[..., 0], load[..., 1], load[..., 2]
+    if point is not None:
+        torque = torque - (point.x - body.x) * fy + (point.y - body.y) * fx
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([cos * fx + sin * fy, cos * fy - sin * fx, torque], axis=-1)
+
+
+def _frame(q: Float[Array, "T n"], place: int) -> Frame:
+    x, y, angle = (q[:, 3 * place + k] for k in range(3))
+    return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle))
+
+
+def _joint_angle(element: Constraint, frames: list[Frame]) -> Any:
+    """The angle (rad) of a joint's own axes to the ground."""
+    if isinstance(element, Prismatic | Slot | Rack):
+        return frames[0].angle + element.axis
+    if isinstance(element, Driver) and element.coordinate in ("x", "y"):
+        return frames[0].angle
+    if isinstance(element, Distance) or (isinstance(element, Driver) and element.coordinate == "distance"):
+        line = between(element.points, *frames)
+        return jnp.arctan2(line.y, line.x)
+    return frames[-1].angle
+
+
+def _joint_point(element: Any, k: int, frames: list[Frame]) -> Point | None:
+    """Where a joint acts on its body k, in ground coordinates; None where it has no points."""
+    points = getattr(element, "points", None)
+    if points is None or (isinstance(element, Driver) and element.coordinate == "angle"):
+        return None
+    apart = isinstance(element, Distance) or (isinstance(element, Driver) and element.coordinate == "distance")
+    held = k if apart else len(points) - 1  # of a slot, the pin
+    return frames[held].point(points[held])
+
+
+def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, ArrayLike]) -> Float[Array, "m"]:
+    known, counts = mechanism.constraints, {}
+    for name, _ in analyse(mechanism).row_names:
+        counts[name] = counts.get(name, 0) + 1
+    for name, given in compliances.items():
+        if name not in known:
+            raise ValueError(f"compliances: no joint named {quoted(name)}{suggestion(name, known)}")
+        shape, alike = np.shape(given), isinstance(known[name], Revolute) or counts[name] == 1
+        if shape != (counts[name],) and not (shape == () and alike):
+            raise ValueError(f"compliances: {quoted(name)} takes {counts[name]} numbers, one for each of its rows, not {given!r}")
+        if not isinstance(given, Tracer) and not np.all(np.asarray(given) >= 0):
+            raise ValueError(f"compliances: those of {quoted(name)} must not be negative, as {given!r}")
+    rows = [jnp.broadcast_to(jnp.asarray(compliances.get(name, 0.0), float), (count,)) for name, count in counts.items()]
+    return jnp.concatenate(rows) if rows else jnp.zeros(0)
+
+
+def _states(solution: Any) -> tuple[Array, Array, Array]:
+    ts = jnp.asarray(solution.ts)
+    return ts, jnp.asarray(solution.q).reshape(len(ts), -1), jnp.asarray(solution.v).reshape(len(ts), -1)
+
+
+def split_by_compliance(
+    mechanism: Mechanism, t: Any, q: Array, multipliers: Float[Array, "m"], soft: Float[Array, "m"], w: Float[Array, "m"]
+) -> Float[Array, "m"]:
+    """Return the multipliers of the least elastic energy among all that do the same; `w` are the weights of rows."""
+    if not len(soft):
+        return multipliers
+    D = uk.D(mechanism, t, q, w)
+    P = jnp.eye(len(soft)) - D @ SVD(rank_tol=RANK_TOL)(D)
+    K = soft * w**2
+    K, mu = K / jnp.maximum(jnp.max(jax.lax.stop_gradient(K)), jnp.finfo(float).tiny), multipliers / w
+    z = SVD(rank_tol=STIFFEST)(P @ (K[:, None] * P)) @ (P @ (K * mu))
+    return w * (mu - P @ z)
+
+
+@eqx.filter_jit
+def _loads_by_row(mechanism, analysis, ts, q, v, method, baumgarte, soft):
+    """-Psi_q^T lambda, row by row (T, m, n)."""
+    equations = prepare(mechanism, method, baumgarte, analysis)
+
+    def one(t, q, v):
+        found = equations.multipliers(t, q, v)
+        if soft is not None:
+            found = split_by_compliance(mechanism, t, q, found, soft, analysis.scales.weights)
+        return -equations.jacobian(t, q) * found[:, None]
+
+    return jax.vmap(one)(ts, q, v)
+
+
+@eqx.filter_jit
+def _null_spaces(mechanism, analysis, ts, q, rank_tol):
+    """Psi_q (T, m, n), and N (T, m, m) of its scaled rows."""
+
+    def one(t, q):
+        return psi_q(mechanism, t, q), left_null_space(mechanism, t, q, analysis, rank_tol).basis
+
+    return jax.vmap(one)(ts, q)

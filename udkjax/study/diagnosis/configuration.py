@@ -1,0 +1,103 @@
+"""One closed position of a mechanism, its scaled Jacobian and what that leaves free; and closed positions around it.
+
+All of it is NumPy on the scene's programs: nothing is compiled for it. Rows and columns are scaled as in determinacy.py.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.equations.closing import STRIDE
+from udkjax.equations.redundancy import KinematicRows
+
+STEP = 0.1  # of the characteristic length, and rad: from one position to the next of a neighbourhood
+POSITIONS = 12  # of a neighbourhood
+MOVED = 0.01  # of a step: positions nearer than that to each other are the same
+
+
+class Configuration(NamedTuple):
+    """A closed position and the singular value decomposition of its scaled Jacobian J = U S V^T."""
+
+    t: float  # s
+    q: np.ndarray  # (n,)
+    J: np.ndarray  # (m, n)
+    u: np.ndarray
+    sigma: np.ndarray
+    vt: np.ndarray
+    rank: int
+
+    @property
+    def left(self) -> np.ndarray:
+        """The combinations of rows that vanish, (m, m - rank)."""
+        return self.u[:, self.rank :]
+
+    @property
+    def right(self) -> np.ndarray:
+        """The displacements that the constraints allow to first order, (n, n - rank)."""
+        return self.vt[self.rank :].T
+
+    @property
+    def redundancy(self) -> int:
+        """How many rows depend on others."""
+        return len(self.J) - self.rank
+
+    @property
+    def smallest(self) -> float:
+        """The smallest singular value that counts, relative to the largest."""
+        return float(self.sigma[self.rank - 1] / self.sigma[0]) if self.rank else 1.0
+
+
+class Positions:
+    """The closed positions of one mechanism."""
+
+    def __init__(self, rows: KinematicRows, rank_tol: float):
+        self.rows, self.rank_tol = rows, rank_tol
+        length = float(rows.scales.length)
+        self.unit = np.tile([length, length, 1.0], rows.size // 3)
+        self.row_unit = np.asarray(rows.scales.rows, float)
+
+    def at(self, t: float, q: np.ndarray) -> Configuration:
+        """The configuration of coordinates that are closed."""
+        J = self.rows.jacobian(t, q) * self.unit / self.row_unit[:, None]
+        return Configuration(t, q, J, *decomposed(J, self.rank_tol))
+
+    def near(self, t: float, q: np.ndarray) -> Configuration | None:
+        """The closed position nearest to q, or None."""
+        if not self.rows.count:
+            return self.at(t, q)
+        position = self.rows.close(t, q)
+        return None if position is None else self.at(t, position.q)
+
+    def displaced(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
+        """The closed position next to one that is displaced by a step along a direction, in scaled coordinates."""
+        return self.near(start.t if t is None else t, start.q + step * self.unit * direction)
+
+    def distance(self, one: Configuration, two: Configuration) -> float:
+        """How far two positions are apart: the norm of the scaled displacement."""
+        return float(np.linalg.norm((two.q - one.q) / self.unit))
+
+    def around(self, start: Configuration) -> list[Configuration]:
+        """Closed positions along a random motion from one, drivers going on; none where it cannot move."""
+        random, found, last = np.random.default_rng(0), [], start
+        heading, t = random.standard_normal(len(start.q)), start.t
+        for _ in range(POSITIONS if self.rows.count else 0):
+            heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(len(heading)) / np.sqrt(len(heading))
+            allowed = last.right @ (last.right.T @ heading)
+            size = np.linalg.norm(allowed)
+            t += self.rows.tick * STEP / STRIDE
+            direction = allowed / size if size > 0.0 else allowed
+            moved = self.displaced(last, direction, STEP, t) or self.displaced(last, direction, STEP, last.t)
+            if moved is None or self.distance(moved, last) < MOVED * STEP:
+                heading = random.standard_normal(len(heading))
+                continue
+            heading, last = (allowed if size > 0.0 else heading), moved
+            found.append(moved)
+        return found
+
+
+def decomposed(J: np.ndarray, rank_tol: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """U, the singular values, V^T and the rank of a matrix; of one without entries, too."""
+    if not J.size:
+        return np.eye(len(J)), np.zeros(0), np.eye(J.shape[1]), 0
+    u, sigma, vt = np.linalg.svd(J)
+    return u, sigma, vt, int(np.sum(sigma > rank_tol * sigma[0]))

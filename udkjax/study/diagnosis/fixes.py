@@ -1,0 +1,157 @@
+"""What to change about a redundant constraint: each way is tried on the Jacobian everywhere, and the best on the mechanism itself.
+
+A constraint is relaxed by what its kind can give up: a revolute one direction (it becomes a slot, in either of its bodies), a weld
+or a prismatic joint one of its freedoms, anything all of its rows. That helps where the rows that are given up carry the stress
+by which the constraints of a set hold each other in balance, and frees nothing, since others hold it, too.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from udkjax.equations.analysis import analyse
+from udkjax.equations.redundancy import KinematicRows
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.checks import SceneError
+from udkjax.scene.joints import Angle, Prismatic, Revolute, Slot, Weld
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.diagnosis.configuration import Configuration, Positions, decomposed
+from udkjax.study.diagnosis.dependence import Dependency
+
+STEEP = 1e-3  # the smallest singular value relative to the largest: a fix that leaves less is as good as none
+
+
+class Change(NamedTuple):
+    """One way to relax a constraint: what takes its place, and which of its rows stay."""
+
+    text: str
+    element: Any  # a joint; None: nothing
+    slides: tuple[int, float] | None = None  # of a slot made of a revolute: the body that it is in, and its axis there (rad)
+    rows: tuple[int, ...] = ()  # which rows stay, where it is no slot
+
+    def kept(self, rows: np.ndarray, q: np.ndarray, places: list[int | None]) -> np.ndarray:
+        """The rows of the Jacobian that stay, of those of the constraint."""
+        if self.slides is None:
+            return rows[list(self.rows)]
+        body, axis = self.slides
+        place = places[body]
+        angle = axis + (0.0 if place is None else q[3 * place + 2])
+        return np.array([[-np.sin(angle), np.cos(angle)]]) @ rows
+
+
+class Fix(NamedTuple):
+    """A verified change of one constraint: the redundancy falls by `removes`, and the mobility stays."""
+
+    constraint: str
+    change: str  # in words
+    removes: int
+    conditioning: float  # of the scaled Jacobian where it is worst: the smallest singular value that counts over the largest
+    mechanism: Mechanism
+
+
+def fixes_of(
+    mechanism: Mechanism, positions: Positions, at: list[Configuration], owners: list[str], dependency: Dependency
+) -> list[Fix]:
+    """Return for each constraint of a dependent set the best change, verified, the best conditioned first.
+
+    `at` are positions of ordinary rank, in all of which it must help.
+    """
+    found = []
+    for name in dependency.constraints:
+        options = []
+        for change in _changes(mechanism, name, at[0], dependency.stress[name], positions.row_unit[_own(owners, name)]):
+            removes, conditioning = _effect(mechanism, name, change, at, owners, positions.rank_tol)
+            if removes > 0 and conditioning > STEEP * min(c.smallest for c in at):
+                options.append((removes, round(conditioning, 12), change))
+        for removes, conditioning, change in sorted(options, key=lambda option: (-option[0], -option[1])):
+            changed = applied(mechanism, name, change)
+            if changed is not None and _verified(mechanism, changed, removes, at, positions.rank_tol):
+                found.append(Fix(name, change.text, removes, conditioning, changed))
+                break
+    return sorted(found, key=lambda fix: (-fix.removes, -fix.conditioning))
+
+
+def applied(mechanism: Mechanism, name: str, change: Change) -> Mechanism | None:
+    """Return the mechanism with a constraint changed, or None where something else needs it as it is: friction in a revolute."""
+    joints, drivers = dict(mechanism.joints), dict(mechanism.drivers)
+    if change.element is not None:
+        joints[name] = change.element
+    else:
+        joints.pop(name, None)
+        drivers.pop(name, None)
+    try:
+        return Mechanism(mechanism.bodies, joints, drivers, mechanism.forces, mechanism.gravity, mechanism.name)
+    except SceneError:
+        return None
+
+
+def _own(owners: list[str], name: str) -> list[int]:
+    return [k for k, owner in enumerate(owners) if owner == name]
+
+
+def _changes(
+    mechanism: Mechanism, name: str, at: Configuration, stress: np.ndarray, row_unit: np.ndarray
+) -> Iterator[Change]:
+    """The ways to relax a constraint, of which `stress` is the share of N."""
+    element: Any = mechanism.constraints[name]
+    yield Change("remove it", None)
+    force = np.linalg.svd(stress / row_unit[:, None])[0][:, 0]  # the direction that carries most
+    if isinstance(element, Revolute):
+        along = np.arctan2(force[1], force[0])
+        for k, body in enumerate(element.bodies):
+            angle = 0.0 if body == GROUND else at.q[3 * mechanism.body_names.index(body) + 2]
+            axis = _half_turn(along - angle)
+            other = element.bodies[1 - k]
+            slot = Slot((body, other), (element.points[k], element.points[1 - k]), axis=axis)
+            text = f'make it a slot along {np.rad2deg(axis):.4g} degrees of "{body}" for the pin of "{other}"'
+            yield Change(text, slot, (k, axis))
+    if isinstance(element, Weld):
+        yield Change("make it a revolute", Revolute(element.bodies, element.points), None, (0, 1))
+    if isinstance(element, Prismatic):
+        slot = Slot(element.bodies, element.points, element.axis)
+        yield Change("make it a slot: free to turn", slot, None, (0,))
+        yield Change("hold the angle alone", Angle(element.bodies, element.angle), None, (1,))
+
+
+def _half_turn(angle: float) -> float:
+    """The same line's direction in (-90, 90] degrees, rounding left out."""
+    angle = float(np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2)
+    near = round(angle / (np.pi / 2)) * np.pi / 2
+    angle = near if abs(angle - near) < 1e-9 else angle
+    return angle + np.pi if angle < -np.pi / 2 + 1e-9 else angle + 0.0
+
+
+def _effect(
+    mechanism: Mechanism, name: str, change: Change, at: list[Configuration], owners: list[str], rank_tol: float
+) -> tuple[int, float]:
+    """By how much the redundancy falls, -1 where the mobility changes or it is not everywhere the same, and how it conditions."""
+    places = [None if body == GROUND else mechanism.body_names.index(body) for body in mechanism.frames_of(_of(mechanism, name))]
+    own, falls, conditioning = _own(owners, name), set(), np.inf
+    for position in at:
+        rest = np.delete(position.J, own, axis=0)
+        kept = np.concatenate([rest, change.kept(position.J[own], position.q, places)])
+        _, sigma, _, rank = decomposed(kept, rank_tol)
+        falls.add(position.redundancy - (len(kept) - rank) if rank == position.rank else -1)
+        conditioning = min(conditioning, sigma[rank - 1] / sigma[0] if rank else 1.0)
+    return falls.pop() if len(falls) == 1 else -1, float(conditioning)
+
+
+def _of(mechanism: Mechanism, name: str) -> Any:
+    return mechanism.constraints[name]
+
+
+def _verified(before: Mechanism, after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
+    """Whether the changed mechanism itself is closed in all positions, has the same mobility there, and fewer redundant rows."""
+    one, two = analyse(before), analyse(after)
+    positions = Positions(KinematicRows(after), rank_tol)
+    seen = [positions.at(position.t, position.q) for position in at]
+    closed = all(
+        np.max(np.abs(positions.rows.residual(c.t, c.q)), initial=0.0) < rank_tol * max(1.0, positions.rows.scales.size(c.q, np))
+        for c in seen
+    )
+    alike = all(c.rank == position.rank and c.redundancy == position.redundancy - removes for c, position in zip(seen, at, strict=True))
+    known = one.degrees_of_freedom is None or (
+        two.degrees_of_freedom == one.degrees_of_freedom and len(two.redundant) == len(one.redundant) - removes
+    )
+    return closed and alike and known

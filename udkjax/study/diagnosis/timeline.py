@@ -1,0 +1,167 @@
+"""The rank of the constraints along a trajectory: singular values at the outputs, and when between them the rank changes.
+
+A singular value that vanishes at an instant t* is |t - t*| times something nearby: its samples have a minimum there, and the
+minimum has a kink, so that it can be located to rounding of the time. Between outputs the states are those of the trajectory
+integrated anew from the output before, then of a quintic through q, v and a.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.determinacy import singular_values
+from udkjax.equations.quantities import equations_of
+from udkjax.integrate import State, simulate
+from udkjax.integrate.solution import Solution
+from udkjax.pinv import SVD
+from udkjax.scene.mechanism import Mechanism
+
+BETWEEN = 4  # samples from one output to the next, to look for minima
+FINER = 8  # parts of an interval that is integrated anew
+GRID = 16  # parts of a bracket, of which two are left by each refinement
+KINKED = 2.0  # a minimum is one of zero where it is at most so many times the rise to its neighbours
+TIGHT = 1e-12  # rtol and atol of an interval that is integrated anew
+
+
+class Change(NamedTuple):
+    """An instant at which the rank is another one than before and after."""
+
+    time: float  # s
+    earliest: float  # the bracket (s)
+    latest: float
+    rank: int  # at the instant
+    smallest: float  # the singular value that vanishes, at `time`, relative to the largest
+
+
+class Timeline(NamedTuple):
+    """Singular values of the scaled Jacobian along a trajectory, and where the rank changes."""
+
+    ts: Float[np.ndarray, "T"]
+    singular_values: Float[np.ndarray, "T k"]
+    rank: Int[np.ndarray, "T"]
+    changes: tuple[Change, ...]
+    closest: tuple[float, float]  # the time (s), and the smallest relative singular value that counts, over all samples
+
+    @property
+    def smallest(self) -> Float[np.ndarray, "T"]:
+        """The smallest singular value that counts where the rank is ordinary, relative to the largest."""
+        return self.singular_values[:, max(int(self.rank.max()) - 1, 0)] / self.singular_values[:, 0]
+
+
+def timeline(mechanism: Mechanism, solution: Any, rank_tol: float, tol: float | None = None) -> Timeline:
+    """Follow the rank along a trajectory.
+
+    Args:
+        mechanism: the mechanism.
+        solution: ts (T,), q and v (T, bodies, 3); of a `Solution` intervals with a rank change are integrated anew.
+        rank_tol: singular values up to so much of the largest count as zero.
+        tol: half the width of the brackets of times (s); by default 1e-9 of the characteristic time of the scene.
+
+    Returns:
+        The `Timeline`. Times are those of the trajectory as it is given: its own errors are not in the brackets.
+    """
+    analysis = analyse(mechanism)
+    ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
+    alive = np.isfinite(q).reshape(len(ts), -1).all(1)
+    ts, q, v = ts[alive], q[alive].reshape(alive.sum(), -1), v[alive].reshape(alive.sum(), -1)
+    tol = _tolerance(analysis, ts) if tol is None else tol
+    path = _Path(mechanism, analysis, ts, q, v)
+    fine = np.unique(np.concatenate([np.linspace(a, b, BETWEEN + 1) for a, b in zip(ts[:-1], ts[1:])] or [ts]))
+    sampled = path.singular_values(fine)
+    own = np.searchsorted(fine, ts)
+    rank = np.sum(sampled > rank_tol * sampled[:, :1], axis=1)
+    ordinary = int(rank.max(initial=0))
+    if not ordinary:
+        return Timeline(ts, sampled[own], rank[own], (), (float(ts[0]), 1.0))
+    sigma = sampled[:, ordinary - 1] / sampled[:, 0]
+    changes = []
+    for k in _kinks(sigma):
+        low, high = fine[max(k - 1, 0)], fine[min(k + 1, len(fine) - 1)]
+        found = _located(_renewed(mechanism, analysis, solution, ts, low, high) or path, low, high, ordinary, rank_tol, tol)
+        changes += [] if found is None else [found]
+    k = int(np.argmin(sigma))
+    closest = min([(float(sigma[k]), float(fine[k])), *((c.smallest, c.time) for c in changes)])
+    return Timeline(ts, sampled[own], rank[own], tuple(changes), closest[::-1])
+
+
+def _tolerance(analysis: Analysis, ts: np.ndarray) -> float:
+    time = float(analysis.time)
+    return 1e-9 * (time if np.isfinite(time) else float(ts[-1] - ts[0]))
+
+
+def _kinks(sigma: np.ndarray) -> list[int]:
+    """Samples with a minimum that may be one of zero."""
+    before, after = np.append(np.inf, sigma[:-1]), np.append(sigma[1:], np.inf)
+    rise = np.where(np.isfinite(before), before - sigma, 0.0) + np.where(np.isfinite(after), after - sigma, 0.0)
+    return np.flatnonzero((sigma < before) & (sigma <= after) & (sigma <= KINKED * rise)).tolist()
+
+
+def _located(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> Change | None:
+    """The minimum of a singular value in a bracket, if the rank is lower there."""
+    start, end, at, values = low, high, low, np.zeros(0)
+    while True:
+        grid = np.linspace(low, high, GRID + 1)
+        values = path.singular_values(grid)
+        k = int(np.argmin(values[:, rank - 1]))
+        at, values = grid[k], values[k]
+        if high - low <= 2 * tol or np.max(np.diff(grid)) <= 4 * np.spacing(abs(at)):
+            break
+        low, high = grid[max(k - 1, 0)], grid[min(k + 1, GRID)]
+    found = int(np.sum(values > rank_tol * values[0]))
+    if found >= rank:
+        return None
+    return Change(float(at), float(max(start, at - tol)), float(min(end, at + tol)), found, float(values[rank - 1] / values[0]))
+
+
+def _renewed(mechanism: Mechanism, analysis: Analysis, solution: Any, ts: np.ndarray, low: float, high: float) -> "_Path | None":
+    """The trajectory between two times, integrated anew from the output before."""
+    if not isinstance(solution, Solution):
+        return None
+    first = int(np.searchsorted(ts, low, side="right")) - 1
+    later = np.linspace(low, high, 2 * FINER + 1)
+    times = np.unique(np.append(ts[first], later))
+    state = State(solution.q[first], solution.v[first])
+    again = simulate(mechanism, times, state, rtol=TIGHT, atol=TIGHT, throw=False)
+    q, v = (np.asarray(x).reshape(len(times), -1) for x in (again.q, again.v))
+    return _Path(mechanism, analysis, times, q, v) if np.all(np.isfinite(q)) else None
+
+
+class _Path:
+    """Singular values at any time between states, by the quintic through q, v and a of two of them."""
+
+    def __init__(self, mechanism: Mechanism, analysis: Analysis, ts: np.ndarray, q: np.ndarray, v: np.ndarray):
+        self.mechanism, self.analysis = mechanism.bare, analysis
+        self.ts, self.states = ts, (q, v, np.asarray(_accelerations(self.mechanism, analysis, ts, q, v)))
+
+    def singular_values(self, times: np.ndarray) -> np.ndarray:
+        """Of the scaled Jacobian (times, k)."""
+        k = np.clip(np.searchsorted(self.ts, times, side="right") - 1, 0, max(len(self.ts) - 2, 0))
+        following = np.minimum(k + 1, len(self.ts) - 1)
+        h = (self.ts[following] - self.ts[k])[:, None]
+        s = (times - self.ts[k])[:, None] / np.where(h > 0, h, 1.0)
+        one, two = ([x[i] for x in self.states] for i in (k, following))
+        return np.asarray(_singular_values(self.mechanism, self.analysis, times, _quintic(s, h, one, two)))
+
+
+def _quintic(s: np.ndarray, h: np.ndarray, one: list[np.ndarray], two: list[np.ndarray]) -> np.ndarray:
+    """The polynomial of degree five through q, v and a at both ends, at the part s of the way."""
+    (q, v, a), (p, w, c) = one, two
+    rest, slope, bend = p - q - h * v - h**2 * a / 2, h * (w - v - h * a), h**2 * (c - a)
+    third, fourth, fifth = 10 * rest - 4 * slope + bend / 2, -15 * rest + 7 * slope - bend, 6 * rest - 3 * slope + bend / 2
+    return q + s * (h * v + s * (h**2 * a / 2 + s * (third + s * (fourth + s * fifth))))
+
+
+@eqx.filter_jit
+def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: Array, q: Array) -> Array:
+    return jax.vmap(lambda t, q: singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
+
+
+@eqx.filter_jit
+def _accelerations(mechanism: Mechanism, analysis: Analysis, ts: Array, q: Array, v: Array) -> Array:
+    equations = equations_of(mechanism, SVD(), analysis=analysis)
+    return jax.vmap(equations.accelerations)(jnp.asarray(ts), jnp.asarray(q), jnp.asarray(v))
