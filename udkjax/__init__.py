@@ -85,6 +85,8 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.show.player import Animation as Animation
     from udkjax.show.player import animate as animate
     from udkjax.show.player import animate_modes as animate_modes
+    from udkjax.study.diagnosis import Diagnosis as Diagnosis
+    from udkjax.study.diagnosis import diagnose as diagnose
     from udkjax.study.identify import Candidate as Candidate
     from udkjax.study.identify import Design as Design
     from udkjax.study.identify import Estimate as Estimate
@@ -120,6 +122,7 @@ _NAMES = {
         ConstrainedSystem Baumgarte Analysis analyse accelerations violation energy reactions
         unique_reactions uniqueness singular_values
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
+    "udkjax.study.diagnosis": "diagnose Diagnosis",
     "udkjax.study.identify": """
         identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck
         design_experiment Candidate Design""",

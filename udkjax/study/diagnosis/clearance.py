@@ -1,22 +1,25 @@
 """How far a configuration is from the next one where the rank of the constraints changes.
 
-The smallest singular value that counts, sigma, is the distance of J to the nearest matrix of lower rank. Within the mechanism's own
-motion its slope along the displacements V that the constraints allow says how far that is, to first order: sigma / |sigma_V|,
+The smallest singular value that counts, sigma, is the distance of J to the nearest matrix of lower rank. Within the mechanism's
+own motion its slope along the displacements V that the constraints allow says how far that is, to first order: sigma / |sigma_V|,
 where sigma_V = u^T (J_q V) w. A mechanism of one degree of freedom, or one that is driven, is led along its path as well, both
-ways, and the rank change is located as the minimum of sigma, which has a kink there.
+ways. Where sigma vanishes it has a kink, and with its sign turned beyond it goes through zero as smoothly as the path: a
+polynomial through closed positions on both sides has the configuration at its root. None of them is close to it, where closing is
+slow.
 """
 
-from collections.abc import Callable
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import BarycentricInterpolator
+from scipy.optimize import brentq
 
 from udkjax.study.diagnosis.configuration import STEP, Configuration, Positions
 
 SLOPE_STEP = 1e-5  # of the characteristic length, and rad: the third root of rounding, for central differences
-WALK = 160  # steps along the path in each direction: more than two turns
-GOLDEN = (np.sqrt(5) - 1) / 2
-SHRINKS = 60  # of a bracket by the golden section: to rounding
+WALK = 160  # steps along the path in each direction: about a turn of everything, or more
+BESIDE = 4  # positions on each side of a root that the polynomial goes through: what it misses is a step to the eighth
 
 
 class RankChange(NamedTuple):
@@ -45,14 +48,8 @@ def clearance(positions: Positions, at: Configuration, rank: int, walk: bool = T
     sigma = at.sigma[rank - 1]
     slope = np.linalg.norm([_slope(positions, at, direction, rank) for direction in at.right.T]) if at.right.size else 0.0
     estimate = float(sigma / slope) if slope > SLOPE_STEP * sigma else np.inf
-    found, searched = [], 0.0
     driven = at.right.shape[1] == 0 and positions.rows.tick > 0.0
-    if walk and (at.right.shape[1] == 1 or driven):
-        for side in (1.0, -1.0):
-            change, way = _along(positions, at, rank, side)
-            found += [change] if change is not None else []
-            searched = max(searched, way)
-    nearest = min(found, key=lambda change: change.distance, default=None)
+    nearest, searched = (None, 0.0) if not walk or not (at.right.shape[1] == 1 or driven) else _search(positions, at, rank)
     return Clearance(float(sigma / at.sigma[0]), estimate, nearest, searched)
 
 
@@ -62,29 +59,44 @@ def _slope(positions: Positions, at: Configuration, direction: np.ndarray, rank:
     return float(at.u[:, rank - 1] @ change @ at.vt[rank - 1]) / (2 * SLOPE_STEP)
 
 
-def _along(positions: Positions, start: Configuration, rank: int, side: float) -> tuple[RankChange | None, float]:
-    """Walk along the path until sigma has a minimum of zero; also, how far it went."""
-    path, way = [start], [0.0]
+def _search(positions: Positions, start: Configuration, rank: int) -> tuple[RankChange | None, float]:
+    """The nearest rank change on the path, and how far that was followed."""
+    onward, around = _walk(positions, start, rank, 1.0)
+    back = [] if around else _walk(positions, start, rank, -1.0)[0]
+    path = [*reversed(back), start, *onward]
+    way = np.concatenate([[0.0], np.cumsum([positions.distance(a, b) for a, b in pairwise(path)])])
+    way -= way[len(back)]
+    sigma = np.array([c.sigma[rank - 1] for c in path])
+    found = [
+        _root(positions, path, way, sigma, k, rank) for k in range(1, len(path) - 1) if sigma[k - 1] >= sigma[k] <= sigma[k + 1]
+    ]
+    nearest = min((change for change in found if change is not None), key=lambda change: change.distance, default=None)
+    return nearest, float(np.max(np.abs(way)))
+
+
+def _walk(positions: Positions, start: Configuration, rank: int, side: float) -> tuple[list[Configuration], bool]:
+    """Closed positions along the path, to somewhat beyond the first minimum of sigma; and whether they came back to the start."""
+    path, more = [start], WALK
     heading = side * start.right[:, 0] if start.right.shape[1] else np.zeros(len(start.q))
-    for _ in range(WALK):
-        last = path[-1]
-        moved = _step(positions, last, heading, STEP, side)
-        gone = 0.0 if moved is None else positions.distance(last, moved)
-        if moved is None or (gone < STEP / 4 and heading.any()) or moved.rank > rank:
+    while more:
+        last, more = path[-1], more - 1
+        moved = _step(positions, last, heading, STEP, side) or _step(positions, last, heading, 0.7 * STEP, side)
+        if moved is None or moved.rank > rank or (heading.any() and positions.distance(last, moved) < STEP / 4):
             break
         path.append(moved)
-        way.append(way[-1] + gone)
-        if len(path) > 2 and _sigma(path[-2], rank) <= min(_sigma(path[-3], rank), _sigma(path[-1], rank)):
-            lowest, shift = _lowest(lambda s: _step(positions, path[-2], heading, s, side), rank)  # noqa: B023
-            if lowest is not None and lowest.rank < rank:
-                distance = way[-2] + np.copysign(positions.distance(path[-2], lowest), shift)
-                return RankChange(lowest.t, lowest.q.reshape(-1, 3), lowest.rank, float(distance), side > 0), way[-1]
         if moved.right.shape[1]:
             onward = moved.right @ (moved.right.T @ heading)
             heading = onward / np.linalg.norm(onward)
-        if len(path) > 3 and positions.distance(start, moved) < STEP / 2:  # all around
-            break
-    return None, way[-1]
+        if len(path) > 3 and positions.distance(start, moved, turns=False) < STEP:
+            return path[1:], True
+        if len(path) > 2 and more > BESIDE and _kinked([c.sigma[rank - 1] for c in path[-3:]]):
+            more = BESIDE
+    return path[1:], False
+
+
+def _kinked(sigma: list[float]) -> bool:
+    """Whether three values have a minimum that may be one of zero: not above the rise on either side."""
+    return sigma[1] <= min(sigma[0], sigma[2]) and sigma[1] <= max(sigma[0], sigma[2]) - sigma[1]
 
 
 def _step(positions: Positions, at: Configuration, heading: np.ndarray, step: float, side: float) -> Configuration | None:
@@ -92,32 +104,19 @@ def _step(positions: Positions, at: Configuration, heading: np.ndarray, step: fl
     return positions.displaced(at, heading, step, t)
 
 
-def _sigma(at: Configuration, rank: int) -> float:
-    return float(at.sigma[rank - 1])
-
-
-def _lowest(path: Callable[[float], Configuration | None], rank: int) -> tuple[Configuration | None, float]:
-    """The configuration of the smallest sigma between steps of -STEP and STEP, by the golden section."""
-    low, high = -STEP, STEP
-    best: tuple[float, Configuration | None, float] = np.inf, None, 0.0
-
-    def value(s: float) -> float:
-        nonlocal best
-        found = path(s)
-        size = np.inf if found is None else _sigma(found, rank)
-        if size < best[0]:
-            best = size, found, s
-        return size
-
-    one, two = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-    at_one, at_two = value(one), value(two)
-    for _ in range(SHRINKS):
-        if at_one < at_two:
-            high, two, at_two = two, one, at_one
-            one = high - GOLDEN * (high - low)
-            at_one = value(one)
-        else:
-            low, one, at_one = one, two, at_two
-            two = low + GOLDEN * (high - low)
-            at_two = value(two)
-    return best[1], best[2]
+def _root(positions: Positions, path: list, way: np.ndarray, sigma: np.ndarray, k: int, rank: int) -> RankChange | None:
+    """The configuration beside the k-th position where sigma vanishes, if it does."""
+    if not _kinked(sigma[k - 1 : k + 2].tolist()):
+        return None
+    near = slice(max(0, k - BESIDE), k + BESIDE + 1)
+    for turned in (k, k + 1):  # from where on sigma has the other sign
+        signed = np.where(np.arange(len(sigma)) < turned, sigma, -sigma)
+        smooth = BarycentricInterpolator(way[near], signed[near])
+        low, high = (way[k - 1], way[k]) if turned == k else (way[k], way[k + 1])
+        root = float(np.asarray(brentq(lambda s: float(smooth(s)), low, high, xtol=1e-14)))  # noqa: B023
+        q = BarycentricInterpolator(way[near], np.array([c.q for c in path[near]]))(root)
+        t = float(BarycentricInterpolator(way[near], np.array([c.t for c in path[near]]))(root))
+        there = positions.at(t, np.asarray(q))
+        if there.rank < rank and np.max(np.abs(positions.rows.residual(t, there.q))) < positions.rank_tol:
+            return RankChange(t, there.q.reshape(-1, 3), there.rank, abs(root), root > 0)
+    return None

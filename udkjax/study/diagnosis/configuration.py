@@ -72,9 +72,12 @@ class Positions:
         """The closed position next to one that is displaced by a step along a direction, in scaled coordinates."""
         return self.near(start.t if t is None else t, start.q + step * self.unit * direction)
 
-    def distance(self, one: Configuration, two: Configuration) -> float:
-        """How far two positions are apart: the norm of the scaled displacement."""
-        return float(np.linalg.norm((two.q - one.q) / self.unit))
+    def distance(self, one: Configuration, two: Configuration, turns: bool = True) -> float:
+        """How far two positions are apart: the norm of the scaled displacement; whole turns may not count."""
+        way = (two.q - one.q) / self.unit
+        if not turns:
+            way[2::3] = np.remainder(way[2::3] + np.pi, 2 * np.pi) - np.pi
+        return float(np.linalg.norm(way))
 
     def around(self, start: Configuration) -> list[Configuration]:
         """Closed positions along a random motion from one, drivers going on; none where it cannot move."""

@@ -2,8 +2,8 @@
 
 N spans the null space of J^T. The rows of a set S of constraints are dependent if and only if a combination y of the columns of N
 vanishes outside S, N[outside] y = 0, and redundant by nullity(N) - rank(N[outside]). S is minimal if no constraint can be taken
-out of it. Sets are looked for one after another: of the candidates, one grown around each constraint, the smallest; then as many
-of its rows as are redundant are left out, until nothing depends on anything.
+out of it. One set is grown around each constraint; the smallest are taken until their combinations y span all of N. What is
+still missing is looked for without a row of each combination that is known.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,7 +19,6 @@ class Dependency(NamedTuple):
 
     constraints: tuple[str, ...]
     redundancy: int  # how many of their rows are redundant
-    stress: dict[str, np.ndarray]  # of each, the multipliers (rows, redundancy) that keep each other in balance: N of its rows
 
 
 def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple[str, ...]]) -> list[Dependency]:
@@ -27,28 +26,37 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
 
     `owners` is the constraint of each row, `attached` the bodies of each constraint, by which near ones are kept in a set first.
     """
-    owner, kept, found = np.array(owners), np.ones(len(owners), bool), []
-    while N.shape[1]:
-        involved = list(dict.fromkeys(owner[np.linalg.norm(N, axis=1) > DEPENDS].tolist()))
-        if not involved:
-            break
-        candidates = [_around(seed, involved, N, owner, attached) for seed in involved]
-        members = min(candidates, key=len)
-        inside, outside = np.isin(owner, members), ~np.isin(owner, members)
-        y = _vanishing(N[outside])
-        stress = N @ y
-        found.append(Dependency(tuple(members), y.shape[1], {name: stress[owner == name] for name in members}))
-        for _ in range(y.shape[1]):  # leave out a row of it, and with it a column of N
-            row = int(np.argmax(np.where(inside & kept, np.linalg.norm(N @ y, axis=1), -1.0)))
-            N = N @ np.linalg.svd(N[row : row + 1])[2][1:].T
-            y = _vanishing(N[outside])
-            kept[row] = False
-    return found
+    owner, found = np.array(owners), []
+    spanned = np.zeros((N.shape[1], 0))  # the combinations of columns that the sets found so far are made of
+    remaining = N
+    while spanned.shape[1] < N.shape[1]:
+        involved = list(dict.fromkeys(owner[np.linalg.norm(remaining, axis=1) > DEPENDS].tolist()))
+        candidates = [_around(seed, involved, remaining, owner, attached) for seed in involved]
+        for members in sorted(candidates, key=len):
+            own = _vanishing(N[~np.isin(owner, members)])
+            both = np.linalg.svd(np.concatenate([spanned, own], axis=1), full_matrices=False)
+            rank = int(np.sum(both[1] > DEPENDS))
+            if rank > spanned.shape[1]:
+                found.append(Dependency(tuple(members), rank - spanned.shape[1]))
+                spanned = both[0][:, :rank]
+        # What no candidate was made of: without a row of what is known for each of its combinations.
+        remaining = N
+        rest = N @ spanned
+        while rest.shape[1]:
+            row = int(np.argmax(np.linalg.norm(rest, axis=1)))
+            remaining = remaining @ np.linalg.svd(remaining[row : row + 1])[2][1:].T
+            rest = rest @ np.linalg.svd(rest[row : row + 1])[2][1:].T
+    return sorted(found, key=lambda dependency: len(dependency.constraints))
 
 
 def redundant_by(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> int:
     """By how many rows a set of constraints is redundant in itself."""
     return N.shape[1] - _rank(N[~np.isin(np.array(owners), list(members))])
+
+
+def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> np.ndarray:
+    """The combinations of the rows of a set alone that vanish, (m, redundancy): forces by which it keeps itself in balance."""
+    return N @ _vanishing(N[~np.isin(np.array(owners), list(members))])
 
 
 def _around(seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]) -> list[str]:

@@ -1,8 +1,8 @@
-"""What to change about a redundant constraint: each way is tried on the Jacobian everywhere, and the best on the mechanism itself.
+"""What to change about a redundant constraint: each way is tried on the Jacobian, and the best on the mechanism itself.
 
-A constraint is relaxed by what its kind can give up: a revolute one direction (it becomes a slot, in either of its bodies), a weld
-or a prismatic joint one of its freedoms, anything all of its rows. That helps where the rows that are given up carry the stress
-by which the constraints of a set hold each other in balance, and frees nothing, since others hold it, too.
+A constraint is relaxed by what its kind can give up: a revolute one direction (it becomes a slot, in either of its bodies), a
+weld or a prismatic joint one of its freedoms, anything all of its rows. That helps where the rows that are given up carry the
+stress by which the constraints of a set hold each other in balance, and frees nothing, since others hold it, too.
 """
 
 from collections.abc import Iterator
@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from udkjax.equations.analysis import analyse
 from udkjax.equations.redundancy import KinematicRows
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Angle, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, Positions, decomposed
-from udkjax.study.diagnosis.dependence import Dependency
+from udkjax.study.diagnosis.dependence import Dependency, stress_of
 
 STEEP = 1e-3  # the smallest singular value relative to the largest: a fix that leaves less is as good as none
 
@@ -34,10 +33,21 @@ class Change(NamedTuple):
         """The rows of the Jacobian that stay, of those of the constraint."""
         if self.slides is None:
             return rows[list(self.rows)]
-        body, axis = self.slides
+        cos, sin = self._direction(q, places)
+        return np.array([[-sin, cos]]) @ rows
+
+    def alignment(self, force: np.ndarray, q: np.ndarray, places: list[int | None]) -> float:
+        """How much of the stress (rows, redundancy) lies in what a slot gives up, 0 to 1; of any other change, 1."""
+        if self.slides is None:
+            return 1.0
+        return float(np.linalg.norm(self._direction(q, places) @ force[:2]) / np.linalg.norm(force[:2], 2))
+
+    def _direction(self, q: np.ndarray, places: list[int | None]) -> np.ndarray:
+        """The line of the slot in ground axes."""
+        body, axis = self.slides or (0, 0.0)
         place = places[body]
         angle = axis + (0.0 if place is None else q[3 * place + 2])
-        return np.array([[-np.sin(angle), np.cos(angle)]]) @ rows
+        return np.array([np.cos(angle), np.sin(angle)])
 
 
 class Fix(NamedTuple):
@@ -57,16 +67,18 @@ def fixes_of(
 
     `at` are positions of ordinary rank, in all of which it must help.
     """
-    found = []
+    found, stresses = [], [stress_of(position.left, owners, dependency.constraints) for position in at]
     for name in dependency.constraints:
-        options = []
-        for change in _changes(mechanism, name, at[0], dependency.stress[name], positions.row_unit[_own(owners, name)]):
+        options, own = [], _own(owners, name)
+        forces = [stress[own] / positions.row_unit[own, None] for stress in stresses]
+        for change in _changes(mechanism, name, at[0], forces[0]):
             removes, conditioning = _effect(mechanism, name, change, at, owners, positions.rank_tol)
             if removes > 0 and conditioning > STEEP * min(c.smallest for c in at):
-                options.append((removes, round(conditioning, 12), change))
-        for removes, conditioning, change in sorted(options, key=lambda option: (-option[0], -option[1])):
+                aligned = min(change.alignment(force, c.q, _places(mechanism, name)) for force, c in zip(forces, at, strict=True))
+                options.append((removes, round(aligned, 6), round(conditioning, 12), change))
+        for removes, _, conditioning, change in sorted(options, key=lambda option: option[:3], reverse=True):
             changed = applied(mechanism, name, change)
-            if changed is not None and _verified(mechanism, changed, removes, at, positions.rank_tol):
+            if changed is not None and _verified(changed, removes, at, positions.rank_tol):
                 found.append(Fix(name, change.text, removes, conditioning, changed))
                 break
     return sorted(found, key=lambda fix: (-fix.removes, -fix.conditioning))
@@ -90,15 +102,19 @@ def _own(owners: list[str], name: str) -> list[int]:
     return [k for k, owner in enumerate(owners) if owner == name]
 
 
-def _changes(
-    mechanism: Mechanism, name: str, at: Configuration, stress: np.ndarray, row_unit: np.ndarray
-) -> Iterator[Change]:
-    """The ways to relax a constraint, of which `stress` is the share of N."""
+def _places(mechanism: Mechanism, name: str) -> list[int | None]:
+    """Where the bodies of a constraint are among all; None: the ground."""
+    bodies = mechanism.frames_of(mechanism.constraints[name])
+    return [None if body == GROUND else mechanism.body_names.index(body) for body in bodies]
+
+
+def _changes(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarray) -> Iterator[Change]:
+    """The ways to relax a constraint, which carries the multipliers `force` (rows, redundancy) of the stress."""
     element: Any = mechanism.constraints[name]
     yield Change("remove it", None)
-    force = np.linalg.svd(stress / row_unit[:, None])[0][:, 0]  # the direction that carries most
     if isinstance(element, Revolute):
-        along = np.arctan2(force[1], force[0])
+        most = np.linalg.svd(force)[0][:, 0]  # the direction that carries most
+        along = np.arctan2(most[1], most[0])
         for k, body in enumerate(element.bodies):
             angle = 0.0 if body == GROUND else at.q[3 * mechanism.body_names.index(body) + 2]
             axis = _half_turn(along - angle)
@@ -126,8 +142,7 @@ def _effect(
     mechanism: Mechanism, name: str, change: Change, at: list[Configuration], owners: list[str], rank_tol: float
 ) -> tuple[int, float]:
     """By how much the redundancy falls, -1 where the mobility changes or it is not everywhere the same, and how it conditions."""
-    places = [None if body == GROUND else mechanism.body_names.index(body) for body in mechanism.frames_of(_of(mechanism, name))]
-    own, falls, conditioning = _own(owners, name), set(), np.inf
+    own, places, falls, conditioning = _own(owners, name), _places(mechanism, name), set(), np.inf
     for position in at:
         rest = np.delete(position.J, own, axis=0)
         kept = np.concatenate([rest, change.kept(position.J[own], position.q, places)])
@@ -137,21 +152,15 @@ def _effect(
     return falls.pop() if len(falls) == 1 else -1, float(conditioning)
 
 
-def _of(mechanism: Mechanism, name: str) -> Any:
-    return mechanism.constraints[name]
-
-
-def _verified(before: Mechanism, after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
+def _verified(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
     """Whether the changed mechanism itself is closed in all positions, has the same mobility there, and fewer redundant rows."""
-    one, two = analyse(before), analyse(after)
     positions = Positions(KinematicRows(after), rank_tol)
     seen = [positions.at(position.t, position.q) for position in at]
     closed = all(
         np.max(np.abs(positions.rows.residual(c.t, c.q)), initial=0.0) < rank_tol * max(1.0, positions.rows.scales.size(c.q, np))
         for c in seen
     )
-    alike = all(c.rank == position.rank and c.redundancy == position.redundancy - removes for c, position in zip(seen, at, strict=True))
-    known = one.degrees_of_freedom is None or (
-        two.degrees_of_freedom == one.degrees_of_freedom and len(two.redundant) == len(one.redundant) - removes
+    alike = all(
+        c.rank == position.rank and c.redundancy == position.redundancy - removes for c, position in zip(seen, at, strict=True)
     )
-    return closed and alike and known
+    return closed and alike

@@ -1,6 +1,6 @@
 """The branches that meet at a singular configuration: directions that the constraints allow to second order.
 
-Along a curve q(s) with q' = V x, V spanning the null space of J, Psi = 0 asks of the second derivative J q'' = -H(V x, V x), which
+Along a curve q(s) with q' = V x, V spanning the null space of J, Psi = 0 asks of the second derivative J q'' = -H(V x, V x). That
 has a solution if and only if N^T H(V x, V x) = 0: one quadratic form x^T A_i x for each column of N. Its common zeros are the
 tangents of the branches. They are found by Gauss-Newton from many directions at once; each is then walked along, a step, to see
 that there is a motion.
@@ -19,7 +19,9 @@ from udkjax.study.diagnosis.configuration import Configuration, Positions
 STARTS = 400  # directions to look from
 ITERATIONS = 60
 ZERO = 1e-10  # of the forms, whose coefficients are at most one
+DOUBLE = 1e-7  # of a tangent: a double zero is known to the root of rounding
 SAME = 1e-4  # rad: directions nearer than that are one
+ASIDE = 0.1  # rad: how far from a zero to look for others
 STEP = 0.02  # of the characteristic length, and rad: how far a branch is walked along
 ASTRAY = 0.2  # of the step: how far its end may be from the tangent; it bends by the step's square
 
@@ -28,8 +30,8 @@ class Branch(NamedTuple):
     """One of the motions that start from a singular configuration."""
 
     tangent: np.ndarray  # (bodies, 3): m, m, rad along it, the largest of a body's turn or of its way over L being one
-    degrees_of_freedom: int  # on it, next to the configuration
-    rank: int
+    degrees_of_freedom: int  # the dimension of the motions of this branch
+    rank: int  # on it, next to the configuration
     followed: bool  # whether a closed position was found along it, on both sides
 
 
@@ -38,8 +40,8 @@ def branches(mechanism: Mechanism, positions: Positions, at: Configuration) -> l
     A, N, V = quadratic_forms(mechanism, positions, at), at.left, at.right
     if not V.shape[1]:
         return []
-    subspaces = zeros_of(A) if N.shape[1] else [np.eye(V.shape[1])]
-    return [_followed(positions, at, V @ space) for space in subspaces]
+    found = zeros_of(A) if N.shape[1] else [Zeros(np.eye(V.shape[1]), V.shape[1])]
+    return [_followed(positions, at, V @ zeros.space, zeros.dimension) for zeros in found]
 
 
 def quadratic_forms(mechanism: Mechanism, positions: Positions, at: Configuration) -> np.ndarray:
@@ -56,56 +58,72 @@ def _hessian(mechanism, t, q, unit, weights):
     return jax.hessian(lambda x: weights.T @ constraints.psi(mechanism, t, q + unit @ x))(jnp.zeros(unit.shape[1]))
 
 
-def zeros_of(A: np.ndarray) -> list[np.ndarray]:
-    """The directions x (d, g) where all forms x^T A_i x vanish: lines (g = 1), or linear spaces where many are one motion.
+class Zeros(NamedTuple):
+    """Directions in which all forms vanish: a linear space, or one line of a cone that is none."""
 
-    A zero that is not isolated, and whose neighbours are not a linear space, is returned as the line that was found.
-    """
-    d = A.shape[1]
-    size = np.abs(A).max(initial=0.0)
+    space: np.ndarray  # (d, g), orthonormal
+    dimension: int  # of the space, or of the cone
+
+    @property
+    def is_cone(self) -> bool:
+        return self.space.shape[1] < self.dimension
+
+
+def zeros_of(A: np.ndarray) -> list[Zeros]:
+    """The directions x where all forms x^T A_i x vanish: isolated lines, linear spaces, and cones by one line of theirs."""
+    d, size = A.shape[1], np.abs(A).max(initial=0.0)
     if size < ZERO:
-        return [np.eye(d)]
+        return [Zeros(np.eye(d), d)]
     A, random = A / size, np.random.default_rng(0)
-    x = random.standard_normal((STARTS, d))
-    x = np.concatenate([np.eye(d), x / np.linalg.norm(x, axis=1, keepdims=True)])
-    for _ in range(ITERATIONS):
-        value = np.einsum("kij,si,sj->sk", A, x, x)
-        slope = 2 * np.einsum("kij,sj->ski", A, x)
-        residual = np.concatenate([value, np.zeros((len(x), 1))], axis=1)
-        matrix = np.concatenate([slope, x[:, None, :]], axis=1)  # and a step across x
-        x = x - np.einsum("sij,sj->si", np.linalg.pinv(matrix, rcond=1e-9), residual)
-        x = x / np.linalg.norm(x, axis=1, keepdims=True)
-    x = x[np.abs(np.einsum("kij,si,sj->sk", A, x, x)).max(axis=1) < ZERO]
-    found: list[np.ndarray] = []
+    x = _solved(A, np.concatenate([np.eye(d), random.standard_normal((STARTS, d))]))
+    found: list[Zeros] = []
     for direction in x:
-        if any(np.linalg.norm(direction - space @ (space.T @ direction)) < SAME for space in found):
+        if any(np.linalg.norm(direction - z.space @ (z.space.T @ direction)) < SAME for z in found):
             continue
-        space = _linear(A, direction)
-        found = [other for other in found if not _inside(other, space)] + [space]
+        zeros = _around(A, direction)
+        if zeros.is_cone and any(z.is_cone and z.dimension == zeros.dimension for z in found):  # one line is enough
+            continue
+        found = [z for z in found if not _inside(z.space, zeros.space)] + [zeros]
     return found
 
 
-def _linear(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The linear space of zeros around a zero x, or x alone: the kernel of all A_i x, if all forms vanish on it."""
+def _solved(A: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Zeros on the unit sphere, by Gauss-Newton from many directions x (s, d)."""
+    x = x / np.linalg.norm(x, axis=1, keepdims=True)
+    for _ in range(ITERATIONS):
+        residual = np.einsum("kij,si,sj->sk", A, x, x)
+        matrix = np.concatenate([2 * np.einsum("kij,sj->ski", A, x), x[:, None, :]], axis=1)  # and a step across x
+        x = x - np.einsum("sij,sj->si", np.linalg.pinv(matrix, rcond=1e-9), np.pad(residual, ((0, 0), (0, 1))))
+        x = x / np.linalg.norm(x, axis=1, keepdims=True)
+    return x[np.abs(np.einsum("kij,si,sj->sk", A, x, x)).max(axis=1) < ZERO]
+
+
+def _around(A: np.ndarray, x: np.ndarray) -> Zeros:
+    """The zeros around one: the kernel of all A_i x if all forms vanish on it; a cone if there are others near; or x alone."""
     sigma, vt = np.linalg.svd(2 * np.einsum("kij,j->ki", A, x))[1:]
     kernel = vt[int(np.sum(sigma > SAME)) :].T
-    flat = np.abs(np.einsum("ia,kij,jb->kab", kernel, A, kernel)).max(initial=0.0) < SAME**2
-    return kernel if flat and kernel.shape[1] else x[:, None]
+    if kernel.shape[1] > 1:
+        if np.abs(np.einsum("ia,kij,jb->kab", kernel, A, kernel)).max(initial=0.0) < SAME**2:
+            return Zeros(kernel, kernel.shape[1])
+        near = _solved(A, x + ASIDE * kernel.T)
+        if np.any(np.linalg.norm(near - (near @ x)[:, None] * x, axis=1) > ASIDE / 2):
+            return Zeros(x[:, None], kernel.shape[1])
+    return Zeros(x[:, None], 1)
 
 
 def _inside(one: np.ndarray, two: np.ndarray) -> bool:
     return one.shape[1] < two.shape[1] and bool(np.linalg.norm(one - two @ (two.T @ one)) < SAME)
 
 
-def _followed(positions: Positions, at: Configuration, tangents: np.ndarray) -> Branch:
+def _followed(positions: Positions, at: Configuration, tangents: np.ndarray, dimension: int) -> Branch:
     tangent = tangents @ np.ones(tangents.shape[1]) / np.sqrt(tangents.shape[1])
     size = positions.rows.scales.size(positions.unit * tangent, np)
     tangent = tangent / size * np.sign(tangent[np.argmax(np.abs(tangent))])
+    tangent[np.abs(tangent) < DOUBLE] = 0.0
     ends = [positions.displaced(at, tangent, side * STEP) for side in (1.0, -1.0)]
     reached = [end for end, side in zip(ends, (1.0, -1.0), strict=True) if _reached(positions, at, end, side * STEP * tangent)]
     rank = max((end.rank for end in reached if end is not None), default=at.rank)
-    free = len(at.q) - rank
-    return Branch((positions.unit * tangent).reshape(-1, 3), free, rank, len(reached) == 2)
+    return Branch((positions.unit * tangent).reshape(-1, 3), dimension, rank, len(reached) == 2)
 
 
 def _reached(positions: Positions, at: Configuration, end: Configuration | None, way: np.ndarray) -> bool:

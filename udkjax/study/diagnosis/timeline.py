@@ -5,13 +5,14 @@ minimum has a kink, so that it can be located to rounding of the time. Between o
 integrated anew from the output before, then of a quintic through q, v and a.
 """
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.determinacy import singular_values
@@ -71,7 +72,7 @@ def timeline(mechanism: Mechanism, solution: Any, rank_tol: float, tol: float | 
     ts, q, v = ts[alive], q[alive].reshape(alive.sum(), -1), v[alive].reshape(alive.sum(), -1)
     tol = _tolerance(analysis, ts) if tol is None else tol
     path = _Path(mechanism, analysis, ts, q, v)
-    fine = np.unique(np.concatenate([np.linspace(a, b, BETWEEN + 1) for a, b in zip(ts[:-1], ts[1:])] or [ts]))
+    fine = np.unique(np.concatenate([np.linspace(a, b, BETWEEN + 1) for a, b in pairwise(ts)] or [ts]))
     sampled = path.singular_values(fine)
     own = np.searchsorted(fine, ts)
     rank = np.sum(sampled > rank_tol * sampled[:, :1], axis=1)
@@ -85,8 +86,8 @@ def timeline(mechanism: Mechanism, solution: Any, rank_tol: float, tol: float | 
         found = _located(_renewed(mechanism, analysis, solution, ts, low, high) or path, low, high, ordinary, rank_tol, tol)
         changes += [] if found is None else [found]
     k = int(np.argmin(sigma))
-    closest = min([(float(sigma[k]), float(fine[k])), *((c.smallest, c.time) for c in changes)])
-    return Timeline(ts, sampled[own], rank[own], tuple(changes), closest[::-1])
+    least, when = min([(float(sigma[k]), float(fine[k])), *((c.smallest, c.time) for c in changes)])
+    return Timeline(ts, sampled[own], rank[own], tuple(changes), (when, least))
 
 
 def _tolerance(analysis: Analysis, ts: np.ndarray) -> float:
@@ -157,11 +158,11 @@ def _quintic(s: np.ndarray, h: np.ndarray, one: list[np.ndarray], two: list[np.n
 
 
 @eqx.filter_jit
-def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: Array, q: Array) -> Array:
+def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike) -> Array:
     return jax.vmap(lambda t, q: singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
 
 
 @eqx.filter_jit
-def _accelerations(mechanism: Mechanism, analysis: Analysis, ts: Array, q: Array, v: Array) -> Array:
+def _accelerations(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike, v: ArrayLike) -> Array:
     equations = equations_of(mechanism, SVD(), analysis=analysis)
     return jax.vmap(equations.accelerations)(jnp.asarray(ts), jnp.asarray(q), jnp.asarray(v))

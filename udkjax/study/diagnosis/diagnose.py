@@ -1,0 +1,174 @@
+"""`diagnose`: freedoms, redundancy, singularity and determinate forces of a mechanism, and its rank along a trajectory."""
+
+from typing import Any
+
+import numpy as np
+
+from udkjax.equations.determinacy import RANK_TOL, UNIQUE_TOL
+from udkjax.equations.redundancy import KinematicRows
+from udkjax.integrate.assembly import State, close, require_closed
+from udkjax.scene.joints import Revolute, Weld
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.diagnosis.clearance import clearance
+from udkjax.study.diagnosis.configuration import Configuration, Positions, decomposed
+from udkjax.study.diagnosis.dependence import Dependency, dependencies
+from udkjax.study.diagnosis.diagnosis import Diagnosis, JointForces, Redundancy
+from udkjax.study.diagnosis.fixes import Fix, fixes_of
+from udkjax.study.diagnosis.second_order import branches
+from udkjax.study.diagnosis.timeline import timeline
+
+MOST_FIXES = 64  # of a cure, one after another
+
+
+def diagnose(
+    mechanism: Mechanism,
+    state: State | None = None,
+    solution: Any = None,
+    t: float = 0.0,
+    rank_tol: float = RANK_TOL,
+    time_tol: float | None = None,
+    fixes: bool = True,
+    walk: bool = True,
+) -> Diagnosis:
+    """Say what depends on what in a mechanism, what to do about it, and where its rank changes.
+
+    The rank is that of the scaled Jacobian J of Psi: lengths over the characteristic one, angles in radians, each row over what
+    moves it; so a mechanism of a micrometre and one of a kilometre get the same diagnosis.
+
+    Args:
+        mechanism: its numbers are known.
+        state: the configuration; by default the initial guess, or the start of `solution`. It is closed first.
+        solution: a trajectory, for the `timeline`.
+        t: time (s) of the configuration, for drivers.
+        rank_tol: singular values of J up to so much of the largest count as zero.
+        time_tol: half the width of the brackets of the times of rank changes (s); by default 1e-9 of the characteristic time.
+        fixes: whether to look for, and verify, changes that take redundancy away.
+        walk: whether to follow a mechanism of one degree of freedom, or a driven one, along its path to the next rank change.
+
+    Returns:
+        The `Diagnosis`; print it.
+
+    Raises:
+        AssemblyError: the configuration cannot be closed.
+        ValueError: numbers of the mechanism are traced.
+    """
+    if not mechanism.is_known:
+        raise ValueError("diagnose takes known numbers: under jit and vmap take uniqueness and singular_values, which are pure")
+    if state is None and solution is not None:
+        state, t = State(solution.q[0], solution.v[0]), float(solution.ts[0])
+    closure = close(mechanism, t, state)
+    require_closed(mechanism, closure._replace(psi_dot=0.0 * closure.psi_dot))  # velocities have no part in it
+    q = np.asarray(closure.state.q, float)
+    rows = KinematicRows(mechanism)
+    positions = Positions(rows, rank_tol)
+    here = positions.at(float(t), q.ravel())
+    around = positions.around(here)
+    ordinary = max([here.rank, *(c.rank for c in around)])
+    usual = [c for c in [here, *around] if c.rank == ordinary]
+    owners = [name for name, _ in rows.names]
+    permanent, momentary = _dependencies(mechanism, here, usual, owners)
+    if not around and here.right.size:  # it moves to first order only, which is what these rows leave undecided
+        permanent, momentary = [], [*permanent, *momentary]
+    found = [
+        Redundancy(d.constraints, d.redundancy, True, tuple(_fixes(mechanism, positions, usual, owners, d) if fixes else ()))
+        for d in permanent
+    ]
+    found += [Redundancy(d.constraints, d.redundancy, False, ()) for d in momentary]
+    of_joints = [k for k, name in enumerate(owners) if name in mechanism.joints]
+    return Diagnosis(
+        mechanism=mechanism,
+        t=float(t),
+        q=q,
+        coordinates=rows.size,
+        rows=rows.count,
+        rank=here.rank,
+        ordinary_rank=ordinary,
+        joint_rank=decomposed(here.J[of_joints], rank_tol)[3],
+        joint_rows=len(of_joints),
+        can_move=bool(around),
+        redundancies=tuple(found),
+        cure=_cure(mechanism, positions, usual, found) if fixes else (),
+        branches=tuple(branches(mechanism, positions, here)),
+        forces=_forces(mechanism, positions, here, owners),
+        singular_values=here.sigma,
+        clearance=clearance(positions, here, ordinary, walk),
+        timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
+    )
+
+
+def _dependencies(
+    mechanism: Mechanism, here: Configuration, usual: list[Configuration], owners: list[str]
+) -> tuple[list[Dependency], list[Dependency]]:
+    """Those that depend on each other in all positions of ordinary rank, and those that only do so here."""
+    attached = {name: mechanism.frames_of(element) for name, element in mechanism.constraints.items()}
+    best = max(usual, key=lambda c: c.smallest)
+    permanent = dependencies(best.left, owners, attached)
+    if here.rank == best.rank:
+        return permanent, []
+    # Here: the combinations that vanish, less those that vanish everywhere, each of which gives up one row.
+    spared = _spared(best.left)
+    N = here.left
+    for row in spared:
+        if np.linalg.norm(N[row]) > UNIQUE_TOL:
+            N = N @ np.linalg.svd(N[row : row + 1])[2][1:].T
+    return permanent, dependencies(N, owners, attached)
+
+
+def _spared(N: np.ndarray) -> list[int]:
+    """Rows, as many as N has columns, without which the others are independent where N vanishes on J."""
+    chosen: list[int] = []
+    while N.shape[1]:
+        row = int(np.argmax(np.linalg.norm(N, axis=1)))
+        chosen.append(row)
+        N = N @ np.linalg.svd(N[row : row + 1])[2][1:].T
+    return chosen
+
+
+def _fixes(
+    mechanism: Mechanism, positions: Positions, usual: list[Configuration], owners: list[str], dependency: Dependency
+) -> list[Fix]:
+    """The fixes of a set; its stress is that of the first of the positions."""
+    first = max(usual, key=lambda c: c.smallest)
+    others = [c for c in usual if c is not first]
+    return fixes_of(mechanism, positions, [first, *others], owners, dependency)
+
+
+def _cure(mechanism: Mechanism, positions: Positions, usual: list[Configuration], found: list[Redundancy]) -> tuple[Fix, ...]:
+    """The best fixes one after another, each found on what the one before has left, until nothing is redundant."""
+    done: list[Fix] = []
+    current, at, sets = mechanism, usual, [r for r in found if r.permanent]
+    while sets and len(done) < MOST_FIXES:
+        best = max((r.fixes[0] for r in sets if r.fixes), key=lambda fix: (fix.removes, fix.conditioning), default=None)
+        if best is None:
+            return ()
+        done.append(best)
+        current = best.mechanism
+        rows = KinematicRows(current)
+        here = Positions(rows, positions.rank_tol)
+        at, owners = [here.at(c.t, c.q) for c in at], [name for name, _ in rows.names]
+        attached = {name: current.frames_of(element) for name, element in current.constraints.items()}
+        first = max(at, key=lambda c: c.smallest)
+        sets = [
+            Redundancy(d.constraints, d.redundancy, True, tuple(_fixes(current, here, at, owners, d)))
+            for d in dependencies(first.left, owners, attached)
+        ]
+    return tuple(done)
+
+
+def _forces(mechanism: Mechanism, positions: Positions, here: Configuration, owners: list[str]) -> dict[str, JointForces]:
+    """Which multipliers are unique, by N; where one direction of a pin's force alone is, which."""
+    found = {}
+    for name, element in mechanism.constraints.items():
+        own = [k for k, owner in enumerate(owners) if owner == name]
+        N = here.left[own]
+        share = np.linalg.norm(N, axis=1)
+        direction = None
+        if isinstance(element, Revolute | Weld):
+            u, sigma, _ = (
+                np.linalg.svd(N[:2] / positions.row_unit[own[:2], None]) if N.shape[1] else (np.eye(2), np.zeros(1), None)
+            )
+            scale = 1 / float(np.max(positions.row_unit[own[:2]]))
+            loose = int(np.sum(sigma > UNIQUE_TOL * scale))
+            direction = float(np.arctan2(u[1, 1], u[0, 1]) % np.pi) if loose == 1 else None
+        found[name] = JointForces(tuple((share <= UNIQUE_TOL).tolist()), tuple(share.tolist()), direction)
+    return found
