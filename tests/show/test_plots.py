@@ -1,11 +1,18 @@
 import io
+from itertools import combinations
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 
 import udkjax as udk
+from udkjax.equations.quantities import Energy
 from udkjax.integrate import Result, Solution
+from udkjax.show import plots
 from udkjax.show.plots import apart, attachments, outline, placed, trajectory
 from udkjax.study import exact_coordinates
 
@@ -83,3 +90,151 @@ def test_a_run_that_failed_is_drawn_as_far_as_it_came(linkage, exact):
     figure = trajectory(linkage, solution(linkage, broken, code=Result.step_limit))
     figure.savefig(io.BytesIO(), format="png")
     assert np.isfinite(figure.axes[0].get_xlim()).all()
+
+
+# Plots on axes that they are given.
+
+
+@pytest.fixture
+def axes():
+    return Figure().subplots()
+
+
+def line(axes, label) -> np.ndarray:
+    (found,) = (one for one in axes.lines if one.get_label() == label)
+    return np.asarray(found.get_xydata())
+
+
+TS = np.linspace(0, 1, 5)
+
+
+def test_singular_values_and_their_threshold(axes):
+    values = np.array([3.0, 2.0, 1.0, 1e-17]) * np.ones((5, 1))
+    assert plots.draw_singular_values(axes, TS, values, rank_tol=1e-4, least=2) is axes
+    np.testing.assert_allclose(line(axes, "σ4")[:, 1], 1e-17)
+    np.testing.assert_allclose(line(axes, "threshold")[:, 1], 3e-4)
+    assert axes.get_yscale() == "log" and "kg" in axes.get_ylabel() and axes.get_xlabel() == "time (s)"
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["σ3", "σ4", "threshold"]
+
+
+def test_ranks_of_several_runs_are_apart(axes):
+    assert plots.draw_rank(axes, TS, {"one": 11 * np.ones(5), "two": np.array([11, 11, 12, 12, 12])}) is axes
+    assert np.all(line(axes, "two")[:, 1] - line(axes, "one")[:, 1] > 0) and line(axes, "one")[0, 1] == pytest.approx(11, abs=0.1)
+
+
+def test_work_and_precision(axes):
+    assert plots.draw_work_precision(axes, {"A": ([10, 100], [1e-3, 1e-6]), "B": ([20, 50], [1e-2, 1e-4])}) is axes
+    np.testing.assert_allclose(line(axes, "A"), [[10, 1e-3], [100, 1e-6]])
+    assert len({one.get_marker() for one in axes.lines}) == 2 and axes.get_xscale() == axes.get_yscale() == "log"
+
+
+@pytest.fixture
+def sweep_data():
+    data = xarray.Dataset(coords={"mass": ("mass", [1.0, 2.0, 3.0], {"units": "kg"}), "rtol": [1e-8, 1e-6]})
+    data["result"] = ("mass", "rtol"), np.array([[0, 0], [0, int(Result.drift)], [0, 0]])
+    data["violation"] = ("mass", "rtol"), np.arange(6.0).reshape(3, 2), {"units": "m"}
+    return data
+
+
+def test_heat_maps_and_failure_maps(axes, sweep_data):
+    assert plots.draw_sweep(axes, sweep_data, "violation") is axes
+    mesh: Any = axes.collections[0]
+    np.testing.assert_array_equal(np.asarray(mesh.get_array()).ravel(), np.arange(6.0))
+    assert (axes.get_ylabel(), axes.get_xlabel()) == ("mass (kg)", "rtol")
+    assert mesh.colorbar.ax.get_ylabel() == "violation (m)"
+    other = Figure().subplots()
+    assert plots.draw_failures(other, sweep_data) is other
+    mesh = other.collections[0]
+    colours = mesh.cmap(mesh.norm(mesh.get_array()))
+    assert len({tuple(c) for c in colours.reshape(-1, 4)}) == 2
+    assert "drift" in [text.get_text() for text in mesh.colorbar.ax.get_yticklabels()]
+    one = Figure().subplots()
+    plots.draw_sweep(one, sweep_data.isel(rtol=0), "violation")
+    np.testing.assert_array_equal(one.lines[0].get_ydata(), [0, 2, 4])
+    with pytest.raises(ValueError, match="several panels: choose values"):
+        plots.draw_sweep(axes, sweep_data.expand_dims(method=["SVD", "Varga"]), "violation")
+
+
+def test_reactions_and_their_uniqueness(axes):
+    load = np.array([[3.0, 4.0, 0.0]] * 5)
+    assert plots.draw_reactions(axes, TS, {"A": {"link": load}, "B": {"link": 2 * load}}, {"A": True, "B": False}) is axes
+    np.testing.assert_allclose(line(axes, "A")[:, 1], 5)
+    np.testing.assert_allclose(line(axes, "B (not unique)")[:, 1], 10)
+    assert axes.lines[1].get_linestyle() == ":" and axes.get_ylabel() == "force of a joint (N)"
+
+
+def test_a_mode_swings_by_its_part_of_the_size(axes, linkage):
+    shape = np.zeros((4, 3))
+    shape[3, 0] = -5.0  # the coupler moves to the left
+    assert plots.draw_mode(axes, linkage, linkage.q0, shape, swing=0.1) is axes
+    lines = [np.asarray(one.get_xydata()) for one in axes.lines[:-1]]
+    assert len(lines) == 12
+    size = np.ptp(np.concatenate(lines[:4]), axis=0).max()
+    np.testing.assert_allclose(lines[7] - lines[3], [[-0.1 * size, 0]] * len(lines[3]), rtol=0.02, atol=1e-12)
+    np.testing.assert_allclose(lines[11] - lines[3], lines[3] - lines[7])
+
+
+def test_coupler_curves_begin_at_a_mark(axes):
+    path = np.column_stack([np.cos(TS), np.sin(TS)])
+    assert plots.draw_coupler_curves(axes, {"P": path, "Q": 2 * path}) is axes
+    np.testing.assert_allclose(line(axes, "Q"), 2 * path)
+    assert axes.get_aspect() == 1 and (axes.get_xlabel(), axes.get_ylabel()) == ("x (m)", "y (m)")
+    assert list(axes.lines[1].get_xdata()) == [1.0]
+
+
+def test_the_fit_of_one_channel(axes):
+    dims = ("record", "sample", "channel")
+    values = np.arange(6.0).reshape(1, 3, 2)
+    data = xarray.Dataset(
+        {name: (dims, values + k) for k, name in enumerate(("measured", "predicted", "residual", "noise"))}
+        | {"time": (("record", "sample"), np.arange(3.0)[None])},
+        coords={"record": ["run"], "channel": ["angle(a)", "angle(b)"], "channel_units": ("channel", ["rad", "rad"])},
+    )
+    assert plots.draw_fit(axes, data, "angle(b)") is axes
+    np.testing.assert_allclose(line(axes, "measured"), [[0, 1], [1, 3], [2, 5]])
+    np.testing.assert_allclose(line(axes, "predicted")[:, 1], [2, 4, 6])
+    assert axes.get_ylabel() == "angle(b) (rad)"
+    with pytest.raises(ValueError, match=r"no record has a channel 'x': there are angle\(a\), angle\(b\)"):
+        plots.draw_fit(axes, data, "x")
+
+
+def test_every_function_that_draws_says_what_is_on_its_axes(linkage, exact):
+    sol = solution(linkage, exact)
+    cases: list[Any] = [
+        (plots.draw_motion, linkage, exact),
+        (plots.draw_angles, linkage, sol.ts, exact),
+        (plots.draw_violation, sol.ts, udk.violation(linkage, sol)),
+        (plots.draw_energy, sol.ts, udk.energy(linkage, sol)),
+    ]
+    for draw, *arguments in cases:
+        axes = Figure().subplots()
+        assert draw(axes, *arguments) is axes
+        assert axes.get_xlabel().endswith(")") and axes.get_ylabel().endswith(")")
+
+
+def luminance(colour):
+    """How light a colour is, in the eyes (L* of CIE, from 0 to 100)."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)]
+    y = np.dot([0.2126, 0.7152, 0.0722], linear)
+    return 116 * np.cbrt(y) - 16 if y > 0.008856 else 903.3 * y
+
+
+def test_curves_are_told_apart_in_print():
+    """Two curves on the same axes differ by their dashes or marks, or by how light they are."""
+    three = {"A": {"b": np.ones((5, 3))}, "B": {"b": np.ones((5, 3))}, "C": {"b": np.ones((5, 3))}}
+    cases: list[Any] = [
+        (plots.draw_singular_values, TS, np.ones((5, 4)), 1e-4),
+        (plots.draw_rank, TS, {"a": TS, "b": TS, "c": TS}),
+        (plots.draw_work_precision, {name: ([1, 2], [1, 2]) for name in "abcdefg"}),
+        (plots.draw_reactions, TS, three),
+        (plots.draw_coupler_curves, {name: np.ones((5, 2)) for name in "abcd"}),
+        (plots.draw_energy, TS, Energy(jnp.asarray(TS), jnp.asarray(TS))),
+    ]
+    for draw, *arguments in cases:
+        axes = Figure().subplots()
+        draw(axes, *arguments)
+        curves = [one for one in axes.lines if not str(one.get_label()).startswith("_")]
+        for one, other in combinations(curves, 2):
+            differ = one.get_linestyle() != other.get_linestyle() or one.get_marker() != other.get_marker()
+            assert differ or abs(luminance(one.get_color()) - luminance(other.get_color())) > 10, draw.__name__
+    assert max(luminance(colour) for colour in plots.COLOURS) < 75  # none vanishes on white

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.extras import OptionalImport
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS, plain
 
 with OptionalImport():
     from matplotlib.axes import Axes
@@ -64,17 +64,22 @@ def fit(data: "xarray.Dataset") -> Figure:
             axes.set_axis_off()
             continue
         one = panels[place]
-        axes.plot(one.time, one.measured, "o", ms=4, mew=0, alpha=0.5, color=COLOURS[5], label="measured")
-        axes.plot(one.time, one.predicted, color=COLOURS[0], lw=1.1, label="predicted")
+        draw_series(axes, one)
         axes.set_title(one.channel if records == 1 else f"{one.channel}, {one.record}", fontsize="small", loc="left")
         axes.set_ylabel(one.units)
         axes.set_xlabel("time (s)" if not any(place + columns * k in panels for k in range(1, rows)) else "")
-        axes.margins(x=0.01)
-        plain(axes)
     _key(figure, grid[min(panels)])
     few = f"{len(panels)} of {len(every)}; all are in the dataset" if len(panels) < len(every) else ""
     title(figure, data, "measured and predicted", few)
     return figure
+
+
+def draw_series(axes: Axes, one: Series) -> None:
+    """Draw what was measured as points, and what the mechanism shows as a line."""
+    axes.plot(one.time, one.measured, "o", ms=4, mew=0, alpha=0.5, color=COLOURS[5], label="measured")
+    axes.plot(one.time, one.predicted, color=COLOURS[0], lw=1.1, label="predicted")
+    axes.margins(x=0.01)
+    plain(axes)
 
 
 def _panels(data: "xarray.Dataset", every: list[Series]) -> tuple[int, dict[int, Series]]:
@@ -185,9 +190,3 @@ def _unit(one: "xarray.Dataset") -> str:
 def title(figure: Figure, data: "xarray.Dataset", words: str, remark: str = "") -> None:
     """Say above a figure which mechanism it is of, and what it shows."""
     figure.suptitle(f"{data.attrs.get('title') or 'mechanism'}: {words}" + (f"\n({remark})" if remark else ""), fontsize="medium")
-
-
-def plain(axes: Axes) -> None:
-    """Draw a fine grid behind everything."""
-    axes.grid(color="0.93", lw=0.6)
-    axes.set_axisbelow(True)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from udkjax.extras import OptionalImport
-from udkjax.show.fit_figures import fit, plain, residuals, title
-from udkjax.show.plots import COLOURS
+from udkjax.show.fit_figures import fit, residuals, title
 from udkjax.show.profile_figures import profiles
+from udkjax.show.style import COLOURS, plain
 
 with OptionalImport():
     from matplotlib.axes import Axes

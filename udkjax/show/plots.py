@@ -1,22 +1,45 @@
-"""Pictures of a trajectory, as matplotlib figures that belong to nobody else."""
+"""Plots, each on axes of matplotlib that it is given and returns: what a run does, what a sweep finds, what is identified.
+
+    from matplotlib import pyplot
+    from udkjax.show import plots
+
+    plots.draw_energy(pyplot.gca(), sol.ts, udk.energy(mech, sol))
+
+Every axis has its unit. Colours are told apart by everyone, and where curves meet they differ by marks or dashes, too. A figure
+that is made here (`trajectory`) belongs to nobody else.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 
 from udkjax.equations import energy, violation
+from udkjax.equations.quantities import Energy
 from udkjax.extras import OptionalImport
 from udkjax.integrate import Solution
 from udkjax.scene import GROUND, Mechanism
+from udkjax.show import fit_figures, sweep_figures
+from udkjax.show.poses import apart, attachments, outline, placed
+from udkjax.show.style import COLOURS, DASHES, MARKERS, legend, plain
 from udkjax.study.accuracy import largest_violation
 
 with OptionalImport():
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
-# Okabe and Ito's colours, told apart by everyone; the yellow is left out, since thin lines of it vanish on white.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["COLOURS", "apart", "attachments", "legend", "outline", "placed", "trajectory"]  # and every function that draws
+
 WIDE = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
 ROUNDING = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
+SMALLEST = 1e-18  # kg^(-1/2): singular values below it are drawn as it
+RANK_SHIFT = 0.06  # between the ranks of several runs
+LINEAR = 1e-6  # m, rad: a displacement of a mode at which its points move as its derivative says
 SAME_ANGLE = 1e-6  # rad: curves closer than the width of a line share it
 
 
@@ -47,7 +70,7 @@ def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
     return figure
 
 
-def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"], ghosts: int) -> None:
+def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"], ghosts: int = 5) -> Axes:
     """Draw the mechanism in the first of the configurations `q`, fainter in `ghosts` others, and the paths of its bodies."""
     held = attachments(mech)
     for place in range(len(mech.bodies)):
@@ -63,22 +86,10 @@ def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"],
                 axes.plot(*placed(held[body], q[0, place]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
                 axes.plot(*q[0, place, :2], "o", ms=3, color=colour, zorder=4)
     axes.plot(*held[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axes.grid(color="0.92", lw=0.6)
-    axes.set_axisbelow(True)
+    return _plane(axes)
 
 
-def apart(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[int]:
-    """Return up to `count` instants, from the first on, whose poses differ most: each is the farthest from those before it."""
-    poses = np.concatenate([q[..., :2], np.cos(q[..., 2:]), np.sin(q[..., 2:])], axis=-1).reshape(len(q), -1)
-    chosen, distance = [0], np.linalg.norm(poses - poses[0], axis=1)
-    while len(chosen) < count and distance.max() > 0:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(poses - poses[chosen[-1]], axis=1))
-    return chosen
-
-
-def draw_angles(axes: Axes, mech: Mechanism, ts, q: Float[np.ndarray, "T bodies 3"]) -> None:
+def draw_angles(axes: Axes, mech: Mechanism, ts: ArrayLike, q: Float[np.ndarray, "T bodies 3"]) -> Axes:
     """Draw the angle of each body over time; bodies that turn as one share a curve."""
     groups: list[tuple[np.ndarray, list[str], str]] = []
     for place, body in enumerate(mech.bodies):
@@ -91,58 +102,181 @@ def draw_angles(axes: Axes, mech: Mechanism, ts, q: Float[np.ndarray, "T bodies 
             groups.append((angle, [body], COLOURS[place % len(COLOURS)]))
     for angle, names, colour in groups:
         axes.plot(ts, angle, color=colour, lw=1.2, label=", ".join(names) if len(names) < 5 else f"{names[0]} ... {names[-1]}")
-    axes.set_ylabel("angle (rad)")
+    axes.set(xlabel="time (s)", ylabel="angle (rad)")
     if len(groups) <= len(COLOURS):
         legend(axes)
+    return axes
 
 
-def draw_violation(axes: Axes, ts, violated) -> None:
+def draw_violation(axes: Axes, ts: ArrayLike, violated: ArrayLike) -> Axes:
     """Draw the largest violation of any constraint over time, in metres or radians."""
     size = largest_violation(violated)
     axes.semilogy(ts, np.maximum(size, ROUNDING), color=COLOURS[1], lw=1)
     axes.set_ylim(ROUNDING, 1e3 * np.nanmax(size, initial=ROUNDING))
-    axes.set_ylabel("violation (m, rad)")
+    axes.set(xlabel="time (s)", ylabel="violation (m, rad)")
+    return axes
 
 
-def draw_energy(axes: Axes, ts, parts) -> None:
+def draw_energy(axes: Axes, ts: ArrayLike, parts: Energy) -> Axes:
     """Draw the kinetic, potential and total energy over time, seen from their total at the start."""
     start = np.asarray(parts.total)[0]
     axes.plot(ts, np.asarray(parts.kinetic), color=COLOURS[0], lw=1, label="kinetic")
-    axes.plot(ts, np.asarray(parts.potential) - start, color=COLOURS[2], lw=1, label="potential")
+    axes.plot(ts, np.asarray(parts.potential) - start, "--", color=COLOURS[2], lw=1, label="potential")
     axes.plot(ts, np.asarray(parts.total) - start, color="black", lw=1.4, label="total")
-    axes.set_ylabel("energy (J)")
+    axes.set(xlabel="time (s)", ylabel="energy (J)")
     legend(axes)
+    return axes
 
 
-def legend(axes: Axes) -> None:
-    """Name the curves above their axes, where they cover nothing."""
-    axes.legend(
-        loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2, ncols=4, fontsize="small", frameon=False, handlelength=1.2
-    )
+def draw_singular_values(
+    axes: Axes, ts: ArrayLike, values: Float[ArrayLike, "T k"], rank_tol: float | None = None, least: int = 3
+) -> Axes:
+    """Draw the `least` smallest singular values of D in colours and the others in grey; dashed: rank_tol times the largest."""
+    values = np.maximum(np.asarray(values, float), SMALLEST)
+    count = values.shape[1]
+    first = max(count - least, 0)
+    for k in range(first):
+        axes.semilogy(ts, values[:, k], color="0.7", lw=0.8)
+    for k in range(first, count):
+        style = DASHES[(k - first) % len(DASHES)]
+        axes.semilogy(ts, values[:, k], style, color=COLOURS[(k - first) % len(COLOURS)], lw=1.3, label=f"σ{k + 1}")
+    if rank_tol is not None:
+        axes.semilogy(ts, rank_tol * values[:, 0], color="black", lw=0.8, ls=(0, (6, 3)), label="threshold")
+    axes.set(xlabel="time (s)", ylabel="singular value of D (kg$^{-1/2}$)")
+    legend(axes)
+    return plain(axes)
 
 
-def attachments(mech: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:
-    """Return the points at which joints hold each body, in its own frame, each of them once; the ground is one of the bodies."""
-    points: dict[str, list[tuple[float, float]]] = {body: [] for body in (*mech.bodies, GROUND)}
-    for joint in mech.joints.values():
-        for body, point in zip(joint.bodies, np.asarray(getattr(joint, "points", np.empty((0, 2)))), strict=False):
-            points[body].append((float(point[0]), float(point[1])))
-    return {body: np.array(list(dict.fromkeys(held))).reshape(-1, 2) for body, held in points.items()}
+def draw_rank(axes: Axes, ts: ArrayLike, ranks: Mapping[str, ArrayLike] | ArrayLike) -> Axes:
+    """Draw the rank over time; of several runs under their labels, a little apart."""
+    several = ranks if isinstance(ranks, Mapping) else {"": ranks}
+    for k, (label, values) in enumerate(several.items()):
+        shift = RANK_SHIFT * (k - (len(several) - 1) / 2)
+        style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "ls": DASHES[k % len(DASHES)], "lw": 1.4}
+        axes.step(np.asarray(ts), np.asarray(values, float) + shift, where="post", label=label, **style)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set(xlabel="time (s)", ylabel="rank")
+    if isinstance(ranks, Mapping):
+        legend(axes)
+    return plain(axes)
 
 
-def outline(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
-    """Return a line through the points that hold a body, closed where they span an area; a single one is joined to its centre."""
-    if len(points) < 2:
-        points = np.concatenate([points, np.zeros((1, 2))])
-    spread = points - points.mean(axis=0)
-    along = spread @ np.linalg.svd(spread, full_matrices=False)[2][0]
-    flat = np.linalg.matrix_rank(spread, tol=1e-9 * np.abs(spread).max()) < 2
-    order = np.argsort(along if flat else np.arctan2(spread[:, 1], spread[:, 0]))
-    return points[order if flat else np.append(order, order[0])]
+def draw_work_precision(
+    axes: Axes, curves: Mapping[str, tuple[Any, Any]], work: str = "right-hand sides", error: str = "error (m, rad)"
+) -> Axes:
+    """Draw the error against the work of runs at several tolerances: (work, error) of each method under its name."""
+    for k, (name, (effort, errors)) in enumerate(curves.items()):
+        colour, mark = COLOURS[k % len(COLOURS)], MARKERS[k % len(MARKERS)]
+        axes.loglog(effort, errors, marker=mark, ms=4.5, mfc="white", lw=1, color=colour, label=name)
+    axes.set(xlabel=work, ylabel=error)
+    legend(axes)
+    return plain(axes)
 
 
-def placed(points: Float[np.ndarray, "points 2"], coordinates: Float[np.ndarray, "3"]) -> Float[np.ndarray, "points 2"]:
-    """Return where points of a body's own frame are, in ground coordinates."""
-    x, y, angle = coordinates
-    cos, sin = np.cos(angle), np.sin(angle)
-    return points @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
+def draw_sweep(axes: Axes, data: "xarray.Dataset", name: str) -> Axes:
+    """Draw a number of each member of a sweep over its axes: a heat map of two of them, a line over one; grey: no value.
+
+    Raises:
+        ValueError: more than two axes: choose one value of the others by `data.sel` or `data.isel`.
+    """
+    drawn = sweep_figures.draw_panel(axes, data, name)
+    if drawn is not None:
+        axes.figure.colorbar(drawn, ax=axes, label=sweep_figures.words(data, name))
+    return axes
+
+
+def draw_failures(axes: Axes, data: "xarray.Dataset") -> Axes:
+    """Draw how each member of a sweep ended, over its axes: a colour for each `Result`, successes in grey."""
+    drawn = sweep_figures.draw_panel(axes, data, sweep_figures.RESULT)
+    if drawn is not None:
+        sweep_figures.name_results(axes.figure.colorbar(drawn, ax=axes))
+    return axes
+
+
+def draw_reactions(
+    axes: Axes,
+    ts: ArrayLike,
+    loads: Mapping[str, Mapping[str, ArrayLike]],
+    unique: Mapping[str, bool] | None = None,
+) -> Axes:
+    """Draw the size of the force of each joint over time.
+
+    Args:
+        axes: where.
+        ts: times (s).
+        loads: what `udk.reactions` returned: by joint and body, force x, force y (N) and torque (N m).
+        unique: of joints by name, whether the equations decide their force. Of those that are not unique, which are dotted,
+            the share of least norm is drawn: other shares would move the mechanism alike.
+    """
+    for k, (joint, bodies) in enumerate(loads.items()):
+        force = np.linalg.norm(np.asarray(next(iter(bodies.values())), float)[:, :2], axis=1)
+        known = unique is None or unique.get(joint, True)
+        style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "ls": (DASHES[k % 3] if known else ":")}
+        axes.plot(np.asarray(ts), force, lw=1.3, label=joint if known else f"{joint} (not unique)", **style)
+    axes.set(xlabel="time (s)", ylabel="force of a joint (N)")
+    axes.set_ylim(bottom=0)
+    legend(axes)
+    return plain(axes)
+
+
+def draw_mode(
+    axes: Axes, mech: Mechanism, q: Float[ArrayLike, "bodies 3"], shape: Float[ArrayLike, "bodies 3"], swing: float = 0.1
+) -> Axes:
+    """Draw a mode of vibration: the mechanism at rest, in grey, and at both ends of its swing.
+
+    Args:
+        axes: where.
+        mech: what vibrates.
+        q: coordinates at rest (m, m, rad).
+        shape: the displacement of each body, of any size.
+        swing: how far the points that hold bodies move at most, as a part of the mechanism's size.
+    """
+    q, shape, held = np.asarray(q, float), np.asarray(shape, float), attachments(mech)
+    rest = np.concatenate([placed(held[body], q[k]) for k, body in enumerate(mech.bodies)] + [held[GROUND], q[:, :2]])
+    tiny = LINEAR * shape / np.abs(shape).max()
+    moved = [placed(held[body], q[k] + tiny[k]) - placed(held[body], q[k]) for k, body in enumerate(mech.bodies)]
+    scale = swing * np.ptp(rest, axis=0).max() / np.abs(np.concatenate([*moved, tiny[:, :2]])).max()
+    for sign, colour, style in ((0, "0.6", "-"), (1, COLOURS[0], "-"), (-1, COLOURS[1], "--")):
+        for k, body in enumerate(mech.bodies):
+            x, y = placed(outline(held[body]), q[k] + sign * scale * tiny[k]).T
+            axes.plot(x, y, style, color=colour, lw=2.2 if sign else 3.4, solid_capstyle="round", zorder=2 + abs(sign))
+    axes.plot(*held[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
+    return _plane(axes)
+
+
+def draw_coupler_curves(axes: Axes, curves: Mapping[str, Float[ArrayLike, "T 2"]]) -> Axes:
+    """Draw paths of points (m) under their names, each with a mark where it begins."""
+    for k, (name, path) in enumerate(curves.items()):
+        x, y = np.asarray(path, float).T
+        colour = COLOURS[k % len(COLOURS)]
+        axes.plot(x, y, DASHES[k % len(DASHES)], color=colour, lw=1.3, label=name)
+        axes.plot(x[:1], y[:1], MARKERS[k % len(MARKERS)], color=colour, ms=4.5)
+    legend(axes)
+    return _plane(axes)
+
+
+def draw_fit(axes: Axes, data: "xarray.Dataset", channel: str, record: str | None = None) -> Axes:
+    """Draw what was measured of a channel as points, and what the identified mechanism shows as a line.
+
+    Args:
+        axes: where.
+        data: what `Estimate.to_xarray` returned.
+        channel: the name of a channel.
+        record: the name of a record; by default the first that has the channel.
+
+    Raises:
+        ValueError: there is no such channel.
+    """
+    every = fit_figures.series(data)
+    found = [one for one in every if one.channel == channel and record in (None, one.record)]
+    if not found:
+        raise ValueError(f"no record has a channel {channel!r}: there are {', '.join(sorted({one.channel for one in every}))}")
+    fit_figures.draw_series(axes, found[0])
+    axes.set(xlabel="time (s)", ylabel=f"{channel} ({found[0].units})" if found[0].units else channel)
+    legend(axes)
+    return axes
+
+
+def _plane(axes: Axes) -> Axes:
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    return plain(axes)

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from udkjax.extras import OptionalImport
-from udkjax.show.fit_figures import MOST_COLUMNS, plain, title
-from udkjax.show.plots import COLOURS
+from udkjax.show.fit_figures import MOST_COLUMNS, title
+from udkjax.show.style import COLOURS, plain
 
 with OptionalImport():
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ import numpy as np
 
 from udkjax.extras import OptionalImport
 from udkjax.integrate import Result
-from udkjax.show.plots import COLOURS, legend
+from udkjax.show.style import COLOURS, legend
 
 with OptionalImport():
     from matplotlib.axes import Axes
@@ -49,18 +49,12 @@ def _picture(data: Any, name: str) -> Figure:
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)).ravel()
     colours = _codes() if name == RESULT else _scale(data[name].values)
     drawn = None
-    for axes, (chosen, words) in zip(grid, panels, strict=False):
-        part = data.isel(chosen)
-        if MEMBER in across:
-            drawn = _points(axes, part, name, *colours)
-        elif len(across) == 1:
-            _line(axes, part, name, across[0])
-        else:
-            drawn = _map(axes, part, name, across, *colours)
-        axes.set_title(words, fontsize="small")
+    for axes, (chosen, said) in zip(grid, panels, strict=False):
+        drawn = _panel(axes, data.isel(chosen), name, across, colours)
+        axes.set_title(said, fontsize="small")
     for axes in grid[:count][-columns:]:  # below which there is none
         axes.tick_params(labelbottom=True)
-        axes.set_xlabel(_words(data, across[-1]) if len(across) == 2 else axes.get_xlabel())
+        axes.set_xlabel(words(data, across[-1]) if len(across) == 2 else axes.get_xlabel())
     for axes in grid[count:]:
         axes.set_axis_off()
     if drawn is not None:
@@ -68,8 +62,24 @@ def _picture(data: Any, name: str) -> Figure:
     whole = prod(data.sizes[d] for d in others)
     remarks = [f"the first {count} of {whole} panels"] if count < whole else []
     remarks += ["grey: no value"] if drawn is not None and not np.isfinite(data[name].values).all() else []
-    figure.suptitle("; ".join([_words(data, name), *remarks]))
+    figure.suptitle("; ".join([words(data, name), *remarks]))
     return figure
+
+
+def draw_panel(axes: Axes, data: Any, name: str) -> Any:
+    """Draw `result` or another variable with one number a member; return what a colour bar needs, None of a line."""
+    across, panels = _layout(data)
+    if len(panels) > 1:
+        raise ValueError(f"a sweep over {', '.join(map(str, data[RESULT].dims))} needs several panels: choose values by data.sel")
+    return _panel(axes, data.isel(panels[0][0]), name, across, _codes() if name == RESULT else _scale(data[name].values))
+
+
+def _panel(axes: Axes, part: Any, name: str, across: Sequence[str], colours: tuple[Any, Any]) -> Any:
+    if MEMBER in across:
+        return _points(axes, part, name, *colours)
+    if len(across) == 1:
+        return _line(axes, part, name, across[0])
+    return _map(axes, part, name, across, *colours)
 
 
 def _layout(data: Any) -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
@@ -95,7 +105,7 @@ def _map(axes: Axes, part: Any, name: str, across: Sequence[str], cmap: Any, nor
             ticks(np.arange(part.sizes[dim]), [str(v) for v in part[dim].values], rotation=30 if dim == right else 0)
     if not _numeric(part, up):
         axes.set_ylim(part.sizes[up] - 0.5, -0.5)  # as one reads
-    _label(axes, _words(part, right), _words(part, up))
+    _label(axes, words(part, right), words(part, up))
     return drawn
 
 
@@ -124,7 +134,7 @@ def _line(axes: Axes, part: Any, name: str, dim: str) -> None:
         axes.set_xscale("log")
     elif not numeric:
         axes.set_xticks(x, [str(v) for v in part[dim].values], rotation=30)
-    _label(axes, _words(part, dim), "" if name == RESULT else _words(part, name))
+    _label(axes, words(part, dim), "" if name == RESULT else words(part, name))
 
 
 def _points(axes: Axes, part: Any, name: str, cmap: Any, norm: Any) -> Any:
@@ -140,7 +150,7 @@ def _points(axes: Axes, part: Any, name: str, cmap: Any, norm: Any) -> Any:
     for values_, scale in ((x, axes.set_xscale), (y, axes.set_yscale)):
         if _decades(values_):
             scale("log")
-    _label(axes, _words(part, names[0]) if names else MEMBER, _words(part, names[1] if len(names) > 1 else name))
+    _label(axes, words(part, names[0]) if names else MEMBER, words(part, names[1] if len(names) > 1 else name))
     return drawn
 
 
@@ -148,8 +158,13 @@ def _key(figure: Figure, drawn: Any, data: Any, name: str) -> None:
     """What the colours mean."""
     bar = figure.colorbar(drawn, ax=figure.axes, aspect=30)
     if name == RESULT:
-        bar.set_ticks(range(len(Result) + 1), labels=[_result(code) for code in range(len(Result) + 1)])
-        bar.ax.tick_params(length=0)
+        name_results(bar)
+
+
+def name_results(bar: Any) -> None:
+    """Name the colours of a colour bar of results."""
+    bar.set_ticks(range(len(Result) + 1), labels=[_result(code) for code in range(len(Result) + 1)])
+    bar.ax.tick_params(length=0)
 
 
 def _codes() -> tuple[Any, Any]:
@@ -200,7 +215,7 @@ def _numeric(data: Any, dim: str) -> bool:
     return values.dtype.kind in "iuf" and (len(values) < 2 or bool(np.all(np.diff(values) > 0) or np.all(np.diff(values) < 0)))
 
 
-def _words(data: Any, name: str) -> str:
+def words(data: Any, name: str) -> str:
     """A variable or an axis, with its unit."""
     units = data[name].attrs.get("units", "")
     return f"{name.replace('_', ' ')} ({units})" if units not in ("", "1") else name.replace("_", " ")

@@ -500,12 +500,18 @@ class Painter {
     });
   }
 
-  reactions(run, t) {
-    const forces = run.force(t), {anchors, largest} = run.reactions, longest = 80 * this.pt;
+  /** Arrows of forces, and one whose force is told. An arrow that would be longer than three times the usual one is cut. */
+  reactions(run, t, width, height) {
+    const forces = run.force(t), {anchors, usual} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
     anchors.forEach((anchor, k) => {
-      const [x, y] = this.anchor(anchor), fx = longest * forces[2 * k] / largest, fy = longest * forces[2 * k + 1] / largest;
-      if (Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + fx, y - fy], this.theme.force);
+      const [x, y] = this.anchor(anchor), fx = forces[2 * k] / usual, fy = forces[2 * k + 1] / usual;
+      const size = length * Math.min(1, 3 / Math.hypot(fx, fy));
+      if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour);
     });
+    const told = nice(usual / 2), y = height - 14, words = `${short(told)} N`;
+    this.text(words, [width - 14, y], colour, {align: "right", size: 11 / Math.max(1, this.pt)});
+    const end = width - 14 - this.context.measureText(words).width - 7;
+    this.arrow([end - length * told / usual, y], [end, y], colour);
   }
 
   names(run) {
@@ -608,8 +614,6 @@ h1 { font-size: 15px; font-weight: 600; margin: 0; flex: 1; min-width: 0; overfl
 figcaption { position: absolute; left: 16px; top: 10px; right: 16px; pointer-events: none; font-size: 13px; color: var(--soft);
   overflow-wrap: anywhere; }
 figcaption b { color: var(--ink); font-weight: 600; }
-.scale { position: absolute; right: 14px; bottom: 9px; font-size: 12px; color: var(--force); pointer-events: none;
-  font-variant-numeric: tabular-nums; }
 .strip { position: relative; height: 104px; background: var(--panel); border-top: 1px solid var(--line); flex: none; }
 .strip canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: ew-resize; }
 .strip select { position: absolute; left: 8px; top: 3px; max-width: 46%; }
@@ -735,11 +739,10 @@ class Player {
 
   panel(run, k) {
     const canvas = make("canvas", {role: "img", tabindex: 0, "aria-label": `${this.data.title} ${run.label}: motion`});
-    const caption = make("figcaption"), scale = make("div", {class: "scale"});
+    const caption = make("figcaption");
     if (this.runs.length > 1 || this.modes) caption.append(make("b", {}, run.label));
     if (run.note) caption.append(" ", run.note);
-    const panel = {run, canvas, scale, figure: make("figure", {class: "panel"}, canvas, caption, scale)};
-    if (run.reactions) scale.textContent = `longest arrow: ${short(run.reactions.largest)} N`;
+    const panel = {run, canvas, figure: make("figure", {class: "panel"}, canvas, caption)};
     this.pointers(panel);
     return panel;
   }
@@ -969,7 +972,7 @@ class Player {
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
       painter.draw(run.marks);
-      if (show.reactions && run.reactions) painter.reactions(run, t);
+      if (show.reactions && run.reactions) painter.reactions(run, t, width, height);
       if (show.names) painter.names(run);
       painter.bar(step, height);
     }

@@ -16,7 +16,7 @@ runs       a list of
     frame          s, the typical time between two instants
     mode           instead of these: {q: numbers, shape: numbers, frequency: Hz or null}
     measures       a list of {name, unit, log, values: single precision}
-    reactions      {anchors, largest (N), force: packed table of T rows, x and y of each anchor}, or null
+    reactions      {anchors, usual (N), force: packed table of T rows, x and y of each anchor}, or null
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +36,8 @@ PRECISION = (
     1e-5  # of positions, in characteristic lengths, and of angles, in rad: a hundredth of a pixel on a screen of a thousand
 )
 TIME_PRECISION = 1e-9  # of the timeline
-FORCE_PRECISION = 1e-3  # of the largest force
+FORCE_PRECISION = 1e-3  # of the usual force
+USUAL = 0.95  # of the instants: the largest force of any joint, which decides how long arrows are, is below the usual one
 MOST_INSTANTS = 2400  # of one run; a longer one is thinned out evenly, and interpolated by its velocities
 MOST_TRACES = 8
 COMFORTABLE = (4.0, 40.0)  # s: how long it takes to play something at the speed that is chosen for it
@@ -84,11 +85,12 @@ def run_record(
     }
     if with_reactions:
         anchors, forces = reaction_arrows(mechanism, solution)
-        forces = forces[shown]
-        largest = float(np.abs(np.nan_to_num(np.linalg.norm(forces, axis=2))).max(initial=0.0))
-        table = np.nan_to_num(forces).reshape(len(shown), -1)
-        if largest > 0:
-            record["reactions"] = {"anchors": anchors, "largest": largest, "force": packed(table, FORCE_PRECISION * largest)}
+        forces = np.nan_to_num(forces[shown])
+        largest = np.linalg.norm(forces, axis=2).max(axis=1, initial=0.0)
+        usual = float(np.quantile(largest, USUAL)) or float(largest.max(initial=0.0))
+        if usual > 0:
+            table = packed(forces.reshape(len(shown), -1), FORCE_PRECISION * usual)
+            record["reactions"] = {"anchors": anchors, "usual": usual, "force": table}
     return record, poses
 
 
