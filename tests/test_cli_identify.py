@@ -192,16 +192,16 @@ def test_all_mistakes_are_named_at_once(tmp_path, capsys, data):
 
 
 @pytest.mark.slow
-def test_the_example_of_the_readme_finds_what_its_data_was_made_with(tmp_path, monkeypatch, capsys):
+def test_the_example_of_the_guide_finds_what_its_data_was_made_with(tmp_path, monkeypatch, capsys):
     made = runpy.run_path(str(EXAMPLES / "data" / "four_bar.py"))
     text = (EXAMPLES / "data" / "four_bar.csv").read_text()
     made["main"](tmp_path)
     assert (tmp_path / "four_bar.csv").read_text() == text
 
     monkeypatch.chdir(EXAMPLES.parent)
-    readme = Path("README.md").read_text(encoding="utf-8")
-    (code,) = [code for code in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "udk.identify" in code]
-    (command,) = re.findall(r"udkjax (identify .*?)\n```", readme, re.DOTALL)
+    guide = Path("docs/how-to/identify.md").read_text(encoding="utf-8")
+    (code,) = [code for code in re.findall(r"```python\n(.*?)```", guide, re.DOTALL) if "udk.identify" in code]
+    (command,) = re.findall(r"udkjax (identify .*?)\n```", guide, re.DOTALL)
     names: dict[str, Any] = {"udk": udk}
     exec(code, names)
     estimate = names["estimate"]

@@ -108,3 +108,13 @@ def test_an_early_opaque_node_hands_over_its_results():
     assert later.count() == {"mul": 1, "add": 1}
     values = prologue([float(x) for x in X])
     assert later([*map(float, values), 2.0]) == pytest.approx([2.2, 1.3])
+
+
+@pytest.mark.parametrize(("x", "y"), [(1.0, 0.0), (0.0, 0.0), (3.0, 4.0)])
+def test_a_branch_that_is_not_taken_may_divide_by_zero(x, y):
+    """As in JAX: `hypot` divides by the larger of its arguments, and chooses afterwards."""
+    graph = Graph()
+    inputs = [graph.input(name, "state") for name in "xy"]
+    f = lambda x, y: jnp.hypot(x, y) + jnp.where(y > 0, x / jnp.maximum(y, 0.0), 0.0)  # noqa: E731
+    (result,) = trace(f, 0.1, 0.2)(graph, *(np.asarray(s, object) for s in inputs))
+    assert Program(graph, inputs, [result.item()])([x, y])[0] == pytest.approx(float(f(x, y)), rel=1e-15)

@@ -60,7 +60,7 @@ def test_a_regular_mechanism(swinging, formulation, stabilization):
     assert jnp.abs(reference.q - reference.q[0]).max() > 0.3
     assert_allclose(sol.q, reference.q, atol=2e-7)
     assert_allclose(sol.v, reference.v, atol=2e-6)
-    assert dict(sol.settings)["formulation"] == type(formulation).__name__
+    assert sol.settings["formulation"] == type(formulation).__name__
 
 
 @pytest.mark.slow
@@ -102,7 +102,7 @@ def test_constraints_hold_without_stabilization(partitioned):
     equations = equations_of(mech)
     rest = [equations.violation(t, q.ravel(), v.ravel()) for t, q, v in zip(TS, sol.q, sol.v, strict=True)]
     assert max(float(jnp.abs(r).max()) for pair in rest for r in pair) < 1e-13
-    assert dict(sol.settings)["stabilization"] == "NoneType"
+    assert sol.settings["stabilization"] == "NoneType"
 
 
 def test_only_what_is_independent_is_judged(partitioned):

@@ -164,7 +164,8 @@ def _apply(node: Node, values: list[Any]) -> Any:
         return primitive.bind(*(jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)), **parameters)
     with jax.ensure_compile_time_eval():
         known = [jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)]
-        return np.asarray(primitive.bind(*known, **parameters)).item()
+        found = np.asarray(primitive.bind(*known, **parameters))
+        return found[()] if any(isinstance(v, np.generic) for v in values) else found.item()  # Python's floats raise where 1/0 is
 
 
 def _call(details: Details, arguments: Sequence[Scalar], values: list[Any]) -> list[Any]:

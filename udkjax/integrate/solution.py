@@ -63,7 +63,12 @@ class Solution(eqx.Module):
     rtol: Float[Array, ""]
     atol: Float[Array, ""]
     bodies: tuple[str, ...] = eqx.field(static=True)
-    settings: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    choices: tuple[tuple[str, str], ...] = eqx.field(static=True)  # `settings`, hashable
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """What was chosen, by name: the method, the solver, the engine and why it was taken, ..."""
+        return dict(self.choices)
 
     @property
     def result(self) -> Any:
@@ -91,7 +96,7 @@ class Solution(eqx.Module):
             "bodies": ", ".join(self.bodies),
             **{name.replace("_", " "): f"{int(np.sum(value)):,}" for name, value in self.stats.items()},
             "rtol, atol": f"{np.max(np.asarray(self.rtol)):g}, {np.max(np.asarray(self.atol)):g}",
-            **{name.replace("_", " "): value for name, value in self.settings},
+            **{name.replace("_", " "): value for name, value in self.choices},
         }
         members = f" of {np.size(self.code)} members" if np.ndim(self.code) else ""
         return html_table(f"a simulation{members}", (), list(rows.items()))
@@ -121,7 +126,7 @@ class Solution(eqx.Module):
             **{f"stats_{k}": int(v) for k, v in self.stats.items()},
             "setting_rtol": float(self.rtol),
             "setting_atol": float(self.atol),
-            **{f"setting_{k}": v for k, v in self.settings},
+            **{f"setting_{k}": v for k, v in self.choices},
             **{f"version_{k}": v for k, v in versions().items()},
         }
         if mechanism is not None:

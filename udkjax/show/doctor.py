@@ -50,7 +50,7 @@ def engine_here() -> tuple[str, str]:
         solution = simulate(double_pendulum(), np.array([0.0, 0.1]))
     except Exception as error:
         return "none", f"a small simulation fails: {type(error).__name__}: {error}"
-    engine, _, reason = dict(solution.settings)["engine"].partition(": ")
+    engine, _, reason = solution.settings["engine"].partition(": ")
     return engine, reason or "by default; diffrax where a choice of yours needs it, as `Solution.settings` says"
 
 
