@@ -48,8 +48,8 @@ LOST = 0.1  # m, rad: an error above it
 def starts(mechanism: udk.Mechanism, deltas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return q and v (kinds, deltas, bodies, 3) whose largest Psi (m), or Psi_dot (m/s), is delta."""
     equations = prepare(mechanism, udk.SVD())
-    q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
-    plus, _, root = equations.linearized("closure", 0.0, q, v)
+    q = mechanism.q0.ravel()
+    plus, _, root = equations.linearized_position(0.0, q)
     away = root * (plus @ jnp.asarray(np.random.default_rng(SEED).standard_normal(12)))
     away = np.asarray(away / jnp.abs(equations.jacobian(0.0, q) @ away).max()).reshape(-1, 3)
     none, moved = 0.0 * deltas[:, None, None] * away, deltas[:, None, None] * away

@@ -186,7 +186,7 @@ def _matrices(mech: Mechanism, ts, q, v) -> tuple:
     equations: Any = prepare(mech, SVD())
 
     def one(t, q, v):
-        return equations.linearized("closure", t, q, v)[0].matrix, *equations.violation(t, q, v)
+        return equations.linearized_position(t, q)[0].matrix, *equations.violation(t, q, v)
 
     return jax.vmap(one)(ts, q.reshape(len(q), -1), v.reshape(len(v), -1))
 

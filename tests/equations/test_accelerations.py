@@ -233,9 +233,9 @@ def test_the_tangential_part_is_what_projection_leaves(mechanisms, nearby, metho
     def parts(mech, q, v, dq, dv):
         equations, t = prepare(mech, method), 0.0
         q, v = equations.project(t, *equations.project(t, q, v))
-        left = equations.tangential(t, q, v, dq, dv)
+        left = equations.tangent_part(t, q, v, dq, dv)
         moved = equations.project(t, q + dq, v)[0] - q, equations.project(t, q, v + 1e7 * dv)[1] - v
-        return left, moved, equations.tangential(t, q, v, *left)
+        return left, moved, equations.tangent_part(t, q, v, *left)
 
     (left_q, left_v), (moved_q, moved_v), again = parts(mech, q, v, dq, dv)
     assert_allclose(left_q, moved_q, atol=1e-12)

@@ -10,8 +10,11 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax import GROUND
-from udkjax.equations.code import code, scalars
+from udkjax.equations.implicit_derivative import acceleration_derivative, projection_derivative
+from udkjax.equations.scalar_programs import elimination_programs
+from udkjax.equations.structure import leaves_as_scalars
 from udkjax.equations.textbook import TextbookEquations, prepare
+from udkjax.pinv.rank_policy import RankPolicy
 
 
 def driven():
@@ -41,11 +44,11 @@ def test_they_are_those_of_the_textbook(scene, name):
     leaves, tree = jax.tree.flatten(mechanism.bare)
     dleaves = [random.standard_normal(np.shape(x)) * 0.1 for x in leaves]
     dt, dq, dv = 0.7, random.standard_normal(q.size), random.standard_normal(v.size)
-    programs = code(mechanism, analysis.redundant_rows or (), True, "check")
+    programs = elimination_programs(mechanism, analysis.redundant_rows or (), True, RankPolicy.REFUSE)
 
     @jax.jit
     def by_jax(leaves, dleaves):
-        numbers = lambda leaves: [*scalars(leaves), 2.0, 3.0, 1e-14, 1e-14]  # noqa: E731
+        numbers = lambda leaves: [*leaves_as_scalars(leaves), 2.0, 3.0, 1e-14, 1e-14]  # noqa: E731
         constants = lambda leaves: jnp.stack([jnp.asarray(c) for c in programs.prologue(numbers(leaves))])  # noqa: E731
 
         def expected(leaves, t, q, v):
@@ -63,15 +66,15 @@ def test_they_are_those_of_the_textbook(scene, name):
         return jax.jvp(constants, (leaves,), (dleaves,)), jax.jvp(expected, at, along)[1]
 
     (constants, dconstants), expected = by_jax([jnp.asarray(x, float) for x in leaves], dleaves)
-    derivative = programs.derivative(name, (*[True] * len(constants), True, True, True))
+    make = acceleration_derivative if name == "accelerations" else projection_derivative
+    derivative = make(programs, (*[True] * len(constants), True, True, True))
     given = [*map(float, constants), t, *q.tolist(), *v.tolist()]
-    outputs = 0 if name == "projection" else len(programs.outputs[name])
-    kept = derivative.evaluation(name)(given)[outputs:]
+    stored = derivative.evaluation(given)[len(derivative.evaluation.outputs) - len(derivative.stored) :]
     dots = [*map(float, dconstants), dt, *dq.tolist(), *dv.tolist()]
-    found = np.array(derivative.forward([*given, *kept, *dots]))
+    found = np.array(derivative.forward([*given, *stored, *dots]))
     assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * float(1 + np.abs(expected).max()))
     weights = random.standard_normal(len(found))
-    back = np.array(derivative.reverse([*given, *kept, *weights.tolist()]))
+    back = np.array(derivative.reverse([*given, *stored, *weights.tolist()]))
     terms = np.abs(weights) @ np.abs(found)
     assert_allclose(back @ dots, weights @ found, rtol=0, atol=1e-10 * float(terms))
 
@@ -84,9 +87,9 @@ class _Weighted:
 
 
 def test_a_driver_that_is_not_differentiated_changes_nothing():
-    programs = code(driven(), (), False, "check")
+    programs = elimination_programs(driven(), (), False, RankPolicy.REFUSE)
     still, moving = (
-        programs.derivative("accelerations", (*[False] * len(programs.constants), t, True, True)) for t in (False, True)
+        acceleration_derivative(programs, (*[False] * len(programs.constants), t, True, True)) for t in (False, True)
     )
     assert len(moving.inputs) == len(still.inputs) + 1
     assert len(moving.forward.order) > len(still.forward.order)

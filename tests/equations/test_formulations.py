@@ -222,22 +222,29 @@ def test_derivatives_where_rows_are_redundant(linkage, placed):
 # --- completion of a partitioned state
 
 
+def partitioned(mechanism, t, q, v):
+    """The equations with the partition that is chosen at a state, and which coordinates are independent."""
+    held = equations_of(mechanism, None, None, udk.CoordinatePartitioning()).fix_partition(t, q, v)
+    assert held.independent is not None
+    return held, held.independent
+
+
 def test_the_dependent_follow_from_the_independent(linkage, placed):
     """Move every dependent coordinate by up to 0.05: Newton finds back, and the independent ones stay to the bit."""
     q, v = (x.ravel() for x in placed(-0.8, 1.3))
-    held = equations_of(linkage, None, None, udk.CoordinatePartitioning()).held(T0, q, v)
-    assert int(held.independent.sum()) == 1
-    off = jnp.where(held.independent, 0.0, 0.05 * jnp.cos(jnp.arange(12.0)))
+    held, independent = partitioned(linkage, T0, q, v)
+    assert int(independent.sum()) == 1
+    off = jnp.where(independent, 0.0, 0.05 * jnp.cos(jnp.arange(12.0)))
     closed, rate = held.project(T0, q + off, v + 10 * off)
     assert_allclose(closed, q, atol=1e-13)
     assert_allclose(rate, v, atol=1e-12)
-    assert (closed == q)[held.independent].all() and (rate == v)[held.independent].all()
+    assert (closed == q)[independent].all() and (rate == v)[independent].all()
 
 
 def test_a_guess_too_far_away_is_not_a_number(linkage, placed):
     q, v = (x.ravel() for x in placed(-0.8, 1.3))
-    held = equations_of(linkage, None, None, udk.CoordinatePartitioning()).held(T0, q, v)
-    off = jnp.where(held.independent, 0.0, 0.4 * jnp.cos(jnp.arange(12.0)))
+    held, independent = partitioned(linkage, T0, q, v)
+    off = jnp.where(independent, 0.0, 0.4 * jnp.cos(jnp.arange(12.0)))
     assert np.isnan(jnp.concatenate(held.rates(T0, q + off, v))).any()
     assert np.isfinite(jnp.concatenate(held.rates(T0, q + 0.1 * off, v))).all()
 
@@ -247,11 +254,11 @@ def test_completion_has_derivatives(linkage, placed):
     angle = jnp.array(-0.8)
     pose = lambda s: jnp.concatenate([x.ravel() for x in placed(s, 1.3)])  # noqa: E731
     y = pose(angle)
-    held = equations_of(linkage, None, None, udk.CoordinatePartitioning()).held(T0, *jnp.split(y, 2))
+    held, independent = partitioned(linkage, T0, *jnp.split(y, 2))
     project = lambda y: jnp.concatenate(held.project(T0, *jnp.split(y, 2)))  # noqa: E731
     jacobian, backward = jax.jit(lambda y: (jax.jacfwd(project)(y), jax.jacrev(project)(y)))(y)
     along = jax.jvp(pose, (angle,), (jnp.ones(()),))[1]
     assert_allclose(jacobian @ along, along, atol=1e-11)
-    dependent = jnp.tile(~held.independent, 2)
+    dependent = jnp.tile(~independent, 2)
     assert_allclose(jacobian[:, dependent], 0.0, atol=1e-11)
     assert_allclose(backward, jacobian, atol=1e-11)

@@ -9,8 +9,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import analyse, constraints, loads, prepare
-from udkjax.equations.code import code, scalars
+from udkjax.equations import constraints, loads, prepare
+from udkjax.equations.scalar_programs import elimination_programs, scene_programs
+from udkjax.equations.structure import leaves_as_scalars
+from udkjax.pinv.rank_policy import RankPolicy
 
 P = [[0.2, -0.1], [-0.3, 0.15]]
 
@@ -160,18 +162,18 @@ def states(mech):
 def terms(mech, states):
     """What the programs say."""
 
-    programs = code(mech, analyse(mech).redundant_rows or (), False, "drop")
-    constants = programs.prologue([*map(float, scalars(jax.tree.leaves(mech.bare))), 1e-8, 1e-8])
+    programs = scene_programs(mech)
+    constants = programs.prologue([*map(float, leaves_as_scalars(jax.tree.leaves(mech.bare))), 1e-8, 1e-8])
     (m, n), slots = programs.pattern.shape, programs.pattern.slots
 
     def at(t, q, v):
-        run = lambda name: np.array(programs.program(name)([*constants, t, *q.tolist(), *v.tolist()]), float)  # noqa: E731
-        values, b, free, root = np.split(run("rows"), [slots, slots + m, slots + m + n])
+        run = lambda program: np.array(program([*constants, t, *q.tolist(), *v.tolist()]), float)  # noqa: E731
+        values, b, free, root = np.split(run(programs.equation_terms), [slots, slots + m, slots + m + n])
         A = programs.pattern.dense(values, np) / root
-        kinetic, potential = run("energy")
+        kinetic, potential = run(programs.energy)
         return {
-            "psi": run("psi"),
-            "psi_dot": run("psi_dot"),
+            "psi": run(programs.psi),
+            "psi_dot": run(programs.psi_dot),
             "psi_q": A,
             "gamma": b + A @ free,
             "mass": root**-2,
@@ -236,16 +238,17 @@ def test_one_force_element_alone(mech, states, name):
     alone = udk.Mechanism(mech.bodies, pin, forces={name: mech.forces[name]}, gravity=(0.0, 0.0))
     t, q, v = (s[1] for s in states)
     q = q.at[0].set(-0.5)  # at the stop
-    programs = code(alone, (), False, "drop")
-    constants = programs.prologue([*map(float, scalars(jax.tree.leaves(alone.bare))), 1e-8, 1e-8])
-    free = jnp.array(programs.program("rows")([*constants, float(t), *q.tolist(), *v.tolist()])[-18:-9])
+    programs = scene_programs(alone)
+    constants = programs.prologue([*map(float, leaves_as_scalars(jax.tree.leaves(alone.bare))), 1e-8, 1e-8])
+    free = jnp.array(programs.equation_terms([*constants, float(t), *q.tolist(), *v.tolist()])[-18:-9])
     assert jnp.abs(free).max() > 1e-3
     assert_allclose(free * loads.mass(alone), loads.force(alone, t, q, v), rtol=1e-12, atol=1e-12)
 
 
 def test_values_are_inputs_and_types_are_structure(mech):
     other = jax.tree.map(lambda x: 1.1 * x, mech)
-    assert code(other, (), False, "drop") is code(mech, (), False, "drop")
+    one, two = (elimination_programs(m, (), False, RankPolicy.DROP) for m in (other, mech))
+    assert one is two
 
 
 @pytest.fixture(scope="module")

@@ -8,21 +8,23 @@ import pytest
 
 import udkjax as udk
 from udkjax.equations.analysis import analyse
-from udkjax.equations.code import code
+from udkjax.equations.implicit_derivative import acceleration_derivative, projection_derivative
+from udkjax.equations.scalar_programs import elimination_programs
+from udkjax.pinv.rank_policy import RankPolicy
 
 GROUND = "ground"
 PAIR = 51  # operations that a sine and a cosine take together, where they are arithmetic
 CHOICES = ("gt", "ge", "and", "select_n")
 
 
-def programs(mechanism, elimination="drop", baumgarte=False, analysis=None):
-    """The scene's code, of the rows that are not redundant."""
-    return code(mechanism, (analysis or analyse(mechanism)).redundant_rows or (), baumgarte, elimination)
+def programs(mechanism, policy=RankPolicy.DROP, baumgarte=False, analysis=None):
+    """The scene's programs, of the rows that are not redundant."""
+    return elimination_programs(mechanism, (analysis or analyse(mechanism)).redundant_rows or (), baumgarte, policy)
 
 
 def right_hand_side(mechanism, **choices):
     """How many operations of each kind the accelerations take."""
-    return programs(mechanism, **choices).program("accelerations").count()
+    return programs(mechanism, **choices).accelerations.count()
 
 
 def arithmetic(counts) -> int:
@@ -35,7 +37,7 @@ def trigonometry(counts) -> dict[str, int]:
 
 def uses_time(mechanism) -> bool:
     found = programs(mechanism)
-    return found.program("accelerations").uses(found.equations.t)
+    return found.accelerations.uses(found.equations.t)
 
 
 def joined(mechanism, joints=None, drivers=None, forces=None):
@@ -125,14 +127,14 @@ def test_a_body_without_dampers_is_not_asked_for_its_velocity():
     spring = lambda *damping: {"s": udk.TorsionSpring((GROUND, "wheel"), 3.0, *damping)}  # noqa: E731
     for forces, used in ((spring(), False), (spring(0.1), True)):
         found = programs(udk.Mechanism({"wheel": udk.Body(1.0, 0.1)}, forces=forces))
-        assert any(found.program("accelerations").uses(v) for v in found.equations.v) == used
+        assert any(found.accelerations.uses(v) for v in found.equations.v) == used
 
 
 def test_without_stabilization_psi_and_its_rate_are_not_evaluated(linkage, plain):
     """Of hinges, only Psi holds positions of centres of mass, and only Psi_dot holds their velocities."""
     for baumgarte in (False, True):
         found = programs(linkage, baumgarte=baumgarte)
-        program, e = found.program("accelerations"), found.equations
+        program, e = found.accelerations, found.equations
         assert any(program.uses(e.q[3 * k + i]) for k in range(4) for i in (0, 1)) == baumgarte
         assert any(program.uses(e.v[3 * k + i]) for k in range(4) for i in (0, 1)) == baumgarte
     stabilized = right_hand_side(linkage, baumgarte=True)
@@ -143,8 +145,8 @@ def test_without_stabilization_psi_and_its_rate_are_not_evaluated(linkage, plain
 def test_energies_only_where_asked_for(linkage):
     found = programs(linkage)
     squares = found.equations.kinetic_energy
-    assert squares.index in found.program("energy").order
-    assert squares.index not in found.program("accelerations").order
+    assert squares.index in found.energy.order
+    assert squares.index not in found.accelerations.order
 
 
 # --- redundancy
@@ -170,21 +172,19 @@ def test_a_row_left_out_is_never_computed():
     assert "exp" in right_hand_side(three, analysis=dataclasses.replace(analyse(three), redundant_rows=()))
 
 
-@pytest.mark.parametrize("name", ["accelerations", "nearer", "tangential"])
+@pytest.mark.parametrize("name", ["accelerations", "newton_q", "tangent_part"])
 @pytest.mark.parametrize("copies", [2, 3])
 @pytest.mark.parametrize("baumgarte", [False, True], ids=["", "Baumgarte"])
 def test_a_duplicated_joint_adds_no_operation(linkage, copies, baumgarte, name):
     more = {f"{joint} {k}": linkage.joints[joint] for joint in linkage.joints for k in range(1, copies)}
-    one, other = (programs(m, baumgarte=baumgarte).program(name).count() for m in (linkage, joined(linkage, joints=more)))
+    one, other = (getattr(programs(m, baumgarte=baumgarte), name).count() for m in (linkage, joined(linkage, joints=more)))
     assert one == other
 
 
-def test_rows_left_out_are_watched_only_where_asked_for(linkage, plain):
-    auto = programs(linkage, "check")
-    watched, checked = (sum(auto.program(name).count().values()) for name in ("accelerations_watched", "accelerations"))
-    assert checked < watched < checked + 100
-    # Dropping chooses at each pivot; checking asks about all of them.
-    assert checked == sum(plain.values()) - plain["select_n"] + plain["gt"] - 1
+def test_pivots_that_are_refused_are_only_asked_about(linkage, plain):
+    """Dropping chooses at each pivot; refusing joins the answers for all of them."""
+    refusing = programs(linkage, RankPolicy.REFUSE).accelerations.count()
+    assert sum(refusing.values()) == sum(plain.values()) - plain["select_n"] + plain["gt"] - 1
 
 
 # --- structure
@@ -197,12 +197,12 @@ def test_rows_left_out_are_watched_only_where_asked_for(linkage, plain):
 )
 def test_pivots_that_need_not_wait_for_each_other_do_not(mechanism, pivots, most):
     """A division takes several times as long as what is between two of them: those in a row are what a single run waits for."""
-    found = programs(mechanism, "check")
-    program, row = found.program("accelerations"), {}
+    found = programs(mechanism, RankPolicy.REFUSE)
+    program, row = found.accelerations, {}
     for index in program.order:
         node = program.graph.nodes[index]
         row[index] = max((row.get(a.index, 0) for a in node.arguments), default=0) + (node.kind == "div")
-    assert len(found.kept) == pivots <= program.count()["div"]
+    assert len(found.independent_rows) == pivots <= program.count()["div"]
     assert max(row[s.index] for s in program.outputs) <= most
 
 
@@ -219,11 +219,11 @@ def test_a_chain_of_loops_grows_linearly():
     assert counts[2] - counts[1] < 1.2 * (counts[1] - counts[0])
 
 
-def test_a_step_of_a_projection_factorizes_once(linkage, plain):
-    """In position and velocity at once: 11 reciprocals, of the pivots."""
-    step = programs(linkage).program("nearer").count()
-    assert step["div"] == 11
-    assert sum(step.values()) <= 1.5 * sum(plain.values())  # with a choice at each pivot, and for two residuals
+def test_the_end_of_a_step_factorizes_once(linkage, plain):
+    """For velocities, accelerations and two changes: 11 reciprocals, of the pivots, and one, of the distance."""
+    step = programs(linkage).end_of_step.count()
+    assert step["div"] == 12
+    assert sum(step.values()) <= 2.5 * sum(plain.values())  # four linear systems instead of one
 
 
 def test_numbers_that_change_make_no_other_code(linkage):
@@ -234,20 +234,20 @@ def test_numbers_that_change_make_no_other_code(linkage):
 # --- derivatives
 
 
-def derivative(mechanism, name="accelerations", t=False, q=True, v=True, constants=()):
+def derivative(mechanism, make=acceleration_derivative, t=False, q=True, v=True, constants=()):
     found = programs(mechanism)
-    moving = [k in constants for k in range(len(found.constants))]
-    return found.derivative(name, (*moving, t, q, v))
+    active = [k in constants for k in range(len(found.constants))]
+    return make(found, (*active, t, q, v))
 
 
 @pytest.mark.parametrize(("direction", "most"), [("forward", 0.5), ("reverse", 0.6)])
 def test_a_derivative_takes_half_of_what_the_accelerations_take_and_factorizes_nothing(linkage, plain, direction, most):
     found = derivative(linkage)
-    more = arithmetic(found.evaluation("accelerations").count()) - arithmetic(plain)  # what the derivative needs to know
+    more = arithmetic(found.evaluation.count()) - arithmetic(plain)  # what the derivative needs to know
     further = getattr(found, direction).count()
     assert arithmetic(further) + more <= most * (arithmetic(plain) + PAIR * plain["sincos"])
     assert not {"div", "sqrt", "sincos"} & set(further)
-    assert found.evaluation("accelerations").count()["div"] == 11
+    assert found.evaluation.count()["div"] == 11
 
 
 def test_only_what_moves_is_differentiated(linkage):
@@ -260,10 +260,10 @@ def test_only_what_moves_is_differentiated(linkage):
 def test_a_driver_that_is_not_differentiated_adds_only_its_row(rod):
     """Along q and v, time does not move: of the motor's motion no derivative is taken beyond those in the accelerations."""
     motor = joined(rod, drivers={"motor": udk.Driver((GROUND, "rod"), "angle", udk.Sine(1.0, 2.0))})
-    assert trigonometry(derivative(motor).evaluation("accelerations").count()) == trigonometry(right_hand_side(motor))
+    assert trigonometry(derivative(motor).evaluation.count()) == trigonometry(right_hand_side(motor))
 
 
 def test_a_projection_is_differentiated_by_one_further_factorization(linkage):
     """At the state that it returns."""
-    found = derivative(linkage, "projection")
-    assert sum(program.count().get("div", 0) for program in (found.evaluation("projection"), found.forward)) == 11
+    found = derivative(linkage, projection_derivative)
+    assert sum(program.count().get("div", 0) for program in (found.evaluation, found.forward)) == 11

@@ -1,6 +1,6 @@
 """The textbook against what must hold of it, and the programs against the textbook, in every scene of the library.
 
-Every type of joint, driver and force element is held against it in test_expressions.py.
+Every type of joint, driver and force element is held against it in test_scalar_equations.py.
 """
 
 import inspect
@@ -13,9 +13,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import code as elements
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.scalar_programs import elimination_programs
+from udkjax.equations.structure import is_large, leaves_as_scalars
+from udkjax.pinv.rank_policy import RankPolicy
 
 SVD = udk.SVD(1e-9)
 T0 = jnp.array(0.3)
@@ -170,22 +172,22 @@ def named(program, constants, t, q, v):
     return np.array(program([*constants, float(t), *q.tolist(), *v.tolist()]), float)
 
 
-@pytest.mark.parametrize("elimination", ["check", "drop"])
-def test_programs_are_the_textbook(moved, elimination):
+@pytest.mark.parametrize("policy", RankPolicy)
+def test_programs_are_the_textbook(moved, policy):
     """Terms, energies and accelerations; on the rows that are kept, since off the manifold the others disagree."""
     mech, q, v = moved
     gains, analysis = udk.Baumgarte(2.0, 3.0), udk.analyse(mech)
     redundant = analysis.redundant_rows or ()
-    if elements.is_large(mech):
+    if is_large(mech):
         pytest.skip("written as loops (tests/native/test_loops.py)")
-    programs = elements.code(mech, redundant, True, elimination)
+    programs = elimination_programs(mech, redundant, True, policy)
     leaves = jax.tree.leaves(mech.bare)
-    constants = programs.prologue([*map(float, elements.scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14])
-    run = lambda name: named(programs.program(name), constants, T0, q, v)  # noqa: E731
+    constants = programs.prologue([*map(float, leaves_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14])
+    run = lambda program: named(program, constants, T0, q, v)  # noqa: E731
     (m, n), slots = programs.pattern.shape, programs.pattern.slots
-    values, b, free, root = np.split(run("rows"), [slots, slots + m, slots + m + n])
+    values, b, free, root = np.split(run(programs.equation_terms), [slots, slots + m, slots + m + n])
     psi_q = programs.pattern.dense(values, np) / root
-    psi, psi_dot, (T, V) = run("psi"), run("psi_dot"), run("energy")
+    psi, psi_dot, (T, V) = run(programs.psi), run(programs.psi_dot), run(programs.energy)
     gamma = b + psi_q @ free + 4.0 * psi_dot + 9.0 * psi
     found = {
         "psi": psi,
@@ -202,7 +204,7 @@ def test_programs_are_the_textbook(moved, elimination):
     expected = textbook(mech.bare, q, v, udk.SVD(1e-11), gains, analysis.scales.weights * kept)
     for name, array in found.items():
         close_to(array, expected[name], 1e-11)
-    close_to(run("accelerations")[:n], expected["a"], 1e-8)
+    close_to(run(programs.accelerations)[:n], expected["a"], 1e-8)
 
 
 @pytest.mark.parametrize("method", [udk.Elimination(1e-6), udk.Varga(1e-6), udk.Auto(1e-6)], ids=["Elimination", "Varga", "Auto"])

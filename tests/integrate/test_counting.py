@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.equations.motion import Tangential
+from udkjax.equations.abstract_system import TangentPart
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, count_evaluations, evaluations
 from udkjax.integrate.multistep import Multistep, from_controller
@@ -123,10 +123,10 @@ class Oscillator(eqx.Module):
     def project(self, t, q, v):
         return q, v
 
-    def tangential(self, t, q, v, dq, dv):
-        return Tangential(dq, dv)
+    def tangent_part(self, t, q, v, dq, dv):
+        return TangentPart(dq, dv)
 
-    def held(self, t, q, v):
+    def fix_partition(self, t, q, v):
         return self
 
     @property

@@ -8,16 +8,16 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests import loops
-from udkjax.equations import code as size
 from udkjax.equations import constraints, loads
+from udkjax.equations import structure as size
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse
-from udkjax.equations.code import structure
-from udkjax.equations.large_code import large_code
+from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scales import known_scales
 from udkjax.expressions.loops import Clear, Loop
 from udkjax.native.loops import LoopWriter
 from udkjax.pinv.block_order import eliminations
+from udkjax.pinv.rank_policy import RankPolicy
 
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
 NOTHING = 1e-20  # a threshold of pivots below that of any that is more than rounding
@@ -62,31 +62,31 @@ class At:
     def __init__(self, mechanism, baumgarte=None, every=False):
         redundant = analyse(mechanism).redundant_rows or ()
         gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
-        code = large_code(*structure(mechanism), redundant, bool(gains), "watch")
-        self.code, self.mechanism = code.careful if every else code, mechanism
+        code = loop_programs(mechanism, redundant, bool(gains), RankPolicy.FALL_BACK)
+        self.code, self.mechanism = code.with_all_rows if every else code, mechanism
         state, random = udk.assemble(mechanism, throw=False), np.random.default_rng(1)
-        n = self.code.n
+        n = self.code.coordinate_count
         self.t = 0.2
         self.q = np.ravel(state.q) + 1e-2 * random.standard_normal(n)
         self.v = np.ravel(state.v) + 0.3 * random.standard_normal(n)
         self.numbers = np.concatenate([np.ravel(x) for x in [*jax.tree.leaves(mechanism.bare), *gains, NOTHING, NOTHING]])
         self.constants = np.zeros(len(self.code.constants))
         loops.run(self.code.prologue, {"numbers": self.numbers, "constants": self.constants})
-        kept = [k for k in range(self.code.m) if every or k not in redundant]
-        self.weights = np.isin(np.arange(self.code.m), kept).astype(float)
+        kept = [k for k in range(self.code.row_count) if every or k not in redundant]
+        self.weights = np.isin(np.arange(self.code.row_count), kept).astype(float)
 
     def arrays(self, constants=None, q=None, v=None, **more):
         code = self.code
-        found = {name: np.full(size, np.nan) for name, size in code.kept.items()}
-        found |= {x: np.full(code.n, np.nan) for x in ("a", "q1", "v1", "dq1", "dv1")}
+        found = {name: np.full(size, np.nan) for name, size in code.stored_sizes.items()}
+        found |= {x: np.full(code.coordinate_count, np.nan) for x in ("a", "q1", "v1", "dq1", "dv1")}
         found |= {x: np.full(1, np.nan) for x in ("safe", "distance", "rank")}
         given = {"constants": self.constants, "t": np.array([self.t]), "q": self.q, "v": self.v}
         given |= {k: x for k, x in (("constants", constants), ("q", q), ("v", v)) if x is not None}
-        return found | given | {"psi": np.full(code.m, np.nan), "made_of": np.full(code.made_of, np.nan)} | more
+        return found | given | {"psi": np.full(code.row_count, np.nan), "terms": np.full(code.term_count, np.nan)} | more
 
     def run(self, name, **given):
         found = self.arrays(**given)
-        loops.run(self.code.program(name), found)
+        loops.run(getattr(self.code, name), found)
         return found
 
 
@@ -115,22 +115,22 @@ def test_residuals_are_those_of_the_textbook(at):
 
 
 def test_corrections_take_residuals_away(at):
-    if not at.code.m:
+    if not at.code.row_count:
         return
     kept = at.weights > 0
     root, A = uk.root(at.mechanism), np.asarray(constraints.psi_q(at.mechanism, at.t, at.q))[kept]
     D = A * root
     psi, rate = (np.asarray(x)[kept] for x in (constraints.psi(at.mechanism, at.t, at.q), at.run("psi_dot")["psi"]))
-    for name, x, array, residual in (("closer", at.q, "q1", psi), ("output", at.v, "v1", rate)):
+    for name, x, array, residual in (("newton_q", at.q, "q1", psi), ("newton_v_and_psi", at.v, "v1", rate)):
         expected = x - root * (np.linalg.pinv(D) @ residual)
         assert_allclose(at.run(name)[array], expected, atol=1e-9)
 
 
 def test_what_is_tangential(at):
     random = np.random.default_rng(2)
-    dq, dv = random.standard_normal((2, at.code.n))
-    found = at.run("tangential", dq=dq, dv=dv)
-    again = at.run("finish", dq=dq, dv=dv)
+    dq, dv = random.standard_normal((2, at.code.coordinate_count))
+    found = at.run("tangent_part", dq=dq, dv=dv)
+    again = at.run("end_of_step", dq=dq, dv=dv)
     A = np.asarray(constraints.psi_q(at.mechanism, at.t, at.q))[at.weights > 0]
     mass = np.asarray(loads.mass(at.mechanism))
     for name, given in (("dq1", dq), ("dv1", dv)):
@@ -147,18 +147,21 @@ def test_steps_with_care_take_all_rows():
     flat = np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0], [2.0, 0.0, 0.0]]).ravel()
     at.numbers[-2] = 1e-10
     loops.run(at.code.prologue, {"numbers": at.numbers, "constants": at.constants})
-    still = np.zeros(at.code.n)
-    expected = uk.accelerations(at.mechanism, at.t, flat, still, udk.SVD(1e-6), None, jnp.ones(at.code.m))
+    still = np.zeros(at.code.coordinate_count)
+    expected = uk.accelerations(at.mechanism, at.t, flat, still, udk.SVD(1e-6), None, jnp.ones(at.code.row_count))
     assert_allclose(at.run("accelerations", q=flat, v=still)["a"], expected, atol=1e-8)
     ranks = at.run("accelerations", q=flat, v=still)
-    loops.run(at.code.program("rank"), ranks)
+    loops.run(at.code.rank, ranks)
     assert ranks["rank"] == np.linalg.matrix_rank(constraints.psi_q(at.mechanism, at.t, flat))
+
+
+RESULTS = {"accelerations": ["a"], "projection": ["q1", "v1"], "newton_q": ["q1"], "newton_v": ["v1"]}
 
 
 def test_no_number_is_written_once_it_was_read():
     """Derivatives rely on it."""
     code = At(loaded()).code
-    programs = [evaluated.program for evaluated in code.evaluated.values()]
+    programs = [getattr(code, f"differentiable_{name}").program for name in RESULTS]
     for program in programs:
         read: set[tuple[str, int]] = set()
         for part in program.parts:
@@ -178,19 +181,18 @@ def test_no_number_is_written_once_it_was_read():
                 assert not {p for p in outputs if p[0] != "ratio"} & read
 
 
-@pytest.mark.parametrize("name", ["accelerations", "projection", "position", "velocity"])
+@pytest.mark.parametrize("name", RESULTS)
 def test_derivatives_against_differences(at, name):
     code, random = at.code, np.random.default_rng(4)
-    results = {"accelerations": ["a"], "projection": ["q1", "v1"], "position": ["q1"], "velocity": ["v1"]}[name]
-    evaluated = code.evaluated[name]
+    results, evaluated = RESULTS[name], getattr(code, f"differentiable_{name}")
     q, v = at.q, at.v
     for _ in range(6 if name == "projection" else 0):  # its derivatives are those of a state on the manifold
-        state = at.run("closer", q=q)
+        state = at.run("newton_q", q=q)
         q = state["q1"]
-        v = at.run("output", q=q, v=v)["v1"]
+        v = at.run("newton_v_and_psi", q=q, v=v)["v1"]
     dconstants = random.standard_normal(len(code.constants)) * at.constants
     dconstants[:2] = 0.0
-    dq, dv = random.standard_normal((2, code.n))
+    dq, dv = random.standard_normal((2, code.coordinate_count))
 
     def value(h):
         found = at.arrays(at.constants + h * dconstants, q + h * dq, v + h * dv)
@@ -210,7 +212,7 @@ def test_derivatives_against_differences(at, name):
     w = random.standard_normal(len(along))
     reverse = found | {f"bar_{x}": np.zeros(len(a)) for x, a in found.items()}
     for k, x in enumerate(results):
-        reverse[f"bar_{x}"] = w[k * code.n : (k + 1) * code.n].copy()
+        reverse[f"bar_{x}"] = w[k * code.coordinate_count : (k + 1) * code.coordinate_count].copy()
     loops.run(evaluated.derivative().reverse, reverse)
     total = reverse["bar_constants"] @ dconstants + reverse["bar_q"] @ dq + reverse["bar_v"] @ dv
     assert_allclose(total, w @ along, rtol=1e-9, atol=1e-11)
@@ -220,11 +222,11 @@ def test_constants_by_jax_are_those_of_the_loops(at):
     assert_allclose(at.code.constants_of(jnp.asarray(at.numbers[:-2]))[2:], at.constants[2:], rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["finish", "rows"])
+@pytest.mark.parametrize("name", ["end_of_step", "equation_terms"])
 def test_machine_code_runs_the_loops(at, name, code, width):
-    program = at.code.program(name)
+    program = getattr(at.code, name)
     random = np.random.default_rng(5)
-    given = at.arrays(dq=random.standard_normal(at.code.n), dv=random.standard_normal(at.code.n))
+    given = at.arrays(dq=random.standard_normal(at.code.coordinate_count), dv=random.standard_normal(at.code.coordinate_count))
     writer = LoopWriter(width)
     names = sorted(program.arrays)
     writer.write(program, "whole", names, {x: (x, 0) for x in names})
@@ -238,10 +240,10 @@ def test_machine_code_runs_the_loops(at, name, code, width):
 
 
 def test_the_code_does_not_grow_with_the_scene():
-    few, many = (large_code(*structure(udk.library.n_four_bar(n)), (), False, "drop") for n in (7, 70))
+    few, many = (loop_programs(udk.library.n_four_bar(n)) for n in (7, 70))
     for code in (few, many):
-        for name in ("accelerations", "finish", "rows"):
-            code.program(name)
+        for name in ("accelerations", "end_of_step", "equation_terms"):
+            getattr(code, name)
     assert len(few._kernels) == len(many._kernels) < 60
 
 

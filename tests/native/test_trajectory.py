@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
-from udkjax.equations import analysis, code, constraints, loads
+from udkjax.equations import analysis, constraints, loads, structure
 
 TOL = 1e-9
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
@@ -76,7 +76,7 @@ def forgotten():
 def served(monkeypatch, request):
     """All of these runs are by machine code, but for those of tests that look themselves."""
     if request.param == "loops":
-        monkeypatch.setattr(code, "LARGE", 0)
+        monkeypatch.setattr(structure, "LARGE", 0)
         monkeypatch.setattr(analysis, "_analyses", analysis._Cache())  # what is found by loops is not left to other tests
     seen, module = [], sys.modules["udkjax.integrate.simulate"]
     reason = module.unserved

@@ -20,13 +20,14 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.equations.code import code, is_large, structure
-from udkjax.equations.large_code import large_code
+from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.redundancy import redundant_rows
+from udkjax.equations.scalar_programs import scene_programs
 from udkjax.equations.scales import Scales, known_scales, traced_scales
+from udkjax.equations.structure import is_large, structure
 from udkjax.scene.mechanism import Mechanism
 
-MOST = 256  # analyses at hand; the one that was made first makes room
+CACHE_SIZE = 256  # analyses at hand; the one that was made first makes room
 
 
 class Analysis(eqx.Module):
@@ -85,7 +86,7 @@ def analyse(mechanism: Mechanism) -> Analysis:
         return Analysis(traced_scales(mechanism), 3 * len(mechanism.body_names), _row_names(mechanism), None)
     mechanism = mechanism.bare
     kind = structure(mechanism)
-    return _analyses.get((kind, _bytes(mechanism)), lambda: _analysed(mechanism, kind))
+    return _analyses.get((kind, _bytes_of(mechanism)), lambda: _analyse(mechanism, kind))
 
 
 class _Cache:
@@ -103,7 +104,7 @@ class _Cache:
         found = make()
         with self._lock:
             self._found[key] = found
-            while len(self._found) > MOST:
+            while len(self._found) > CACHE_SIZE:
                 self._found.popitem(last=False)
         return found
 
@@ -111,20 +112,20 @@ class _Cache:
 _analyses, _redundant = _Cache(), _Cache()
 
 
-def _analysed(mechanism: Mechanism, kind: Any) -> Analysis:
+def _analyse(mechanism: Mechanism, kind: Any) -> Analysis:
     with jax.ensure_compile_time_eval():  # while something else is traced, too
         scales = known_scales(mechanism)
         # Masses and loads decide nothing about rows: mechanisms that differ in them alone share what was found.
         geometry = list(mechanism.constraints.values()), mechanism.q0
-        rows = _redundant.get((kind, _bytes(geometry)), lambda: redundant_rows(mechanism))
+        rows = _redundant.get((kind, _bytes_of(geometry)), lambda: redundant_rows(mechanism))
         return Analysis(scales, 3 * len(mechanism.body_names), _row_names(mechanism), rows)
 
 
 def _row_names(mechanism: Mechanism) -> tuple[tuple[str, int], ...]:
     if is_large(mechanism):
-        return tuple(large_code(*structure(mechanism), (), False, "drop").layout.row_names)
-    return tuple(code(mechanism, (), False, None).equations.row_names)
+        return tuple(loop_programs(mechanism).row_names)
+    return tuple(scene_programs(mechanism).equations.row_names)
 
 
-def _bytes(tree: Any) -> bytes:
+def _bytes_of(tree: Any) -> bytes:
     return b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree))

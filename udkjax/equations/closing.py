@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.code import code, scalars
+from udkjax.equations.scalar_programs import scene_programs
 from udkjax.equations.scales import Scales, rank_tolerance
+from udkjax.equations.structure import leaves_as_scalars
+from udkjax.expressions import Program
 from udkjax.scene.mechanism import Mechanism
 
 # Of the scene's scales: what counts as closed. Rounding leaves 1e-15; a scene that cannot be closed leaves what its lengths are
@@ -122,35 +124,35 @@ class DenseRows:
 
     def __init__(self, mechanism: Mechanism, scales: Scales):
         self.scales = jax.tree.map(np.asarray, scales)
-        self._code = code(mechanism, (), False, None)
+        self._programs = scene_programs(mechanism)
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(mechanism)]
-        self._constants = self._code.prologue([*map(float, scalars(leaves)), 0.0, 0.0])
-        self.count, self.size = self._code.pattern.shape
-        self.names = self._code.equations.row_names
-        self.root = self._run("closure", 0.0, np.zeros(self.size), np.zeros(self.size))[-self.size :]
+        self._constants = self._programs.prologue([*map(float, leaves_as_scalars(leaves)), 0.0, 0.0])
+        self.count, self.size = self._programs.pattern.shape
+        self.names = self._programs.equations.row_names
+        self.root = self._run(self._programs.closure_terms, 0.0, np.zeros(self.size), np.zeros(self.size))[-self.size :]
         self.metric, self._tol = self.root, float(rank_tolerance(mechanism))
 
-    def _run(self, name: str, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return np.array(self._code.program(name)([*self._constants, t, *q.tolist(), *v.tolist()]), float)
+    def _run(self, program: Program, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.array(program([*self._constants, t, *q.tolist(), *v.tolist()]), float)
 
     def violation(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Psi and Psi_dot."""
-        return self._run("psi", t, q, v), self._run("psi_dot", t, q, v)
+        return self._run(self._programs.psi, t, q, v), self._run(self._programs.psi_dot, t, q, v)
 
     def residual(self, t: float, q: np.ndarray) -> np.ndarray:
-        return self._run("psi", t, q, q) / self.scales.rows
+        return self._run(self._programs.psi, t, q, q) / self.scales.rows
 
     def jacobian(self, t: float, q: np.ndarray) -> np.ndarray:
         """Psi_q (m, n)."""
-        values = self._run("closure", t, q, q)[: self._code.pattern.slots]
-        return self._code.pattern.dense(values, np) / self.root
+        values = self._run(self._programs.closure_terms, t, q, q)[: self._programs.pattern.slots]
+        return self._programs.pattern.dense(values, np) / self.root
 
     def plus(self, t: float, q: np.ndarray) -> Truncated:
         """D^+ of weighted rows in the metric."""
         return Truncated.of(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
 
     def correction(self, t: float, q: np.ndarray) -> np.ndarray:
-        return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._run("psi", t, q, q)))
+        return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._run(self._programs.psi, t, q, q)))
 
     def assembled(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
         """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
@@ -159,7 +161,7 @@ class DenseRows:
         q = close_position(self, t, q, np)
         plus = self.plus(t, q)
         for _ in range(2):  # the second removes the rounding errors of the first
-            v = v - self.metric * (plus @ (self.scales.weights * self._run("psi_dot", t, q, v)))
+            v = v - self.metric * (plus @ (self.scales.weights * self._run(self._programs.psi_dot, t, q, v)))
         return q, v, *self.violation(t, q, v), plus.rank
 
 
@@ -176,7 +178,7 @@ class TracedRows(NamedTuple):
         return self.equations.violation(t, q, q)[0] / self.scales.rows
 
     def correction(self, t: Any, q: Any) -> Any:
-        plus, psi, root = self.equations.linearized("closure", t, q, q)
+        plus, psi, root = self.equations.linearized_position(t, q)
         return -root * (plus @ psi)
 
     def assembled(self, close: Callable[[Any, Any, Any], Any], t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -185,6 +187,6 @@ class TracedRows(NamedTuple):
             return q, v, *self.equations.violation(t, q, v), 0
         q, rank = close(self, t, q), 0
         for _ in range(2):  # the second removes the rounding errors of the first
-            plus, residual, root = self.equations.linearized("rate", t, q, v)
+            plus, residual, root = self.equations.linearized_velocity(t, q, v)
             v, rank = v - root * (plus @ residual), plus.rank
         return q, v, *self.equations.violation(t, q, v), rank

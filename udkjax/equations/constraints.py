@@ -1,8 +1,8 @@
 """The constraints of a mechanism along a motion: Psi, Psi_q, Psi_dot and gamma (de Falco, Pennestri, Vita 2005, section 3).
 
 Each joint and driver says what its residual is, and nothing more; all derivatives are taken of that by JAX. Here this is done
-as it reads, on arrays, without regard to which entries are zero; elements that are alike speak together (kinds.py). Faster forms
-of the same functions are held against this one.
+as it reads, on arrays, without regard to which entries are zero; elements of the same structure are evaluated together
+(structure.py). Faster forms of the same functions are held against this one.
 
 In all of them t is the time (s), and q and v are the coordinates and velocities of the n / 3 bodies, x, y (m) and angle (rad) of
 one after another: flat (n,), or (bodies, 3), which is made flat. The m rows are those of the joints in their order, then those
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.equations.kinds import Kind, kinds, of_each
+from udkjax.equations.structure import ElementKind, element_kinds, evaluate_by_kind
 from udkjax.scene.mechanism import Mechanism
 
 State = Float[ArrayLike, "n"] | Float[ArrayLike, "n/3 3"]
@@ -24,7 +24,9 @@ State = Float[ArrayLike, "n"] | Float[ArrayLike, "n/3 3"]
 
 def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
     """Psi(t, q), which is zero where all joints are closed (m, rad)."""
-    found = of_each(lambda c, *frames: vector(c.residual(t, *frames)), mechanism, [*mechanism.constraints.values()], bodies(q))
+    found = evaluate_by_kind(
+        lambda c, *frames: vector(c.residual(t, *frames)), mechanism, [*mechanism.constraints.values()], bodies(q)
+    )
     return jnp.concatenate([jnp.ravel(rows) for _, rows in found])[_places(found)] if found else jnp.zeros(0)
 
 
@@ -49,15 +51,15 @@ def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array
 def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
     """The constraint that each row of Psi belongs to, and its number within it."""
     names, constraints = list(mechanism.constraints), [*mechanism.constraints.values()]
-    say = lambda c, *frames: vector(c.residual(0.0, *frames))  # noqa: E731
-    rows = jax.eval_shape(lambda: [rows for _, rows in of_each(say, mechanism, constraints, bodies(mechanism.q0))])
+    residual = lambda c, *frames: vector(c.residual(0.0, *frames))  # noqa: E731
+    rows = jax.eval_shape(lambda: [rows for _, rows in evaluate_by_kind(residual, mechanism, constraints, bodies(mechanism.q0))])
     size = np.zeros(len(names), int)
-    for kind, found in zip(kinds(mechanism, constraints), rows, strict=True):
+    for kind, found in zip(element_kinds(mechanism, constraints), rows, strict=True):
         size[kind.members] = found.shape[1]
     return [(name, k) for name, count in zip(names, size, strict=True) for k in range(count)]
 
 
-def _places(found: list[tuple[Kind, Any]]) -> np.ndarray:
+def _places(found: list[tuple[ElementKind, Any]]) -> np.ndarray:
     """Where the rows of all constraints in their order are among those of their kinds."""
     owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in found])
     return np.argsort(owner, kind="stable")

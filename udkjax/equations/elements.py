@@ -1,4 +1,4 @@
-"""What one element says, a constraint or a force, as scalars of a graph: traced once for all elements that are alike.
+"""What one element says, a constraint or a force, as scalars of a graph: traced once for all elements of the same structure.
 
 For a constraint with residual Psi(t, q) the graph gets, all by forward differentiation of the residual alone, along (1, v):
 
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.kinds import Alike
+from udkjax.equations.structure import ElementStructure
 from udkjax.expressions import Differential, Graph, Scalar, operations, trace
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
@@ -47,7 +47,7 @@ def _frames(ground: tuple[bool, ...], q: Any, v: Any = None) -> list[Frame]:
     return frames
 
 
-def differentiated(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
+def differentiated(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
     """Psi, the rows of Psi_q over the columns of q, Psi_dot and gamma of a constraint on scalars."""
     along, bend = _traced(*kind)
     one, zero = graph.constant(1.0), graph.constant(0.0)
@@ -93,7 +93,7 @@ def _shorter(graph: Graph, known: list[Row], one: list[Scalar], other: list[Scal
     return other if operations(graph, given, other) < operations(graph, given, one) else one
 
 
-def applied(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
+def applied(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
     """The generalized loads of a force element over the columns of q, and its potential, on scalars."""
     loads, energy = _traced_force(*kind)
     numbers = [np.asarray(s, object) for s in (t, *q, *v)]
@@ -106,7 +106,7 @@ def has_pieces(element: Any) -> bool:
     return type(element).piece not in (Constraint.piece, ForceElement.piece)
 
 
-def piece(graph: Graph, kind: Alike, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]) -> Scalar:
+def piece(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]) -> Scalar:
     """Which of its smooth pieces an element is in, on scalars."""
     (found,) = _traced_piece(*kind)(graph, leaves, [np.asarray(s, object) for s in (t, *q, *v)])
     return scalar(found)

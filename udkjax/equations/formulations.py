@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.motion import Motion, Tangential, Vector
+from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
@@ -28,14 +28,14 @@ class Formulation(eqx.Module):
     """A way to the accelerations of a system. Given to `simulate(..., formulation=...)`."""
 
     @abstractmethod
-    def of(self, equations: Motion) -> Motion:
+    def of(self, equations: AbstractSystem) -> AbstractSystem:
         """The equations of a system, solved in this way."""
 
 
 class Solved(Formulation):
     """A formulation that is a way to solve for a at a given state, and nothing else."""
 
-    def of(self, equations: Motion) -> "Formulated":
+    def of(self, equations: AbstractSystem) -> "Formulated":
         return Formulated(equations, self)
 
     @abstractmethod
@@ -132,7 +132,7 @@ def along(M: Float[Array, "n n"], F: Vector, N: Float[Array, "n k"], a_p: Vector
     return a_p + N @ z
 
 
-class Rewritten(Motion):
+class Rewritten(AbstractSystem):
     """Equations of motion around others, with the accelerations found in another way.
 
     At constant rank they are the same function, so their derivatives are those of the equations inside.
@@ -152,8 +152,8 @@ class Rewritten(Motion):
     def size(self, dq: Vector) -> Any:
         return self.equations.size(dq)
 
-    def excess(self, psi: Vector) -> Any:
-        return self.equations.excess(psi)
+    def violation_size(self, psi: Vector) -> Any:
+        return self.equations.violation_size(psi)
 
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
         return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
@@ -166,7 +166,7 @@ class Rewritten(Motion):
 class Formulated(Rewritten):
     """A formulation for given states. Projection, and the rows that it leaves out, are those of the equations inside."""
 
-    equations: Motion
+    equations: AbstractSystem
     formulation: Solved
 
     def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
@@ -175,8 +175,8 @@ class Formulated(Rewritten):
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.project(t, q, v)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
-        return self.equations.tangential(t, q, v, dq, dv)
+    def tangent_part(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
+        return self.equations.tangent_part(t, q, v, dq, dv)
 
 
 @eqx.filter_custom_jvp

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.equations.motion import Motion, Tangential, Vector
+from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
@@ -31,7 +31,7 @@ class ConstrainedSystem(eqx.Module):
     breakpoints: Float[Array, "k"] | None = eqx.field(converter=optional, default=None)
 
 
-class GeneralEquations(Motion):
+class GeneralEquations(AbstractSystem):
     """The equations of a `ConstrainedSystem` by one method, with the interface that the integrator knows from a mechanism's.
 
     Rows of Psi come first, those of phi after them. With M = L L^T, D = A L^(-T) for the rows A = (Psi_q; phi_v):
@@ -60,7 +60,7 @@ class GeneralEquations(Motion):
             v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
         return q, v
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+    def tangent_part(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """(I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq."""
         if self.system.constraint is not None:
             slopes = jax.jacfwd(self._psi, 1)(t, q)
@@ -70,7 +70,7 @@ class GeneralEquations(Motion):
             slopes = self._slopes(t, q, v)
             plus, weight = self._plus(q, slopes)
             dv = dv - weight(plus @ (slopes @ dv))
-        return Tangential(dq, dv)
+        return TangentPart(dq, dv)
 
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Any:
         return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))

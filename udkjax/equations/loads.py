@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.constraints import State, bodies, vector
-from udkjax.equations.kinds import of_each
+from udkjax.equations.structure import evaluate_by_kind
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -51,5 +51,5 @@ def stated_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Floa
     return total.ravel()
 
 
-def _of_forces(say: Any, mechanism: Mechanism, q: State, v: State) -> Any:
-    return of_each(say, mechanism, [*mechanism.forces.values()], bodies(q), bodies(v))
+def _of_forces(function: Any, mechanism: Mechanism, q: State, v: State) -> Any:
+    return evaluate_by_kind(function, mechanism, [*mechanism.forces.values()], bodies(q), bodies(v))

@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, Vector
 from udkjax.equations.closing import STRIDE
 from udkjax.equations.formulations import Formulation, Rewritten, along
-from udkjax.equations.motion import MechanismMotion, Motion, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
@@ -45,8 +45,8 @@ class CoordinatePartitioning(Formulation):
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
 
-    def of(self, equations: Motion) -> "Partitioned":
-        if not isinstance(equations, MechanismMotion):
+    def of(self, equations: AbstractSystem) -> "Partitioned":
+        if not isinstance(equations, MechanismSystem):
             raise ValueError("CoordinatePartitioning takes a Mechanism: a ConstrainedSystem may have nonholonomic constraints")
         if equations.stabilized:
             raise ValueError(
@@ -62,17 +62,17 @@ class Partitioned(Rewritten):
     Without a partition held, it is chosen at each state anew.
     """
 
-    equations: MechanismMotion
+    equations: MechanismSystem
     formulation: CoordinatePartitioning
     dependent: Any = None  # which coordinates are, (n,), if that is held
 
     def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         """a = a_p + N z at the state as it is."""
-        return _accelerations(self.held(t, q, v), t, q, v)
+        return _accelerations(self.fix_partition(t, q, v), t, q, v)
 
     def rates(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """v and a at the state that the independent coordinates and velocities determine."""
-        held = self.held(t, q, v)
+        held = self.fix_partition(t, q, v)
         closed, v = _completed(held, t, q, v)
         # Farther from where the step predicts it, it might be another assembly of the mechanism: a shorter step is taken.
         near = self.equations.size(closed - q) <= STRIDE
@@ -80,9 +80,9 @@ class Partitioned(Rewritten):
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Solve the constraints for what is dependent."""
-        return _completed(self.held(t, q, v), t, q, v)
+        return _completed(self.fix_partition(t, q, v), t, q, v)
 
-    def held(self, t: Any, q: Vector, v: Vector) -> "Partitioned":
+    def fix_partition(self, t: Any, q: Vector, v: Vector) -> "Partitioned":
         """With the partition that pivoting chooses here."""
         if self.dependent is not None:
             return self

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, prepare_general
-from udkjax.equations.motion import Motion
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
@@ -35,10 +35,10 @@ def equations_of(
     baumgarte: Baumgarte | None = None,
     formulation: Formulation | None = None,
     analysis: Analysis | None = None,
-) -> Motion:
+) -> AbstractSystem:
     """Prepare the equations of motion of whatever has some, by the Udwadia-Kalaba equation or another formulation."""
     if isinstance(system, ConstrainedSystem):
-        equations: Motion = prepare_general(system, method, baumgarte)
+        equations: AbstractSystem = prepare_general(system, method, baumgarte)
     else:
         equations = prepare(system, method, baumgarte, analysis)
     return equations if formulation is None else formulation.of(equations)

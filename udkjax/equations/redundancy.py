@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from udkjax.equations.closing import STRIDE, DenseRows, close_position, is_closed
-from udkjax.equations.code import is_large
 from udkjax.equations.scales import known_scales
+from udkjax.equations.structure import is_large
 from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ class KinematicRows(DenseRows):
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
         length[length == 0.0] = 1.0
-        return self._run("psi", t, q, q), length, D / length[:, None]
+        return self._run(self._programs.psi, t, q, q), length, D / length[:, None]
 
     def parts_of(self, positions: list[Position]) -> list[tuple[np.ndarray, list[Position]]]:
         """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations.elements import Row, applied, differentiated, has_pieces, piece, scalar
-from udkjax.equations.kinds import Alike, alike
+from udkjax.equations.structure import ElementStructure, element_structure
 from udkjax.expressions import Graph, Scalar
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
@@ -74,15 +74,15 @@ class ScalarEquations:
         return [self._constraint(element, scene[name]) for name, element in self.mechanism.constraints.items()]
 
     def _constraint(self, element: Any, scalars: Any):
-        moving = self._moving(element)
-        state = [self.t, [self.q[k] for k in moving], [self.v[k] for k in moving]]
-        value, rows, rate, gamma = differentiated(self.graph, self._alike(element), jax.tree.leaves(scalars), *state)
-        return value, [{moving[k]: entry for k, entry in row.items()} for row in rows], rate, gamma
+        places = self._coordinates(element)
+        state = [self.t, [self.q[k] for k in places], [self.v[k] for k in places]]
+        value, rows, rate, gamma = differentiated(self.graph, self._structure(element), jax.tree.leaves(scalars), *state)
+        return value, [{places[k]: entry for k, entry in row.items()} for row in rows], rate, gamma
 
-    def _alike(self, element: Any) -> Alike:
-        return alike(element, self.mechanism.frames_of(element))
+    def _structure(self, element: Any) -> ElementStructure:
+        return element_structure(element, self.mechanism.frames_of(element))
 
-    def _moving(self, element: Any) -> list[int]:
+    def _coordinates(self, element: Any) -> list[int]:
         return [self.start[name] + k for name in self.mechanism.frames_of(element) if name != GROUND for k in range(3)]
 
     # --- masses and loads
@@ -98,7 +98,7 @@ class ScalarEquations:
         total = [self.graph.constant(0.0)] * len(self.q)
         for name, element in self.mechanism.forces.items():
             loads, _ = self._force(element, self.scene.forces[name])
-            for k, load in zip(self._moving(element), loads, strict=True):
+            for k, load in zip(self._coordinates(element), loads, strict=True):
                 total[k] = total[k] + load
         return total
 
@@ -128,9 +128,9 @@ class ScalarEquations:
         return sum(stored, self.graph.constant(0.0)) - sum(weights, self.graph.constant(0.0))
 
     def _force(self, element: Any, scalars: Any) -> tuple[list[Scalar], Scalar]:
-        moving = self._moving(element)
-        state = [self.t, [self.q[k] for k in moving], [self.v[k] for k in moving]]
-        return applied(self.graph, self._alike(element), jax.tree.leaves(scalars), *state)
+        places = self._coordinates(element)
+        state = [self.t, [self.q[k] for k in places], [self.v[k] for k in places]]
+        return applied(self.graph, self._structure(element), jax.tree.leaves(scalars), *state)
 
     @cached_property
     def pieces(self) -> list[Scalar]:
@@ -141,9 +141,9 @@ class ScalarEquations:
         found = []
         for element, scalars in pairs:
             if has_pieces(element):
-                moving = self._moving(element)
-                state = self.t, [self.q[k] for k in moving], [self.v[k] for k in moving]
-                found.append(piece(self.graph, self._alike(element), jax.tree.leaves(scalars), *state))
+                places = self._coordinates(element)
+                state = self.t, [self.q[k] for k in places], [self.v[k] for k in places]
+                found.append(piece(self.graph, self._structure(element), jax.tree.leaves(scalars), *state))
         return found
 
 

@@ -13,7 +13,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from udkjax.equations.code import as_vector, code, is_large, scalars, structure
+from udkjax.equations.loop_programs import loop_programs
+from udkjax.equations.scalar_programs import scene_programs
+from udkjax.equations.structure import is_large, leaves_as_scalars, leaves_as_vector
+from udkjax.expressions import Program
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -69,37 +72,39 @@ def traced_scales(mechanism: Mechanism) -> Scales:
 
 def _small(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
     """Where Psi_q has entries, their values, a_F, Psi_t and gamma at the initial guess, by the scene's programs."""
-    programs = code(mechanism, (), False, None)
+    programs = scene_programs(mechanism)
     rows, columns = programs.pattern.shape
-    given = [*scalars(jax.tree.leaves(mechanism)), 0.0, 0.0]
+    given = [*leaves_as_scalars(jax.tree.leaves(mechanism)), 0.0, 0.0]
     constants = programs.prologue([*map(float, given)] if xp is np else given)
 
-    def run(name: str, v: Any) -> Any:
-        state = [0.0, *scalars([q]), *scalars([v])] if xp is jnp else [0.0, *q.tolist(), *v.tolist()]
-        return xp.stack([xp.asarray(x, float) for x in programs.program(name)([*constants, *state])])
+    def run(program: Program, v: Any) -> Any:
+        state = [0.0, *leaves_as_scalars([q]), *leaves_as_scalars([v])] if xp is jnp else [0.0, *q.tolist(), *v.tolist()]
+        return xp.stack([xp.asarray(x, float) for x in program([*constants, *state])])
 
     if not rows:
-        free, root = xp.split(run("rows", v), 2)
+        free, root = xp.split(run(programs.equation_terms, v), 2)
         none = xp.zeros(0)
         return (np.zeros(0, int), np.zeros(0, int)), none, free, none, none
     slots = programs.pattern.slots
-    values, b, free, root = xp.split(run("rows", v), [slots, slots + rows, slots + rows + columns])
+    values, b, free, root = xp.split(run(programs.equation_terms, v), [slots, slots + rows, slots + rows + columns])
     psi_q = programs.pattern.dense(values, xp) / root
     places = np.nonzero(programs.pattern.dense(np.ones(slots), np))
-    return places, psi_q[places], free, run("psi_dot", 0 * v), b + psi_q @ free
+    return places, psi_q[places], free, run(programs.psi_dot, 0 * v), b + psi_q @ free
 
 
 def _large(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
     """The same of a large scene, by its loops."""
-    from udkjax.equations.large_code import large_code
-
-    found = large_code(*structure(mechanism), (), False, "drop")
-    row, column, *_ = found.entries
-    numbers = as_vector(jax.tree.leaves(mechanism))
-    _, rate, values = found.geometry(numbers, xp)(0.0, q, 0 * v)
+    programs = loop_programs(mechanism)
+    row, column, *_ = programs.d_entries
+    numbers = leaves_as_vector(jax.tree.leaves(mechanism))
+    _, rate, values = programs.geometry(numbers, xp)(0.0, q, 0 * v)
     psi_q = values * xp.sqrt(mass_of(mechanism, xp))[column]
-    free, b = found.loaded(numbers, xp)(0.0, q, v)
-    gamma = np.bincount(row, psi_q * free[column], found.m) if xp is np else jnp.zeros(found.m).at[row].add(psi_q * free[column])
+    free, b = programs.loads(numbers, xp)(0.0, q, v)
+    gamma = (
+        np.bincount(row, psi_q * free[column], programs.row_count)
+        if xp is np
+        else jnp.zeros(programs.row_count).at[row].add(psi_q * free[column])
+    )
     return (row, column), psi_q, free, rate, b + gamma
 
 

@@ -17,10 +17,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from udkjax.equations.closing import close_position, is_closed
-from udkjax.equations.code import as_vector, structure
-from udkjax.equations.large_code import large_code
+from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.redundancy import SAMPLES, tick
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
+from udkjax.equations.structure import leaves_as_vector
 from udkjax.pinv.sparse import minimum_degree
 from udkjax.scene.mechanism import Mechanism
 
@@ -100,9 +100,9 @@ class SparseRows:
     """
 
     def __init__(self, mechanism: Mechanism, kinematic: bool = False):
-        self._code = code = large_code(*structure(mechanism), (), False, "drop")
-        self.count, self.size = code.m, code.n
-        self.names = code.layout.row_names
+        self._programs = programs = loop_programs(mechanism)
+        self.count, self.size = programs.row_count, programs.coordinate_count
+        self.names = programs.row_names
         self.samples = SAMPLES if self.count <= MANY else SAMPLES // 3
         self.scales = jax.tree.map(np.asarray, known_scales(mechanism))
         root = 1 / np.sqrt(mass_of(mechanism, np))
@@ -110,12 +110,12 @@ class SparseRows:
         self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
         self._stretch = self.metric / root
         self.tick = tick(self.scales)
-        self._evaluate = code.geometry(as_vector(jax.tree.leaves(mechanism)), np)
+        self._evaluate = programs.geometry(leaves_as_vector(jax.tree.leaves(mechanism)), np)
 
     @cached_property
     def _order(self) -> list[int]:
         rows: list[set[int]] = [set() for _ in range(self.count)]
-        for i, k in zip(*self._code.entries[:2], strict=True):
+        for i, k in zip(*self._programs.d_entries[:2], strict=True):
             rows[i].add(k // 3)
         return minimum_degree(rows)
 
@@ -126,7 +126,7 @@ class SparseRows:
         return psi, length, D
 
     def _scaled(self, values: np.ndarray) -> tuple[Any, np.ndarray]:
-        row, column, *_ = self._code.entries
+        row, column, *_ = self._programs.d_entries
         D = csr_array((values * self._stretch[column], (row, column)), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
         length[length == 0.0] = 1.0

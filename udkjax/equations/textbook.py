@@ -10,15 +10,15 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.abstract_system import MechanismSystem, TangentPart, Vector
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.motion import MechanismMotion, Tangential, Vector
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
 
 
-class TextbookEquations(MechanismMotion):
+class TextbookEquations(MechanismSystem):
     """The equations of motion of one mechanism by one pseudoinverse.
 
     Coordinates and velocities are flat vectors (3 bodies,): x, y, angle of each body in turn. Rows are weighted by
@@ -47,11 +47,11 @@ class TextbookEquations(MechanismMotion):
         """One Newton step in position and one in velocity: at a state on the manifold it has the tangents of a projection."""
         return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+    def tangent_part(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
         mechanism, w = self.mechanism, self.weights
         of = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
-        return Tangential(*of(jnp.stack([dq, dv])))
+        return TangentPart(*of(jnp.stack([dq, dv])))
 
     def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows."""
@@ -80,15 +80,18 @@ class TextbookEquations(MechanismMotion):
         """Kinetic and potential energy (J)."""
         return loads.kinetic_energy(self.mechanism, v), loads.potential_energy(self.mechanism, t, q, v)
 
-    def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Any, Array, Vector]:
-        """D^+, what it is to be applied to, and M^(-1/2): of "rows" b, of "closure" Psi, of "rate" Psi_dot; rows are weighted."""
+    def linearized_position(self, t: Any, q: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
         mechanism, w = self.mechanism, self.weights
-        residual = {
-            "rows": lambda: uk.b(mechanism, t, q, v, self.baumgarte, w),
-            "closure": lambda: uk.weighted(w, constraints.psi(mechanism, t, q)),
-            "rate": lambda: uk.weighted(w, constraints.psi_dot(mechanism, t, q, v)),
-        }
-        return uk.plus(self.method, uk.D(mechanism, t, q, w)), residual[name](), uk.root(mechanism)
+        return (
+            uk.plus(self.method, uk.D(mechanism, t, q, w)),
+            uk.weighted(w, constraints.psi(mechanism, t, q)),
+            uk.root(mechanism),
+        )
+
+    def linearized_velocity(self, t: Any, q: Vector, v: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
+        mechanism, w = self.mechanism, self.weights
+        rate = uk.weighted(w, constraints.psi_dot(mechanism, t, q, v))
+        return uk.plus(self.method, uk.D(mechanism, t, q, w)), rate, uk.root(mechanism)
 
     @property
     def weights(self) -> Float[Array, "m"]:

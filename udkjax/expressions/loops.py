@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from udkjax.expressions.emit import Program
+from udkjax.expressions.graph import Graph, Scalar
 
 SET, ADD, LEAST = "set", "add", "least"  # an output replaces what is there, is added to it, or the smaller of both stays
 
@@ -31,6 +32,34 @@ class Kernel:
         self.program, self.inputs, self.outputs = program, list(inputs), list(outputs)
         used = {s.array for x, s in zip(program.inputs, inputs, strict=True) if program.uses(x)}
         self.arrays = sorted(used | {s.array for s in outputs})
+
+
+class KernelWriter:
+    """Writes a kernel: what it reads, what it computes in `graph`, and where it writes that to."""
+
+    def __init__(self, graph: Graph | None = None):
+        self.graph = Graph() if graph is None else graph
+        self._inputs: dict[Scalar, Slot] = {}
+        self._outputs: list[tuple[Scalar, Slot]] = []
+
+    def read(self, array: str, base: int | None, offset: int = 0) -> Scalar:
+        """Read a number of an array."""
+        s = self.graph.input((array, base, offset), array)
+        self._inputs[s] = Slot(array, base, offset)
+        return s
+
+    def bind(self, s: Scalar, array: str, base: int | None, offset: int = 0) -> None:
+        """Read an input that the graph has already."""
+        self._inputs[s] = Slot(array, base, offset)
+
+    def write(self, s: Scalar, array: str, base: int | None, offset: int = 0, how: str = SET) -> None:
+        """Write a number to an array."""
+        self._outputs.append((s, Slot(array, base, offset, how)))
+
+    def kernel(self) -> Kernel:
+        """Return what was written."""
+        program = Program(self.graph, list(self._inputs), [s for s, _ in self._outputs])
+        return Kernel(program, list(self._inputs.values()), [slot for _, slot in self._outputs])
 
 
 class Loop(NamedTuple):

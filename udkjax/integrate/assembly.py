@@ -31,10 +31,10 @@ from udkjax.equations.closing import (
     damped_step,
     is_closed,
 )
-from udkjax.equations.code import is_large
 from udkjax.equations.constraints import psi
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
+from udkjax.equations.structure import is_large
 from udkjax.equations.textbook import prepare
 from udkjax.integrate import by_native
 from udkjax.integrate.derivatives import Function, Linear, Mask, those

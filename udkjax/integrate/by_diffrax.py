@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from udkjax.equations.motion import Motion
+from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.first_step import first_step
@@ -58,7 +58,7 @@ def by_diffrax(
     return Raw(q, v, violated, reached, status, t_end[0], end[0], *steps, right_hand_sides)
 
 
-def derivative(t: Any, y: Float[Array, "2n"], equations: Motion) -> Float[Array, "2n"]:
+def derivative(t: Any, y: Float[Array, "2n"], equations: AbstractSystem) -> Float[Array, "2n"]:
     """(v, a)."""
     return jnp.concatenate(equations.rates(t, *jnp.split(y, 2)))
 

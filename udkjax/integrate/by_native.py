@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.code import Code, code, is_large, scalars, structure
 from udkjax.equations.elements import has_pieces
-from udkjax.equations.large_code import LargeCode, large_code
+from udkjax.equations.loop_programs import LoopPrograms, loop_programs
+from udkjax.equations.scalar_programs import EliminationPrograms, elimination_programs, scene_programs
 from udkjax.equations.scales import Scales
+from udkjax.equations.structure import is_large, leaves_as_scalars
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.tableau import is_explicit, method_of
@@ -23,6 +24,7 @@ from udkjax.native.steps import DONE, WITH_CARE
 from udkjax.native.tableau import EULER
 from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, SETTINGS
 from udkjax.pinv import Auto, Elimination
+from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
 # --- closing
@@ -115,8 +117,7 @@ def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: An
 
 
 def _closing(mechanism: Mechanism, moving: tuple[bool, ...] | None = None, mode: str = "closing") -> Kind:
-    large = is_large(mechanism)
-    programs = large_code(*structure(mechanism), (), False, "drop") if large else code(mechanism, (), False, None)
+    programs = loop_programs(mechanism) if is_large(mechanism) else scene_programs(mechanism)
     return Kind(programs, Tableau(EULER), projected=False, breaks=False, moving=moving, mode=mode)
 
 
@@ -172,7 +173,7 @@ def recorded(problem: Any, moving: Any) -> Raw:
 def rows_kept(problem: Any) -> int:
     """How many rows elimination takes."""
     equations = problem.equations
-    return len(equations.scales.rows) - len(_left_out(equations))
+    return len(equations.scales.rows) - len(equations.redundant or ())
 
 
 def serves_derivatives(moving: Any) -> bool:
@@ -189,9 +190,9 @@ def _constants(equations: TextbookEquations, code: Any) -> Any:
     def constants(arrays: Any) -> Any:
         mechanism, baumgarte = eqx.combine(arrays, rest)
         numbers = [*jax.tree.leaves(mechanism), *_gains(baumgarte), jnp.zeros(2)]
-        if isinstance(code, LargeCode):
+        if isinstance(code, LoopPrograms):
             return code.constants_of(_vector(numbers, jnp))
-        return [jnp.asarray(c) for c in code.prologue(scalars(numbers))]
+        return [jnp.asarray(c) for c in code.prologue(leaves_as_scalars(numbers))]
 
     return constants, arrays
 
@@ -210,7 +211,7 @@ def pushed(problem: Any, moving: Any, change: Any) -> tuple[Raw, tuple[Array, Ar
     constants, arrays = _constants(problem.equations, kind.code)
     still = jax.tree.map(jnp.zeros_like, arrays)
     dconstants = jax.jvp(constants, (arrays,), (eqx.combine(_numbers_of(change), still),))[1]
-    if isinstance(kind.code, LargeCode):
+    if isinstance(kind.code, LoopPrograms):
         along = dconstants if any(kind.moving or ()) else jnp.zeros(0)
     else:
         along = _vector([jnp.zeros(0), *(dc for dc, m in zip(dconstants, kind.moving or (), strict=True) if m)], jnp)
@@ -229,7 +230,7 @@ def pulled(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
     cbar, qbar, vbar = native_p.bind(*_inputs(problem, kind.code), *bars, kind=kind, times=len(problem.ts))[len(OUTPUTS) :]
     constants, arrays = _constants(problem.equations, kind.code)
     values, back = jax.vjp(constants, arrays)
-    if isinstance(kind.code, LargeCode):
+    if isinstance(kind.code, LoopPrograms):
         of_constants: Any = cbar[0] if any(kind.moving or ()) else jnp.zeros_like(values)
     else:
         found = iter(cbar[0])
@@ -243,37 +244,29 @@ def pulled(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
 
 def _moving(problem: Any, moving: Any) -> tuple[bool, ...]:
     """Of the constants of the code of derivatives: which depend on what is moving. Loops do not tell them apart."""
-    code = _watching(_code(problem))
+    code = _programs(problem).for_derivatives
     numbers, which = (jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_numbers_of(problem), _numbers_of(moving)))
     moves = [m is True for x, m in zip(numbers, which, strict=True) if x is not None for _ in range(np.size(x))]
-    if isinstance(code, LargeCode):
+    if isinstance(code, LoopPrograms):
         return (any(moves),) * len(code.constants)
     return code.prologue.depends_on([*moves, False, False])
 
 
-def _watching(code: Code) -> Code:
-    """The code of derivatives: it leaves out what depends on other rows, where a step is taken with care."""
-    return code.watching
-
-
-def _left_out(equations: TextbookEquations) -> tuple[int, ...]:
-    return equations.redundant or ()
-
-
-def _code(problem: Any) -> Any:
-    """The programs of a problem's scene."""
-    equations = problem.equations
-    drops, large = isinstance(equations.method, Elimination), is_large(equations.mechanism)
-    elimination = "drop" if drops else "watch" if large else "check"
-    settings = _left_out(equations), equations.baumgarte is not None, elimination
-    return large_code(*structure(equations.mechanism), *settings) if large else code(equations.mechanism, *settings)
+def _programs(problem: Problem) -> EliminationPrograms | LoopPrograms:
+    """The programs of a problem's scene: with pivots that are refused, where the method falls back on a rank-revealing one."""
+    equations: Any = problem.equations
+    mechanism, rows, baumgarte = equations.mechanism, equations.redundant or (), equations.baumgarte is not None
+    drops = isinstance(equations.method, Elimination)
+    if is_large(mechanism):
+        return loop_programs(mechanism, rows, baumgarte, RankPolicy.DROP if drops else RankPolicy.FALL_BACK)
+    return elimination_programs(mechanism, rows, baumgarte, RankPolicy.DROP if drops else RankPolicy.REFUSE)
 
 
 def _kind(problem: Any, moving: tuple[bool, ...] | None = None, mode: str = "run") -> Kind:
-    programs, mechanism = _code(problem), problem.equations.mechanism
+    programs, mechanism = _programs(problem), problem.equations.mechanism
     breaks = problem.breakpoints is not None or _has_pieces(mechanism)
     method = Tableau(method_of(problem.solver))
-    return Kind(programs if moving is None else _watching(programs), method, problem.projected, breaks, moving, mode)
+    return Kind(programs if moving is None else programs.for_derivatives, method, problem.projected, breaks, moving, mode)
 
 
 def _has_pieces(mechanism: Mechanism) -> bool:
@@ -285,14 +278,14 @@ def _inputs(problem: Any, code: Any = None, xp: Any = jnp) -> list[Any]:
     equations: TextbookEquations = problem.equations
     method: Any = equations.method
     rank_tol = method.rank_tol
-    least = method.branch_tol if isinstance(method, Auto) else rank_tol**2
-    programs = _code(problem) if code is None else code
-    drop = (WITH_CARE * rank_tol) ** 2 if programs.elimination == "watch" else least
+    safe_tol = method.branch_tol if isinstance(method, Auto) else rank_tol**2
+    programs = _programs(problem) if code is None else code
+    drop_tol = (WITH_CARE * rank_tol) ** 2 if programs.policy is RankPolicy.FALL_BACK else safe_tol
     first = 0.0 if problem.h is None else problem.h
     care = WITH_CARE * rank_tol
     settings = [problem.rtol, problem.atol, problem.smallest, first, problem.length, problem.rate, care, problem.max_steps]
     given = {
-        "numbers": _vector([*jax.tree.leaves(equations.mechanism), *_gains(equations.baumgarte), drop, least], xp),
+        "numbers": _vector([*jax.tree.leaves(equations.mechanism), *_gains(equations.baumgarte), drop_tol, safe_tol], xp),
         "ts": problem.ts,
         "q": problem.q,
         "v": problem.v,

@@ -29,7 +29,7 @@ class Constrained(Wrapper):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         if self.projected and not isinstance(self.solver, Multistep):
             made_jump = jnp.array(True)
-        equations, solver = args.held(t0, *jnp.split(y0, 2)), self.solver
+        equations, solver = args.fix_partition(t0, *jnp.split(y0, 2)), self.solver
         judged = None if equations.independent is None else jnp.tile(equations.independent, 2)
         if judged is not None:
             solver = _judging(solver, judged)

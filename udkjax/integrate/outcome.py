@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.motion import Motion
+from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.problem import Raw
 from udkjax.integrate.solution import Result
 from udkjax.native.steps import AHEAD, DONE, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
@@ -36,7 +36,7 @@ def outcome(run: Run, xp: Any = jnp) -> tuple[Array, Array, Bool[Array, "T"]]:
     return code, xp.where(started, time, run.ts[0]), reached & (started | first)
 
 
-def stopped(equations: Motion, span: Array, status: Array, t: Array, y: Array) -> Array:
+def stopped(equations: AbstractSystem, span: Array, status: Array, t: Array, y: Array) -> Array:
     """The status of a run that ended in (t, y), and whether its step became too small because of what is not finite there.
 
     Or right ahead.

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.equations.motion import Motion
+from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.undifferentiated import undifferentiated
 
 
 class Problem(eqx.Module):
     """What to integrate: q'' = a(t, q, v) of some equations from ts[0] to ts[-1]. Its arrays may be batched."""
 
-    equations: Motion
+    equations: AbstractSystem
     ts: Float[Array, "T"]
     q: Float[Array, "n"]
     v: Float[Array, "n"]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.equations.motion import Motion, Tangential
+from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.native.steps import TAKEN_BACK
 
@@ -16,28 +16,28 @@ class Projection(eqx.Module):
     """Project positions and velocities after each step, by the smallest change in the mass metric (the default stabilization)."""
 
 
-def project(equations: Motion, t: Any, y: Float[Array, "2n"]) -> Float[Array, "2n"]:
+def project(equations: AbstractSystem, t: Any, y: Float[Array, "2n"]) -> Float[Array, "2n"]:
     """(q, v) on the manifold."""
     q, v = jnp.split(y, 2)
     return jnp.concatenate(equations.project(t, q, v))
 
 
-def lasting(equations: Motion, t: Any, q: Array, v: Array, dq: Array, dv: Array) -> Tangential:
+def lasting(equations: AbstractSystem, t: Any, q: Array, v: Array, dq: Array, dv: Array) -> TangentPart:
     """The errors dq and dv of a step that ends in q and v, with what projection takes back of them counted by `TAKEN_BACK`."""
     equations, t, q, v, dq, dv = undifferentiated((equations, t, q, v, dq, dv))
-    left = equations.tangential(t, q, v, dq, dv)
-    return Tangential(left.dq + TAKEN_BACK * (dq - left.dq), left.dv + TAKEN_BACK * (dv - left.dv))
+    left = equations.tangent_part(t, q, v, dq, dv)
+    return TangentPart(left.dq + TAKEN_BACK * (dq - left.dq), left.dv + TAKEN_BACK * (dv - left.dv))
 
 
-def violation(equations: Motion, t: Any, y: Float[Array, "2n"]) -> Float[Array, ""]:
+def violation(equations: AbstractSystem, t: Any, y: Float[Array, "2n"]) -> Float[Array, ""]:
     """The largest of any row of Psi over its scale, also of those that the method leaves out."""
     if not equations.constrained:
         return jnp.zeros(())
     equations, t, y = undifferentiated((equations, t, y))
-    return equations.excess(equations.violation(t, *jnp.split(y, 2))[0])
+    return equations.violation_size(equations.violation(t, *jnp.split(y, 2))[0])
 
 
-def project_all(equations: Motion, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:
+def project_all(equations: AbstractSystem, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:
     """States at many times, each returned to the manifold.
 
     An interpolated state lies off it by the error of the interpolation: it takes one projection more than a step.

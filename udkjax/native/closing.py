@@ -7,11 +7,12 @@ rows, weighted, by rotations (least_norm.py).
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from udkjax.equations.closing import HALVINGS, ITERATIONS, ROUNDING, STRIDE
-from udkjax.equations.code import Code
+from udkjax.equations.scalar_programs import ScenePrograms
 from udkjax.native.ir import INT, POINTER, Function, Value
 from udkjax.native.least_norm import least_norm
 from udkjax.native.tableau import EULER
@@ -26,7 +27,7 @@ class Closing(Trajectory):
 
     results = ("state", "residuals", "rank")
 
-    def __init__(self, code: Code, vector: int):
+    def __init__(self, code: Any, vector: int):
         super().__init__(Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector))
 
     def text(self) -> str:
@@ -38,8 +39,8 @@ class Closing(Trajectory):
         self._run()
         return self._joined()
 
-    def _wanted(self) -> list[str]:
-        return ["rows", "psi", "psi_dot"]
+    def _wanted(self, code: ScenePrograms) -> dict[str, Any]:
+        return {"equation_terms": code.equation_terms, "psi": code.psi, "psi_dot": code.psi_dot}
 
     def _solver(self):
         """The functions of D^+."""
@@ -131,7 +132,7 @@ class Closing(Trajectory):
         work, n, m, p = f.given["work"], self.n, self.m, self.places
         right, x = (Value(f, f.reserve("double", max(c, 1)), POINTER) for c in (m, n))
         self._call(f, "psi_dot" if kind == VELOCITY else "psi")
-        self._call(f, "rows")
+        self._call(f, "equation_terms")
         with f.each(m) as i:
             f.store(f.load(work, i + p["psi"]), right, i)
         f.call("solve", work, f.const(0, INT), right, x, s.care)

@@ -1,11 +1,12 @@
 """Closing a large mechanism, and its derivatives: with the corrections of its programs of loops.
 
 A correction q - M^(-1/2) D^T x, D D^T x = Psi, is by elimination of all rows, without those that depend on others. Its derivative
-is that of equations/large_code.py; the length of a step that is limited is a function of it, too.
+is that of equations/loop_programs.py; the length of a step that is limited is a function of it, too.
 """
 
 from typing import Any
 
+from udkjax.equations.loop_programs import LoopPrograms
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
 from udkjax.expressions.loops import Clear, LoopProgram
 from udkjax.native.closing import POSITION, VELOCITY, Closing
@@ -18,7 +19,7 @@ KINDS = {"position": (POSITION, "q"), "velocity": (VELOCITY, "v")}
 
 
 class ClosingByLoops(Closing):
-    """The text of a module that closes members, of `LargeCode` of all rows."""
+    """The text of a module that closes members, of `LoopPrograms` of all rows."""
 
     def __init__(self, code: Any, vector: int):
         super().__init__(code, vector)
@@ -26,8 +27,8 @@ class ClosingByLoops(Closing):
         self.corrections = {name: ByLoops(self, name) for name in KINDS}
         self.places.add("K", max(x.kept for x in self.corrections.values()))
 
-    def _wanted(self) -> list[str]:
-        return ["psi", "psi_dot", "rank"]
+    def _wanted(self, code: LoopPrograms) -> dict[str, Any]:
+        return {"psi": code.psi, "psi_dot": code.psi_dot, "rank": code.rank}
 
     def _solver(self):
         for correction in self.corrections.values():
@@ -111,7 +112,7 @@ class ReverseByLoops(ClosingByLoops, Back):
     def __init__(self, code: Any, moving: tuple[bool, ...], vector: int):
         super().__init__(code, vector)
         self.numbers_moving = sum(moving)
-        self._add_record(code.given)
+        self._add_record(code.prologue_input_count)
         for name in ("Y q", "Y v"):
             self.places.add(name, self.n)
 
@@ -121,7 +122,7 @@ class ReverseByLoops(ClosingByLoops, Back):
         at = {"numbers": ("numbers", 0), "constants": ("work", p["constants"])}
         at |= {f"{COTANGENT}numbers": ("work", p["numbersbar"]), f"{COTANGENT}constants": ("work", p["cbar"])}
         back = LoopDerivative(self.code.prologue.parts, ()).reverse.parts
-        program = LoopProgram([Clear(f"{COTANGENT}numbers", 0, self.code.given), *back])
+        program = LoopProgram([Clear(f"{COTANGENT}numbers", 0, self.code.prologue_input_count), *back])
         self.loops.write(program, "prologue_back", ("numbers", "work"), at)
         for name, correction in self.corrections.items():
             correction.reverse()

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from udkjax.equations.closing import ITERATIONS
-from udkjax.equations.code import Code
+from udkjax.equations.scalar_programs import ScenePrograms
 from udkjax.expressions import Program, cotangents, tangents
 from udkjax.native.closing import POSITION, VELOCITIES, VELOCITY, Closing
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
@@ -180,11 +180,11 @@ class Back(_Moving):
 class _WrittenOut(_Moving):
     """What both modes have in common: the change of the rows, and (A^+)^T."""
 
-    def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
+    def __init__(self, code: ScenePrograms, moving: tuple[bool, ...], vector: int):
         super().__init__(code, vector)
-        graph, e, outputs = code.graph, code.equations, code.outputs
+        graph, e = code.graph, code.equations
         self.slots = code.pattern.slots
-        self.changed = [*outputs["rows"][: self.slots], *e.psi, *e.psi_dot, *code.root]
+        self.changed = [*code.entries, *e.psi, *e.psi_dot, *code.root]
         inputs = code.prologue.inputs
         self.numbers = [s for s, m in zip(inputs, moving, strict=True) if m]
         self.numbers_moving = len(self.numbers)
@@ -220,7 +220,7 @@ class _WrittenOut(_Moving):
 
     def _corrected(self, f: Function, kind: int):
         """x and y of the correction at the state in X, with A in R."""
-        self._call(f, "rows")
+        self._call(f, "equation_terms")
         self._call(f, "psi_dot" if kind == VELOCITY else "psi")
         s = Lane(f, self.places)
         with f.each(self.m) as i:
@@ -241,7 +241,7 @@ class _WrittenOut(_Moving):
 class ClosingForward(_WrittenOut, Along):
     """Closing along directions, with its programs written out."""
 
-    def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
+    def __init__(self, code: ScenePrograms, moving: tuple[bool, ...], vector: int):
         super().__init__(code, moving, vector)
         self._add_ways()
         w = self.ways
@@ -311,7 +311,7 @@ class ClosingForward(_WrittenOut, Along):
 class ClosingReverse(_WrittenOut, Back):
     """Closing and back, with its programs written out."""
 
-    def __init__(self, code: Code, moving: tuple[bool, ...], vector: int):
+    def __init__(self, code: ScenePrograms, moving: tuple[bool, ...], vector: int):
         super().__init__(code, moving, vector)
         self._add_record(self.numbers_moving)
         for name, count in {"bars": len(self.changed), "w": self.n, "u": self.m}.items():

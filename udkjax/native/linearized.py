@@ -12,7 +12,8 @@ corrections that close a mechanism, of its `position` and of its `velocity`, as 
 
 from typing import Any, Protocol
 
-from udkjax.equations.large_code import LargeCode
+from udkjax.equations.implicit_derivative import acceleration_derivative, projection_derivative
+from udkjax.equations.loop_programs import DifferentiableProgram, LoopPrograms
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
 from udkjax.expressions.loops import Clear, LoopProgram
 from udkjax.native.program import Place, numbered
@@ -40,7 +41,7 @@ class Linearized(Protocol):
 
 def linearized(trajectory: Any, name: str) -> Linearized:
     """The one or the other, as the code of a trajectory is."""
-    return (ByLoops if isinstance(trajectory.code, LargeCode) else WrittenOut)(trajectory, name)
+    return (ByLoops if isinstance(trajectory.code, LoopPrograms) else WrittenOut)(trajectory, name)
 
 
 class WrittenOut:
@@ -48,15 +49,16 @@ class WrittenOut:
 
     def __init__(self, trajectory: Any, name: str):
         self._in, self._name, self._suffix = trajectory, name, SUFFIXES[name]
-        self._derivative = trajectory.code.derivative(name, (*trajectory.moving, False, True, True))  # the constants, t, q, v
-        self.kept = len(self._derivative.kept)
+        derivative = acceleration_derivative if name == "accelerations" else projection_derivative
+        self._derivative = derivative(trajectory.code, (*trajectory.moving, False, True, True))  # the constants, t, q, v
+        self.kept = len(self._derivative.stored)
 
     def evaluation(self):
         t = self._in
         pointers, outputs = ("work", "kept"), numbered("kept", self.kept)
         if self._name == "accelerations":
             pointers, outputs = ("work", "out", "kept"), [*numbered("out", t.n), *t._work("safe", 1), *outputs]
-        t._write(self._derivative.evaluation(self._name), f"evaluation{self._suffix}", pointers, t._state(), outputs)
+        t._write(self._derivative.evaluation, f"evaluation{self._suffix}", pointers, t._state(), outputs)
 
     def forward(self):
         t, w = self._in, self._in.ways
@@ -79,22 +81,31 @@ class WrittenOut:
         t._write(self._derivative.reverse, f"reverse{self._suffix}", pointers, inputs, found)
 
 
+def _differentiable(programs: LoopPrograms, name: str) -> DifferentiableProgram:
+    return {
+        "accelerations": lambda: programs.differentiable_accelerations,
+        "projection": lambda: programs.differentiable_projection,
+        "position": lambda: programs.differentiable_newton_q,
+        "velocity": lambda: programs.differentiable_newton_v,
+    }[name]()
+
+
 class ByLoops:
     """Loops, which keep all arrays that they leave behind."""
 
     def __init__(self, trajectory: Any, name: str):
         self._in, self._name, self._suffix = trajectory, name, SUFFIXES[name]
-        self._evaluated = trajectory.code.evaluated[name]
+        self._evaluated = _differentiable(trajectory.code, name)
         self._derivative = self._evaluated.derivative([] if trajectory.count else ["constants"])
         used = self._evaluated.program.arrays
-        self._sizes = {x: count for x, count in trajectory.code.kept.items() if x in used}
+        self._sizes = {x: count for x, count in trajectory.code.stored_sizes.items() if x in used}
         self._at: dict[str, Place] = {}
         self.kept, places = 0, trajectory.places
         for x, count in self._sizes.items():
             self._at[x] = ("kept", self.kept)
             self.kept += count
         if "along" not in places.places:  # changes or cotangents of what is kept, of both programs
-            places.add("along", sum(trajectory.code.kept.values()))
+            places.add("along", sum(trajectory.code.stored_sizes.values()))
         names = {"t": "X t", "q": "X q", "v": "X v", "constants": "constants", "safe": "safe"}
         self._at |= {x: ("work", places[place]) for x, place in names.items()}
 

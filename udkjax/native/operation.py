@@ -17,7 +17,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from udkjax.equations.large_code import LargeCode
+from udkjax.equations.loop_programs import LoopPrograms
 from udkjax.native import machine
 from udkjax.native.closing import Closing
 from udkjax.native.closing_by_loops import ClosingByLoops, ForwardByLoops, ReverseByLoops
@@ -34,7 +34,7 @@ FEW = 2  # members up to which one follows another: eight lanes take as long as 
 class Kind(NamedTuple):
     """Which trajectory: all that its code depends on but the number of lanes."""
 
-    code: Any  # `Code` or `LargeCode`
+    code: Any  # `ScenePrograms` or `LoopPrograms`
     method: "Tableau"
     projected: bool
     breaks: bool
@@ -64,7 +64,7 @@ CLOSING_BY_LOOPS: dict[str, Any] = {"closing forward": ForwardByLoops, "closing 
 @lru_cache(maxsize=256)
 def written(kind: Kind, width: int) -> Trajectory:
     """A kind of trajectory in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it."""
-    loops = isinstance(kind.code, LargeCode)
+    loops = isinstance(kind.code, LoopPrograms)
     if kind.mode == "closing":
         trajectory: Trajectory = (ClosingByLoops if loops else Closing)(kind.code, machine.lanes())
     elif kind.mode in CLOSING:

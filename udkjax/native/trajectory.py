@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.equations.code import Code
-from udkjax.equations.large_code import LargeCode
+from udkjax.equations.loop_programs import LoopPrograms
+from udkjax.equations.scalar_programs import EliminationPrograms, ScenePrograms
 from udkjax.expressions import Program
 from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM, least_norm
@@ -88,7 +88,7 @@ INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the 
 class Plan:
     """What a trajectory's code depends on."""
 
-    code: Any  # `Code` or `LargeCode`
+    code: Any  # `ScenePrograms` or `LoopPrograms`
     method: Method
     projected: bool
     breaks: bool
@@ -187,7 +187,7 @@ class Trajectory:
 
     def __init__(self, plan: Plan):
         self.plan, self.code, self.method = plan, plan.code, plan.method
-        code, n, m = plan.code, plan.code.n, plan.code.m
+        code, n, m = plan.code, plan.code.coordinate_count, plan.code.row_count
         self.n, self.m = n, m
         self.constants = len(code.constants)
         p = self.places = Places(plan.width, plan.vector)
@@ -206,15 +206,15 @@ class Trajectory:
             p.add(f"N{k}", n)
         p.add("rows", m)
         p.add("psi", m)
-        p.add("R", code.made_of)
-        self.pieces = len(code.outputs["pieces"]) if isinstance(code, Code) and plan.breaks else 0
+        p.add("R", code.term_count)
+        self.pieces = len(code.equations.pieces) if isinstance(code, ScenePrograms) and plan.breaks else 0
         for name in ("G", "G0"):
             p.add(name, self.pieces)
-        if isinstance(code, LargeCode):
+        if isinstance(code, LoopPrograms):
             for name, count in code.scratch.items():
                 p.add(name, count)
             if self.cares:
-                for name, count in code.careful.scratch.items():
+                for name, count in code.with_all_rows.scratch.items():
                     p.add(f"careful {name}", count)
                 for name in ("careful v", "careful a"):
                     p.add(name, n)
@@ -223,7 +223,7 @@ class Trajectory:
         self.loops = LoopWriter(plan.width)
         self.stage_accelerations = ["P3 a", *(f"A{i}" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
-        self.drop = code.drop_place
+        self.drop = code.drop_tol_index
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
@@ -236,7 +236,7 @@ class Trajectory:
         self._between()
         self._outputs()
         if self.cares:
-            if isinstance(self.code, LargeCode):
+            if isinstance(self.code, LoopPrograms):
                 self._care_by_loops()
             else:
                 self.functions.append(least_norm())
@@ -281,7 +281,7 @@ class Trajectory:
     @property
     def doubts(self) -> bool:
         """Whether pivots may be too small to be trusted."""
-        return self.code.elimination in ("check", "watch")
+        return isinstance(self.code, EliminationPrograms | LoopPrograms) and self.code.policy.reports
 
     @property
     def cares(self) -> bool:
@@ -292,60 +292,69 @@ class Trajectory:
 
     def _programs(self):
         code, n = self.code, self.n
-        if isinstance(code, LargeCode):
+        if isinstance(code, LoopPrograms):
             self._loop_programs(code)
             return
-        state, changes = self._state(), [*self._work("X dq", n), *self._work("X dv", n)]
-        safe = self._work("safe", 1)
+        state, changes, safe = self._state(), [*self._work("X dq", n), *self._work("X dv", n)], self._work("safe", 1)
         outputs = {
             "accelerations": [*numbered("out", n), *safe],
-            "closer": [*self._work("C", n), *safe],
-            "arrival": [*self._work("O v", n), *self._work("O a", n), *safe],
-            "finish": [
+            "newton_q": [*self._work("C", n), *safe],
+            "project_and_accelerate": [*self._work("O v", n), *self._work("O a", n), *safe],
+            "end_of_step": [
                 *(x for name in ("O v", "O a", "O dq", "O dv") for x in self._work(name, n)),
                 *self._work("distance", 1),
                 *safe,
             ],
-            "tangential": [*self._work("O dq", n), *self._work("O dv", n), *self._work("distance", 1)],
-            "output": [*self._work("O v", n), *self._work("psi", self.m)],
+            "tangent_part": [*self._work("O dq", n), *self._work("O dv", n), *self._work("distance", 1)],
+            "newton_v_and_psi": [*self._work("O v", n), *self._work("psi", self.m)],
             "psi": self._work("psi", self.m),
-            "rows": self._work("R", len(code.outputs["rows"])),
+            "equation_terms": self._work("R", code.term_count),
             "psi_dot": self._work("psi", self.m),
             "pieces": self._work("G", self.pieces),
         }
-        for name in self._wanted():
-            inputs = [*state, *changes] if name in ("tangential", "finish") else state
-            self._write(code.program(name), name, ("work", "out"), inputs, outputs[name])
+        for name, program in self._wanted(code).items():
+            inputs = [*state, *changes] if name in ("tangent_part", "end_of_step") else state
+            self._write(program, name, ("work", "out"), inputs, outputs[name])
         inputs = numbered("work", len(code.prologue.inputs))
         self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, numbered("out", self.constants)))
 
-    def _loop_programs(self, code: LargeCode):
+    def _loop_programs(self, code: LoopPrograms):
         found = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
-        found |= {"dq1": "O dq", "dv1": "O dv", "made_of": "R"}
-        at = {
-            x: ("work", self.places[found.get(x, x)])
-            for x in (*found, "constants", "psi", "safe", "distance", "rank", *code.scratch)
-        }
-        for name in self._wanted():
-            self.loops.write(
-                code.program(name), name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {})
-            )
+        found |= {"dq1": "O dq", "dv1": "O dv", "terms": "R"}
+        results = (*found, "constants", "psi", "safe", "distance", "rank")
+        at = {x: ("work", self.places[found.get(x, x)]) for x in (*results, *code.scratch)}
+        for name, program in self._wanted(code).items():
+            self.loops.write(program, name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {}))
         if self.cares:
-            places = {x: f"careful {x}" for x in code.careful.scratch}
+            every = code.with_all_rows
+            places = {x: f"careful {x}" for x in every.scratch}
             places |= {"v1": "careful v", "a": "careful a", "safe": "rank", "distance": "rank"}
             careful = at | {x: ("work", self.places[place]) for x, place in places.items()}
-            for name in ("accelerations", "closer", "arrival", "tangential"):
-                self.loops.write(code.careful.program(name), f"careful_{name}", ("work", "out"), careful)
+            for name, program in {
+                "accelerations": every.accelerations,
+                "newton_q": every.newton_q,
+                "project_and_accelerate": every.project_and_accelerate,
+                "tangent_part": every.tangent_part,
+            }.items():
+                self.loops.write(program, f"careful_{name}", ("work", "out"), careful)
         at = {"numbers": ("work", 0), "constants": ("out", 0)}
         self.loops.write(code.prologue, "prologue", ("work", "out"), at, width=1)
 
-    def _wanted(self) -> list[str]:
-        """The programs that it calls."""
-        wanted = ["accelerations", "rows", "psi", *(["pieces"] if self.pieces else [])]
+    def _wanted(self, code: Any) -> dict[str, Any]:
+        """The programs that it calls, by the names of their functions."""
+        wanted = {"accelerations": code.accelerations, "equation_terms": code.equation_terms, "psi": code.psi}
+        if self.pieces:
+            wanted["pieces"] = code.pieces
         if self.plan.projected:
-            wanted += ["closer", "arrival", "tangential"] if self.method.ends else ["closer", "finish"]
-            wanted += ["output"]
-        return wanted + (["psi_dot"] if self.cares and isinstance(self.code, Code) else [])
+            wanted["newton_q"] = code.newton_q
+            if self.method.ends:
+                wanted |= {"project_and_accelerate": code.project_and_accelerate, "tangent_part": code.tangent_part}
+            else:
+                wanted["end_of_step"] = code.end_of_step
+            wanted["newton_v_and_psi"] = code.newton_v_and_psi
+        if self.cares and isinstance(code, ScenePrograms):
+            wanted["psi_dot"] = code.psi_dot
+        return wanted
 
     def _write(self, program: Program, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]):
         self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs, name in RARE))
@@ -445,13 +454,13 @@ class Trajectory:
             if not method.ends:
                 self._errors(f, s, None, "X dq", "X dv")
             self._newton(f, s, NEWTON_STEPS)
-            self._call(f, "arrival" if method.ends else "finish")
+            self._call(f, "project_and_accelerate" if method.ends else "end_of_step")
             unsafe = (s.judged > 0.5) & (s.safe < 0.5)
             if self.cares:
                 s.where(unsafe, ok=0.0)
             if method.ends:
                 self._errors(f, s, "O a", "X dq", "X dv")
-                self._dropping(f, s, f.const(NOTHING_LEFT, DOUBLE, f.width), lambda: self._call(f, "tangential"))
+                self._dropping(f, s, f.const(NOTHING_LEFT, DOUBLE, f.width), lambda: self._call(f, "tangent_part"))
             if self.cares:
                 again = (s.judged > 0.5) & (s.careful > 0.5)
                 with f.if_(f.any_of(again)):
@@ -528,7 +537,7 @@ class Trajectory:
         """Newton's method to Psi = 0 of lanes that are `judged`, until it moves nothing but rounding errors."""
 
         def closer(moving: Value):
-            self._call(f, "closer")
+            self._call(f, "newton_q")
             s.where(moving & (s.safe < 0.5), ok=0.0)
 
         self._to_manifold(f, s, getattr(s, which) > 0.5, closer, steps)
@@ -942,12 +951,12 @@ class Trajectory:
         if self.plan.projected:
             tolerance = self._tolerance(f, s, "X v")
             threshold = f.min(f.max(TURNED / tolerance, NOTHING_LEFT), USELESS)
-            if self.code.elimination == "drop":
+            if not self.doubts:
                 threshold = None
 
             def close():
                 self._newton(f, s, OUTPUT_STEPS, which)
-                self._call(f, "output")
+                self._call(f, "newton_v_and_psi")
 
             close() if threshold is None else self._dropping(f, s, threshold, close)
         else:
@@ -1042,7 +1051,7 @@ class Trajectory:
 
         # The accelerations of lanes whose pivots were not safe.
         f, s = self._function("accelerate_carefully", [(POINTER, "work"), (POINTER, "out")])
-        self._call(f, "rows")
+        self._call(f, "equation_terms")
         for k, right, x in each_lane(f, (s.judged > 0.5) & (s.careful > 0.5) & (s.safe < 0.5)):
             solved(f, k, right, x, "R", slots)
             with f.each(n) as i:
@@ -1054,7 +1063,7 @@ class Trajectory:
         careful = (s.judged > 0.5) & (s.careful > 0.5)
 
         def closer(moving: Value):
-            self._call(f, "rows")
+            self._call(f, "equation_terms")
             self._call(f, "psi")
             with f.each(self.rowcount) as r:
                 self._put(f, "C", r, self._vector(f, "X q", r))
@@ -1064,7 +1073,7 @@ class Trajectory:
                     put(f, "C", k, i, number(f, "X q", k, i) - root(f, k, i) * f.load(x, i))
 
         self._to_manifold(f, s, careful & (s.ok < 0.5), closer)
-        self._call(f, "rows")
+        self._call(f, "equation_terms")
         doubtful = careful & (s.ok < 0.5)
         with f.if_(f.any_of(doubtful)):
             self._call(f, "psi_dot")
@@ -1097,12 +1106,12 @@ class Trajectory:
         self._take(f, (s.judged > 0.5) & (s.careful > 0.5) & (s.safe < 0.5), "careful a", "out")
         f, s = self._function("arrive_carefully", [(POINTER, "work"), (POINTER, "out")])
         careful, doubtful = (s.judged > 0.5) & (s.careful > 0.5), s.ok < 0.5
-        self._to_manifold(f, s, careful & doubtful, lambda moving: self._call(f, "careful_closer"))
+        self._to_manifold(f, s, careful & doubtful, lambda moving: self._call(f, "careful_newton_q"))
         with f.if_(f.any_of(careful & doubtful)):
-            self._call(f, "careful_arrival")
+            self._call(f, "careful_project_and_accelerate")
             for x in "va":
                 self._take(f, careful & doubtful, f"careful {x}", f"O {x}")
-        self._dropping(f, s, f.const(NOTHING_LEFT, DOUBLE, f.width), lambda: self._call(f, "careful_tangential"))
+        self._dropping(f, s, f.const(NOTHING_LEFT, DOUBLE, f.width), lambda: self._call(f, "careful_tangent_part"))
 
     def _take(self, f: Function, mask: Value, source: str, to: str):
         """An array of coordinates from another, in some lanes."""
@@ -1182,9 +1191,9 @@ class Trajectory:
                     v = self._vector(f, "P3 v", r)
                     self._put(f, "X q", r, f.fma(self._over(f, later), v, self._vector(f, "P3 q", r)))
                     self._put(f, "X v", r, v)
-                self._call(f, "rows")
+                self._call(f, "equation_terms")
                 total = f.variable(0.0)
-                with f.each(self.code.made_of) as i:
+                with f.each(self.code.term_count) as i:
                     x = f.load(work, i * width + p["R"] * width, width)
                     total.value = f.fma(x, 0.0, total.value)
                 s.where(stopped & total.value.is_not(0.0), code=NOT_FINITE)

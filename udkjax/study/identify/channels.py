@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.equations.motion import MechanismMotion
+from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.textbook import prepare
 from udkjax.pinv import SVD
 from udkjax.scene.bodies import GROUND, Frame, between
@@ -258,7 +258,7 @@ class _Motion:
     @cached_property
     def dynamics(self) -> _Dynamics:
         """Solve the equations of motion: only where a channel asks for it."""
-        equations: MechanismMotion = prepare(self.mechanism, SVD())
+        equations: MechanismSystem = prepare(self.mechanism, SVD())
         mass = jnp.stack([jnp.stack([body.mass, body.mass, body.inertia]) for body in self.mechanism.bodies.values()])
 
         def at(t, q, v):

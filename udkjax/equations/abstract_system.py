@@ -12,14 +12,14 @@ from udkjax.equations.scales import Scales
 Vector = Float[Array, "n"]
 
 
-class Tangential(NamedTuple):
+class TangentPart(NamedTuple):
     """The parts of small changes of q and v within the constraint manifold."""
 
     dq: Vector
     dv: Vector
 
 
-class Motion(eqx.Module):
+class AbstractSystem(eqx.Module):
     """The equations of motion of one system, ready to be evaluated. Coordinates and velocities are flat vectors (n,)."""
 
     @property
@@ -27,11 +27,11 @@ class Motion(eqx.Module):
     def constrained(self) -> bool:
         """Whether there are any constraints."""
 
-    def size(self, dq: Vector) -> Any:
+    def size(self, dq: Vector) -> Float[Array, ""]:
         """The largest of a change of coordinates, in units of the system's own. By default these are one."""
         return jnp.max(jnp.abs(dq), initial=0.0)
 
-    def excess(self, psi: Vector) -> Any:
+    def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
         """The largest violation of any row of Psi, in units of the system's own. By default these are one."""
         return jnp.max(jnp.abs(psi), initial=0.0)
 
@@ -44,24 +44,26 @@ class Motion(eqx.Module):
         """lambda of all rows, of minimum norm."""
 
     @abstractmethod
-    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
-        """M (n, n), F (n,), A (m, n) and c (m,) of M a + A^T lambda = F and A a = c, with Baumgarte's terms in c."""
+    def matrices(
+        self, t: Any, q: Vector, v: Vector
+    ) -> tuple[Float[Array, "n n"], Vector, Float[Array, "m n"], Float[Array, "m"]]:
+        """M, F, A and c of M a + A^T lambda = F and A a = c, with Baumgarte's terms in c."""
 
     @abstractmethod
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """q and v returned to the constraint manifold."""
 
-    def tangential(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> Tangential:
+    def tangent_part(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """What projection at q leaves of small changes of positions and velocities. By default: all of them."""
-        return Tangential(dq, dv)
+        return TangentPart(dq, dv)
 
     @abstractmethod
-    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Float[Array, "m"], Float[Array, "k"]]:
         """Psi and the residuals of the velocities, of all rows."""
 
     @abstractmethod
     def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
-        """Whether everything that the equations are made of is a number."""
+        """Whether all terms of the equations are finite."""
 
     # Where only some coordinates are integrated. By default it is all of them.
 
@@ -69,26 +71,26 @@ class Motion(eqx.Module):
         """What an integrator integrates: the rates of q and of v."""
         return v, self.accelerations(t, q, v)
 
-    def held(self, t: Any, q: Vector, v: Vector) -> Self:
-        """The same, with what is chosen at the start of a step held until its end."""
+    def fix_partition(self, t: Any, q: Vector, v: Vector) -> Self:
+        """The same system with what is chosen at the start of a step fixed until its end."""
         return self
 
     @property
-    def independent(self) -> Any:
-        """Which coordinates and velocities are integrated, and so under error control: booleans (n,), or None: all."""
+    def independent(self) -> Bool[Array, "n"] | None:
+        """Which coordinates and velocities are integrated, and so under error control; None: all."""
         return None
 
 
-class MechanismMotion(Motion):
+class MechanismSystem(AbstractSystem):
     """The equations of motion of a mechanism, whose coordinates and velocities are x, y, angle of each body in turn."""
 
     scales: eqx.AbstractVar[Scales]
 
-    def size(self, dq: Vector) -> Any:
+    def size(self, dq: Vector) -> Float[Array, ""]:
         """The largest of a change of coordinates: lengths over the characteristic length, angles in rad."""
         return self.scales.size(dq)
 
-    def excess(self, psi: Vector) -> Any:
+    def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
         """The largest violation of any row of Psi, each over the row's scale."""
         return self.scales.violation(psi)
 
@@ -103,7 +105,7 @@ class MechanismMotion(Motion):
         """Whether Baumgarte's terms are fed back."""
 
     @abstractmethod
-    def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+    def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Kinetic and potential energy (J)."""
 
     @abstractmethod
@@ -115,5 +117,9 @@ class MechanismMotion(Motion):
         """D and Psi, their rows weighted by `Scales.weights`, and M^(-1/2), of all rows."""
 
     @abstractmethod
-    def linearized(self, name: str, t: Any, q: Any, v: Any) -> tuple[Any, Array, Vector]:
-        """D^+ by the method, what it is to be applied to (`b`, `psi` or `psi_dot`), and M^(-1/2); rows are weighted."""
+    def linearized_position(self, t: Any, q: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
+        """D^+ by the method and Psi, their rows weighted, and M^(-1/2)."""
+
+    @abstractmethod
+    def linearized_velocity(self, t: Any, q: Vector, v: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
+        """D^+ by the method and Psi_dot, their rows weighted, and M^(-1/2)."""

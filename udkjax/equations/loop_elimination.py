@@ -1,0 +1,255 @@
+"""Elimination of D D^T of a large scene by loops: block by block, in an order of least fill that is chosen once.
+
+A diagonal block of D D^T belongs to a constraint, another one to two constraints that hold the same body. A front is a block that
+is eliminated, with the later blocks that it meets: fronts of the same sizes are eliminated by the same kernel. A row whose pivot
+does not exceed `drop_tol` times its diagonal entry of D D^T is left out, with zero for the reciprocal of its pivot.
+"""
+
+from collections.abc import Hashable, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from udkjax.equations.loop_layout import DROP_TOL, ENTRIES, RIGHT, SAFE_TOL, ConstraintGroup, arrays_of_solve
+from udkjax.equations.loop_terms import LoopTerms, Parts, dot
+from udkjax.expressions import Scalar
+from udkjax.expressions.loops import ADD, LEAST, Clear, KernelWriter, Loop
+from udkjax.pinv.block_order import Elimination, eliminations
+from udkjax.pinv.sparse import absolute, greater, where
+
+
+def triangle(i: int, j: int) -> int:
+    """Return the place of an entry in a lower triangle that is stored row by row."""
+    return i * (i + 1) // 2 + j
+
+
+class BlockElimination:
+    """Loops that form D D^T, factorize it and solve with the factors, in arrays that it adds to the layout of `terms`.
+
+    `gram` holds first the diagonal blocks, each with its diagonal as it was before elimination, then the others. `factors` lies
+    as `gram` does: of a diagonal block the reciprocals of the pivots and L, of another one its part of L. `ratio` is the
+    smallest pivot relative to its diagonal entry.
+    """
+
+    def __init__(self, terms: LoopTerms):
+        self.terms, layout = terms, terms.layout
+        # Of each block: its group, and which of the group's elements it belongs to.
+        self._elements = [(group, i) for group in layout.eliminated for i in range(len(group.members))]
+        self._sizes = [len(group.rows) for group, _ in self._elements]
+        bodies = [set(group.bodies[:, i].tolist()) for group, i in self._elements]
+        self.order: list[Elimination] = eliminations(self._sizes, bodies)
+        self._diagonals = [layout.reserve("gram", p + p * (p + 1) // 2) for p in self._sizes]
+        self._position = {k: j for j, k in enumerate(k for e in self.order for k in e.blocks)}
+        self._off_diagonal_start, self._off_diagonal = layout.sizes["gram"], {}
+        for e in self.order:
+            for k, later in zip(e.blocks, e.later, strict=True):
+                for a in later:
+                    self._off_diagonal[a, k] = layout.reserve("gram", self._sizes[a] * self._sizes[k])
+        self._off_diagonal_size = layout.sizes["gram"] - self._off_diagonal_start
+        layout.add_solves()
+
+    def _place(self, block: int, column: int) -> int:
+        group, i = self._elements[block]
+        return int(group.table[i, column])
+
+    # --- programs
+
+    def factorize(self) -> Parts:
+        """Form and factorize D D^T of the entries in `D`."""
+        if self._off_diagonal_size:
+            yield Clear("gram", self._off_diagonal_start, self._off_diagonal_size)
+        yield from self._gram
+        yield Clear("ratio", 0, 1, np.inf)
+        for e in self.order:
+
+            def write(w: KernelWriter, e: Elimination = e):
+                _eliminate(w, e.size, e.sizes)
+
+            yield Loop(self.terms.kernel(("eliminate", e.size, e.sizes), write), self._front_table(e))
+
+    def solve(self, solve: int = 0) -> Parts:
+        """x = (D D^T)^(-1) right, and jt_x = D^T x."""
+        yield from self.substitute(solve)
+        yield from self.terms.jt(solve)
+
+    def substitute(self, solve: int) -> Parts:
+        """x = (D D^T)^(-1) right."""
+        names = arrays_of_solve(solve)
+        yield Clear(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
+        for e in self.order:
+
+            def forward(w: KernelWriter, e: Elimination = e):
+                _substitute_forward(w, e.size, e.sizes)
+
+            yield Loop(self.terms.kernel(("forward", e.size, e.sizes), forward), self._front_table(e), names)
+        for e in reversed(self.order):
+
+            def backward(w: KernelWriter, e: Elimination = e):
+                _substitute_backward(w, e.size, e.sizes)
+
+            yield Loop(self.terms.kernel(("backward", e.size, e.sizes), backward), self._front_table(e)[::-1], names)
+
+    def safe(self) -> Loop:
+        """Whether all pivots exceed `safe_tol`."""
+
+        def write(w: KernelWriter):
+            w.write(greater(w.read("ratio", None), w.read("constants", None, SAFE_TOL)), "safe", None)
+
+        return self.terms.once("safe", write)
+
+    def distance(self) -> Loop:
+        """The distance from dependence: the root of the smallest pivot relative to its diagonal entry."""
+
+        def write(w: KernelWriter):
+            w.write(w.graph.sqrt(w.read("ratio", None)), "distance", None)
+
+        return self.terms.once("distance", write)
+
+    def rank(self) -> Parts:
+        """How many rows the last factorization did not drop."""
+        yield Clear("rank", 0, 1)
+        for p in sorted(set(self._sizes)):
+
+            def count(w: KernelWriter, p: int = p):
+                zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
+                for j in range(p):
+                    inverse = w.read("factors", 0, p + triangle(j, j))
+                    w.write(where(greater(absolute(inverse), zero), one, zero), "rank", None, 0, ADD)
+
+            blocks = [start for start, size in zip(self._diagonals, self._sizes, strict=True) if size == p]
+            yield Loop(self.terms.kernel(("rank", p), count), np.array(blocks)[:, None])
+
+    # --- D D^T
+
+    @cached_property
+    def _gram(self) -> list[Loop]:
+        found, start = [], 0
+        for group in self.terms.layout.eliminated:
+            found.append(self._diagonal_blocks(group, self._diagonals[start : start + len(group.members)]))
+            start += len(group.members)
+        return found + self._off_diagonal_blocks()
+
+    def _diagonal_blocks(self, group: ConstraintGroup, places: Sequence[int]) -> Loop:
+        p, base = len(group.rows), group.table.shape[1]
+
+        def write(w: KernelWriter):
+            entries = [group.entries(w, row) for row in group.rows]
+            for i in range(p):
+                for j in range(i + 1):
+                    s = dot(w.graph, entries[i], entries[j])
+                    w.write(s, "gram", base, p + triangle(i, j))
+                    if i == j:
+                        w.write(s, "gram", base, i)
+
+        table = np.concatenate([group.table, np.array(places)[:, None]], 1)
+        return Loop(self.terms.kernel(("diagonal", group), write), table)
+
+    def _off_diagonal_blocks(self) -> list[Loop]:
+        """The share of each body in the block of each pair of constraints that hold it, one loop for pairs that are alike."""
+        holders: dict[int, list[tuple[int, int]]] = {}  # of each body: blocks, and which of their bodies it is
+        for block, (group, i) in enumerate(self._elements):
+            for slot, body in enumerate(group.bodies[:, i].tolist()):
+                holders.setdefault(body, []).append((block, slot))
+        tables: dict[tuple[ConstraintGroup, int, ConstraintGroup, int], list[list[int]]] = {}
+        for blocks in holders.values():
+            blocks.sort(key=lambda x: self._position[x[0]])
+            for j, (early, s) in enumerate(blocks):
+                for late, r in blocks[j + 1 :]:
+                    if early != late:
+                        entries = self._place(late, ENTRIES), self._place(early, ENTRIES)
+                        key = self._elements[late][0], r, self._elements[early][0], s
+                        tables.setdefault(key, []).append([*entries, self._off_diagonal[late, early]])
+        return [Loop(self._product(*key), np.array(table)) for key, table in tables.items()]
+
+    def _product(self, g: ConstraintGroup, r: int, h: ConstraintGroup, s: int):
+        def write(w: KernelWriter):
+            one = [[g.entry(w, row, 3 * r + k, 0) for k in range(3)] for row in g.rows]
+            two = [[h.entry(w, row, 3 * s + k, 1) for k in range(3)] for row in h.rows]
+            for i, x in enumerate(one):
+                for j, y in enumerate(two):
+                    w.write(dot(w.graph, x, y), "gram", 2, i * len(two) + j, ADD)
+
+        key: Hashable = ("product", g, r, h, s)
+        return self.terms.kernel(key, write)
+
+    def _front_table(self, e: Elimination) -> np.ndarray:
+        """The table of fronts of the same sizes.
+
+        Its columns: where the block's factors and its right-hand side begin; of each later block that it meets, the block of both
+        and its right-hand side; then the lower triangle of the blocks of those, row by row.
+        """
+        table = []
+        for k, later in zip(e.blocks, e.later, strict=True):
+            row = [self._diagonals[k], self._place(k, RIGHT)]
+            for a in later:
+                row += [self._off_diagonal[a, k], self._place(a, RIGHT)]
+            for i, a in enumerate(later):
+                row += [self._off_diagonal[a, b] for b in later[:i]] + [self._diagonals[a]]
+            table.append(row)
+        return np.array(table)
+
+
+# Kernels of a front: a block of p rows, and the later blocks that it meets, of so many rows each.
+
+
+def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
+    drop_tol = w.read("constants", None, DROP_TOL)
+    zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
+    S = [[w.read("gram", 0, p + triangle(i, j)) for j in range(i + 1)] for i in range(p)]
+    below = [[[w.read("gram", 2 + 2 * a, i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)]
+    rows = [row for block in below for row in block]
+    ratios = []
+    for j in range(p):
+        pivot, diagonal = S[j][j], w.read("gram", 0, j)
+        inverse = where(greater(pivot, diagonal * drop_tol), one / pivot, zero)
+        ratios.append(absolute(pivot * (one / diagonal)))
+        for i in range(j + 1, p):
+            lower = S[i][j] * inverse
+            for k in range(j + 1, i + 1):
+                S[i][k] = S[i][k] - lower * S[k][j]
+            for row in rows:
+                row[i] = row[i] - lower * row[j]
+            w.write(lower, "factors", 0, p + triangle(i, j))
+        w.write(inverse, "factors", 0, p + triangle(j, j))
+        S[j][j] = inverse
+    for x in ratios:
+        w.write(x, "ratio", None, 0, LEAST)
+    scaled = [[[s * S[j][j] for j, s in enumerate(row)] for row in block] for block in below]
+    for a, block in enumerate(scaled):
+        for i, row in enumerate(block):
+            for j, s in enumerate(row):
+                w.write(s, "factors", 2 + 2 * a, i * p + j)
+    base = 2 + 2 * len(later)
+    for a, block in enumerate(scaled):
+        for b in range(a + 1):
+            for i, row in enumerate(block):
+                for j, other in enumerate(below[b]):
+                    if a > b or j <= i:
+                        place = i * later[b] + j if a > b else later[a] + triangle(i, j)
+                        w.write(-dot(w.graph, row, other), "gram", base, place, ADD)
+            base += 1
+
+
+def _substitute_forward(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
+    y = [w.read("right", 1, i) - w.read("sum", 1, i) for i in range(p)]
+    for i in range(p):
+        for j in range(i):
+            y[i] = y[i] - w.read("factors", 0, p + triangle(i, j)) * y[j]
+        w.write(y[i], "y", 1, i)
+    for a, size in enumerate(later):
+        for i in range(size):
+            row: list[Scalar] = [w.read("factors", 2 + 2 * a, i * p + j) for j in range(p)]
+            w.write(dot(w.graph, row, y), "sum", 3 + 2 * a, i, ADD)
+
+
+def _substitute_backward(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
+    x = [w.read("y", 1, i) * w.read("factors", 0, p + triangle(i, i)) for i in range(p)]
+    for a, size in enumerate(later):
+        for i in range(size):
+            s = w.read("x", 3 + 2 * a, i)
+            for j in range(p):
+                x[j] = x[j] - w.read("factors", 2 + 2 * a, i * p + j) * s
+    for j in reversed(range(p)):
+        for i in range(j + 1, p):
+            x[j] = x[j] - w.read("factors", 0, p + triangle(i, j)) * x[i]
+        w.write(x[j], "x", 1, j)

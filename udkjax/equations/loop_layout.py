@@ -1,0 +1,192 @@
+"""Where the numbers of a large scene lie in the arrays of its programs of loops.
+
+A loop runs one kernel for every element of a group, or for every body. Its table has one row for each of them, with the places in
+the arrays at which begins what belongs to it: its coordinates, its constants, its rows of Psi, its entries of D.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+
+from udkjax.equations.element_programs import (
+    ConstraintPrograms,
+    ElementPrograms,
+    ForcePrograms,
+    constraint_programs,
+    force_programs,
+)
+from udkjax.equations.structure import ElementKind, element_kinds
+from udkjax.expressions import Scalar
+from udkjax.expressions.loops import KernelWriter
+from udkjax.scene.mechanism import Mechanism
+
+# Columns of the table of bodies: where the coordinates of each, its sine and cosine, and its constants begin.
+COORDINATES, SINE, BODY_CONSTANTS = 0, 1, 2
+# Columns of the table of a group, before three for each of its bodies as above: where the constants of each element, its entries
+# of D, its eliminated rows and all of its rows begin.
+OWN_CONSTANTS, ENTRIES, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
+# Constants of the scene, then of each body: M^(-1/2), M^(-1) and M^(1/2), each of x and y, and of the angle.
+DROP_TOL, SAFE_TOL, GAINS = 0, 1, 2
+ROOT, COMPLIANCE, WEIGHT, PER_BODY = 0, 2, 4, 6
+MASS_OR_INERTIA = (0, 0, 1)  # which of the two, of x, y and the angle
+
+SOLVES = 4  # linear systems in one program, at most
+# Arrays of each: D D^T x = right, and jt_x = D^T x; y = right - sum, where L y = right.
+SOLVE_ARRAYS = ("right", "sum", "y", "x", "jt_x")
+
+
+def arrays_of_solve(solve: int) -> dict[str, str]:
+    """Return the names that the arrays of one of the linear systems have in a program."""
+    return {name: f"{name}{solve}" for name in SOLVE_ARRAYS}
+
+
+@dataclass(eq=False, frozen=True)
+class ElementGroup:
+    """Elements of one structure, with the table of their loops."""
+
+    programs: ElementPrograms
+    members: np.ndarray  # (elements,) their indices among the constraints or force elements
+    bodies: np.ndarray  # (bodies of each, elements)
+    table: np.ndarray  # (elements, columns)
+
+    @property
+    def coordinates(self) -> int:
+        """How many coordinates an element depends on."""
+        return 3 * len(self.bodies)
+
+
+@dataclass(eq=False, frozen=True)
+class ConstraintGroup(ElementGroup):
+    """Constraints of one structure, of which the same rows are eliminated."""
+
+    programs: ConstraintPrograms
+    rows: tuple[int, ...] = ()  # the rows of each that are eliminated
+    entry_index: dict[int, int] = field(default_factory=dict)  # of the nodes of D that are no constants: which number of `D`
+
+    def entry(self, w: KernelWriter, row: int, k: int, base: int = ENTRIES) -> Scalar:
+        """Read an entry of D from where the elements wrote it; `base` is the column of a table."""
+        s = self.programs.outputs["D"][row * self.coordinates + k]
+        if s.constant is not None:
+            return w.graph.constant(s.constant)
+        found = w.read("D", base, self.entry_index[s.index])
+        return found if s.sign > 0 else -found
+
+    def entries(self, w: KernelWriter, row: int, base: int = ENTRIES) -> list[Scalar]:
+        """Read all entries of a row of D."""
+        return [self.entry(w, row, k, base) for k in range(self.coordinates)]
+
+
+@dataclass(eq=False, frozen=True)
+class ForceGroup(ElementGroup):
+    """Force elements of one structure."""
+
+    programs: ForcePrograms
+
+
+class Layout:
+    """The groups of a scene's elements, and the sizes of all arrays, for one choice of rows that are eliminated."""
+
+    def __init__(self, mechanism: Mechanism, redundant_rows: tuple[int, ...], baumgarte: bool, every_row: bool):
+        self.gains, self.baumgarte = 2 if baumgarte else 0, baumgarte
+        self.body_count = len(mechanism.body_names)
+        self.coordinate_count = 3 * self.body_count
+        self.gravity = GAINS + self.gains
+        self.first_body = self.gravity + 2
+        self.constant_count = self.first_body + PER_BODY * self.body_count
+        n = self.coordinate_count
+        self.sizes = {"sines": 2 * self.body_count, "free": n, "load": n, "ratio": 1, "D": 0, "gram": 0}
+        self._eliminated = 0  # rows so far
+        self._mechanism, self._loaded = mechanism, bool(mechanism.forces)
+        rows = self._find_rows(redundant_rows)
+        self.constraints = [self._constraint_group(kind, rows, every_row) for kind in self._kinds(rows)]
+        forces = element_kinds(mechanism, list(mechanism.forces.values()))
+        self.forces = [self._force_group(kind) for kind in forces]
+        self.eliminated = [group for group in self.constraints if group.rows]
+        self.body_table = np.array([[3 * b, 2 * b, self.of_body(b)] for b in range(self.body_count)]).reshape(-1, 3)
+
+    def _kinds(self, labels: Sequence[Any] | None = None) -> list[ElementKind]:
+        return element_kinds(self._mechanism, list(self._mechanism.constraints.values()), labels)
+
+    def _programs(self, kind: ElementKind) -> ConstraintPrograms:
+        return constraint_programs(kind.structure, self.baumgarte, self._loaded)
+
+    def _find_rows(self, redundant_rows: tuple[int, ...]) -> list[tuple[int, ...]]:
+        """The independent rows of each constraint."""
+        sizes = np.zeros(len(self._mechanism.constraints), int)
+        for kind in self._kinds():
+            sizes[kind.members] = self._programs(kind).row_count
+        self.row_starts = np.cumsum([0, *sizes])
+        self.row_count = int(self.row_starts[-1])
+        names = zip(self._mechanism.constraints, sizes, strict=True)
+        self.row_names = [(name, k) for name, size in names for k in range(size)]
+        independent = ~np.isin(np.arange(self.row_count), redundant_rows)
+        ends = zip(self.row_starts, self.row_starts[1:], strict=False)
+        return [tuple(np.flatnonzero(independent[i:j]).tolist()) for i, j in ends]
+
+    def _constraint_group(self, kind: ElementKind, rows: list[tuple[int, ...]], every_row: bool) -> ConstraintGroup:
+        programs, size = self._programs(kind), len(kind.members)
+        chosen = tuple(range(programs.row_count)) if every_row else rows[kind.members[0]]
+        index: dict[int, int] = {}
+        for s in programs.outputs["D"]:
+            if s.constant is None:
+                index.setdefault(s.index, len(index))
+        starts = self._own_constants(programs, size), self.reserve("D", len(index) * size), self._eliminated
+        steps = len(programs.constants), len(index), len(chosen)
+        self._eliminated += len(chosen) * size
+        columns = [start + step * np.arange(size) for start, step in zip(starts, steps, strict=True)]
+        table = self._table(kind, [*columns, self.row_starts[kind.members]])
+        return ConstraintGroup(programs, kind.members, kind.bodies, table, chosen, index)
+
+    def _force_group(self, kind: ElementKind) -> ForceGroup:
+        programs, size = force_programs(kind.structure), len(kind.members)
+        constants = self._own_constants(programs, size) + len(programs.constants) * np.arange(size)
+        return ForceGroup(programs, kind.members, kind.bodies, self._table(kind, [constants, 0, 0, 0]))
+
+    def _own_constants(self, programs: ElementPrograms, size: int) -> int:
+        self.constant_count += len(programs.constants) * size
+        return self.constant_count - len(programs.constants) * size
+
+    def _table(self, kind: ElementKind, columns: Sequence[Any]) -> np.ndarray:
+        of_bodies = [column for b in kind.bodies for column in (3 * b, 2 * b, self.of_body(b))]
+        return np.stack([np.broadcast_to(c, (len(kind.members),)) for c in (*columns, *of_bodies)], 1)
+
+    def of_body(self, body: Any) -> Any:
+        """Where the constants of a body begin."""
+        return self.first_body + PER_BODY * body
+
+    def reserve(self, name: str, count: int) -> int:
+        """Make room for so many more numbers in an array; return where they begin."""
+        self.sizes[name] += count
+        return self.sizes[name] - count
+
+    def add_solves(self) -> None:
+        """Add the arrays of linear systems, once the factors have their size."""
+        self.sizes["factors"] = self.sizes["gram"]
+        for k in range(SOLVES):
+            self.sizes |= {f"{name}{k}": self.coordinate_count if name == "jt_x" else self._eliminated for name in SOLVE_ARRAYS}
+
+    @cached_property
+    def d_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of the entries of D: row, column, place in the array `D` (with a one behind it), and by what that is multiplied."""
+        found = [np.zeros((4, 0))]
+        for group in self.constraints:
+            for place, s in enumerate(group.programs.outputs["D"]):
+                if s.is_zero:
+                    continue
+                row, k = divmod(place, group.coordinates)
+                ones = np.ones(len(group.table))
+                where = self.sizes["D"] * ones if s.constant is not None else group.table[:, ENTRIES] + group.entry_index[s.index]
+                factor = ones * (s.sign if s.constant is None else s.constant)
+                column = group.table[:, BODIES + 3 * (k // 3)] + k % 3
+                found.append(np.stack([group.table[:, ROW] + row, column, where, factor]))
+        row, column, place, factor = np.concatenate(found, 1)
+        return row.astype(int), column.astype(int), place.astype(int), factor
+
+
+def abstract_mechanism(tree: Any, shapes: tuple) -> Mechanism:
+    """Return the mechanism of a structure, with shapes in place of its numbers."""
+    return jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes])

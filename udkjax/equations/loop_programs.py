@@ -1,0 +1,374 @@
+"""The programs of a large scene as loops: the same as scalar_programs.py has, with code that does not grow with the scene.
+
+Terms come from loops over elements of the same structure (loop_terms.py), linear systems from elimination by blocks
+(loop_elimination.py), and derivatives from loops, too (`DifferentiableProgram`).
+"""
+
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.equations.element_programs import ConstraintPrograms
+from udkjax.equations.loop_elimination import BlockElimination
+from udkjax.equations.loop_layout import (
+    BODIES,
+    BODY_CONSTANTS,
+    COMPLIANCE,
+    COORDINATES,
+    DROP_TOL,
+    GAINS,
+    OWN_CONSTANTS,
+    ROOT,
+    SAFE_TOL,
+    WEIGHT,
+    ElementGroup,
+    Layout,
+    abstract_mechanism,
+)
+from udkjax.equations.loop_terms import LoopTerms, Parts
+from udkjax.equations.structure import structure
+from udkjax.expressions.loop_derivative import LoopDerivative
+from udkjax.expressions.loops import Clear, Kernel, KernelWriter, Loop, LoopProgram, by_arrays
+from udkjax.pinv.rank_policy import RankPolicy
+from udkjax.scene.mechanism import Mechanism
+
+NOT_DIFFERENTIATED = ("t", "gram", "factors", "ratio")  # arrays
+
+
+class DifferentiableProgram(NamedTuple):
+    """A program, and the part of it that is differentiated, with respect to all arrays but those that are `fixed`.
+
+    No factorization is differentiated. Accelerations and single corrections, such as q - M^(-1/2) D^T x with D D^T x = Psi, are
+    refined once,
+
+        D D^T x = b,      D D^T x1 = b - D D^T x,      a = a_F + M^(-1/2) D^T (x + x1),
+
+    with x1 of nothing but rounding errors: with x and the factors fixed, the derivative of that is the one of a. A projection is
+    differentiated where all residuals vanish, and with them whatever they multiply: D is fixed, too.
+    """
+
+    program: LoopProgram
+    parts: Sequence[Loop | Clear]
+    fixed: Collection[str]
+
+    def derivative(self, fixed: Collection[str] = ()) -> LoopDerivative:
+        """Return the derivative, with further arrays fixed."""
+        return LoopDerivative(self.parts, {*self.fixed, *fixed})
+
+
+class LoopPrograms:
+    """Programs over arrays of numbers. Each takes the arrays `constants`, t, q and, where it needs them, v, dq and dv.
+
+    The results are the arrays a, q1, v1, dq1, dv1, psi, terms, rank, distance, and safe: whether all pivots exceed `safe_tol`.
+    What a program computes on the way stays in arrays of its own, of the sizes `scratch`: no number is written again once it has
+    been read. Rows with small pivots are dropped, whatever the policy is.
+    """
+
+    def __init__(
+        self,
+        tree: Any,
+        shapes: tuple,
+        redundant_rows: tuple[int, ...],
+        baumgarte: bool,
+        policy: RankPolicy,
+        every_row: bool = False,
+        kernels: dict[Hashable, Kernel] | None = None,
+    ):
+        self._settings = tree, shapes, redundant_rows, baumgarte, policy
+        self._kernels = {} if kernels is None else kernels
+        self.policy, self.redundant_rows = policy, redundant_rows
+        layout = self._layout = Layout(abstract_mechanism(tree, shapes), redundant_rows, baumgarte, every_row)
+        self._terms = LoopTerms(layout, self._kernels)
+        self._elimination = BlockElimination(self._terms)
+        self.scratch, self.row_names = layout.sizes, layout.row_names
+        self.coordinate_count, self.row_count = layout.coordinate_count, layout.row_count
+        self.constants = range(layout.constant_count)
+        starts = np.cumsum([0, *(int(np.prod(shape)) for shape, _ in shapes)])
+        places = [np.arange(a, b).reshape(s) for a, b, (s, _) in zip(starts, starts[1:], shapes, strict=False)]
+        self._number_count = int(starts[-1])
+        self._places: Mechanism = jax.tree.unflatten(tree, places)  # where each number of the scene is among all of them
+
+    @property
+    def stored_sizes(self) -> dict[str, int]:
+        """The sizes of all arrays that derivatives may need of a state."""
+        n = self.coordinate_count
+        return self.scratch | {"sines1": 2 * (n // 3), "q1": n, "v1": n}
+
+    @property
+    def term_count(self) -> int:
+        """How many numbers `equation_terms` returns."""
+        return self.coordinate_count + self.row_count
+
+    @property
+    def drop_tol_index(self) -> int:
+        """Which of the constants is `drop_tol`."""
+        return DROP_TOL
+
+    @property
+    def prologue_input_count(self) -> int:
+        """How many numbers `prologue` takes."""
+        return self._number_count + self._layout.gains + 2
+
+    @property
+    def for_derivatives(self) -> "LoopPrograms":
+        """The programs whose derivatives are taken."""
+        return self
+
+    @cached_property
+    def with_all_rows(self) -> "LoopPrograms":
+        """The same programs, of the same constants, on all rows: redundant ones may be independent in singular configurations."""
+        return LoopPrograms(*self._settings, every_row=True, kernels=self._kernels)
+
+    # --- programs
+
+    @cached_property
+    def accelerations(self) -> LoopProgram:
+        """a; safe."""
+        return _program(
+            self._acceleration_system, self._factorize, self._elimination.solve(), [self._a(0)], [self._elimination.safe()]
+        )
+
+    @cached_property
+    def newton_q(self) -> LoopProgram:
+        """q1, q after a Newton step to Psi = 0; safe."""
+        terms = self._terms
+        position = [terms.sincos(), *terms.elements(("D", "psi"))]
+        step = [*self._factorize, *self._elimination.solve(), terms.corrected("q", "q1", 0)]
+        return _program(position, step, [self._elimination.safe()])
+
+    @cached_property
+    def newton_v_and_psi(self) -> LoopProgram:
+        """v1, v after the Newton step to Psi_dot = 0; and psi, of all rows."""
+        return _program(self._newton_v, self._terms.residuals("psi", "psi"))
+
+    @cached_property
+    def project_and_accelerate(self) -> LoopProgram:
+        """v1, and a there; safe."""
+        return _program(self._project_and_accelerate)
+
+    @cached_property
+    def tangent_part(self) -> LoopProgram:
+        """dq1 and dv1: what projection leaves of the changes dq and dv; distance."""
+        return _program([self._terms.sincos(), *self._terms.elements(("D",))], self._factorize, self._tangent_parts(0))
+
+    @cached_property
+    def end_of_step(self) -> LoopProgram:
+        """What `project_and_accelerate` and `tangent_part` return, by the same factors."""
+        return _program(self._project_and_accelerate, self._tangent_parts(2))
+
+    @cached_property
+    def psi(self) -> LoopProgram:
+        """psi: Psi of all rows."""
+        return _program([self._terms.sincos()], self._terms.residuals("psi", "psi"))
+
+    @cached_property
+    def psi_dot(self) -> LoopProgram:
+        """psi: Psi_dot of all rows."""
+        return _program([self._terms.sincos()], self._terms.residuals("psi_dot", "psi"))
+
+    @cached_property
+    def equation_terms(self) -> LoopProgram:
+        """terms: a_F (zero where it is gravity), and b of all rows."""
+        terms = self._terms
+
+        def write(w: KernelWriter):
+            for k in range(3):
+                free = w.read("free", COORDINATES, k) if self._layout.forces else w.graph.constant(0.0)
+                w.write(free, "terms", COORDINATES, k)
+
+        free = [terms.sincos(), *terms.free_accelerations("v"), terms.over_bodies("copy free", write)]
+        return _program(free, terms.residuals("b", "terms", self.coordinate_count))
+
+    @cached_property
+    def rank(self) -> LoopProgram:
+        """rank: how many rows the last factorization did not drop."""
+        return _program(self._elimination.rank())
+
+    @cached_property
+    def prologue(self) -> LoopProgram:
+        """`constants`, from `numbers`: all numbers of the scene, the gains, `drop_tol` and `safe_tol`."""
+        layout, scene = self._layout, KernelWriter()
+        copies = [(GAINS + k, self._number_count + k) for k in range(layout.gains)]
+        copies += [(k, self._number_count + layout.gains + k) for k in (DROP_TOL, SAFE_TOL)]
+        copies += [(layout.gravity + k, int(place)) for k, place in enumerate(np.ravel(self._places.gravity))]
+        for to, place in copies:
+            scene.write(scene.read("numbers", None, place), "constants", None, to)
+        body = KernelWriter()
+        for k in range(2):
+            mass = body.read("numbers", k)
+            root = body.graph.sqrt(body.graph.constant(1.0) / mass)
+            for start, value in ((ROOT, root), (COMPLIANCE, root * root), (WEIGHT, body.graph.constant(1.0) / root)):
+                body.write(value, "constants", 2, start + k)
+        bodies = [[int(b.mass), int(b.inertia), layout.of_body(k)] for k, b in enumerate(self._places.bodies.values())]
+        parts = [Loop(scene.kernel(), np.zeros((1, 1), int)), Loop(body.kernel(), np.array(bodies).reshape(-1, 3))]
+        constraints, forces = list(self._places.constraints.values()), list(self._places.forces.values())
+        parts += [self._group_constants(group, constraints) for group in layout.constraints]
+        parts += [self._group_constants(group, forces) for group in layout.forces]
+        return LoopProgram(parts)
+
+    def _group_constants(self, group: ElementGroup, elements: Sequence[Any]) -> Loop:
+        programs, table = group.programs, group.table
+        members = [jax.tree.leaves(elements[i]) for i in group.members]
+        starts = np.array([[np.ravel(x)[0] if np.size(x) else 0 for x in leaves] for leaves in members], int)
+        w, columns = KernelWriter(programs.graph), table.shape[1]
+        for k, leaf in enumerate(programs.leaves):
+            for place, s in enumerate(leaf.flat):
+                w.bind(s, "numbers", columns + k, place)
+        if isinstance(programs, ConstraintPrograms):
+            for k, s in enumerate(programs.roots):
+                w.bind(s, "constants", BODIES + 3 * (k // 2) + BODY_CONSTANTS, ROOT + k % 2)
+            for k, s in enumerate([*programs.gains, *programs.gravity]):
+                w.bind(s, "constants", None, (GAINS if self._layout.gains else self._layout.gravity) + k)
+        for k, s in enumerate(programs.constants):
+            w.write(s, "constants", OWN_CONSTANTS, k)
+        return Loop(w.kernel(), np.concatenate([table, starts.reshape(len(members), -1)], 1))
+
+    # --- parts of programs
+
+    @property
+    def _factorize(self) -> Parts:
+        return self._elimination.factorize()
+
+    @property
+    def _acceleration_system(self) -> list[Loop | Clear]:
+        """D D^T, and b as the right-hand side."""
+        terms = self._terms
+        return [terms.sincos(), *terms.free_accelerations("v"), *terms.elements(("D", "b"))]
+
+    def _a(self, *solves: int) -> Loop:
+        return self._terms.constrained_accelerations(*solves)
+
+    @property
+    def _newton_v(self) -> list[Loop | Clear]:
+        terms = self._terms
+        rates = [terms.sincos(), *terms.elements(("D", "psi_dot"))]
+        return [*rates, *self._factorize, *self._elimination.solve(), terms.corrected("v", "v1", 0)]
+
+    @property
+    def _project_and_accelerate(self) -> list[Loop | Clear]:
+        terms = self._terms
+        system = [*terms.free_accelerations("v1"), *terms.elements(("b",), "v1", 1)]
+        return [*self._newton_v, *system, *self._elimination.solve(1), self._a(1), self._elimination.safe()]
+
+    def _tangent_parts(self, solve: int) -> Parts:
+        for k, change in enumerate(("dq", "dv"), solve):
+            yield from self._terms.rates(change, k)
+            yield from self._elimination.solve(k)
+            yield self._terms.corrected(change, f"{change}1", k)
+        yield self._elimination.distance()
+
+    # --- derivatives
+
+    @cached_property
+    def differentiable_accelerations(self) -> DifferentiableProgram:
+        """a; safe."""
+        return self._refined(self._acceleration_system[1:], self._a(0, 1), self._elimination.safe())
+
+    @cached_property
+    def differentiable_newton_q(self) -> DifferentiableProgram:
+        """q1."""
+        return self._refined(list(self._terms.elements(("D", "psi"))), self._terms.corrected("q", "q1", 0, 1))
+
+    @cached_property
+    def differentiable_newton_v(self) -> DifferentiableProgram:
+        """v1."""
+        return self._refined(list(self._terms.elements(("D", "psi_dot"))), self._terms.corrected("v", "v1", 0, 1))
+
+    @cached_property
+    def differentiable_projection(self) -> DifferentiableProgram:
+        """q1 and v1."""
+        terms, solve = self._terms, self._elimination.solve
+        position = [terms.sincos(), *terms.elements(("psi",)), *solve(0), terms.corrected("q", "q1", 0)]
+        at_q1 = terms.elements(("psi_dot",), "v", 1, q="q1", sines="sines1")
+        velocity = [terms.sincos("q1", "sines1"), *at_q1, *solve(1), terms.corrected("v", "v1", 1)]
+        program = _program([terms.sincos(), *terms.elements(("D",))], self._factorize, position[1:], velocity)
+        return DifferentiableProgram(program, [*position, *velocity], {*NOT_DIFFERENTIATED, "D"})
+
+    def _refined(self, system: Sequence[Loop | Clear], result: Loop, *rest: Loop) -> DifferentiableProgram:
+        terms, elimination = self._terms, self._elimination
+        before = [terms.sincos(), *system]
+        after = [*terms.jt(0), *terms.remainder(0, 1), *elimination.solve(1), result]
+        program = _program(before, self._factorize, elimination.substitute(0), after, rest)
+        return DifferentiableProgram(program, [*before, *after], {*NOT_DIFFERENTIATED, "sum0", "y0", "x0"})
+
+    # --- by arrays: without machine code
+
+    @property
+    def d_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of the entries of D: row, column, place in the array `D` (with a one behind it), and by what that is multiplied."""
+        return self._layout.d_entries
+
+    def constants_of(self, numbers: Array) -> Array:
+        """The constants as a function of the numbers of the scene and the gains."""
+        return self._constants_by_arrays(numbers, jnp)
+
+    def _constants_by_arrays(self, numbers: Any, xp: Any) -> Any:
+        arrays = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(self.constants))}
+        return by_arrays(self.prologue, arrays, xp)["constants"]
+
+    def geometry(self, numbers: Any, xp: Any) -> Callable[[Any, Any, Any], tuple[Any, Any, Any]]:
+        """Return a function of t, q and v, of the numbers of the scene: Psi, Psi_dot and the entries of D at `d_entries`."""
+        run = self._run_by_arrays(self._geometry, numbers, xp)
+        _, _, places, factors = self.d_entries
+
+        def evaluate(t: Any, q: Any, v: Any) -> tuple[Any, Any, Any]:
+            found = run(t, q, v)
+            return found["psi"], found["psi_dot"], xp.append(found["D"], 1.0)[places] * factors
+
+        return evaluate
+
+    def loads(self, numbers: Any, xp: Any) -> Callable[[Any, Any, Any], tuple[Any, Any]]:
+        """Return a function of t, q and v, of the numbers of the scene: a_F, and b of all rows."""
+        run, n = self._run_by_arrays(self.equation_terms, numbers, xp), self.coordinate_count
+        gravity = xp.tile(xp.append(numbers[np.ravel(self._places.gravity)], 0.0), n // 3)
+
+        def evaluate(t: Any, q: Any, v: Any) -> tuple[Any, Any]:
+            terms = run(t, q, v)["terms"]
+            return terms[:n] if self._layout.forces else gravity, terms[n:]
+
+        return evaluate
+
+    @cached_property
+    def _geometry(self) -> LoopProgram:
+        terms = self._terms
+        rows = [*terms.residuals("psi", "psi"), *terms.residuals("psi_dot", "psi_dot")]
+        return _program([terms.sincos(), *terms.elements(("D",))], rows)
+
+    def _run_by_arrays(self, program: LoopProgram, numbers: Any, xp: Any) -> Callable[[Any, Any, Any], dict[str, Any]]:
+        """Run a program in which no round of a loop takes anything from another, by NumPy or JAX."""
+        constants = self._constants_by_arrays(numbers, xp)
+        sizes = self.scratch | {"psi": self.row_count, "psi_dot": self.row_count, "terms": self.term_count}
+        results = {"psi", "psi_dot", "terms", "D"}
+        blank = {x: xp.zeros(size) for x, size in sizes.items() if x in program.arrays | results}
+
+        def run(t: Any, q: Any, v: Any) -> dict[str, Any]:
+            given = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v}
+            return by_arrays(program, blank | given, xp)
+
+        return run
+
+
+def _program(*parts: Iterable[Loop | Clear]) -> LoopProgram:
+    return LoopProgram([part for some in parts for part in some])
+
+
+@lru_cache(maxsize=16)
+def _loop_programs(
+    tree: Any, shapes: tuple, redundant_rows: tuple[int, ...], baumgarte: bool, policy: RankPolicy
+) -> LoopPrograms:
+    return LoopPrograms(tree, shapes, redundant_rows, baumgarte, policy)
+
+
+def loop_programs(
+    mechanism: Mechanism,
+    redundant_rows: tuple[int, ...] = (),
+    baumgarte: bool = False,
+    policy: RankPolicy = RankPolicy.DROP,
+) -> LoopPrograms:
+    """Return the programs of a mechanism's structure as loops; the arguments are those of `elimination_programs`."""
+    return _loop_programs(*structure(mechanism), redundant_rows, baumgarte, policy)

@@ -1,0 +1,38 @@
+"""What elimination does with a small pivot: the one decision near singular configurations.
+
+D D^T = L diag(p) L^T. The pivot p_i, relative to its row's diagonal entry of D D^T, is the square of the sine of the angle
+between row i and the rows eliminated before it: a rounding error where the row depends on them, small near a singular
+configuration. Elimination loses digits by the factor 1 / p_i. Two thresholds meet it, both numbers that may be traced:
+
+    drop_tol    at or below it the row counts as dependent: it is left out, with zero for 1 / p_i;
+    safe_tol    at or below it the result is not to be trusted: the program says so by its last output, `safe`.
+
+The policy is static: it decides which of the two a program looks at.
+"""
+
+from enum import Enum
+
+
+class RankPolicy(Enum):
+    """What elimination does with a pivot below a threshold."""
+
+    REFUSE = "refuse"
+    """Look at no pivot while eliminating, and report whether all exceed `safe_tol`. A step that is not safe is refused; machine
+    code takes it again by a rank-revealing method. The fastest: no operation waits for a comparison."""
+
+    DROP = "drop"
+    """Leave out the rows whose pivots do not exceed `drop_tol`, and trust the rest: the pseudoinverse by elimination alone."""
+
+    FALL_BACK = "fall back"
+    """Leave out the rows whose pivots do not exceed `drop_tol`, and report whether all exceed `safe_tol`: what the rank-revealing
+    method that a refused step falls back on does, written as elimination. Derivatives and large scenes take it."""
+
+    @property
+    def drops(self) -> bool:
+        """Whether dependent rows are left out."""
+        return self is not RankPolicy.REFUSE
+
+    @property
+    def reports(self) -> bool:
+        """Whether a result says that it is not safe."""
+        return self is not RankPolicy.DROP
