@@ -39,6 +39,16 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.integrate.assembly import State as State
     from udkjax.integrate.assembly import assemble as assemble
     from udkjax.integrate.assembly import check as check
+    from udkjax.integrate.events import Attach as Attach
+    from udkjax.integrate.events import Contact as Contact
+    from udkjax.integrate.events import Event as Event
+    from udkjax.integrate.events import Events as Events
+    from udkjax.integrate.events import Impact as Impact
+    from udkjax.integrate.events import JointLimit as JointLimit
+    from udkjax.integrate.events import Lock as Lock
+    from udkjax.integrate.events import Log as Log
+    from udkjax.integrate.events import Release as Release
+    from udkjax.integrate.events import Stop as Stop
     from udkjax.pinv import SVD as SVD
     from udkjax.pinv import Auto as Auto
     from udkjax.pinv import Elimination as Elimination
@@ -118,6 +128,7 @@ _NAMES = {
         Spring TorsionSpring Force Torque Friction""",
     "udkjax.pinv": "SVD Varga Greville Householder GramSchmidt Elimination Auto",
     "udkjax.integrate.assembly": "AssemblyError State assemble check",
+    "udkjax.integrate.events": "Event Events JointLimit Contact Stop Log Impact Release Attach Lock",
     "udkjax.equations": """
         ConstrainedSystem Baumgarte Analysis analyse accelerations violation energy reactions
         unique_reactions uniqueness singular_values

@@ -23,7 +23,8 @@ from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
-from udkjax.integrate.solution import Result, SimulationError, Solution
+from udkjax.integrate.simulate_events import Choices, simulate_events
+from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     import diffrax
 
 MAX_STEPS = 100_000
+MAX_EVENTS = 64
 # Of the rows' scales. Projection leaves rounding errors, unless the rows that it does not see drift. Without it drift is what one
 # looks at, up to where a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
 # 2e-3 open.
@@ -58,6 +60,8 @@ def simulate(
     progress: Any = None,
     analysis: Analysis | None = None,
     engine: Literal["auto", "native", "diffrax"] = "auto",
+    events: Any = None,
+    max_events: int = MAX_EVENTS,
 ) -> Solution:
     """Integrate the motion of a mechanism; return its states at the times `ts` (T,), in s. The motion starts at ts[0].
 
@@ -81,6 +85,13 @@ def simulate(
     solver, adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` says which it
     was, and why.
 
+    `events` are what happens where a condition crosses zero: `Event`, `JointLimit`, `Contact`, one or a list of them, with
+    actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`; up to `max_events` happen. They are located to rounding,
+    whatever `ts` is, and the run starts anew behind each; several at one instant happen one after the other. An output at the
+    very time of an event is the state after it. `Solution.events` holds times and states before and after; `Result` says
+    whether one of them ended the run. Both engines serve them, and batches: each member has its own events and its own code.
+    Such runs have first derivatives, forward and reverse, through the times of the events (saltation), but none by `ts`.
+
     A run that does not reach its end raises `SimulationError`, which carries the solution; with `throw=False`, or when numbers
     are traced, `Solution.result` tells instead. A violation of Psi above `drift_tol` (of L, or rad) at an output time ends the
     solution there. A guess that cannot be closed raises `AssemblyError`.
@@ -101,6 +112,22 @@ def simulate(
         if state is None and closure is None:
             closure = close(mechanism, start, analysis=analysis)
 
+    if events is not None:
+        if not isinstance(mechanism, Mechanism) or choices[1] is not None or choices[3] is not None:
+            what = (
+                "a ConstrainedSystem"
+                if not isinstance(mechanism, Mechanism)
+                else "an adjoint of diffrax's"
+                if choices[1]
+                else "progress"
+            )
+            raise ValueError(f"a run with events takes a Mechanism, JAX's own derivatives and no progress meter: not {what}")
+        more = (SMALLEST_STEP, isinstance(stabilization, Projection), solver, max_steps, max_events, engine)
+        baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
+        told: Any = (number(rtol), number(atol), method, baumgarte, formulation, drift, _step(dt0), *more)
+        solution = simulate_events(mechanism, events, analysis, ts, state, closure, Choices(*told))
+        return _required(solution, mechanism, closure, throw)
+
     def run(analysis: Analysis | None) -> tuple[Solution, Any]:
         return _run(bare, analysis, ts, state, closure, *settings, *choices, engine)
 
@@ -109,9 +136,16 @@ def simulate(
         return solution
     if isinstance(mechanism, Mechanism) and missed and mechanism.is_known:
         solution, _ = run(analyse(mechanism))  # the analysis was of other numbers, in which a row depended
-    if throw and isinstance(mechanism, Mechanism) and closure is not None:
+    return _required(solution, mechanism, closure, throw)
+
+
+def _required(solution: Solution, mechanism: Any, closure: Closure | None, throw: bool) -> Solution:
+    """A solution; raise what a run that failed raises."""
+    if not throw or isinstance(solution.code, Tracer):
+        return solution
+    if isinstance(mechanism, Mechanism) and closure is not None:
         require_closed(mechanism, closure)
-    if throw and solution.result != Result.successful:
+    if not solution.result.is_success:
         raise SimulationError(solution.cause, solution)
     return solution
 

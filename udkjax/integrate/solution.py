@@ -24,6 +24,16 @@ class Result(IntEnum):
     not_finite = 3
     drift = 4
     could_not_assemble = 5
+    event_stop = 6
+    at_rest = 7
+    event_limit = 8
+    beyond_contact = 9
+    event_impossible = 10
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the run went as far as it should: to its last time, or to an event that ends it."""
+        return self in (Result.successful, Result.event_stop, Result.at_rest)
 
 
 CAUSES = {
@@ -36,6 +46,12 @@ CAUSES = {
     Result.drift: "the constraints are violated by more than `drift_tol`: stabilize (`Projection()`), or, where the numbers "
     "of the scene make rows independent that its analysis found redundant, analyse it anew or take method=SVD()",
     Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for the joints that stay open",
+    Result.event_stop: "an event stopped the run",
+    Result.at_rest: 'a contact whose impacts have at_rest="stop" came to rest',
+    Result.event_limit: "there were more events than `max_events`: raise it, or look for what makes them follow so closely",
+    Result.beyond_contact: "the run starts beyond a contact or limit, where its condition is negative already",
+    Result.event_impossible: "an event asks for what the constraints do not allow: an impact in a direction in which they leave "
+    "no motion, or a joint attached where it is open",
 }
 
 
@@ -64,6 +80,7 @@ class Solution(eqx.Module):
     atol: Float[Array, ""]
     bodies: tuple[str, ...] = eqx.field(static=True)
     choices: tuple[tuple[str, str], ...] = eqx.field(static=True)  # `settings`, hashable
+    events: Any = None  # `Events`, where there were any to look for
 
     @property
     def settings(self) -> dict[str, str]:

@@ -1,0 +1,320 @@
+"""Events: what happens to a mechanism where a scalar condition along its motion crosses zero.
+
+An event is a `condition`, the `direction` in which its zero counts, and an `action`. Conditions see the frames of all bodies by
+name, as joints and force elements see theirs:
+
+    udk.Event(lambda t, at: at["link"].angle, udk.Log(), name="vertical")
+
+Ready-made ones: `JointLimit`, `Contact`. Numbers that are traced or differentiated belong into an equinox module whose `__call__`
+is the condition, as those of the ready-made ones do: what a plain function closes over is fixed when it is compiled.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+from udkjax.scene.bodies import GROUND, Frame, Point, between
+from udkjax.scene.checks import quoted, suggestion
+from udkjax.scene.fields import number, optional
+from udkjax.scene.joints import Joint, Prismatic, Revolute, Slot
+from udkjax.scene.mechanism import Mechanism
+
+Frames = Mapping[str, Frame]
+FIXED = Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+
+
+# --- actions
+
+
+class Action(eqx.Module):
+    """What an event does."""
+
+
+class Stop(Action):
+    """End the run: `Result.event_stop`."""
+
+
+class Log(Action):
+    """Note time and state, and go on."""
+
+
+class Impact(Action):
+    """Reverse the rate of the condition, g >= 0 being what is allowed: g_dot+ = -restitution g_dot-.
+
+    The jump of the velocities is the smallest in the metric of M that keeps all constraints (impact.py): no friction. Rebounds
+    that have become too small to follow end in rest: with `at_rest="hold"` the condition is held at zero, as a constraint, until
+    the contact would have to pull; with "stop" the run ends there (`Result.at_rest`).
+    """
+
+    restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
+
+
+class Release(Action):
+    """Take a joint or driver away, from then on: one of the scene's, or what `Attach` or `Lock` has added, by its name."""
+
+    name: str = eqx.field(static=True)
+
+
+class Attach(Action):
+    """Add a joint, under a `name`, from then on. Numbers that it leaves to the guess are those of the state at the event.
+
+    Velocities jump as in an inelastic impact: the smallest change in the metric of M that the new constraints allow.
+    """
+
+    joint: Joint
+    name: str = eqx.field(static=True)
+
+
+class Lock(Action):
+    """Stop all motion in a revolute or prismatic joint or a slot's sliding, where it is, as `Attach` does.
+
+    What it adds is called as the joint with ".lock" behind it: `Release("elbow.lock")` takes it away again.
+    """
+
+    joint: str = eqx.field(static=True)
+
+
+# --- events
+
+
+class Event(eqx.Module):
+    """Where `condition(t, frames)`, a scalar, crosses zero, `action` happens.
+
+    `frames` maps the name of each body, and "ground", to its frame: x, y, angle, cos, sin, vx, vy, omega, `point`, `velocity`.
+    `direction` is 1 for rising, -1 for falling, 0 for either; of an `Impact`, before whose zero the condition is positive, always
+    -1. Only crossings count: a run that starts at a zero, or that touches one and turns back, does not cross it. But an `Impact`
+    whose condition is zero at the start, and falling, happens at once.
+    """
+
+    condition: Callable[[Any, Frames], Any]
+    action: Action = Stop()
+    direction: int = eqx.field(static=True, default=0)
+    name: str = eqx.field(static=True, default="")
+
+    def expand(self, mechanism: Mechanism) -> list["Event"]:
+        """This event as a list: ready-made ones stand for several."""
+        return [self]
+
+
+class JointLimit(eqx.Module):
+    """A stop at the `lower` or `upper` end of a joint's travel, or both: an `Impact` at each.
+
+    Of a revolute joint the coordinate is theta2 - theta1 (rad), of a prismatic joint or a slot how far point 2 is from point 1
+    along the axis (m). The events are called as the joint (or `name`), with ".lower" or ".upper" behind it.
+    """
+
+    joint: str = eqx.field(static=True)
+    lower: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
+    upper: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
+    restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
+    name: str = eqx.field(static=True, default="")
+
+    def expand(self, mechanism: Mechanism) -> list[Event]:
+        """One event for each limit."""
+        name, found = self.name or self.joint, []
+        coordinate = joint_coordinate(mechanism, self.joint, f"limit {quoted(name)}")
+        if self.lower is None and self.upper is None:
+            raise ValueError(f"limit {quoted(name)}: give `lower` or `upper`, or both")
+        for side, limit, sign in (("lower", self.lower, 1.0), ("upper", self.upper, -1.0)):
+            if limit is not None:
+                action = Impact(self.restitution, self.at_rest)
+                found.append(Event(_Within(coordinate, limit, number(sign)), action, -1, f"{name}.{side}"))
+        return found
+
+
+class Contact(eqx.Module):
+    """A point of a body hits a line, fixed to the ground or to another body, that it cannot pass: an `Impact`, without friction.
+
+    The line goes through the point `through` of the body `on`; the `normal`, of any length, is on the side that is allowed. Both
+    are in that body's own frame (m).
+    """
+
+    body: str = eqx.field(static=True)
+    point: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))
+    through: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))
+    normal: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 1.0))
+    restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    on: str = eqx.field(static=True, default=GROUND)
+    at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
+    name: str = eqx.field(static=True, default="")
+
+    def expand(self, mechanism: Mechanism) -> list[Event]:
+        """The event."""
+        name = self.name or f"{self.body} on {self.on}"
+        for body in (self.body, self.on):
+            _require(body, [*mechanism.body_names, GROUND], f"contact {quoted(name)}", "body")
+        if self.body == self.on:
+            raise ValueError(f"contact {quoted(name)}: {quoted(self.body)} cannot touch itself")
+        if not isinstance(self.normal, Tracer) and not np.any(np.asarray(self.normal)):
+            raise ValueError(f"contact {quoted(name)}: the normal must not be zero")
+        gap = _Gap((self.body, self.on), self.point, self.through, self.normal)
+        return [Event(gap, Impact(self.restitution, self.at_rest), -1, name)]
+
+
+class Events(eqx.Module):
+    """The events of a run in their order: times (s), states before and after, and which each was.
+
+    Where numbers are traced, or in a batch, there are `max_events` of each, padded with NaN, and -1 for `index`.
+    """
+
+    time: Float[Array, "events"]
+    index: Int[Array, "events"]  # of `names`
+    q_before: Float[Array, "events bodies 3"]
+    v_before: Float[Array, "events bodies 3"]
+    q_after: Float[Array, "events bodies 3"]
+    v_after: Float[Array, "events bodies 3"]
+    count: Int[Array, ""]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def of(self, name: str) -> Float[Array, "k"]:
+        """The times (s) of the events of one name, of a single run."""
+        _require(name, self.names, "events", "event")
+        return self.time[np.asarray(self.index) == self.names.index(name)]
+
+    @property
+    def counts(self) -> dict[str, Any]:
+        """How many events there were of each name."""
+        return {name: (self.index == k).sum(-1) for k, name in enumerate(self.names)}
+
+
+# --- the conditions of the ready-made ones
+
+
+class JointCoordinate(eqx.Module):
+    """What moves in a joint: theta2 - theta1 (rad), or the distance of point 2 from point 1 along the axis (m)."""
+
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    points: Float[Array, "2 2"] | None = None
+    axis: Float[Array, ""] | None = None
+
+    def of(self, one: Frame, two: Frame) -> Any:
+        """The coordinate."""
+        if self.points is None or self.axis is None:
+            return two.angle - one.angle
+        return one.vector((jnp.cos(self.axis), jnp.sin(self.axis))).dot(between(self.points, one, two))
+
+
+class _Within(eqx.Module):
+    """How far a joint is from its limit."""
+
+    coordinate: JointCoordinate
+    limit: Float[Array, ""]
+    sign: Float[Array, ""]
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        return self.coordinate.bodies
+
+    def __call__(self, t: Any, frames: Frames) -> Any:
+        return self.sign * (self.coordinate.of(*(frames[name] for name in self.bodies)) - self.limit)
+
+
+class _Gap(eqx.Module):
+    """How far a point is from a line."""
+
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    point: Float[Array, "2"]
+    through: Float[Array, "2"]
+    normal: Float[Array, "2"]
+
+    def __call__(self, t: Any, frames: Frames) -> Any:
+        one, two = (frames[name] for name in self.bodies)
+        p, q, n = one.point(self.point), two.point(self.through), two.vector(self.normal)
+        return Point(p.x - q.x, p.y - q.y).dot(n) / jnp.sqrt(self.normal[0] ** 2 + self.normal[1] ** 2)
+
+
+def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoordinate:
+    """The coordinate of a joint of a mechanism, by its name; `where` begins the message of an error."""
+    _require(joint, mechanism.joint_names, where, "joint")
+    found = mechanism.joints[joint]
+    if isinstance(found, Revolute):
+        return JointCoordinate(found.bodies)
+    if isinstance(found, Prismatic | Slot):
+        return JointCoordinate(found.bodies, found.points, found.axis)
+    kinds = "a revolute or prismatic joint, or a slot"
+    raise ValueError(f"{where}: {quoted(joint)} is a {type(found).__name__}, and must be {kinds}")
+
+
+def expanded(events: Sequence[Any], mechanism: Mechanism) -> tuple[Event, ...]:
+    """All events, each with a name of its own; raise `ValueError` where one cannot be."""
+    found: list[Event] = []
+    for k, event in enumerate(events):
+        if not hasattr(event, "expand"):
+            raise ValueError(f"events[{k}]: must be an Event, a JointLimit or a Contact, is a {type(event).__name__}")
+        for one in event.expand(mechanism):
+            name = one.name or f"event{k + 1}"
+            if any(name == other.name for other in found):
+                raise ValueError(f"event {quoted(name)}: two events have this name; give one of them another (`name=`)")
+            found.append(_named(one, name))
+    for event in found:
+        _check(event, mechanism)
+    if not found:
+        raise ValueError("events: the list is empty; leave it out for a run without events")
+    return tuple(found)
+
+
+def frames_of(names: Sequence[str], q: Array, v: Array | None = None) -> dict[str, Frame]:
+    """The frames of all bodies by name, and the ground's, of flat q and v; without v they have no velocities."""
+    q = q.reshape(-1, 3)
+    rates = [()] * len(names) if v is None else v.reshape(-1, 3)
+    frames: dict[str, Frame] = {GROUND: FIXED}
+    for name, x, dx in zip(names, q, rates, strict=True):
+        seen: Any = (*x, jnp.cos(x[2]), jnp.sin(x[2]), *dx)
+        frames[name] = Frame(*seen)
+    return frames
+
+
+def sees_velocity(event: Event, mechanism: Mechanism) -> bool:
+    """Whether a condition depends on velocities: frames that have none do not serve it."""
+    try:
+        return event.condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel())) is None
+    except (TypeError, AttributeError, ValueError):  # as arithmetic with None raises, of Python, JAX or NumPy
+        return True
+
+
+def _named(event: Event, name: str) -> Event:
+    return Event(event.condition, event.action, -1 if isinstance(event.action, Impact) else event.direction, name)
+
+
+def _check(event: Event, mechanism: Mechanism) -> None:
+    where, action = f"event {quoted(event.name)}", event.action
+    if not isinstance(action, Action):
+        raise ValueError(f"{where}: the action must be Stop(), Log(), Impact(...), ..., is a {type(action).__name__}")
+    if event.direction not in (-1, 0, 1):
+        raise ValueError(f"{where}: the direction must be -1, 0 or 1, is {event.direction}")
+    if not callable(event.condition):
+        raise ValueError(f"{where}: the condition must be a function (t, frames), is a {type(event.condition).__name__}")
+    try:
+        value = jnp.asarray(event.condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())))
+    except KeyError as error:
+        name = error.args[0]
+        raise ValueError(f"{where}: no body named {quoted(str(name))}{suggestion(name, mechanism.body_names)}") from error
+    if value.shape:
+        raise ValueError(f"{where}: the condition must return one number, not an array of shape {value.shape}")
+    if isinstance(action, Impact):
+        if sees_velocity(event, mechanism):
+            raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
+        e = action.restitution
+        if not isinstance(e, Tracer) and not np.all((np.asarray(e) >= 0) & (np.asarray(e) <= 1)):
+            raise ValueError(f"{where}: the restitution must be from 0 to 1, is {float(e):g}")
+        if action.at_rest not in ("hold", "stop"):
+            raise ValueError(f'{where}: at_rest must be "hold" or "stop", is {action.at_rest!r}')
+    elif isinstance(action, Lock):
+        joint_coordinate(mechanism, action.joint, where)
+    elif isinstance(action, Attach):
+        if action.name in mechanism.constraints:
+            raise ValueError(f"{where}: {quoted(action.name)} is in the scene already; attach the joint under another name")
+        for body in action.joint.bodies:
+            _require(body, [*mechanism.body_names, GROUND], where, "body")
+
+
+def _require(name: str, known: Sequence[str], where: str, what: str) -> None:
+    if name not in known:
+        raise ValueError(f"{where}: no {what} named {quoted(name)}{suggestion(name, known)}")

@@ -1,0 +1,194 @@
+"""Phases: the mechanisms that one scene with events goes through, as constraints are released, added, or contacts come to rest.
+
+All have the scene's bodies, and so its states. Which of them can be reached, and what leads from one to another, is found before
+the run by following every event from every phase; each then has equations, and machine code, of its own.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+from jax.core import Tracer
+from jaxtyping import Array
+
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.integrate.events import FIXED, Attach, Event, Impact, JointCoordinate, Lock, Release, frames_of, joint_coordinate
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.checks import quoted, suggestion
+from udkjax.scene.fields import number, optional
+from udkjax.scene.joints import Angle, Joint, filled
+from udkjax.scene.mechanism import Mechanism, Origin
+
+MOST_PHASES = 32  # each is compiled
+
+
+class Tables(NamedTuple):
+    """Where events lead, as [phase][event]: hashable, so that what is compiled for them is found again."""
+
+    after: tuple[tuple[int, ...], ...]  # the phase that follows an event
+    resting: tuple[tuple[int, ...], ...]  # that of a contact that comes to rest
+    freed: tuple[tuple[int, ...], ...]  # that of a contact at rest that lets go
+    held: tuple[tuple[int, ...], ...]  # the row of Psi that holds a contact; -1: none
+
+
+class Phases(eqx.Module):
+    """Mechanisms, their analyses, and how events lead from one to another. The first is where a run starts."""
+
+    mechanisms: tuple[Mechanism, ...]
+    analyses: tuple[Analysis, ...]
+    added: tuple[Joint, ...]  # what `Attach` and `Lock` add, with the numbers that the state at the event decides left out
+    added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # of each: the event, and the name of the joint
+    tables: Tables = eqx.field(static=True)
+
+    def with_added(self, phase: int, joints: Sequence[Joint]) -> Mechanism:
+        """The mechanism of a phase with the joints as the events have added them."""
+        mechanism = self.mechanisms[phase]
+        for (_, name), joint in zip(self.added_by, joints, strict=True):
+            if name in mechanism.joint_names:
+                place = mechanism.joint_names.index(name)
+                mechanism = eqx.tree_at(lambda m, place=place: m._joints[place], mechanism, joint)
+        return mechanism
+
+    def first_added(self) -> tuple[Joint, ...]:
+        """What events add, as it would be at the initial guess."""
+        return tuple(self.resolved(k, self.mechanisms[0].q0.ravel()) for k in range(len(self.added)))
+
+    def resolved(self, k: int, q: Array) -> Joint:
+        """What the k-th of them is when it is added at q."""
+        joint, frames = self.added[k], frames_of(self.mechanisms[0].body_names, q)
+        return jax.tree.map(number, joint.resolved(*(frames[name] for name in joint.attached)))
+
+
+def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis) -> Phases:
+    """Find the phases of a mechanism with events. Raises `ValueError` where there are too many."""
+    added, added_by = _additions(mechanism, events)
+    names = [name for _, name in added_by]
+    known = [*mechanism.constraints, *names]
+    for event in events:
+        if isinstance(event.action, Release) and event.action.name not in known:
+            near = suggestion(event.action.name, known)
+            raise ValueError(f"event {quoted(event.name)}: no joint or driver named {quoted(event.action.name)}{near}")
+    first: frozenset[str] = frozenset(mechanism.constraints)
+    found, steps = [first], []
+    for active in found:  # which grows while it is followed
+        rows = [_steps(event, active, names, added_by, k) for k, event in enumerate(events)]
+        for target in (x for row in rows for x in row):
+            if target not in found:
+                found.append(target)
+        if len(found) > MOST_PHASES:
+            raise ValueError(
+                f"events: more than {MOST_PHASES} combinations of constraints can follow one another; contacts with "
+                'at_rest="stop" instead of "hold" add none'
+            )
+        steps.append(rows)
+    place = {active: k for k, active in enumerate(found)}
+    after, resting, freed = (tuple(tuple(place[row[i]] for row in rows) for rows in steps) for i in range(3))
+    contacts = {_contact(event): HeldContact.of(event, mechanism) for event in events if _holds(event)}
+    extra = {**dict(zip(names, added, strict=True)), **contacts}
+    mechanisms = [_with(mechanism, active, extra) for active in found]
+    analyses = [analysis]
+    for active, phase in zip(found[1:], mechanisms[1:], strict=True):
+        own = _with(mechanism, active - extra.keys(), {})
+        analyses.append(_analysis(phase, lambda own=own: analysis if own is mechanism else analyse(own)))
+    held = tuple(
+        tuple(_row(a, _contact(e)) if _contact(e) in active else -1 for e in events)
+        for active, a in zip(found, analyses, strict=True)
+    )
+    tables = Tables(after, resting, freed, held)
+    return Phases(tuple(m.bare for m in mechanisms), tuple(analyses), tuple(added), tuple(added_by), tables)
+
+
+def _additions(mechanism: Mechanism, events: Sequence[Event]) -> tuple[list[Joint], list[tuple[int, str]]]:
+    joints, by = [], []
+    for k, event in enumerate(events):
+        if isinstance(event.action, Attach):
+            joints.append(event.action.joint)
+            by.append((k, event.action.name))
+        elif isinstance(event.action, Lock):
+            coordinate = joint_coordinate(mechanism, event.action.joint, f"event {quoted(event.name)}")
+            bodies, points, axis = coordinate.bodies, coordinate.points, coordinate.axis
+            joints.append(Angle(bodies) if points is None or axis is None else Displacement(bodies, points, axis))
+            by.append((k, f"{event.action.joint}.lock"))
+    for k, name in by:
+        if [other for _, other in by].count(name) > 1:
+            raise ValueError(f"event {quoted(events[k].name)}: two events add {quoted(name)}; give one of them another name")
+    return joints, by
+
+
+def _steps(event: Event, active: frozenset[str], names: Sequence[str], by: Sequence[tuple[int, str]], k: int) -> Any:
+    """The constraints after an event, after it has come to rest, and after its contact has let go."""
+    action = event.action
+    added = frozenset(name for i, name in by if i == k)
+    after = active - {action.name} if isinstance(action, Release) else active | added
+    contact = frozenset([_contact(event)] if _holds(event) else [])
+    return after, active | contact, active - contact
+
+
+def _holds(event: Event) -> bool:
+    return isinstance(event.action, Impact) and event.action.at_rest == "hold"
+
+
+def _contact(event: Event) -> str:
+    return f"{event.name}.contact"
+
+
+def _analysis(phase: Mechanism, of_own: Callable[[], Analysis]) -> Analysis:
+    """That of a phase. What is added by traced numbers is taken to be independent of the scene's own constraints."""
+    found = analyse(phase)
+    own = of_own() if found.redundant_rows is None else found
+    if own.redundant_rows is None or found.redundant_rows is not None:
+        return found
+    rows = tuple(found.row_names.index(row) for row in own.redundant)
+    return replace(found, redundant_rows=rows)
+
+
+def _row(analysis: Analysis, name: str) -> int:
+    return [n for n, _ in analysis.row_names].index(name)
+
+
+def _with(mechanism: Mechanism, active: frozenset[str], extra: dict[str, Joint]) -> Mechanism:
+    """The mechanism with the constraints that are active, of its own and others."""
+    if active == frozenset(mechanism.constraints):
+        return mechanism
+    joints = {name: joint for name, joint in mechanism.joints.items() if name in active}
+    added = {name: joint for name, joint in extra.items() if name in active}
+    drivers = {name: driver for name, driver in mechanism.drivers.items() if name in active}
+    origin = None
+    if mechanism.origin is not None and not any(isinstance(x, Tracer) for x in jax.tree.leaves(list(added.values()))):
+        origin = Origin(_with(mechanism.origin.mechanism, active, extra))
+    return Mechanism(mechanism.bodies, joints | added, drivers, mechanism.forces, mechanism.gravity, mechanism.name, origin)
+
+
+class HeldContact(Joint):
+    """A contact at rest: its condition is kept at zero. 1 row, in the condition's unit."""
+
+    labels: tuple[str, ...] = eqx.field(static=True)  # the names by which the condition knows the bodies
+    condition: Callable[[Any, Any], Any]
+
+    @classmethod
+    def of(cls, event: Event, mechanism: Mechanism) -> "HeldContact":
+        """That of an event; of all bodies, unless its condition has an attribute `bodies`."""
+        bodies = getattr(event.condition, "bodies", mechanism.body_names)
+        return cls(bodies=bodies, labels=tuple(bodies), condition=event.condition)
+
+    def residual(self, t, *frames):
+        return [self.condition(t, {GROUND: FIXED, **dict(zip(self.labels, frames, strict=True))})]
+
+
+class Displacement(Joint):
+    """Point 2 stays where it is along `axis` of body 1. 1 row (m): its distance from point 1 along it, less `position`."""
+
+    points: Any = eqx.field(converter=number)
+    axis: Any = eqx.field(converter=number)
+    position: Any = eqx.field(converter=optional, default=None)
+
+    def residual(self, t, *frames):
+        return [self._along(*frames) - self.position]
+
+    def resolved(self, *frames):
+        return filled(self, "position", self._along(*frames))
+
+    def _along(self, one, two):
+        return JointCoordinate(self.bodies, self.points, self.axis).of(one, two)
