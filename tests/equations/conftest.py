@@ -18,7 +18,7 @@ def kkt():
     """Accelerations and multipliers from M a + Psi_q^T lambda = F, Psi_q a = gamma, in the sense of least squares."""
 
     def solved(mechanism, t, q, v):
-        A, gamma, M, F = (np.asarray(x) for x in terms(mechanism.bare, jnp.asarray(t), jnp.asarray(q), jnp.asarray(v)))
+        A, gamma, M, F = (np.asarray(x) for x in terms(mechanism.without_origin, jnp.asarray(t), jnp.asarray(q), jnp.asarray(v)))
         matrix = np.block([[M, A.T], [A, np.zeros((len(A), len(A)))]])
         solution = np.linalg.lstsq(matrix, np.concatenate([F, gamma]), rcond=1e-9)[0]
         return solution[: len(q)], solution[len(q) :]
@@ -34,7 +34,7 @@ def closed():
         q, t = mechanism.q0.ravel(), jnp.array(0.0)
         v = jnp.asarray(np.random.default_rng(seed).standard_normal(q.shape))
         rows = jax.jit(lambda m, t, q, v: (constraints.psi_q(m, t, q), constraints.psi_dot(m, t, q, v)))
-        A, rate = rows(mechanism.bare, t, q, v)
+        A, rate = rows(mechanism.without_origin, t, q, v)
         return q, v - jnp.linalg.pinv(A, rtol=1e-9) @ rate
 
     return state

@@ -41,7 +41,7 @@ def test_they_are_those_of_the_textbook(scene, name):
     state = udk.assemble(mechanism, t)
     q, v = (np.asarray(x).ravel() for x in (state.q, state.v))
     analysis, gains = udk.analyse(mechanism), udk.Baumgarte(2.0, 3.0)
-    leaves, tree = jax.tree.flatten(mechanism.bare)
+    leaves, tree = jax.tree.flatten(mechanism.without_origin)
     dleaves = [random.standard_normal(np.shape(x)) * 0.1 for x in leaves]
     dt, dq, dv = 0.7, random.standard_normal(q.size), random.standard_normal(v.size)
     programs = elimination_programs(mechanism, analysis.redundant_rows or (), True, RankPolicy.REFUSE)

@@ -163,7 +163,7 @@ def terms(mech, states):
     """What the programs say."""
 
     programs = scene_programs(mech)
-    constants = programs.prologue([*map(float, leaves_as_scalars(jax.tree.leaves(mech.bare))), 1e-8, 1e-8])
+    constants = programs.prologue([*map(float, leaves_as_scalars(jax.tree.leaves(mech.without_origin))), 1e-8, 1e-8])
     (m, n), slots = programs.pattern.shape, programs.pattern.slots
 
     def at(t, q, v):
@@ -239,7 +239,7 @@ def test_one_force_element_alone(mech, states, name):
     t, q, v = (s[1] for s in states)
     q = q.at[0].set(-0.5)  # at the stop
     programs = scene_programs(alone)
-    constants = programs.prologue([*map(float, leaves_as_scalars(jax.tree.leaves(alone.bare))), 1e-8, 1e-8])
+    constants = programs.prologue([*map(float, leaves_as_scalars(jax.tree.leaves(alone.without_origin))), 1e-8, 1e-8])
     free = jnp.array(programs.equation_terms([*constants, float(t), *q.tolist(), *v.tolist()])[-18:-9])
     assert jnp.abs(free).max() > 1e-3
     assert_allclose(free * loads.mass(alone), loads.force(alone, t, q, v), rtol=1e-12, atol=1e-12)

@@ -59,7 +59,7 @@ def close_to(found, expected, rtol):
 def test_accelerations_and_multipliers_solve_the_equations_of_motion(moved):
     """M a + Psi_q^T lambda = F; and Psi_q a is gamma as far as it can be: what is left is orthogonal to the columns of D."""
     mech, q, v = moved
-    x = textbook(mech.bare, q, v, SVD)
+    x = textbook(mech.without_origin, q, v, SVD)
     size = 1.0 + np.abs(x["psi_q"]).max(initial=0.0) * np.abs(x["lambda"]).max(initial=0.0)
     assert_allclose(x["M"] * x["a"] + x["psi_q"].T @ x["lambda"], x["F"], rtol=0, atol=1e-10 * size)
     left, D = x["psi_q"] @ x["a"] - x["gamma"], x["psi_q"] / np.sqrt(x["M"])
@@ -71,7 +71,7 @@ def test_rates_are_derivatives_along_a_motion(moved):
     mech, q, v = moved
     a = jnp.cos(jnp.arange(q.size))
     psi = jax.jit(lambda s: constraints.psi(mech, T0 + s, q + v * s + a * s**2 / 2))
-    x, h = textbook(mech.bare, q, v, SVD), 1e-3
+    x, h = textbook(mech.without_origin, q, v, SVD), 1e-3
     samples = np.array([psi(k * h) for k in range(-3, 4)])
     close_to(np.array([-1, 9, -45, 0, 45, -9, 1]) @ samples / (60 * h), x["psi_dot"], 1e-9)
     close_to(np.array([2, -27, 270, -490, 270, -27, 2]) @ samples / (180 * h**2), x["psi_q"] @ a - x["gamma"], 1e-7)
@@ -110,12 +110,14 @@ def test_a_duplicated_constraint_changes_nothing(name, closed):
         mech.bodies, {**mech.joints, "copy": mech.joints[joint]}, mech.drivers, mech.forces, gravity=mech.gravity
     )
     q, v = closed(mech)
-    once, again = (textbook(m.bare, q, v, SVD, t=jnp.array(0.0)) for m in (mech, twice))
+    once, again = (textbook(m.without_origin, q, v, SVD, t=jnp.array(0.0)) for m in (mech, twice))
     close_to(again["a"], once["a"], 1e-11)
     close_to(again["psi_q"].T @ again["lambda"], once["psi_q"].T @ once["lambda"], 1e-11)
     off = q + 1e-4 * jnp.cos(jnp.arange(q.size))
     project = jax.jit(lambda m: jnp.concatenate(uk.project(m, 0.0, off, v, SVD, steps=4)))
-    close_to(project(twice.bare), project(mech.bare), 1e-7)  # where redundant rows disagree, copies count twice
+    close_to(
+        project(twice.without_origin), project(mech.without_origin), 1e-7
+    )  # where redundant rows disagree, copies count twice
 
 
 def test_the_linkage_of_the_paper(placed):
@@ -123,18 +125,18 @@ def test_the_linkage_of_the_paper(placed):
     mech = udk.library.parallelogram()
     for angle in (-0.8, 0.4, 2.0):
         q, v = (x.ravel() for x in placed(angle, 1.3))
-        assert_allclose(textbook(mech.bare, q, v, SVD)["a"][2], -3.5 * 9.81 * np.cos(angle) / 3.05, rtol=1e-12)
+        assert_allclose(textbook(mech.without_origin, q, v, SVD)["a"][2], -3.5 * 9.81 * np.cos(angle) / 3.05, rtol=1e-12)
 
 
 def test_weights_change_no_solution_of_consistent_rows_and_zero_leaves_one_out():
     mech = udk.library.parallelogram(-0.8)
     q, v = mech.q0.ravel(), mech.v0.ravel()
-    plain = textbook(mech.bare, q, v, SVD)
+    plain = textbook(mech.without_origin, q, v, SVD)
     w = jnp.linspace(0.1, 10.0, 12)
-    weighted = textbook(mech.bare, q, v, SVD, w=w)
+    weighted = textbook(mech.without_origin, q, v, SVD, w=w)
     assert_allclose(weighted["a"], plain["a"], atol=1e-12)
     close_to(weighted["psi_q"].T @ weighted["lambda"], plain["psi_q"].T @ plain["lambda"], 1e-12)
-    without = textbook(mech.bare, q, v, SVD, w=w.at[11].set(0.0))
+    without = textbook(mech.without_origin, q, v, SVD, w=w.at[11].set(0.0))
     assert_allclose(without["a"], plain["a"], atol=1e-11)
     assert without["lambda"][11] == 0.0 and np.abs(plain["lambda"][11]) > 1.0
 
@@ -181,7 +183,7 @@ def test_programs_are_the_textbook(moved, policy):
     if is_large(mech):
         pytest.skip("written as loops (tests/native/test_loops.py)")
     programs = elimination_programs(mech, redundant, True, policy)
-    leaves = jax.tree.leaves(mech.bare)
+    leaves = jax.tree.leaves(mech.without_origin)
     constants = programs.prologue([*map(float, leaves_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14])
     run = lambda program: named(program, constants, T0, q, v)  # noqa: E731
     (m, n), slots = programs.pattern.shape, programs.pattern.slots
@@ -201,7 +203,7 @@ def test_programs_are_the_textbook(moved, policy):
     }
     kept = np.ones(len(analysis.row_names))
     kept[list(redundant)] = 0.0
-    expected = textbook(mech.bare, q, v, udk.SVD(1e-11), gains, analysis.scales.weights * kept)
+    expected = textbook(mech.without_origin, q, v, udk.SVD(1e-11), gains, analysis.scales.weights * kept)
     for name, array in found.items():
         close_to(array, expected[name], 1e-11)
     close_to(run(programs.accelerations)[:n], expected["a"], 1e-8)
@@ -212,13 +214,13 @@ def test_every_pseudoinverse_gives_what_singular_values_give(moved, method):
     """Accelerations and multipliers of minimum norm, of all rows, weighted; where rows that are redundant agree."""
     mech, _, v = moved
     analysis, q = udk.analyse(mech), udk.assemble(mech, T0).q.ravel()
-    q, v = jax.jit(lambda m, q, v: uk.project(m, T0, q, v, udk.SVD(1e-6), steps=3))(mech.bare, q, v)
-    expected = textbook(mech.bare, q, v, udk.SVD(1e-6), None, analysis.scales.weights)
+    q, v = jax.jit(lambda m, q, v: uk.project(m, T0, q, v, udk.SVD(1e-6), steps=3))(mech.without_origin, q, v)
+    expected = textbook(mech.without_origin, q, v, udk.SVD(1e-6), None, analysis.scales.weights)
 
     @eqx.filter_jit
     def both(m, q, v):
         equations = prepare(m, method, analysis=analysis)
         return equations.accelerations(T0, q, v), equations.multipliers(T0, q, v)
 
-    for found, name in zip(both(mech.bare, q, v), ("a", "lambda"), strict=True):
+    for found, name in zip(both(mech.without_origin, q, v), ("a", "lambda"), strict=True):
         close_to(found, expected[name], 1e-9)

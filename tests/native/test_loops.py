@@ -69,7 +69,9 @@ class At:
         self.t = 0.2
         self.q = np.ravel(state.q) + 1e-2 * random.standard_normal(n)
         self.v = np.ravel(state.v) + 0.3 * random.standard_normal(n)
-        self.numbers = np.concatenate([np.ravel(x) for x in [*jax.tree.leaves(mechanism.bare), *gains, NOTHING, NOTHING]])
+        self.numbers = np.concatenate(
+            [np.ravel(x) for x in [*jax.tree.leaves(mechanism.without_origin), *gains, NOTHING, NOTHING]]
+        )
         self.constants = np.zeros(len(self.code.constants))
         loops.run(self.code.prologue, {"numbers": self.numbers, "constants": self.constants})
         kept = [k for k in range(self.code.row_count) if every or k not in redundant]
@@ -264,7 +266,7 @@ def test_blocks_that_are_alike_are_eliminated_in_a_run():
 
 def changed(mechanism, scale):
     """A mechanism with all its numbers changed a little."""
-    leaves, tree = jax.tree.flatten(mechanism.bare)
+    leaves, tree = jax.tree.flatten(mechanism.without_origin)
     factors = 1.0 + 0.01 * np.sin(np.arange(len(leaves)))
     return jax.tree.unflatten(tree, [x * (1.0 + scale * (f - 1.0)) for x, f in zip(leaves, factors, strict=True)])
 

@@ -33,7 +33,7 @@ def terms(mechanism, t, q, v):
 def by_scipy(mechanism, ts, state=None, gains=(0.0, 0.0)):
     """The motion from M a + Psi_q^T lambda = F, Psi_q a = gamma in the sense of least squares, by SciPy."""
     state = udk.assemble(mechanism) if state is None else state
-    bare, n = mechanism.bare, state.q.size
+    bare, n = mechanism.without_origin, state.q.size
 
     def slope(t, y):
         A, gamma, M, F = map(np.asarray, terms(bare, t, y[:n], y[n:]))

@@ -79,12 +79,12 @@ def analyse(mechanism: Mechanism) -> Analysis:
     redundant rows stay unknown, and `Auto` then takes singular values throughout, by diffrax: right, and a hundred times slower.
     Analyse before the trace, and hand it on: `simulate(mechanism, ts, analysis=analysis)`.
     """
-    if not mechanism.is_known:
+    if not mechanism.is_concrete:
         if mechanism.origin is not None:
             return analyse(mechanism.origin.mechanism)
-        mechanism = mechanism.bare
+        mechanism = mechanism.without_origin
         return Analysis(traced_scales(mechanism), 3 * len(mechanism.body_names), _row_names(mechanism), None)
-    mechanism = mechanism.bare
+    mechanism = mechanism.without_origin
     kind = structure(mechanism)
     return _analyses.get((kind, _bytes_of(mechanism)), lambda: _analyse(mechanism, kind))
 

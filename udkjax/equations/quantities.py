@@ -63,7 +63,7 @@ def accelerations(
     are (n,).
     """
     if isinstance(mechanism, Mechanism):
-        analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.bare
+        analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.without_origin
     t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
     return _accelerations(mechanism, analysis, t, q, v, method, stabilization, formulation, multipliers)
 
@@ -102,7 +102,7 @@ def _energy(equations: Any, t: Any, q: Any, v: Any) -> Energy:
 def _along(mechanism: Any, solution: Any, quantity: Callable, method: Any = None, baumgarte: Any = None) -> Any:
     analysis, method = None, SVD() if method is None else method
     if isinstance(mechanism, Mechanism):
-        analysis, mechanism = analyse(mechanism), mechanism.bare
+        analysis, mechanism = analyse(mechanism), mechanism.without_origin
     return _evaluate(mechanism, analysis, solution.ts, solution.q, solution.v, quantity, method, baumgarte)
 
 

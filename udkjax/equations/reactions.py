@@ -74,7 +74,7 @@ def reactions(
     """
     soft = None if compliances is None else _compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
-    by_row = _loads_by_row(mechanism.bare, analysis, *states, method, stabilization, soft)
+    by_row = _loads_by_row(mechanism.without_origin, analysis, *states, method, stabilization, soft)
     return _by_body(mechanism, states[1], by_row, lambda part: part.sum(0), frame, about)
 
 
@@ -87,7 +87,7 @@ def unique_reactions(
     `rank_tol` is that of `uniqueness`.
     """
     analysis, (ts, q, _) = analyse(mechanism), _states(solution)
-    Psi_q, N = _null_spaces(mechanism.bare, analysis, ts, q, jnp.asarray(rank_tol))
+    Psi_q, N = _null_spaces(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol))
     rows = [name for name, _ in analysis.row_names]
     unit = jnp.stack([1.0, 1.0, analysis.length])  # of a force, and of a torque in forces
 

@@ -28,7 +28,7 @@ def is_large(mechanism: Mechanism) -> bool:
 
 def structure(mechanism: Mechanism) -> tuple[Any, tuple]:
     """Return the tree of a mechanism, and the shape and the type of each of its numbers."""
-    leaves, tree = jax.tree.flatten(mechanism.bare)
+    leaves, tree = jax.tree.flatten(mechanism.without_origin)
     return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
 
 

@@ -124,7 +124,7 @@ def prepare(
     A method without a `rank_tol` gets `rank_tolerance`. `analysis` is that of `analyse`, by default made here.
     """
     analysis = analyse(mechanism) if analysis is None else analysis
-    mechanism = mechanism.bare
+    mechanism = mechanism.without_origin
     chosen: Any = Auto() if method is None else method
     tol = rank_tolerance(mechanism) if chosen.rank_tol is None else chosen.rank_tol
     chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)

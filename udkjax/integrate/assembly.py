@@ -110,7 +110,7 @@ def close(
     """
     if not _known((mechanism, t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
-        return _close(mechanism.bare, analysis, t, state)
+        return _close(mechanism.without_origin, analysis, t, state)
     of, when, found = _latest.get(id(mechanism), (None, 0.0, None))
     if found is not None and state is None and of is not None and of() is mechanism and when == np.asarray(t).item():
         return found

@@ -97,7 +97,7 @@ def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis)
         for active, a in zip(found, analyses, strict=True)
     )
     tables = Tables(after, resting, freed, held)
-    return Phases(tuple(m.bare for m in mechanisms), tuple(analyses), tuple(added), tuple(added_by), tables)
+    return Phases(tuple(m.without_origin for m in mechanisms), tuple(analyses), tuple(added), tuple(added_by), tables)
 
 
 def _additions(mechanism: Mechanism, events: Sequence[Event]) -> tuple[list[Joint], list[tuple[int, str]]]:

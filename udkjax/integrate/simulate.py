@@ -108,7 +108,7 @@ def simulate(
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
     bare: Any = mechanism
     if isinstance(mechanism, Mechanism):
-        analysis, bare = analyse(mechanism) if analysis is None else analysis, mechanism.bare
+        analysis, bare = analyse(mechanism) if analysis is None else analysis, mechanism.without_origin
         if state is None and closure is None:
             closure = close(mechanism, start, analysis=analysis)
 
@@ -134,7 +134,7 @@ def simulate(
     solution, missed = run(analysis)
     if isinstance(solution.code, Tracer):
         return solution
-    if isinstance(mechanism, Mechanism) and missed and mechanism.is_known:
+    if isinstance(mechanism, Mechanism) and missed and mechanism.is_concrete:
         solution, _ = run(analyse(mechanism))  # the analysis was of other numbers, in which a row depended
     return _required(solution, mechanism, closure, throw)
 

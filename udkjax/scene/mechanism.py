@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from udkjax.deprecation import renamed_attributes
 from udkjax.scene.bodies import GROUND, Body, Frame
 from udkjax.scene.checks import Entry, SceneError, not_hashable, problems_of
 from udkjax.scene.description import mechanism_html
@@ -26,7 +27,7 @@ _FIXED = Frame(0.0, 0.0, 0.0, 1.0, 0.0)
 
 
 class Origin:
-    """The known numbers that a mechanism with traced ones was made from. It is hashable, and equal where its numbers are."""
+    """The concrete mechanism that one with traced numbers was made from. It is hashable, and equal where its numbers are."""
 
     def __init__(self, mechanism: "Mechanism"):
         self.mechanism = mechanism
@@ -58,7 +59,7 @@ class Mechanism(eqx.Module):
     joint_names: tuple[str, ...] = eqx.field(static=True)
     driver_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
-    origin: Origin | None = eqx.field(static=True)  # of traced numbers: the known ones that they stand for, if there are any
+    origin: Origin | None = eqx.field(static=True)  # of traced numbers: the concrete ones that they stand for
     # JAX sorts the keys of a dict: tuples keep the user's order.
     _bodies: tuple[Body, ...]
     _joints: tuple[Joint, ...]
@@ -137,8 +138,8 @@ class Mechanism(eqx.Module):
         return jnp.concatenate(named) if named else None
 
     @property
-    def bare(self) -> "Mechanism":
-        """The same without its `origin`: what is compiled for it serves every origin."""
+    def without_origin(self) -> "Mechanism":
+        """The same mechanism without its `origin`: what is compiled for it serves every origin."""
         if self.origin is None:
             return self
         copy = object.__new__(type(self))
@@ -147,9 +148,11 @@ class Mechanism(eqx.Module):
         return copy
 
     @property
-    def is_known(self) -> bool:
+    def is_concrete(self) -> bool:
         """Whether no number is traced."""
         return not any(isinstance(leaf, Tracer) for leaf in self._numbers)
+
+    __getattr__ = renamed_attributes("Mechanism", bare="without_origin", is_known="is_concrete")
 
     @property
     def _numbers(self) -> list[Any]:
@@ -172,7 +175,7 @@ class Mechanism(eqx.Module):
         """
         new, gravity = replaced(self, values)
         traced = any(isinstance(value, Tracer) for value in jax.tree.leaves(dict(values)))
-        origin = Origin(self) if traced and self.is_known else self.origin
+        origin = Origin(self) if traced and self.is_concrete else self.origin
         return Mechanism(new["body"], new["joint"], new["driver"], new["force"], gravity, self.name, origin)
 
 

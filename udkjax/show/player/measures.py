@@ -58,7 +58,7 @@ def singular_values(mechanism: Mechanism, solution: Any) -> Float[np.ndarray, "T
     weights = analyse(mechanism).scales.weights
     if len(weights) == 0:
         return np.zeros((len(solution.ts), 0))
-    matrices = _matrices(mechanism.bare, solution.ts, solution.q, weights)
+    matrices = _matrices(mechanism.without_origin, solution.ts, solution.q, weights)
     finite = np.isfinite(matrices).all((1, 2))
     found = np.full((len(matrices), min(matrices.shape[1:])), np.nan)
     found[finite] = np.linalg.svd(matrices[finite], compute_uv=False)

@@ -52,7 +52,7 @@ def diagnose(
         AssemblyError: the configuration cannot be closed.
         ValueError: numbers of the mechanism are traced.
     """
-    if not mechanism.is_known:
+    if not mechanism.is_concrete:
         raise ValueError("diagnose takes known numbers: under jit and vmap take uniqueness and singular_values, which are pure")
     if state is None and solution is not None:
         state, t = State(solution.q[0], solution.v[0]), float(solution.ts[0])

@@ -50,7 +50,7 @@ def quadratic_forms(mechanism: Mechanism, positions: Positions, at: Configuratio
     if not N.shape[1] or not V.shape[1]:
         return np.zeros((N.shape[1], V.shape[1], V.shape[1]))
     unit, weights = positions.unit[:, None] * V, N / positions.row_unit[:, None]
-    return np.asarray(_hessian(mechanism.bare, at.t, at.q, unit, weights))
+    return np.asarray(_hessian(mechanism.without_origin, at.t, at.q, unit, weights))
 
 
 @jax.jit

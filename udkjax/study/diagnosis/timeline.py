@@ -136,7 +136,7 @@ class _Path:
     """Singular values at any time between states, by the quintic through q, v and a of two of them."""
 
     def __init__(self, mechanism: Mechanism, analysis: Analysis, ts: np.ndarray, q: np.ndarray, v: np.ndarray):
-        self.mechanism, self.analysis = mechanism.bare, analysis
+        self.mechanism, self.analysis = mechanism.without_origin, analysis
         self.ts, self.states = ts, (q, v, np.asarray(_accelerations(self.mechanism, analysis, ts, q, v)))
 
     def singular_values(self, times: np.ndarray) -> np.ndarray:
