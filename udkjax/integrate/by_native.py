@@ -18,11 +18,11 @@ from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.problem import Problem, Raw
 from udkjax.integrate.tableau import is_explicit, method_of
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.native.layout import INFO, INPUTS, OUTPUTS, SETTINGS
 from udkjax.native.operation import Kind, Tableau, compiled, native_p, shapes_of, written
 from udkjax.native.program import UnsupportedError
 from udkjax.native.steps import DONE, WITH_CARE
 from udkjax.native.tableau import EULER
-from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, SETTINGS
 from udkjax.pinv import Auto, Elimination
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism

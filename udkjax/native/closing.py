@@ -13,10 +13,13 @@ import numpy as np
 
 from udkjax.equations.closing import HALVINGS, ITERATIONS, ROUNDING, STRIDE
 from udkjax.equations.scalar_programs import ScenePrograms
+from udkjax.native.fallback import write_solve
 from udkjax.native.ir import INT, POINTER, Function, Value
+from udkjax.native.layout import Lane, Plan
 from udkjax.native.least_norm import least_norm
+from udkjax.native.members import write_begin, write_run
 from udkjax.native.tableau import EULER
-from udkjax.native.trajectory import Lane, Plan, Trajectory
+from udkjax.native.trajectory import Trajectory
 
 POSITION, VELOCITY = 0, 1  # what a correction is of
 VELOCITIES = 2  # corrections: the second removes the rounding errors of the first
@@ -32,29 +35,29 @@ class Closing(Trajectory):
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
-        self._programs()
+        self.write_programs()
         self._solver()
-        self._begin()
+        write_begin(self)
         self._close()
-        self._run()
-        return self._joined()
+        write_run(self)
+        return self.joined()
 
-    def _wanted(self, code: ScenePrograms) -> dict[str, Any]:
+    def program_names(self, code: ScenePrograms) -> dict[str, Any]:
         return {"equation_terms": code.equation_terms, "psi": code.psi, "psi_dot": code.psi_dot}
 
     def _solver(self):
         """The functions of D^+."""
         self.functions.append(least_norm())
-        self._solve()
+        write_solve(self)
 
     def _close(self):
         """`close(work, call)`: the member in the one lane."""
-        f, s = self._function("close", [(POINTER, "work"), (POINTER, "call")])
+        f, s = self.function("close", [(POINTER, "work"), (POINTER, "call")])
         work, n, m, p = f.given["work"], self.n, self.m, self.places
 
         def size() -> Value:
             """|Psi|, each row over its scale; not a number where a row is none."""
-            self._call(f, "psi")
+            self.invoke(f, "psi")
             total = f.variable(0.0)
             with f.each(m) as i:
                 part = f.load(work, i + p["psi"]) / f.load(work, i + p["rows"])
@@ -108,16 +111,16 @@ class Closing(Trajectory):
 
     def _written(self, f: Function, s: Lane):
         """The state, Psi and Psi_dot there, and the rank of D."""
-        member, work = self._whole(f, s.member), f.given["work"]
+        member, work = self.to_int(f, s.member), f.given["work"]
 
         def address(name: str, length: int) -> Value:
-            return f.at(f.load(f.given["call"], self.call.index(name), base=POINTER), member * length)
+            return f.at(f.load(f.given["call"], self.call_fields.index(name), base=POINTER), member * length)
 
         state, residuals = address("state", 2 * self.n), address("residuals", 2 * self.m)
-        self._copied(f, state, 0, "X q", f.const(0, INT))
-        self._copied(f, state, self.n, "X v", f.const(0, INT))
+        self.copy_lane(f, state, 0, "X q", f.const(0, INT))
+        self.copy_lane(f, state, self.n, "X v", f.const(0, INT))
         for name, offset in (("psi", 0), ("psi_dot", self.m)):
-            self._call(f, name)
+            self.invoke(f, name)
             with f.each(self.m) as i:
                 f.store(f.load(work, i + self.places["psi"]), residuals, i + offset)
         self._ranked(f)
@@ -131,8 +134,8 @@ class Closing(Trajectory):
         """-M^(-1/2) D^+ Psi at the state in X, or of Psi_dot, as coordinates."""
         work, n, m, p = f.given["work"], self.n, self.m, self.places
         right, x = (Value(f, f.reserve("double", max(c, 1)), POINTER) for c in (m, n))
-        self._call(f, "psi_dot" if kind == VELOCITY else "psi")
-        self._call(f, "equation_terms")
+        self.invoke(f, "psi_dot" if kind == VELOCITY else "psi")
+        self.invoke(f, "equation_terms")
         with f.each(m) as i:
             f.store(f.load(work, i + p["psi"]), right, i)
         f.call("solve", work, f.const(0, INT), right, x, s.care)
@@ -159,7 +162,7 @@ class Closing(Trajectory):
         with f.each(self.n) as i:
             f.store(f.load(work, i + p["C"]), work, i + p[f"X {x}"])
 
-    def _round(self, f: Function, s: Lane, fill):
+    def step_all(self, f: Function, s: Lane, fill):
         f.call("close", f.given["work"], f.given["call"])
         s.active = f.const(0.0)
         fill()

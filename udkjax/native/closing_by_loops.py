@@ -12,8 +12,8 @@ from udkjax.expressions.loops import Clear, LoopProgram
 from udkjax.native.closing import POSITION, VELOCITY, Closing
 from udkjax.native.closing_derivatives import Along, Back
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.layout import Lane
 from udkjax.native.linearized import ByLoops
-from udkjax.native.trajectory import Lane
 
 KINDS = {"position": (POSITION, "q"), "velocity": (VELOCITY, "v")}
 
@@ -27,7 +27,7 @@ class ClosingByLoops(Closing):
         self.corrections = {name: ByLoops(self, name) for name in KINDS}
         self.places.add("K", max(x.kept for x in self.corrections.values()))
 
-    def _wanted(self, code: LoopPrograms) -> dict[str, Any]:
+    def program_names(self, code: LoopPrograms) -> dict[str, Any]:
         return {"psi": code.psi, "psi_dot": code.psi_dot, "rank": code.rank}
 
     def _solver(self):
@@ -36,7 +36,7 @@ class ClosingByLoops(Closing):
 
     def _evaluate(self, f: Function, name: str):
         """The corrected state, in `K`."""
-        f.call(f"evaluation_{name}", f.given["work"], self._address(f, "K"))
+        f.call(f"evaluation_{name}", f.given["work"], self.address(f, "K"))
 
     def _change(self, f: Function, name: str, i: Value) -> Value:
         """A coordinate of the whole correction."""
@@ -56,7 +56,7 @@ class ClosingByLoops(Closing):
         with f.each(self.code.scratch["factors"]) as i:
             x = f.load(f.given["work"], i + (self.places["K"] + self.corrections["position"].place("factors")))
             f.store(x, f.given["work"], i + self.places["factors"])
-        self._call(f, "rank")
+        self.invoke(f, "rank")
 
     def _longest(self, f: Function, name: str) -> tuple[Value, Value]:
         """The largest change of a coordinate by the whole correction, in units of the scene, and which it is."""
@@ -88,13 +88,13 @@ class ForwardByLoops(ClosingByLoops, Along):
         return super().text()
 
     def _push(self, name: str):
-        f, _ = self._function(f"push_{name}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
+        f, _ = self.function(f"push_{name}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         x = KINDS[name][1]
         self._evaluate(f, name)
         longest, which = self._longest(f, name)
         limits = (f.given["limited"] > 0.5) & (longest > 0.0)
         with self._each_way(f):
-            f.call(f"forward_{name}", f.given["work"], self._address(f, "K"), f.given["way"], f.given["way"])
+            f.call(f"forward_{name}", f.given["work"], self.address(f, "K"), f.given["way"], f.given["way"])
             change = f.variable(0.0)  # of the longest step, over its length
             with f.each(self.n) as i:
                 step = self._at(f, f"O {x}", i, "way") - self._at(f, f"X {x}", i, "way")
@@ -130,7 +130,7 @@ class ReverseByLoops(ClosingByLoops, Back):
         return super().text()
 
     def _pull(self, name: str):
-        f, _ = self._function(f"pull_{name}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
+        f, _ = self.function(f"pull_{name}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         x = KINDS[name][1]
         self._evaluate(f, name)
         longest, which = self._longest(f, name)
@@ -143,5 +143,5 @@ class ReverseByLoops(ClosingByLoops, Back):
             self._more(f, f"Y {x}", which, -(along.value / self._change(f, name, which)))
         with f.each(self.n) as i:
             self._more(f, f"B {x}", i, -self._at(f, f"Y {x}", i))
-        f.call(f"reverse_{name}", f.given["work"], self._address(f, "K"))
+        f.call(f"reverse_{name}", f.given["work"], self.address(f, "K"))
         self._pulled(f)

@@ -21,10 +21,11 @@ from udkjax.equations.closing import ITERATIONS
 from udkjax.equations.scalar_programs import ScenePrograms
 from udkjax.expressions import Program, cotangents, tangents
 from udkjax.native.closing import POSITION, VELOCITIES, VELOCITY, Closing
+from udkjax.native.fallback import entries
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.layout import Lane, Layout
 from udkjax.native.least_norm import LEAST_NORM
 from udkjax.native.program import numbered, write
-from udkjax.native.trajectory import Lane, Places
 
 
 class _Moving(Closing):
@@ -57,7 +58,7 @@ class Along(_Moving):
 
     def _add_ways(self):
         """The memory of a way."""
-        self.ways = w = Places(1, self.plan.vector)
+        self.ways = w = Layout(1, self.plan.vector)
         w.add("numbers", self.numbers_moving)
         w.add("constants", self.constants)
         for name in ("X q", "X v", "O q", "O v"):
@@ -67,35 +68,35 @@ class Along(_Moving):
     def _each_way(self, f: Function) -> Iterator[Value]:
         call = f.load(f.given["work"], self.places["call"], base=POINTER)
         first = f.load(f.given["work"], self.places["ways"], base=POINTER)
-        with f.each(f.load(call, self.call.index("directions"), base=INT)) as p:
+        with f.each(f.load(call, self.call_fields.index("directions"), base=INT)) as p:
             f.given["way"] = f.at(first, p * self.ways.size)
             yield p
 
     def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
         f.call("push_velocity" if kind == VELOCITY else "push_position", f.given["work"], scale, limited)
 
-    def _begun(self, f: Function, lane: Value, member: Value):
+    def begin_member(self, f: Function, lane: Value, member: Value):
         del lane
-        call = self._call_of(f)
+        call = self.call_record(f)
         with self._each_way(f) as p:
             for name, to, count in (("dnumbers", "numbers", self.numbers_moving), ("dq", "X q", self.n), ("dv", "X v", self.n)):
-                start = self._of_member(f, call, name, member)
+                start = self.member_address(f, call, name, member)
                 with f.each(count) as i:
                     self._set(f, to, i, f.load(start, p * count + i), "way")
-            f.call("prologue_along", self._of_member(f, call, "numbers", member), f.given["way"], f.given["work"])
+            f.call("prologue_along", self.member_address(f, call, "numbers", member), f.given["way"], f.given["work"])
 
     def _ended_closing(self, f: Function, member: Value):
-        call = self._call_of(f)
-        directions = f.load(call, self.call.index("directions"), base=INT)
+        call = self.call_record(f)
+        directions = f.load(call, self.call_fields.index("directions"), base=INT)
         with self._each_way(f) as p:
-            to = f.at(f.load(call, self.call.index("dstate"), base=POINTER), (member * directions + p) * (2 * self.n))
+            to = f.at(f.load(call, self.call_fields.index("dstate"), base=POINTER), (member * directions + p) * (2 * self.n))
             for k, x in enumerate("qv"):
                 with f.each(self.n) as i:
                     f.store(self._at(f, f"X {x}", i, "way"), to, i + k * self.n)
 
-    def _memory(self, f: Function, call: Value) -> list[Value]:
-        size = f.load(call, self.call.index("directions"), base=INT) * self.ways.size
-        block, start = self._allocated(f, size)
+    def allocate_memory(self, f: Function, call: Value) -> list[Value]:
+        size = f.load(call, self.call_fields.index("directions"), base=INT) * self.ways.size
+        block, start = self.allocate(f, size)
         with f.each(size) as i:
             f.store(0.0, start, i)
         f.store(start, f.given["work"], self.places["ways"], base=POINTER)
@@ -131,33 +132,33 @@ class Back(_Moving):
                 self._more(f, f"B {x}", i, self._at(f, f"G {x}", i))
 
     def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
-        number = self._whole(f, self._at(f, "records", 0))
+        number = self.to_int(f, self._at(f, "records", 0))
         row = f.at(f.given["work"], number * self.row + self.places["record"])
         for k, x in enumerate((f.const(float(kind)), scale, limited)):
             f.store(x, row, k)
-        self._copied(f, row, 3, "X q", f.const(0, INT))
-        self._copied(f, row, 3 + self.n, "X v", f.const(0, INT))
+        self.copy_lane(f, row, 3, "X q", f.const(0, INT))
+        self.copy_lane(f, row, 3 + self.n, "X v", f.const(0, INT))
         self._set(f, "records", 0, self._at(f, "records", 0) + 1.0)
 
-    def _begun(self, f: Function, lane: Value, member: Value):
+    def begin_member(self, f: Function, lane: Value, member: Value):
         del lane
         self._set(f, "records", 0, f.const(0.0))
         with f.each(self.constants) as i:
             self._set(f, "cbar", i, f.const(0.0))
-        bars = self._of_member(f, self._call_of(f), "statebar", member)
+        bars = self.member_address(f, self.call_record(f), "statebar", member)
         for k, x in enumerate("qv"):
             with f.each(self.n) as i:
                 self._set(f, f"B {x}", i, f.load(bars, i + k * self.n))
 
     def _ended_closing(self, f: Function, member: Value):
-        call = self._call_of(f)
+        call = self.call_record(f)
 
         def left() -> Value:
             return self._at(f, "records", 0) > 0.5
 
         with f.while_(left):
             self._set(f, "records", 0, self._at(f, "records", 0) - 1.0)
-            row = f.at(f.given["work"], self._whole(f, self._at(f, "records", 0)) * self.row + self.places["record"])
+            row = f.at(f.given["work"], self.to_int(f, self._at(f, "records", 0)) * self.row + self.places["record"])
             for k, x in enumerate("qv"):
                 with f.each(self.n) as i:
                     self._set(f, f"X {x}", i, f.load(row, i + (3 + k * self.n)))
@@ -166,13 +167,13 @@ class Back(_Moving):
                 return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))
 
             f.choose(f.load(row, 0) > 0.5, pull("pull_velocity"), pull("pull_position"))
-        f.call("prologue_back", self._of_member(f, call, "numbers", member), f.given["work"])
+        f.call("prologue_back", self.member_address(f, call, "numbers", member), f.given["work"])
         for name, place, count in (
             ("numbersbar", "numbersbar", self.numbers_moving),
             ("qbar", "B q", self.n),
             ("vbar", "B v", self.n),
         ):
-            to = f.at(f.load(call, self.call.index(name), base=POINTER), member * count)
+            to = f.at(f.load(call, self.call_fields.index(name), base=POINTER), member * count)
             with f.each(count) as i:
                 f.store(self._at(f, place, i), to, i)
 
@@ -197,13 +198,13 @@ class _WrittenOut(_Moving):
     def _shared(self):
         """`transposed`: y = (A^+)^T x of what is in x, into Y; A is that of R."""
         n, m = self.n, self.m
-        f, s = self._function("transposed", [(POINTER, "work"), (POINTER, "x"), (POINTER, "y")])
+        f, s = self.function("transposed", [(POINTER, "work"), (POINTER, "x"), (POINTER, "y")])
         A, b = (Value(f, f.reserve(DOUBLE, max(c, 1)), POINTER) for c in (m * n, n))
         with f.each(m * n) as i:
             f.store(0.0, A, i)
         with f.each(n) as i:
             f.store(f.load(f.given["x"], i), b, i)
-        for row, column, slot, sign in self._entries(f):
+        for row, column, slot, sign in entries(self, f):
             f.store(self._entry(f, row, slot, sign), A, column * m + row)
         rank = Value(f, f.reserve(DOUBLE), POINTER)
         f.call(LEAST_NORM, A, b, f.given["y"], f.const(n, INT), f.const(m, INT), s.care, rank)
@@ -220,13 +221,13 @@ class _WrittenOut(_Moving):
 
     def _corrected(self, f: Function, kind: int):
         """x and y of the correction at the state in X, with A in R."""
-        self._call(f, "equation_terms")
-        self._call(f, "psi_dot" if kind == VELOCITY else "psi")
+        self.invoke(f, "equation_terms")
+        self.invoke(f, "psi_dot" if kind == VELOCITY else "psi")
         s = Lane(f, self.places)
         with f.each(self.m) as i:
             self._set(f, "r", i, self._at(f, "psi", i))
-        f.call("solve", f.given["work"], f.const(0, INT), self._address(f, "r"), self._address(f, "x"), s.care)
-        f.call("transposed", f.given["work"], self._address(f, "x"), self._address(f, "Y"))
+        f.call("solve", f.given["work"], f.const(0, INT), self.address(f, "r"), self.address(f, "x"), s.care)
+        f.call("transposed", f.given["work"], self.address(f, "x"), self.address(f, "Y"))
 
     def _longest(self, f: Function) -> tuple[Value, Value]:
         """The largest change of a coordinate by the whole correction, in units of the scene, and which it is."""
@@ -256,11 +257,11 @@ class ClosingForward(_WrittenOut, Along):
         seeds = {s: graph.input(("closing", s.index), "tangent") for s in self.state}
         changes = tangents(graph, self.changed, seeds)
         w = self.ways
-        inputs = [*self._state(), *(("way", w["constants"] + k) for k in range(self.constants))]
+        inputs = [*self.state_places(), *(("way", w["constants"] + k) for k in range(self.constants))]
         inputs += [("way", w[f"X {x}"] + k) for x in "qv" for k in range(self.n)]
         program = Program(graph, [*self.given, *seeds.values()], changes)
         places = [("way", w["changes"] + k) for k in range(len(changes))]
-        self._write(program, "changes", ("work", "way"), inputs, places)
+        self.write_program(program, "changes", ("work", "way"), inputs, places)
         seeds = {s: graph.input(("number", s.index), "tangent") for s in self.numbers}
         program = Program(graph, [*self.code.prologue.inputs, *seeds.values()], tangents(graph, self.code.constants, seeds))
         inputs = [
@@ -275,7 +276,7 @@ class ClosingForward(_WrittenOut, Along):
         return super().text()
 
     def _push(self, name: str, kind: int):
-        f, s = self._function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
+        f, s = self.function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._corrected(f, kind)
         longest, which = self._longest(f)
         residual, root = self.slots + (self.m if kind == VELOCITY else 0), self.slots + 2 * self.m
@@ -286,11 +287,11 @@ class ClosingForward(_WrittenOut, Along):
                 self._set(f, "g", i, f.const(0.0), "way")
             with f.each(self.m) as i:
                 self._set(f, "right", i, self._at(f, "changes", i + residual, "way"), "way")
-            for row, column, slot, sign in self._entries(f):
+            for row, column, slot, sign in entries(self, f):
                 change = self._at(f, "changes", slot, "way") * sign
                 self._more(f, "g", column, change * self._weight(f, row) * self._at(f, "Y", row), "way")
                 self._more(f, "right", row, -(change * self._at(f, "x", column)), "way")
-            for row, column, slot, sign in self._entries(f):
+            for row, column, slot, sign in entries(self, f):
                 self._more(f, "right", row, -(self._at(f, "R", slot) * sign * self._at(f, "g", column, "way")), "way")
             right, dx = (f.at(f.given["way"], self.ways[x]) for x in ("right", "dx"))
             f.call("solve", f.given["work"], f.const(0, INT), right, dx, s.care)
@@ -322,14 +323,14 @@ class ClosingReverse(_WrittenOut, Back):
         graph, n = self.graph, self.n
         seeds = [graph.input(("closing", k), "cotangent") for k in range(len(self.changed))]
         program = Program(graph, [*self.given, *seeds], cotangents(graph, self.changed, seeds, self.state))
-        inputs = [*self._state(), *self._work("bars", len(seeds))]
-        found = [*self._work("G c", self.constants), *self._work("G q", n), *self._work("G v", n)]
-        self._write(program, "pull_rows", ("work",), inputs, found)
+        inputs = [*self.state_places(), *self.work_places("bars", len(seeds))]
+        found = [*self.work_places("G c", self.constants), *self.work_places("G q", n), *self.work_places("G v", n)]
+        self.write_program(program, "pull_rows", ("work",), inputs, found)
         seeds = [graph.input(("constant", k), "cotangent") for k in range(self.constants)]
         back = cotangents(graph, self.code.constants, seeds, self.numbers)
-        inputs = [*numbered("numbers", len(self.code.prologue.inputs)), *self._work("cbar", self.constants)]
+        inputs = [*numbered("numbers", len(self.code.prologue.inputs)), *self.work_places("cbar", self.constants)]
         program = Program(graph, [*self.code.prologue.inputs, *seeds], back)
-        places = self._work("numbersbar", self.numbers_moving)
+        places = self.work_places("numbersbar", self.numbers_moving)
         self.functions.append(write(program, "prologue_back", 1, ("numbers", "work"), inputs, places))
         self._shared()
         for name, kind in (("pull_position", POSITION), ("pull_velocity", VELOCITY)):
@@ -337,7 +338,7 @@ class ClosingReverse(_WrittenOut, Back):
         return super().text()
 
     def _pull(self, name: str, kind: int):
-        f, _ = self._function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
+        f, _ = self.function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._corrected(f, kind)
         longest, which = self._longest(f)
         residual, root = self.slots + (self.m if kind == VELOCITY else 0), self.slots + 2 * self.m
@@ -358,10 +359,10 @@ class ClosingReverse(_WrittenOut, Back):
             self._set(f, "bars", i + root, bar * self._at(f, "x", i))
             self._set(f, "w", i, bar * self._root(f, i))
             self._set(f, "g", i, bar * self._root(f, i))
-        f.call("transposed", f.given["work"], self._address(f, "w"), self._address(f, "u"))
-        for row, column, slot, sign in self._entries(f):
+        f.call("transposed", f.given["work"], self.address(f, "w"), self.address(f, "u"))
+        for row, column, slot, sign in entries(self, f):
             self._more(f, "g", column, -(self._entry(f, row, slot, sign) * self._at(f, "u", row)))
-        for row, column, slot, sign in self._entries(f):
+        for row, column, slot, sign in entries(self, f):
             bar = f.fma(self._at(f, "Y", row), self._at(f, "g", column), -(self._at(f, "u", row) * self._at(f, "x", column)))
             self._more(f, "bars", slot, bar * sign * self._weight(f, row))
         with f.each(self.m) as i:

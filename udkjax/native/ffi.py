@@ -7,7 +7,8 @@ generated along with the code that it calls: it reads the buffers of the frame a
 from typing import Any
 
 from udkjax.native.ir import INT, POINTER, Function, Value
-from udkjax.native.trajectory import INPUTS, Trajectory
+from udkjax.native.layout import INPUTS
+from udkjax.native.trajectory import Trajectory
 
 # Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, and in it the arguments and results, 40 bytes each:
 # size, extensions, count, types, buffers.
@@ -21,7 +22,7 @@ VERSION = (0, 1)
 
 def handler(trajectory: Trajectory, name: str) -> Function:
     """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions."""
-    f, fields = Function(name, [(POINTER, "frame")], returns="ptr", rare=True), trajectory.call
+    f, fields = Function(name, [(POINTER, "frame")], returns="ptr", rare=True), trajectory.call_fields
     inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
     frame = f.given["frame"]
 

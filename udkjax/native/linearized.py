@@ -57,8 +57,8 @@ class WrittenOut:
         t = self._in
         pointers, outputs = ("work", "kept"), numbered("kept", self.kept)
         if self._name == "accelerations":
-            pointers, outputs = ("work", "out", "kept"), [*numbered("out", t.n), *t._work("safe", 1), *outputs]
-        t._write(self._derivative.evaluation, f"evaluation{self._suffix}", pointers, t._state(), outputs)
+            pointers, outputs = ("work", "out", "kept"), [*numbered("out", t.n), *t.work_places("safe", 1), *outputs]
+        t.write_program(self._derivative.evaluation, f"evaluation{self._suffix}", pointers, t.state_places(), outputs)
 
     def forward(self):
         t, w = self._in, self._in.ways
@@ -68,17 +68,17 @@ class WrittenOut:
 
         tangents = [*way("constants", t.count), *way("X q", t.n), *way("X v", t.n)]
         outputs = numbered("out", t.n) if self._name == "accelerations" else [*way("O q", t.n), *way("O v", t.n)]
-        inputs = [*t._state(), *numbered("kept", self.kept), *tangents]
-        t._write(self._derivative.forward, f"forward{self._suffix}", ("work", "kept", "way", "out"), inputs, outputs)
+        inputs = [*t.state_places(), *numbered("kept", self.kept), *tangents]
+        t.write_program(self._derivative.forward, f"forward{self._suffix}", ("work", "kept", "way", "out"), inputs, outputs)
 
     def reverse(self):
         t = self._in
-        found = [*t._work("G c", t.count), *t._work("G q", t.n), *t._work("G v", t.n)]
-        pointers, bars = ("work", "kept"), [*t._work("Y q", t.n), *t._work("Y v", t.n)]
+        found = [*t.work_places("G c", t.count), *t.work_places("G q", t.n), *t.work_places("G v", t.n)]
+        pointers, bars = ("work", "kept"), [*t.work_places("Y q", t.n), *t.work_places("Y v", t.n)]
         if self._name == "accelerations":
             pointers, bars = ("work", "kept", "bar"), numbered("bar", t.n)
-        inputs = [*t._state(), *numbered("kept", self.kept), *bars]
-        t._write(self._derivative.reverse, f"reverse{self._suffix}", pointers, inputs, found)
+        inputs = [*t.state_places(), *numbered("kept", self.kept), *bars]
+        t.write_program(self._derivative.reverse, f"reverse{self._suffix}", pointers, inputs, found)
 
 
 def _differentiable(programs: LoopPrograms, name: str) -> DifferentiableProgram:
@@ -113,7 +113,7 @@ class ByLoops:
         """Where an array begins in what is kept."""
         return self._at[name][1]
 
-    def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, Place]):
+    def write_program(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, Place]):
         self._in.loops.write(program, f"{name}{self._suffix}", pointers, at)
 
     def _along(self, prefix: str) -> dict[str, Place]:
@@ -122,14 +122,14 @@ class ByLoops:
 
     def evaluation(self):
         pointers = ("work", "out", "kept") if self._name == "accelerations" else ("work", "kept")
-        self._write(self._evaluated.program, "evaluation", pointers, self._at | {"a": ("out", 0)})
+        self.write_program(self._evaluated.program, "evaluation", pointers, self._at | {"a": ("out", 0)})
 
     def forward(self):
         w = self._in.ways
         changes = {"constants": "constants", "q": "X q", "v": "X v", "q1": "O q", "v1": "O v"}
         at = self._at | {"a": ("out", 0)} | self._along(TANGENT)
         at |= {TANGENT + x: ("way", w[place]) for x, place in changes.items()} | {f"{TANGENT}a": ("out", 0)}
-        self._write(self._derivative.forward, "forward", ("work", "kept", "way", "out"), at)
+        self.write_program(self._derivative.forward, "forward", ("work", "kept", "way", "out"), at)
 
     def reverse(self):
         t, p = self._in, self._in.places
@@ -140,4 +140,4 @@ class ByLoops:
         pointers = ("work", "kept")
         if self._name == "accelerations":
             pointers, at = ("work", "kept", "bar"), at | {"a": ("bar", 0), f"{COTANGENT}a": ("bar", 0)}
-        self._write(LoopProgram([*cleared, *self._derivative.reverse.parts]), "reverse", pointers, at)
+        self.write_program(LoopProgram([*cleared, *self._derivative.reverse.parts]), "reverse", pointers, at)

@@ -23,9 +23,10 @@ from udkjax.native.closing import Closing
 from udkjax.native.closing_by_loops import ClosingByLoops, ForwardByLoops, ReverseByLoops
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
 from udkjax.native.ffi import handler
+from udkjax.native.layout import INFO, INPUTS, OUTPUTS, Plan
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
-from udkjax.native.trajectory import INFO, INPUTS, OUTPUTS, Plan, Trajectory
+from udkjax.native.trajectory import Trajectory
 from udkjax.native.walk import Reverse
 
 FEW = 2  # members up to which one follows another: eight lanes take as long as two members
@@ -97,7 +98,7 @@ class Compiled:
         following = ctypes.c_int64(0)
         fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
         fields |= {"directions": inputs[-1].shape[names.directions_in], "next": ctypes.addressof(following)}
-        call = (ctypes.c_int64 * len(names.call))(*(fields[name] for name in names.call))
+        call = (ctypes.c_int64 * len(names.call_fields))(*(fields[name] for name in names.call_fields))
         threads = min(os.cpu_count() or 1, members)
         if threads == 1:
             self._run(ctypes.addressof(call))

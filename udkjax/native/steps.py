@@ -72,6 +72,7 @@ TURNED, USELESS = 1e-15, 1e-8
 # to two fifths more.
 WITH_CARE = 0.2
 
+OUTPUT_STEPS = 7  # of Newton's method to an output: where two branches of the manifold meet, it halves the distance in each
 NEWTON_STEPS = 3  # in a projection, at most: the last of which usually finds nothing to do
 # Of the characteristic length, and rad: a Newton step that moves q by less leaves rounding errors, since it converges
 # quadratically.

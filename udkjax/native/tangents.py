@@ -12,9 +12,13 @@ and the accelerations, the end of a step and the outputs, which are projected, b
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from udkjax.native.dense_output import write_between, write_differences
 from udkjax.native.ir import INT, POINTER, Function, Value
+from udkjax.native.layout import Lane, Layout, Plan
 from udkjax.native.linearized import Linearized, linearized
-from udkjax.native.trajectory import POINTS, Lane, Places, Plan, Trajectory
+from udkjax.native.runge_kutta import stage_state
+from udkjax.native.steps import POINTS
+from udkjax.native.trajectory import Trajectory
 
 
 class Differentiated(Trajectory):
@@ -33,11 +37,11 @@ class Differentiated(Trajectory):
         if self.of_projection:
             self.places.add("KP", self.of_projection.kept)
 
-    def _stage(self, f: Function, i: int):
-        f.call("evaluation", f.given["work"], self._address(f, f"A{i}"), self._address(f, f"K{i}"))
+    def accelerate_stage(self, f: Function, i: int):
+        f.call("evaluation", f.given["work"], self.address(f, f"A{i}"), self.address(f, f"K{i}"))
 
-    def _programs(self):
-        super()._programs()
+    def write_programs(self):
+        super().write_programs()
         for each in self._linearized:
             each.evaluation()
 
@@ -49,7 +53,7 @@ class Differentiated(Trajectory):
     def _evaluate_end(self, f: Function):
         """What is known of the state in X, that of a projection."""
         if self.of_projection:
-            f.call("evaluation_projection", f.given["work"], self._address(f, "KP"))
+            f.call("evaluation_projection", f.given["work"], self.address(f, "KP"))
 
 
 class Forward(Differentiated):
@@ -61,7 +65,7 @@ class Forward(Differentiated):
 
     def __init__(self, plan: Plan, moving: tuple[bool, ...]):
         super().__init__(plan, moving)
-        self.ways = w = Places(plan.width, plan.vector)
+        self.ways = w = Layout(plan.width, plan.vector)
         w.add("constants", self.count)
         for name in ("X q", "X v", "O q", "O v"):
             w.add(name, self.n)
@@ -73,25 +77,25 @@ class Forward(Differentiated):
         for k in range(3 * POINTS):
             w.add(f"N{k}", self.n)
 
-    def _derivatives(self):
+    def write_derivatives(self):
         for each in self._linearized:
             each.forward()
         w = self.ways
-        self._differences("tangent_differences", ("way", w))
-        self._between("tangent_between", ("way", w))
+        write_differences(self, "tangent_differences", ("way", w))
+        write_between(self, "tangent_between", ("way", w))
 
     @contextmanager
     def _each_way(self, f: Function) -> Iterator[Value]:
         """What is done for every direction, with `way` where its memory is."""
         call = f.load(f.given["work"], self.places["call"] * f.width, base=POINTER)
         first = f.load(f.given["work"], self.places["ways"] * f.width, base=POINTER)
-        with f.each(f.load(call, self.call.index("directions"), base=INT)) as p:
+        with f.each(f.load(call, self.call_fields.index("directions"), base=INT)) as p:
             f.given["way"] = f.at(first, p * (self.ways.size * f.width))
             yield p
 
     def _along(self, f: Function, name: str, kept: str, out: Value | None = None):
         way = f.given["way"]
-        f.call(name, f.given["work"], self._address(f, kept), way, out or way)
+        f.call(name, f.given["work"], self.address(f, kept), way, out or way)
 
     def _arrived(self, f: Function):
         """O q and O v of a way: X q and X v once projected, at the state in X, which is on the manifold."""
@@ -100,84 +104,84 @@ class Forward(Differentiated):
         else:
             with f.each(self.rowcount) as r:
                 for x in "qv":
-                    self._put(f, f"O {x}", r, self._vector(f, f"X {x}", r, "way"), "way")
+                    self.put(f, f"O {x}", r, self.vector(f, f"X {x}", r, "way"), "way")
 
-    def _accepted(self, f: Function, s: Lane, accept: Value):
+    def record_step(self, f: Function, s: Lane, accept: Value):
         """The changes of the state in P3, from those in P2, where the step began."""
         step = f.select(s.begin > 0.5, 0.0, s.t1 - s.T2)
-        h, begin = self._over(f, step), s.begin > 0.5
+        h, begin = self.spread(f, step), s.begin > 0.5
         with self._each_way(f), f.each(self.rowcount) as r:
             for k in range(POINTS - 1):
                 for x in "qva":
-                    mine, other = (self._vector(f, f"P{j} {x}", r, "way") for j in (k, k + 1))
-                    self._put(f, f"P{k} {x}", r, f.select(accept, other, mine), "way")
+                    mine, other = (self.vector(f, f"P{j} {x}", r, "way") for j in (k, k + 1))
+                    self.put(f, f"P{k} {x}", r, f.select(accept, other, mine), "way")
         begins = f.all_of(begin | ~accept)
         with f.if_(~begins):
             for i in range(1, self.last):
-                self._stage_state(f, s, i, "P2", step)
+                stage_state(self, f, s, i, "P2", step)
                 with self._each_way(f):
                     self._changed_stage(f, i, h)
                     self._along(f, "forward", f"K{i}", self._way_address(f, f"A{i}"))
         setattr(s, "X t", s.T3)
         with f.each(self.rowcount) as r:
             for x in "qv":
-                self._put(f, f"X {x}", r, self._vector(f, f"P3 {x}", r))
+                self.put(f, f"X {x}", r, self.vector(f, f"P3 {x}", r))
         self._evaluate_end(f)
-        f.call("evaluation", f.given["work"], self._address(f, "C"), self._address(f, f"K{self.last}"))
+        f.call("evaluation", f.given["work"], self.address(f, "C"), self.address(f, f"K{self.last}"))
         with self._each_way(f):
             self._changed_stage(f, self.last, h)
             with f.each(self.rowcount) as r:
                 for x in "qv":
-                    new = f.select(begin, self._vector(f, f"P2 {x}", r, "way"), self._vector(f, f"X {x}", r, "way"))
-                    self._put(f, f"X {x}", r, new, "way")
+                    new = f.select(begin, self.vector(f, f"P2 {x}", r, "way"), self.vector(f, f"X {x}", r, "way"))
+                    self.put(f, f"X {x}", r, new, "way")
             self._arrived(f)
             with f.each(self.rowcount) as r:
                 for x in "qv":
-                    self._put(f, f"X {x}", r, self._vector(f, f"O {x}", r, "way"), "way")
+                    self.put(f, f"X {x}", r, self.vector(f, f"O {x}", r, "way"), "way")
             self._along(f, "forward", f"K{self.last}", self._way_address(f, "N0"))
             with f.each(self.rowcount) as r:
                 for name, x in (("O q", "q"), ("O v", "v"), ("N0", "a")):
-                    old, new = self._vector(f, f"P3 {x}", r, "way"), self._vector(f, name, r, "way")
-                    self._put(f, f"P3 {x}", r, f.select(accept, new, old), "way")
+                    old, new = self.vector(f, f"P3 {x}", r, "way"), self.vector(f, name, r, "way")
+                    self.put(f, f"P3 {x}", r, f.select(accept, new, old), "way")
 
     def _changed_stage(self, f: Function, i: int, h: Value):
         """The change of the state of stage i, in X of a way."""
         node, names = float(self.method.nodes[i]), ["P2 a", *self.stage_accelerations[1:]]
         with f.each(self.rowcount) as r:
-            q, v = self._vector(f, "P2 q", r, "way"), self._vector(f, "P2 v", r, "way")
-            sum_q, sum_v = (self._weighted(f, row[i], r, names, "way") for row in (self.method.q, self.method.v))
+            q, v = self.vector(f, "P2 q", r, "way"), self.vector(f, "P2 v", r, "way")
+            sum_q, sum_v = (self.weighted_sum(f, row[i], r, names, "way") for row in (self.method.q, self.method.v))
             slope = v * node if sum_q is None else f.fma(h, sum_q, v * node)
-            self._put(f, "X q", r, f.fma(h, slope, q), "way")
-            self._put(f, "X v", r, v if sum_v is None else f.fma(h, sum_v, v), "way")
+            self.put(f, "X q", r, f.fma(h, slope, q), "way")
+            self.put(f, "X v", r, v if sum_v is None else f.fma(h, sum_v, v), "way")
 
     def _way_address(self, f: Function, name: str) -> Value:
         return f.at(f.given["way"], self.ways[name] * f.width)
 
-    def _interpolated(self, f: Function, s: Lane):
+    def record_output(self, f: Function, s: Lane):
         with f.each(self.rowcount) as r:
-            self._put(f, "X v", r, self._vector(f, "O v", r))  # the programs look for states there
+            self.put(f, "X v", r, self.vector(f, "O v", r))  # the programs look for states there
         self._evaluate_end(f)
         with self._each_way(f) as p:
             f.call("tangent_differences", f.given["work"], f.given["way"])
             f.call("tangent_between", f.given["work"], f.given["way"])
             self._arrived(f)
             with f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
-                self._write_change(f, s, k, p, self._whole(f, f.lane(s.written, k)) + 1, "O q", "O v")
+                self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "O q", "O v")
 
     def _write_change(self, f: Function, s: Lane, k: Value, p: Value, number: Value, q: str, v: str):
         """The change of a state of lane k along direction p."""
-        member = self._whole(f, f.lane(s.member, k))
-        times, directions = (f.load(self._call_of(f), self.call.index(x), base=INT) for x in ("times", "directions"))
+        member = self.to_int(f, f.lane(s.member, k))
+        times, directions = (f.load(self.call_record(f), self.call_fields.index(x), base=INT) for x in ("times", "directions"))
         row = (member * directions + p) * times + number
-        to = f.at(f.load(self._call_of(f), self.call.index("dys"), base=POINTER), row * (2 * self.n))
-        self._copied(f, to, 0, q, k, "way")
-        self._copied(f, to, self.n, v, k, "way")
+        to = f.at(f.load(self.call_record(f), self.call_fields.index("dys"), base=POINTER), row * (2 * self.n))
+        self.copy_lane(f, to, 0, q, k, "way")
+        self.copy_lane(f, to, self.n, v, k, "way")
 
-    def _begun(self, f: Function, lane: Value, member: Value):
+    def begin_member(self, f: Function, lane: Value, member: Value):
         with self._each_way(f) as p:
 
             def given(name: str, count: int, places: list[str]):
-                start = self._of_member(f, self._call_of(f), name, member)
+                start = self.member_address(f, self.call_record(f), name, member)
                 with f.each(count) as i:
                     x = f.load(start, p * count + i)
                     for place in places:
@@ -190,26 +194,29 @@ class Forward(Differentiated):
                 for name in (*(f"P{k} a" for k in range(POINTS)), *(f"A{j}" for j in range(1, self.last))):
                     f.store(0.0, f.given["way"], (i + self.ways[name]) * f.width + lane)
 
-    def _ended(self, f: Function, s: Lane):
+    def end_members(self, f: Function, s: Lane):
         """The changes of the first state, which is taken as it is given, and of the last."""
-        times, directions = (f.load(self._call_of(f), self.call.index(x), base=INT) for x in ("times", "directions"))
+        times, directions = (f.load(self.call_record(f), self.call_fields.index(x), base=INT) for x in ("times", "directions"))
         with self._each_way(f) as p, f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
-            member = self._whole(f, f.lane(s.member, k))
+            member = self.to_int(f, f.lane(s.member, k))
             for place, name in (("X q", "dq"), ("X v", "dv")):
-                start = self._of_member(f, self._call_of(f), name, member)
+                start = self.member_address(f, self.call_record(f), name, member)
                 with f.each(self.n) as i:
                     x = f.load(start, p * self.n + i)
                     f.store(x, f.given["way"], (i + self.ways[place]) * f.width + k)
             self._write_change(f, s, k, p, f.const(0, INT), "X q", "X v")
             self._write_change(f, s, k, p, times - 1, "P3 q", "P3 v")
-            to = f.at(f.load(self._call_of(f), self.call.index("dend"), base=POINTER), (member * directions + p) * (2 * self.n))
-            self._copied(f, to, 0, "P3 q", k, "way")
-            self._copied(f, to, self.n, "P3 v", k, "way")
+            to = f.at(
+                f.load(self.call_record(f), self.call_fields.index("dend"), base=POINTER),
+                (member * directions + p) * (2 * self.n),
+            )
+            self.copy_lane(f, to, 0, "P3 q", k, "way")
+            self.copy_lane(f, to, self.n, "P3 v", k, "way")
 
-    def _memory(self, f: Function, call: Value) -> list[Value]:
+    def allocate_memory(self, f: Function, call: Value) -> list[Value]:
         """Memory for all directions."""
-        count = f.load(call, self.call.index("directions"), base=INT)
-        block, start = self._allocated(f, count * (self.ways.size * f.width))
+        count = f.load(call, self.call_fields.index("directions"), base=INT)
+        block, start = self.allocate(f, count * (self.ways.size * f.width))
         with f.each(count * (self.ways.size * f.width)) as i:
             f.store(0.0, start, i)
         f.store(start, f.given["work"], self.places["ways"] * f.width, base=POINTER)

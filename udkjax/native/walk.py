@@ -15,9 +15,10 @@ Members run side by side in lanes and walk back side by side; the next ones foll
 from collections.abc import Sequence
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.steps import DONE
+from udkjax.native.layout import Lane, Plan
+from udkjax.native.runge_kutta import stage_state
+from udkjax.native.steps import DONE, POINTS, STRETCH
 from udkjax.native.tangents import Differentiated
-from udkjax.native.trajectory import POINTS, STRETCH, Lane, Plan
 
 FIRST = 512  # points that a record has room for, before it grows
 HEAD = 3  # numbers of a point before its state: its time, how many outputs were written before its step, whether it begins anew
@@ -47,7 +48,7 @@ class Reverse(Differentiated):
             p.add(f"M{k}", n)
         self.row = HEAD + 3 * n
 
-    def _derivatives(self):
+    def write_derivatives(self):
         for each in self._linearized:
             each.reverse()
         self._transposed_differences()
@@ -56,12 +57,12 @@ class Reverse(Differentiated):
 
     # --- the record
 
-    def _accepted(self, f: Function, s: Lane, accept: Value):
+    def record_step(self, f: Function, s: Lane, accept: Value):
         with f.if_(self._walks(f)):
             for k in self._each_marked(f, accept):
                 self._note(f, s, k)
 
-    def _begun(self, f: Function, lane: Value, member: Value):
+    def begin_member(self, f: Function, lane: Value, member: Value):
         del member
         with f.if_(self._walks(f)):
             self._new_record(f, lane)
@@ -85,25 +86,25 @@ class Reverse(Differentiated):
         points, capacity = self._lane(f, "points", k), self._lane(f, "capacity", k)
         with f.if_(points >= capacity):
             self._put_lane(f, "capacity", k, capacity * 2.0)
-            size = self._whole(f, capacity * 2.0) * (self.row * 8)
+            size = self.to_int(f, capacity * 2.0) * (self.row * 8)
             old = self._lane(f, "record", k, POINTER)
             new = f.op(f"call ptr @realloc(ptr {old.name}, i64 {size.name})", POINTER)
             f.declared.add("declare ptr @realloc(ptr, i64)")
             self._put_lane(f, "record", k, new, POINTER)
-        row = f.at(self._lane(f, "record", k, POINTER), self._whole(f, points) * self.row)
+        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, points) * self.row)
         for j, name in enumerate(("T3", "written", "begin")):
             f.store(self._lane(f, name, k), row, j)
         for j, x in enumerate("qva"):
-            self._copied(f, row, HEAD + j * self.n, f"P3 {x}", k)
+            self.copy_lane(f, row, HEAD + j * self.n, f"P3 {x}", k)
         self._put_lane(f, "points", k, points + 1.0)
 
     def _recalled(self, f: Function, k: Value, number: Value, point: str):
         """A point of lane k from its record; before the first one there is the first."""
-        row = f.at(self._lane(f, "record", k, POINTER), self._whole(f, f.max(number, 0.0)) * self.row)
+        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, f.max(number, 0.0)) * self.row)
         self._put_lane(f, f"T{point[1:]}", k, f.load(row, 0))
         for j, x in enumerate("qva"):
             with f.each(self.n) as i:
-                place = i * f.width + k + self._start(f"{point} {x}", "work")
+                place = i * f.width + k + self.start(f"{point} {x}", "work")
                 f.store(f.load(row, i + (HEAD + j * self.n)), f.given["work"], place)
 
     # --- the way back
@@ -116,29 +117,29 @@ class Reverse(Differentiated):
     def _added(self, f: Function, mask: Value):
         """The cotangents of the constants that a program has found, to those of lanes in question."""
         with f.each(self.count) as i:
-            total = f.load(f.given["work"], i * f.width + self._start("cbar", "work"), f.width)
-            more = f.load(f.given["work"], i * f.width + self._start("G c", "work"), f.width)
-            f.store(f.select(mask, total + more, total), f.given["work"], i * f.width + self._start("cbar", "work"), f.width)
+            total = f.load(f.given["work"], i * f.width + self.start("cbar", "work"), f.width)
+            more = f.load(f.given["work"], i * f.width + self.start("G c", "work"), f.width)
+            f.store(f.select(mask, total + more, total), f.given["work"], i * f.width + self.start("cbar", "work"), f.width)
 
     def _projected_back(self, f: Function, mask: Value):
         """Y through the projection that led to the state in X: G q and G v."""
         if self.of_projection:
             self._evaluate_end(f)
-            f.call("reverse_projection", f.given["work"], self._address(f, "KP"))
+            f.call("reverse_projection", f.given["work"], self.address(f, "KP"))
             self._added(f, mask)
         else:
             with f.each(self.rowcount) as r:
                 for x in "qv":
-                    self._put(f, f"G {x}", r, self._vector(f, f"Y {x}", r))
+                    self.put(f, f"G {x}", r, self.vector(f, f"Y {x}", r))
 
     def _accelerated_back(self, f: Function, kept: str, bar: str, mask: Value):
         """The cotangents of accelerations, through the equations at the state in X: G q and G v."""
-        f.call("reverse", f.given["work"], self._address(f, kept), self._address(f, bar))
+        f.call("reverse", f.given["work"], self.address(f, kept), self.address(f, bar))
         self._added(f, mask)
 
     def _transposed_differences(self):
         """From cotangents of divided differences (M) to those of the points (B): `differences`, transposed; M is cleared."""
-        f, s = self._function("differences_back")
+        f, s = self.function("differences_back")
         active = s.at > 0.5
         times = [getattr(s, f"T{POINTS - 1 - k}") for k in range(POINTS)]
         step = times[0] - times[1]
@@ -146,7 +147,7 @@ class Reverse(Differentiated):
         for i in range(POINTS):
             for j in range(i + 1, POINTS):
                 d = times[j] - times[i]
-                inverse[i, j] = self._over(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
+                inverse[i, j] = self.spread(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
         sofar = None
         for k in range(1, POINTS - 1):
             near = (times[k] - times[k + 1]) * STRETCH >= step
@@ -159,7 +160,7 @@ class Reverse(Differentiated):
             for degree in reversed(range(count)):
                 length = count - degree
                 mask = used[degree // 3]
-                mine = self._vector(f, f"M{degree}", r)
+                mine = self.vector(f, f"M{degree}", r)
                 mine = mine if mask is None else f.select(mask, mine, 0.0)
                 here = [zero] * length
                 for i, bar in enumerate(column):  # of the column after this one
@@ -173,89 +174,89 @@ class Reverse(Differentiated):
                         here[i] = here[i] - part
                 here[0] = here[0] + mine
                 column = here
-                self._put(f, f"M{degree}", r, zero)
+                self.put(f, f"M{degree}", r, zero)
             for i, bar in enumerate(column):
                 bars["q"][i // 3] = bars["q"][i // 3] + bar
             for k in range(POINTS):
                 for x in "qva":
                     name = f"B{POINTS - 1 - k} {x}"
-                    old = self._vector(f, name, r)
-                    self._put(f, name, r, f.select(active, old + bars[x][k], old))
+                    old = self.vector(f, name, r)
+                    self.put(f, name, r, f.select(active, old + bars[x][k], old))
 
     def _step_back(self):
         """From the cotangents of P3 to those of P2, of lanes that are not yet back (`at`)."""
-        f, s = self._function("step_back")
+        f, s = self.function("step_back")
         active = s.at > 0.5
         step = f.select((s.begin > 0.5) | ~active, 0.0, s.T3 - s.T2)
-        h, last = self._over(f, step), self.last
+        h, last = self.spread(f, step), self.last
         stages = range(1, last)
         for i in stages:
-            self._stage_state(f, s, i, "P2", step)
-            self._stage(f, i)
+            stage_state(self, f, s, i, "P2", step)
+            self.accelerate_stage(f, i)
         setattr(s, "X t", s.T3)
         with f.each(self.rowcount) as r:
             for x in "qv":
-                self._put(f, f"X {x}", r, self._vector(f, f"P3 {x}", r))
-        f.call("evaluation", f.given["work"], self._address(f, "C"), self._address(f, f"K{last}"))
+                self.put(f, f"X {x}", r, self.vector(f, f"P3 {x}", r))
+        f.call("evaluation", f.given["work"], self.address(f, "C"), self.address(f, f"K{last}"))
         self._accelerated_back(f, f"K{last}", "B3 a", active)
         with f.each(self.rowcount) as r:
             for x in "qv":
-                self._put(f, f"Y {x}", r, self._vector(f, f"B3 {x}", r) + self._vector(f, f"G {x}", r))
+                self.put(f, f"Y {x}", r, self.vector(f, f"B3 {x}", r) + self.vector(f, f"G {x}", r))
         self._projected_back(f, active)
         self._collected(f, h, last, range(last), active, first=True)
         for i in reversed(stages):
-            self._stage_state(f, s, i, "P2", step)
+            stage_state(self, f, s, i, "P2", step)
             self._accelerated_back(f, f"K{i}", f"S{i}", active)
             self._collected(f, h, i, range(i), active)
         with f.each(self.rowcount) as r:
-            old = self._vector(f, "B2 a", r)
-            self._put(f, "B2 a", r, f.select(active, old + self._vector(f, "S0", r), old))
+            old = self.vector(f, "B2 a", r)
+            self.put(f, "B2 a", r, f.select(active, old + self.vector(f, "S0", r), old))
 
     def _collected(self, f: Function, h: Value, i: int, stages: Sequence[int], active: Value, first: bool = False):
         """The cotangents G of the state of stage i, to those of the point before and of the stages that it is made of."""
         method, zero = self.method, f.const(0.0, DOUBLE, self.plan.vector)
         with f.each(self.rowcount) as r:
-            of_q, of_v = (self._vector(f, f"G {x}", r) for x in "qv")
+            of_q, of_v = (self.vector(f, f"G {x}", r) for x in "qv")
             hq = h * of_q
             for x, more in (("q", of_q), ("v", f.fma(hq, float(method.nodes[i]), of_v))):
-                old = self._vector(f, f"B2 {x}", r)
-                self._put(f, f"B2 {x}", r, f.select(active, old + more, old))
+                old = self.vector(f, f"B2 {x}", r)
+                self.put(f, f"B2 {x}", r, f.select(active, old + more, old))
             hhq, hv = h * hq, h * of_v
             for j in stages:
                 a2, a = float(method.q[i][j]), float(method.v[i][j])
-                total = zero if first else self._vector(f, f"S{j}", r)
+                total = zero if first else self.vector(f, f"S{j}", r)
                 total = f.fma(hhq, a2, total) if a2 else total
                 total = f.fma(hv, a, total) if a else total
                 if first or a2 or a:
-                    self._put(f, f"S{j}", r, total)
+                    self.put(f, f"S{j}", r, total)
 
     def _walk(self):
         """Walk back all members that are `ready`, and write the cotangents of what they began with."""
-        f, s = self._function("walk", [(POINTER, "work"), (POINTER, "call")])
+        f, s = self.function("walk", [(POINTER, "work"), (POINTER, "call")])
         n, call, yes = self.n, f.given["call"], f.const(1.0, DOUBLE, f.width)
-        times = f.load(call, self.call.index("times"), base=INT)
+        times = f.load(call, self.call_fields.index("times"), base=INT)
         s.at = f.select(s.ready > 0.5, s.points - 1.0, 0.0)
         zeros = [f"B{k} {x}" for k in range(POINTS) for x in "qva"] + [f"M{k}" for k in range(3 * POINTS)]
         for names, length in ((zeros, n), (["cbar"], self.count)):
             with f.each(length) as i:
                 for name in names:
-                    f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], i * f.width + self._start(name, "work"), f.width)
+                    f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], i * f.width + self.start(name, "work"), f.width)
 
         def given(k: Value, number: Value, to: str):
             """The cotangents of an output of lane k are added to arrays of coordinates."""
             member = self._lane(f, "member", k)
-            bars = f.at(self._of_member(f, call, "ysbar", member), number * (2 * n))
+            bars = f.at(self.member_address(f, call, "ysbar", member), number * (2 * n))
             more(k, bars, to)
 
         def more(k: Value, bars: Value, to: str):
             for x, offset in (("q", 0), ("v", n)):
                 with f.each(n) as i:
-                    place = i * f.width + k + self._start(f"{to} {x}", "work")
+                    place = i * f.width + k + self.start(f"{to} {x}", "work")
                     total = f.load(f.given["work"], place) + f.load(bars, i + offset)
                     f.store(total, f.given["work"], place)
 
         for k in self._each_marked(f, s.ready > 0.5):
-            more(k, self._of_member(f, call, "endbar", self._lane(f, "member", k)), "B3")
+            more(k, self.member_address(f, call, "endbar", self._lane(f, "member", k)), "B3")
             with f.if_(self._lane(f, "code", k).is_(float(DONE))):
                 given(k, times - 1, "B3")
             for j in range(POINTS):
@@ -272,29 +273,29 @@ class Reverse(Differentiated):
                 s.any = yes
                 with f.each(n) as i:
                     for x in "qv":
-                        place = i * f.width + self._start(f"Y {x}", "work")
+                        place = i * f.width + self.start(f"Y {x}", "work")
                         f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], place, f.width)
                 for k in self._each_marked(f, s.due > 0.5):
-                    number, member = self._whole(f, self._lane(f, "written", k)), self._lane(f, "member", k)
-                    self._put_lane(f, "next", k, self._input(f, call, "ts", member, number))
+                    number, member = self.to_int(f, self._lane(f, "written", k)), self._lane(f, "member", k)
+                    self._put_lane(f, "next", k, self.input_number(f, call, "ts", member, number))
                     given(k, number, "Y")
-                    row = (self._whole(f, member) * times + number) * n
+                    row = (self.to_int(f, member) * times + number) * n
                     for x in "qv":
-                        state = f.at(f.load(call, self.call.index(f"{x}s"), base=POINTER), row)
+                        state = f.at(f.load(call, self.call_fields.index(f"{x}s"), base=POINTER), row)
                         with f.each(n) as i:
-                            place = i * f.width + k + self._start(f"X {x}", "work")
+                            place = i * f.width + k + self.start(f"X {x}", "work")
                             f.store(f.load(state, i), f.given["work"], place)
                 setattr(s, "X t", s.next)
                 mask = s.due > 0.5
                 self._projected_back(f, mask)
-                ahead = [self._over(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
+                ahead = [self.spread(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
                 with f.each(self.rowcount) as r:
-                    of_q, of_v = (self._vector(f, f"G {x}", r) for x in "qv")
+                    of_q, of_v = (self.vector(f, f"G {x}", r) for x in "qv")
                     # q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the products pi_k of differences of times.
                     one, slope = f.const(1.0, DOUBLE, self.plan.vector), f.const(0.0, DOUBLE, self.plan.vector)
                     for k in range(3 * POINTS):
-                        old = self._vector(f, f"M{k}", r)
-                        self._put(f, f"M{k}", r, f.select(mask, f.fma(one, of_q, f.fma(slope, of_v, old)), old))
+                        old = self.vector(f, f"M{k}", r)
+                        self.put(f, f"M{k}", r, f.select(mask, f.fma(one, of_q, f.fma(slope, of_v, old)), old))
                         slope = f.fma(slope, ahead[k // 3], one)
                         one = one * ahead[k // 3]
                 s.where(mask, written=s.written - 1.0)
@@ -306,11 +307,11 @@ class Reverse(Differentiated):
                 for name in "BP":
                     for k in reversed(range(POINTS)):
                         for x in "qva":
-                            old = self._vector(f, f"{name}{k} {x}", r)
+                            old = self.vector(f, f"{name}{k} {x}", r)
                             if k or name == "B":
                                 zero = f.const(0.0, DOUBLE, self.plan.vector)
-                                new = self._vector(f, f"{name}{k - 1} {x}", r) if k else zero
-                                self._put(f, f"{name}{k} {x}", r, f.select(active, new, old))
+                                new = self.vector(f, f"{name}{k - 1} {x}", r) if k else zero
+                                self.put(f, f"{name}{k} {x}", r, f.select(active, new, old))
             for k in reversed(range(1, POINTS)):
                 s.where(active, **{f"T{k}": getattr(s, f"T{k - 1}")})
             s.where(active, at=s.at - 1.0)
@@ -320,28 +321,28 @@ class Reverse(Differentiated):
         # What is left is that of the first state as it was given, which is the first output, too.
         for k in self._each_marked(f, s.ready > 0.5):
             given(k, f.const(0, INT), "B3")
-            number = self._whole(f, self._lane(f, "member", k))
+            number = self.to_int(f, self._lane(f, "member", k))
             for name, place, length in (("cbar", "cbar", self.count), ("qbar", "B3 q", n), ("vbar", "B3 v", n)):
-                to = f.at(f.load(call, self.call.index(name), base=POINTER), number * length)
+                to = f.at(f.load(call, self.call_fields.index(name), base=POINTER), number * length)
                 with f.each(length) as i:
-                    f.store(f.load(f.given["work"], i * f.width + k + self._start(place, "work")), to, i)
+                    f.store(f.load(f.given["work"], i * f.width + k + self.start(place, "work")), to, i)
             f.line(f"call void @free(ptr {self._lane(f, 'record', k, POINTER).name})")
         s.ready = f.const(0.0, DOUBLE, f.width)
 
     def _head(self, f: Function, k: Value):
         """What is noted of the step that led to the point where lane k is."""
-        row = f.at(self._lane(f, "record", k, POINTER), self._whole(f, self._lane(f, "at", k)) * self.row)
+        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, self._lane(f, "at", k)) * self.row)
         self._put_lane(f, "before", k, f.load(row, 1))
         self._put_lane(f, "begin", k, f.load(row, 2))
 
-    def _ended(self, f: Function, s: Lane):
+    def end_members(self, f: Function, s: Lane):
         s.where(s.due > 0.5, ready=1.0)
 
-    def _next(self, f: Function, s: Lane, fill):
+    def take_next(self, f: Function, s: Lane, fill):
         with f.if_(~f.any_of(s.active > 0.5)):
             with f.if_(self._walks(f)):
                 f.call("walk", f.given["work"], f.given["call"])
             fill()
 
     def _walks(self, f: Function) -> Value:
-        return f.load(self._call_of(f), self.call.index("directions"), base=INT) > 0
+        return f.load(self.call_record(f), self.call_fields.index("directions"), base=INT) > 0

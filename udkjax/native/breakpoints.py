@@ -1,0 +1,60 @@
+"""Where the next step ends: at the end of the run, at a breakpoint, or where it was planned to."""
+
+import numpy as np
+
+from udkjax.native.ir import DOUBLE, INT, Function, Value
+from udkjax.native.layout import Lane
+from udkjax.native.module import Module
+from udkjax.native.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS, SAME
+
+
+def aim(t: Module, f: Function, s: Lane):
+    """`t1`, `step`, `begin`, `last` and `lands` of the next step of each lane (breakpoints.py)."""
+    where, yes = f.select, f.const(1.0, DOUBLE, f.width)
+    begin = (s.steps if t.plan.breaks else s.tried) < 0.0
+    t1 = s.T3 + s.h
+    last = (t1 >= s.end - s.smallest) & ~begin
+    if not t.plan.breaks:
+        t1 = where(last, s.end, t1)
+        s.lands = f.const(0.0, DOUBLE, f.width)
+    else:
+        here = s.T3
+        s.t1, s.behind = f.const(np.inf, DOUBLE, f.width), here
+        next_breakpoint(t, f, s, here)
+        end = s.t1
+        crossing = s.crossing if t.pieces else f.const(np.inf, DOUBLE, f.width)
+        stop = f.min(end, crossing)
+        rest = f.min(stop, s.end) - here
+        parts = f.max(float(POINTS - 1) - s.steps, 1.0)
+        share = here + rest / parts
+        several = (s.steps < float(POINTS - 2)) & (t1 > share) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
+        if t.pieces:
+            several = several & s.aim.is_not(float(AIM_ACROSS))
+        t1 = where(several, share, t1)
+        reaches = (t1 >= stop - s.smallest * 2.0) & (stop < s.end - s.smallest) & ~begin
+        last = last & ~reaches & ~several
+        final = s.end - f.max(s.end - end, 0.0)
+        t1 = where(reaches, stop, where(last, final, t1))
+        t1 = where(begin, s.behind, t1)
+        s.lands = where(reaches & (end <= crossing), yes, 0.0)
+    t1 = where(begin, s.behind if t.plan.breaks else s.T3, t1)
+    s.t1 = t1
+    s.step = where((s.judged > 0.5) & ~begin, t1 - s.T3, 0.0)
+    s.begin = where(begin, yes, 0.0)
+    s.last = where(last, yes, 0.0)
+
+
+def next_breakpoint(t: Module, f: Function, s: Lane, here: Value):
+    """t1: just before the next breakpoint; behind: just behind all of those that are here."""
+    call = f.given["call"]
+    knots, width = f.load(call, t.call_fields.index("knots"), base=INT), f.width
+    with f.each(knots) as k:
+        if width == 1:
+            at = t.input_number(f, call, "breaks", s.member, k)
+        else:
+            f.call("gather", f.given["work"], call, k)
+            at = s.due
+        ahead = at > here + s.smallest
+        s.t1 = f.select(ahead, f.min(at - s.smallest * ENDS_BEFORE, s.t1), s.t1)
+        passed = at <= here + s.smallest * SAME
+        s.behind = f.select(passed, f.max(at + s.smallest * BEGINS_BEHIND, s.behind), s.behind)

@@ -1,0 +1,142 @@
+"""The step controller: whether a step counts, and how long the next one is."""
+
+from typing import Any
+
+import numpy as np
+
+from udkjax.native.ir import BOOL, DOUBLE, Function, Value
+from udkjax.native.layout import Lane
+from udkjax.native.manifold import velocity_tolerance
+from udkjax.native.module import Module
+from udkjax.native.power import power
+from udkjax.native.singular import is_clear, step_around, time_to_singularity
+from udkjax.native.steps import (
+    CAUTIOUS,
+    CUT,
+    DODGE,
+    DODGES,
+    DONE,
+    EXPECTED,
+    FORESEEN,
+    GAP,
+    GROW,
+    PAST,
+    POINTS,
+    RUNNING,
+    SAFETY,
+    SHRINK,
+    STEEPEST,
+    STEP_LIMIT,
+    STEP_TOO_SMALL,
+    SURE,
+)
+
+
+def write_decide(t: Module):
+    """Accept or reject the step of lanes that are `judged`, and choose the next one; `until`: outputs up to there are due."""
+    f, s = t.function("decide")
+    where, yes = f.select, f.const(1.0, DOUBLE, f.width)
+    inf = f.const(np.inf, DOUBLE, f.width)
+    judged, careful, error = s.judged > 0.5, s.careful > 0.5, s.error
+    begin = s.begin > 0.5
+    bad = judged & ~(error < np.inf)
+    # --- doubt, and steps a little shorter instead
+    if t.doubts:
+        doubt = bad & ~careful
+        far_from_here = is_clear(t, f, s, s.distance2)
+        beside = judged & ~careful & (error < 1.0) & ~is_clear(t, f, s, s.distance) & (s.last < 0.5)
+        left = time_to_singularity(t, f, s)
+        past = (left > 0.0) & (left < s.h * SURE) & (s.distance * left > s.distance2 * EXPECTED * (s.h - left))
+        beside = beside & ~(past & is_clear(t, f, s, s.distance, PAST))
+        dodge = (doubt | beside) & far_from_here & (s.dodged < float(DODGES)) & ~begin
+        s.where(judged, dodged=where(dodge, s.dodged + 1.0, 0.0))
+        doubt = doubt & ~dodge
+        s.doubt = where(doubt, yes, 0.0)
+        judged = judged & ~doubt
+    else:
+        s.doubt = f.const(0.0, DOUBLE, f.width)
+        dodge = f.const(False, BOOL, f.width)
+    tried = where(judged, s.tried + 1.0, s.tried)
+    again = f.const(False, BOOL, f.width)
+    if t.pieces:
+        s.again = where(judged, yes, 0.0)
+        f.call("leave", f.given["work"])
+        again = s.again > 0.5
+    accept = judged & (error < 1.0) & ~dodge & ~again
+    stepped, begun = ~begin, judged & begin
+    # --- the next step
+    order, step = t.method.order, s.t1 - s.T3
+    size = where(f.is_finite(error), f.max(error, 1e-30), 1e30)
+    rate = size / power(f, step, float(int(order)), whole=True)
+    foreseen = size * f.min(rate / s.rate, STEEPEST)
+    steep = accept & (foreseen > 1.0)
+    aim = where(steep, foreseen * (SAFETY**order / FORESEEN), size)
+    factor = power(f, aim, -1.0 / order) * SAFETY
+    factor = f.max(factor, where(accept & ~steep, yes, SHRINK))
+    factor = f.min(factor, where(accept, f.const(GROW, DOUBLE, f.width), SAFETY))
+    h = where(judged, step * where(dodge, f.const(DODGE, DOUBLE, f.width), factor), s.h)
+    h = where(again, s.h, h)
+    failed = judged & ~accept & stepped & ~again
+    if t.doubts:
+        h = where(failed, step_around(t, f, s, left, step, h), h)
+    s.behind = h
+    with f.if_(f.any_of(begun)):
+        s.behind = where(begun, first_step(t, f, s), s.behind)
+    h = s.behind
+    code = where(judged & (h < s.smallest), f.const(STEP_TOO_SMALL, DOUBLE, f.width), s.code)
+    code = where(code.is_(float(RUNNING)) & judged & (tried >= s.max_steps), STEP_LIMIT, code)
+    code = where(judged & bad & begin & ~accept, where(code.is_(float(RUNNING)), STEP_TOO_SMALL, code), code)
+    code = where(accept & (s.last > 0.5), DONE, code)
+    # --- where it stands
+    with f.if_(f.any_of(accept)):
+        for k in range(POINTS - 1):
+            t.copy_point(f, accept, f"P{k + 1}", f"P{k}")
+            s.where(accept, **{f"T{k}": getattr(s, f"T{k + 1}")})
+        t.copy_point(f, accept, ("X q", "O v", "O a"), f"P{POINTS - 1}")
+        s.where(accept, T3=s.t1)
+        s.where(accept, distance0=s.distance1)
+        s.where(accept, distance1=s.distance2)
+        s.where(accept, distance2=s.distance)
+        if t.m:
+            s.where(accept, tolerance=velocity_tolerance(t, f, s, "P3 v"))
+        t.record_step(f, s, accept)
+    s.where(accept & stepped, rate=rate)
+    first = s.tried < 0.0
+    if t.plan.breaks:
+        h = where(accept & stepped & (step < s.h * CUT), f.max(h, s.h), h)
+        h = where(begun & (tried > 0.0), s.h * CAUTIOUS, h)
+        s.where(begun, rate=inf, distance0=inf, distance1=inf)
+        s.where(judged, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
+        s.where(accept & (s.lands > 0.5), steps=-1.0)
+    del first
+    cost = where(begin, f.const(1.0, DOUBLE, f.width), float(t.method.stages))
+    cost = where(careful, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
+    s.where(judged, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
+    # --- outputs
+    ready = accept & ((s.accepted > 0.0) | (stepped & (s.last > 0.5)))
+    until = where(ready, s.t1, -np.inf)
+    if t.plan.breaks:
+        enough = ~begun & ((s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
+        until = where(enough, until + where(s.lands > 0.5, s.smallest * GAP, 0.0), -np.inf)
+    s.until = until
+    s.where(accept, accepted=s.accepted + 1.0)
+
+
+def first_step(t: Module, f: Function, s: Lane) -> Value:
+    """As given, or one over which the state changes by a small part of itself (first_step.py)."""
+    rtol = t.spread(f, s.rtol)
+
+    def relative(of_q: str, of_v: str) -> Any:
+        def both(r: Value) -> list[Value]:
+            return [
+                f.abs(t.vector(f, name, r)) / f.fma(rtol, f.abs(t.vector(f, y, r)), t.vector(f, scale, r))
+                for name, y, scale in ((of_q, "X q", "scale q"), (of_v, "O v", "scale v"))
+            ]
+
+        return both
+
+    size, rate = t.largest(f, relative("X q", "O v")), t.largest(f, relative("O v", "O a"))
+    span = s.end - s.start
+    ordinary = f.is_finite(rate) & (rate > 0.0) & (size > 0.0)
+    chosen = f.select(ordinary, f.min(size / f.select(ordinary, rate, 1.0) * 0.01, span), span * 1e-4)
+    return f.select(s.first > 0.0, f.min(s.first, span), chosen)

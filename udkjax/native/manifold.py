@@ -1,0 +1,88 @@
+"""Projection: Newton's method that returns positions and velocities to the constraint manifold."""
+
+from collections.abc import Callable
+from typing import Any
+
+from udkjax.native.ir import DOUBLE, INT, Function, Value
+from udkjax.native.layout import Lane
+from udkjax.native.module import Module
+from udkjax.native.steps import FAR, NEWTON_STEPS, NOTHING_LEFT, OUTPUT_STEPS, TURNED, USELESS
+
+
+def newton(t: Module, f: Function, s: Lane, steps: int, which: str = "judged"):
+    """Newton's method to Psi = 0 of lanes that are `judged`, until it moves nothing but rounding errors."""
+
+    def closer(moving: Value):
+        t.invoke(f, "newton_q")
+        s.where(moving & (s.safe < 0.5), ok=0.0)
+
+    iterate_newton(t, f, s, getattr(s, which) > 0.5, closer, steps)
+
+
+def iterate_newton(t: Module, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):
+    """Newton's method of some lanes: `closer` leaves X q nearer to the manifold in C."""
+    s.moving = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+    k = f.variable(0, INT, 1)
+    with f.while_(lambda: f.any_of(s.moving > 0.5) & (k.value < steps)):
+        moving = s.moving > 0.5
+        closer(moving)
+        change = take_newton_step(t, f, moving)
+        s.moving = f.select(moving & ~(change <= FAR), f.const(1.0, DOUBLE, f.width), 0.0)
+        k.value = k.value + 1
+
+
+def take_newton_step(t: Module, f: Function, moving: Value) -> Value:
+    """Take X q from C in lanes that move; return the largest change, in the scene's own units."""
+
+    def change(r: Value) -> list[Value]:
+        old, new = t.vector(f, "X q", r), t.vector(f, "C", r)
+        t.put(f, "X q", r, f.select(moving, new, old))
+        return [f.abs(new - old) * t.vector(f, "inverse unit", r)]
+
+    return t.largest(f, change)
+
+
+def with_threshold(t: Module, f: Function, s: Lane, threshold: Value, do: Any):
+    """What is done with another threshold of pivots."""
+    if t.drop is None:
+        do()
+        return
+    place = (t.places["constants"] + t.drop) * f.width
+    before = f.load(f.given["work"], place, f.width)
+    f.store(threshold, f.given["work"], place, f.width)
+    do()
+    f.store(before, f.given["work"], place, f.width)
+
+
+def velocity_tolerance(t: Module, f: Function, s: Lane, name: str) -> Value:
+    """What the fastest velocity may err, in its unit."""
+    fastest = t.largest(f, lambda r: [f.abs(t.vector(f, name, r)) * t.vector(f, "inverse unit", r)])
+    return f.fma(s.rtol, fastest / s.omega, s.atol)
+
+
+def project_output(t: Module, f: Function, s: Lane, which: str):
+    """Return X q and X v to the manifold, as X q and O v; `violated` is how far they are from it."""
+    if t.plan.projected:
+        tolerance = velocity_tolerance(t, f, s, "X v")
+        threshold = f.min(f.max(TURNED / tolerance, NOTHING_LEFT), USELESS)
+        if not t.doubts:
+            threshold = None
+
+        def close():
+            newton(t, f, s, OUTPUT_STEPS, which)
+            t.invoke(f, "newton_v_and_psi")
+
+        close() if threshold is None else with_threshold(t, f, s, threshold, close)
+    else:
+        t.invoke(f, "psi")
+        with f.each(t.rowcount) as r:
+            t.put(f, "O v", r, t.vector(f, "X v", r))
+    worst = f.variable(0.0)
+    if t.m:
+        with f.each(t.m) as i:
+            place = i * f.width + t.places["psi"] * f.width
+            psi = f.load(f.given["work"], place, f.width)
+            scale = f.load(f.given["work"], i * f.width + t.places["rows"] * f.width, f.width)
+            x = f.abs(psi) / scale
+            worst.value = f.select((x > worst.value) | x.is_not(x), x, worst.value)  # what is none stays
+    s.violated = worst.value

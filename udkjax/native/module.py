@@ -1,0 +1,308 @@
+"""One module of machine code: its functions, and how they reach the numbers of a run."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from udkjax.equations.loop_programs import LoopPrograms
+from udkjax.equations.scalar_programs import EliminationPrograms, ScenePrograms
+from udkjax.expressions import Program
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.layout import INPUTS, LANE_NUMBERS, OUTPUTS, Lane, Layout, Plan
+from udkjax.native.loops import LoopWriter
+from udkjax.native.program import Place, numbered, write
+from udkjax.native.steps import POINTS
+
+# Once a run, beside singularities, or where a piece may end.
+RARE = ("leave", "solve", "finish_members", "begin", "arrive_carefully", "accelerate_carefully", "equation_terms", "psi_dot")
+
+
+class Module:
+    """The text of one module of machine code: its functions, and how they reach the numbers of a run.
+
+    `run` is called with a record of 8-byte fields (`call_fields`): how many members, output times, breakpoints and directions
+    there are; the addresses of inputs, their strides from member to member (numbers), the addresses of outputs, and that of the
+    number of the next member, which threads share.
+    """
+
+    inputs: tuple[str, ...] = ()  # besides those of every run
+    results: tuple[str, ...] = OUTPUTS
+    outputs: tuple[str, ...] = ()
+    directions_in = 0  # which dimension of the last input says how many directions there are
+    module = ""  # the text, once it is written
+
+    @property
+    def call_fields(self) -> tuple[str, ...]:
+        inputs = (*INPUTS, *self.inputs)
+        strides = (f"{x} stride" for x in inputs)
+        return "members", "times", "knots", "directions", *inputs, *strides, *self.results, *self.outputs, "next"
+
+    def __init__(self, plan: Plan):
+        self.plan, self.code, self.method = plan, plan.code, plan.method
+        code, n, m = plan.code, plan.code.coordinate_count, plan.code.row_count
+        self.n, self.m = n, m
+        self.constants = len(code.constants)
+        p = self.places = Layout(plan.width, plan.vector)
+        for name in LANE_NUMBERS:
+            p.add(name)
+        p.add("constants", self.constants)
+        p.add("X t")
+        for name in ("X q", "X v", "X dq", "X dv", "O v", "O a", "O dq", "O dv", "C", "scale q", "scale v", "inverse unit"):
+            p.add(name, n)
+        for k in range(POINTS):
+            for x in "qva":
+                p.add(f"P{k} {x}", n)
+        for i in range(1, plan.method.stages):
+            p.add(f"A{i}", n)
+        for k in range(3 * POINTS):
+            p.add(f"N{k}", n)
+        p.add("rows", m)
+        p.add("psi", m)
+        p.add("R", code.term_count)
+        self.pieces = len(code.equations.pieces) if isinstance(code, ScenePrograms) and plan.breaks else 0
+        for name in ("G", "G0"):
+            p.add(name, self.pieces)
+        if isinstance(code, LoopPrograms):
+            for name, count in code.scratch.items():
+                p.add(name, count)
+            if self.cares:
+                for name, count in code.with_all_rows.scratch.items():
+                    p.add(f"careful {name}", count)
+                for name in ("careful v", "careful a"):
+                    p.add(name, n)
+        self.ways = self.places  # of one direction of a derivative
+        self.functions: list[Function] = []
+        self.loops = LoopWriter(plan.width)
+        self.stage_accelerations = ["P3 a", *(f"A{i}" for i in range(1, plan.method.stages))]
+        self.rowcount = -(-n * plan.width // plan.vector)
+        self.drop = code.drop_tol_index
+
+    def joined(self) -> str:
+        functions = [*self.functions, *self.loops.functions]
+        declared = sorted(set().union(*(f.declared for f in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
+        return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
+
+    @property
+    def doubts(self) -> bool:
+        """Whether pivots may be too small to be trusted."""
+        return isinstance(self.code, EliminationPrograms | LoopPrograms) and self.code.policy.reports
+
+    @property
+    def cares(self) -> bool:
+        """Whether steps may be taken again with care."""
+        return self.doubts and self.m > 0
+
+    def write_programs(self):
+        code, n = self.code, self.n
+        if isinstance(code, LoopPrograms):
+            self.write_loop_programs(code)
+            return
+        state, changes, safe = (
+            self.state_places(),
+            [*self.work_places("X dq", n), *self.work_places("X dv", n)],
+            self.work_places("safe", 1),
+        )
+        outputs = {
+            "accelerations": [*numbered("out", n), *safe],
+            "newton_q": [*self.work_places("C", n), *safe],
+            "project_and_accelerate": [*self.work_places("O v", n), *self.work_places("O a", n), *safe],
+            "end_of_step": [
+                *(x for name in ("O v", "O a", "O dq", "O dv") for x in self.work_places(name, n)),
+                *self.work_places("distance", 1),
+                *safe,
+            ],
+            "tangent_part": [*self.work_places("O dq", n), *self.work_places("O dv", n), *self.work_places("distance", 1)],
+            "newton_v_and_psi": [*self.work_places("O v", n), *self.work_places("psi", self.m)],
+            "psi": self.work_places("psi", self.m),
+            "equation_terms": self.work_places("R", code.term_count),
+            "psi_dot": self.work_places("psi", self.m),
+            "pieces": self.work_places("G", self.pieces),
+        }
+        for name, program in self.program_names(code).items():
+            inputs = [*state, *changes] if name in ("tangent_part", "end_of_step") else state
+            self.write_program(program, name, ("work", "out"), inputs, outputs[name])
+        inputs = numbered("work", len(code.prologue.inputs))
+        self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, numbered("out", self.constants)))
+
+    def write_loop_programs(self, code: LoopPrograms):
+        found = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
+        found |= {"dq1": "O dq", "dv1": "O dv", "terms": "R"}
+        results = (*found, "constants", "psi", "safe", "distance", "rank")
+        at = {x: ("work", self.places[found.get(x, x)]) for x in (*results, *code.scratch)}
+        for name, program in self.program_names(code).items():
+            self.loops.write(program, name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {}))
+        if self.cares:
+            every = code.with_all_rows
+            places = {x: f"careful {x}" for x in every.scratch}
+            places |= {"v1": "careful v", "a": "careful a", "safe": "rank", "distance": "rank"}
+            careful = at | {x: ("work", self.places[place]) for x, place in places.items()}
+            for name, program in {
+                "accelerations": every.accelerations,
+                "newton_q": every.newton_q,
+                "project_and_accelerate": every.project_and_accelerate,
+                "tangent_part": every.tangent_part,
+            }.items():
+                self.loops.write(program, f"careful_{name}", ("work", "out"), careful)
+        at = {"numbers": ("work", 0), "constants": ("out", 0)}
+        self.loops.write(code.prologue, "prologue", ("work", "out"), at, width=1)
+
+    def program_names(self, code: Any) -> dict[str, Any]:
+        """The programs that it calls, by the names of their functions."""
+        wanted = {"accelerations": code.accelerations, "equation_terms": code.equation_terms, "psi": code.psi}
+        if self.pieces:
+            wanted["pieces"] = code.pieces
+        if self.plan.projected:
+            wanted["newton_q"] = code.newton_q
+            if self.method.ends:
+                wanted |= {"project_and_accelerate": code.project_and_accelerate, "tangent_part": code.tangent_part}
+            else:
+                wanted["end_of_step"] = code.end_of_step
+            wanted["newton_v_and_psi"] = code.newton_v_and_psi
+        if self.cares and isinstance(code, ScenePrograms):
+            wanted["psi_dot"] = code.psi_dot
+        return wanted
+
+    def write_program(self, program: Program, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]):
+        self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs, name in RARE))
+
+    def work_places(self, name: str, count: int) -> list[Place]:
+        return [("work", self.places[name] + k) for k in range(count)]
+
+    def state_places(self) -> list[Place]:
+        """The constants, and t, q and v in X."""
+        counts = {"constants": self.constants, "X t": 1, "X q": self.n, "X v": self.n}
+        return [place for name, count in counts.items() for place in self.work_places(name, count)]
+
+    def function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
+        f = Function(name, arguments, self.plan.width, rare=name in RARE)
+        self.functions.append(f)
+        return f, Lane(f, self.places)
+
+    def start(self, name: str, pointer: str) -> int:
+        """Where an array is, in numbers from a pointer."""
+        return (self.places if pointer == "work" else self.ways)[name] * self.plan.width
+
+    def vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
+        """One register of an array of coordinates."""
+        return f.load(f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
+
+    def put(self, f: Function, name: str, r: Value, x: Value, pointer: str = "work"):
+        f.store(x, f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
+
+    def spread(self, f: Function, x: Value) -> Value:
+        """A number of each lane, to go with registers of coordinates."""
+        return x if x.width == self.plan.vector else f.repeat(x, self.plan.vector)
+
+    def largest(self, f: Function, values: Any) -> Value:
+        """The largest, in each lane, of `values(r)` of each register; without what is not a number."""
+        worst = f.variable(0.0, width=self.plan.vector)
+        with f.each(self.rowcount) as r:
+            for x in values(r):
+                worst.value = f.max(x, worst.value)
+        found = worst.value
+        return found if self.plan.width > 1 else f.reduced("fmax", found)
+
+    def total(self, f: Function, x: Value) -> Value:
+        name = f"llvm.vector.reduce.fadd.v{x.width}f64"
+        f.declared.add(f"declare double @{name}(double, {x.type})")
+        return f.op(f"call double @{name}(double {f.const(0.0).name}, {x.type} {x.name})", DOUBLE)
+
+    def address(self, f: Function, name: str) -> Value:
+        return f.at(f.given["work"], self.places[name] * self.plan.width)
+
+    def invoke(self, f: Function, name: str, out: str | None = None):
+        f.call(name, f.given["work"], self.address(f, out) if out else f.given["work"])
+
+    def weighted_sum(
+        self, f: Function, row: np.ndarray, r: Value, names: Sequence[str] | None = None, pointer: str = "work"
+    ) -> Value | None:
+        """sum_j row_j a_j of one register of coordinates; None where all are zero."""
+        total = None
+        for weight, name in zip(row, names or self.stage_accelerations, strict=False):
+            if weight != 0:
+                a = self.vector(f, name, r, pointer)
+                total = a * float(weight) if total is None else f.fma(a, float(weight), total)
+        return total
+
+    def copy_point(self, f: Function, mask: Value, source: Any, to: str):
+        sources = source if isinstance(source, tuple) else [f"{source} {x}" for x in "qva"]
+        with f.each(self.rowcount) as r:
+            for name, x in zip(sources, "qva", strict=True):
+                self.put(f, f"{to} {x}", r, f.select(mask, self.vector(f, name, r), self.vector(f, f"{to} {x}", r)))
+
+    def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work"):
+        """The coordinates of lane k to an address."""
+        with f.each(self.n) as i:
+            f.store(f.load(f.given[pointer], i * f.width + k + self.start(name, pointer)), to, i + start)
+
+    def lane_number(self, f: Function, name: str, k: Value, i: Any) -> Value:
+        """The i-th number of an array, of lane k."""
+        return f.load(f.given["work"], f.like(i, INT, 1) * f.width + self.places[name] * f.width + k)
+
+    def to_int(self, f: Function, x: Value) -> Value:
+        return f.op(f"fptosi double {x.name} to i64", INT)
+
+    def call_record(self, f: Function) -> Value:
+        """What `run` was told."""
+        return f.load(f.given["work"], self.places["call"] * f.width, base=POINTER)
+
+    def input_number(self, f: Function, call: Value, name: str, member: Value, k: Value) -> Value:
+        """The k-th number of an input of a member (one lane)."""
+        return f.load(self.member_address(f, call, name, member), k)
+
+    def member_address(self, f: Function, call: Value, name: str, member: Value) -> Value:
+        """The address of what an input holds of a member (one lane)."""
+        number = member if member.base == INT else self.to_int(f, member)
+        stride = f.load(call, self.call_fields.index(f"{name} stride"), base=INT)
+        pointer = f.load(call, self.call_fields.index(name), base=POINTER)
+        return f.at(pointer, number * stride)
+
+    def write_state(self, f: Function, s: Lane, call: Value, k: Value, number: Value, q: str, v: str):
+        """State number `number` of lane k into the outputs."""
+        member = self.to_int(f, f.lane(s.member, k))
+        times = f.load(call, self.call_fields.index("times"), base=INT)
+        row = member * times + number
+        for name, x in (("qs", q), ("vs", v)):
+            self.copy_lane(f, f.at(f.load(call, self.call_fields.index(name), base=POINTER), row * self.n), 0, x, k)
+        f.store(f.lane(s.violated, k), f.load(call, self.call_fields.index("violation"), base=POINTER), row)
+
+    def allocate(self, f: Function, count: Value) -> tuple[Value, Value]:
+        """So many numbers: what to free, and where they begin, at a register's boundary."""
+        size = count * 8 + 64
+        block = f.op(f"call ptr @malloc(i64 {size.name})", POINTER)
+        address = f.op(f"ptrtoint ptr {block.name} to i64", INT)
+        aligned = f.logic("and", address + 63, -64)
+        return block, f.op(f"inttoptr i64 {aligned.name} to ptr", POINTER)
+
+    def write_derivatives(self):
+        """Its functions."""
+
+    def record_step(self, f: Function, s: Lane, accept: Value):
+        """What it does with a step once its end is in P3."""
+
+    def record_output(self, f: Function, s: Lane):
+        """What it does with a state between steps, in X t, X q and O v, of lanes that are `due`."""
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        """What it does with a member that is taken into a lane."""
+
+    def end_members(self, f: Function, s: Lane):
+        """What it does with members that are done, in lanes that are `due`."""
+
+    def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """One step of all lanes, and what becomes of those that are done."""
+        raise NotImplementedError
+
+    def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """Which members come next, into lanes whose members are done."""
+        fill()
+
+    def allocate_memory(self, f: Function, call: Value) -> list[Value]:
+        """Further memory of a run, in `work` already: what to free."""
+        del f, call
+        return []
+
+    def accelerate_stage(self, f: Function, i: int):
+        """The accelerations of stage i, of the state in X."""
+        self.invoke(f, "accelerations", f"A{i}")

@@ -1,0 +1,31 @@
+"""Steps near singular configurations: how far these are, when they are reached, and a step whose stages avoid them."""
+
+from udkjax.native.ir import DOUBLE, Function, Value
+from udkjax.native.layout import Lane
+from udkjax.native.module import Module
+from udkjax.native.steps import BEFORE, LONGEST, NEAREST, SHORTEST
+
+
+def is_clear(t: Module, f: Function, s: Lane, distance: Value, rounding: float = BEFORE) -> Value:
+    """Whether a step as long as the one that is tried may begin so far away from singular configurations."""
+    return (distance > NEAREST) & (distance * distance * distance * s.tolerance > s.h * s.omega * rounding)
+
+
+def time_to_singularity(t: Module, f: Function, s: Lane) -> Value:
+    """The time that is left until a singular configuration: a root of the parabola through three distances."""
+    t2, t1, t0, d2, d1, d0 = s.T1, s.T2, s.T3, s.distance0, s.distance1, s.distance2
+    slope, before = (d0 - d1) / (t0 - t1), (d1 - d2) / (t1 - t2)
+    curve = (slope - before) / (t0 - t2)
+    slope = slope + curve * (t0 - t1)
+    return -d0 / (slope - curve * (d0 / slope))
+
+
+def step_around(t: Module, f: Function, s: Lane, left: Value, step: Value, otherwise: Value) -> Value:
+    """In place of a step that failed, one with its nodes far from the singular configuration ahead."""
+    low, high = (float(x) for x in t.method.clearings)
+    share = left / step
+    across = left / f.select(share < low, f.const(low, DOUBLE, f.width), high)
+    clear = is_clear(t, f, s, s.distance2 * low * step / left)
+    up_to = f.select((share < 1.0 + low) & clear, left - step * low, step)
+    found = f.select(share < high, across, up_to)
+    return f.select((found > step * SHORTEST) & (found < step * LONGEST), found, otherwise)
