@@ -110,6 +110,10 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.study.identify import design_experiment as design_experiment
     from udkjax.study.identify import identify as identify
     from udkjax.study.identify import length as length
+    from udkjax.study.power_balance import PowerBalance as PowerBalance
+    from udkjax.study.power_balance import power_balance as power_balance
+    from udkjax.study.reaction_peaks import envelope as envelope
+    from udkjax.study.reaction_peaks import reaction_peaks as reaction_peaks
     from udkjax.study.sweep import Axis as Axis
     from udkjax.study.sweep import LatinHypercube as LatinHypercube
     from udkjax.study.sweep import Random as Random
@@ -134,6 +138,8 @@ _NAMES = {
         unique_reactions uniqueness singular_values
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
     "udkjax.study.diagnosis": "diagnose Diagnosis",
+    "udkjax.study.reaction_peaks": "reaction_peaks envelope",
+    "udkjax.study.power_balance": "power_balance PowerBalance",
     "udkjax.study.identify": """
         identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck
         design_experiment Candidate Design""",

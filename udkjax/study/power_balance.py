@@ -1,0 +1,118 @@
+"""Where the power of a motion comes from and where it goes: the check of accelerations, multipliers and velocities together.
+
+With M a + Psi_q^T lambda = F and Psi_q v = -Psi_t the energies T and V change by
+
+    d(T + V)/dt = sum of v . Q_e of the loads that force elements state + sum of dV_e/dt at rest + lambda . Psi_t,
+
+the power of springs' dampers, forces, torques and friction, of potentials that depend on time, and of drivers. Joints do no work.
+The left side is the derivative of the energies along (v, a); the right one knows forces only.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.equations import constraints, loads
+from udkjax.equations.analysis import analyse
+from udkjax.equations.constraints import bodies
+from udkjax.equations.kinds import of_each
+from udkjax.equations.textbook import prepare
+from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.mechanism import Mechanism
+
+
+class PowerBalance(NamedTuple):
+    """Powers (W) at each output time. What they do not explain of the energies' rates is `residual`."""
+
+    drivers: dict[str, Float[Array, "T"]]
+    forces: dict[str, Float[Array, "T"]]  # what is not stored: of dampers, loads, and potentials that change with time
+    joints: dict[str, Float[Array, "T"]]  # of both bodies together: zero, to rounding and what the velocities violate
+    kinetic: Float[Array, "T"]  # dT/dt
+    potential: Float[Array, "T"]  # dV/dt
+
+    @property
+    def supplied(self) -> Float[Array, "T"]:
+        """The power of drivers and force elements together."""
+        return sum([*self.drivers.values(), *self.forces.values()], jnp.zeros_like(self.kinetic))
+
+    @property
+    def residual(self) -> Float[Array, "T"]:
+        """d(T + V)/dt less what is supplied."""
+        return self.kinetic + self.potential - self.supplied
+
+    @property
+    def relative(self) -> Float[Array, ""]:
+        """The largest residual over the largest of the powers that it is the difference of."""
+        parts = [self.kinetic, self.potential, *self.drivers.values(), *self.forces.values()]
+        size = jnp.max(jnp.stack([jnp.max(jnp.abs(part)) for part in parts]))
+        return jnp.max(jnp.abs(self.residual)) / jnp.where(size > 0, size, 1.0)
+
+
+def power_balance(
+    mechanism: Mechanism, solution: Any, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+) -> PowerBalance:
+    """Return the power of each driver, force element and joint along a motion, and the rates of the energies.
+
+    Args:
+        mechanism: the mechanism.
+        solution: ts (T,), q and v (T, bodies, 3).
+        method: decides the rank; by default `SVD`.
+        stabilization: the run's `Baumgarte`, to include what it adds.
+
+    Returns:
+        The `PowerBalance` (W).
+    """
+    ts, flat = jnp.asarray(solution.ts), (len(solution.ts), -1)
+    q, v = (jnp.asarray(x).reshape(flat) for x in (solution.q, solution.v))
+    analysis, method = analyse(mechanism), SVD() if method is None else method
+    by_row, by_force, by_joint, kinetic, potential = _powers(mechanism.bare, analysis, ts, q, v, method, stabilization)
+    owners = [name for name, _ in analysis.row_names]
+
+    def total(values: Array, name: str) -> Array:
+        return values[:, [k for k, owner in enumerate(owners) if owner == name]].sum(1)
+
+    return PowerBalance(
+        drivers={name: total(by_row, name) for name in mechanism.driver_names},
+        forces={name: by_force[:, k] for k, name in enumerate(mechanism.force_names)},
+        joints={name: total(by_joint, name) for name in mechanism.joint_names},
+        kinetic=kinetic,
+        potential=potential,
+    )
+
+
+@eqx.filter_jit
+def _powers(mechanism, analysis, ts, q, v, method, baumgarte):
+    equations = prepare(mechanism, method, baumgarte, analysis)
+
+    def one(t, q, v):
+        a, multipliers = equations.accelerations(t, q, v), equations.multipliers(t, q, v)
+        psi_t = jax.jvp(lambda t: constraints.psi(mechanism, t, q), (t,), (jnp.ones_like(t),))[1]
+        kinetic = jax.jvp(lambda v: loads.kinetic_energy(mechanism, v), (v,), (a,))[1]
+        potential = jax.jvp(lambda t, q: loads.potential_energy(mechanism, t, q, v), (t, q), (jnp.ones_like(t), v))[1]
+        by_joint = -multipliers * (constraints.psi_q(mechanism, t, q) @ v)
+        return multipliers * psi_t, _of_forces(mechanism, t, q, v), by_joint, kinetic, potential
+
+    return jax.vmap(one)(ts, q, v)
+
+
+def _of_forces(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[Array, "forces"]:
+    """The power of each force element that is not the rate of its potential along the motion."""
+
+    def power(element: Any, *frames: Any) -> Array:
+        stated = element.loads(t, *frames)
+        total = jnp.zeros(())
+        for load, frame in zip(stated or (), frames, strict=bool(stated)):
+            total = total + load[0] * frame.vx + load[1] * frame.vy + load[2] * frame.omega
+        if element.potential(t, *frames) is None:
+            return total
+        return total + jax.grad(lambda t: jnp.asarray(element.potential(t, *frames), t.dtype))(t)
+
+    elements = [*mechanism.forces.values()]
+    found = jnp.zeros(len(elements))
+    for kind, powers in of_each(power, mechanism, elements, bodies(q), bodies(v)):
+        found = found.at[kind.members].set(powers)
+    return found

@@ -1,0 +1,110 @@
+"""Peaks and mean squares of reactions over a run, and their envelopes over load cases.
+
+A peak between two outputs is that of the parabola through the largest of |F| and its neighbours,
+
+    |F|_max = y_1 - (y_2 - y_0)^2 / (8 (y_2 - 2 y_1 + y_0)),
+
+which is right to the third order of the distance of the outputs, and whose derivative is that of the motion at the instant of
+the peak. All of it is pure: differentiated through `simulate`, and mapped over mechanisms and runs by `jax.vmap`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from udkjax.equations.reactions import reactions
+from udkjax.scene.mechanism import Mechanism
+
+
+class Peak(NamedTuple):
+    """Of one joint and body over a run: the largest force and torque, when they occur, and the roots of mean squares."""
+
+    force: Float[Array, ""]  # N, of |(fx, fy)|
+    force_time: Float[Array, ""]  # s
+    torque: Float[Array, ""]  # N m, of its absolute value
+    torque_time: Float[Array, ""]  # s
+    rms_force: Float[Array, ""]  # N
+    rms_torque: Float[Array, ""]  # N m
+
+
+class Envelope(NamedTuple):
+    """Of one joint and body over load cases: the largest peaks, and in which case they occur."""
+
+    force: Float[Array, ""]  # N
+    force_case: Int[Array, ""]
+    force_time: Float[Array, ""]  # s
+    torque: Float[Array, ""]  # N m
+    torque_case: Int[Array, ""]
+    torque_time: Float[Array, ""]  # s
+
+
+Peaks = dict[str, dict[str, Peak]]  # of a joint or driver, of a body
+
+
+def reaction_peaks(mechanism: Mechanism, solution: Any, **choices: Any) -> Peaks:
+    """Return the peaks and root mean squares of all reactions over a run.
+
+    Args:
+        mechanism: the mechanism.
+        solution: ts (T,), q and v (T, bodies, 3), T of at least 3.
+        **choices: those of `reactions`: frame, about, compliances, method, stabilization. The torque of a peak is that about the
+            point which `about` chooses: here by default the "joint".
+
+    Returns:
+        A `Peak` for each joint and body, `reaction_peaks(mech, sol)["A"]["link1"].force`; of a run that failed, not a number.
+    """
+    ts = jnp.asarray(solution.ts)
+    if len(ts) < 3:
+        raise ValueError(f"a peak needs at least 3 output times, not {len(ts)}")
+    found = reactions(mechanism, solution, **{"about": "joint", **choices})
+    return {name: {body: _peak(ts, load) for body, load in loads.items()} for name, loads in found.items()}
+
+
+def envelope(cases: Peaks | Sequence[Peaks]) -> dict[str, dict[str, Envelope]]:
+    """Return the largest peaks over load cases; cases that failed are left out.
+
+    `cases` are the peaks of each, or of a batch, as `jax.vmap(reaction_peaks)` returns them, with the cases as the first axis.
+    """
+    batch: Any = cases if isinstance(cases, Mapping) else jax.tree.map(lambda *xs: jnp.stack(xs), *cases)
+    return {name: {body: _envelope(peak) for body, peak in loads.items()} for name, loads in batch.items()}
+
+
+def _peak(ts: Array, load: Float[Array, "T 3"]) -> Peak:
+    square = load[:, 0] ** 2 + load[:, 1] ** 2
+    force = jnp.where(square == 0.0, 0.0, jnp.sqrt(jnp.where(square == 0.0, 1.0, square)))  # with a finite derivative at zero
+    torque = jnp.abs(load[:, 2])
+    return Peak(*_largest(ts, force), *_largest(ts, torque), *(_root_mean_square(ts, x) for x in (square, load[:, 2] ** 2)))
+
+
+def _largest(ts: Array, y: Float[Array, "T"]) -> tuple[Array, Array]:
+    """The largest of samples, by the parabola through it and its neighbours, and when; at an end of the run, the sample."""
+    top = jnp.argmax(y)
+    middle = jnp.clip(top, 1, len(y) - 2)
+    before, at, after = y[middle - 1], y[middle], y[middle + 1]
+    left, right = ts[middle] - ts[middle - 1], ts[middle + 1] - ts[middle]
+    # y = at + slope s + bend s^2, s from the middle
+    bend = ((after - at) / right - (at - before) / left) / (left + right)
+    slope = (at - before) / left + bend * left
+    inside = (top == middle) & (bend < 0)
+    shift = jnp.where(inside, -slope / (2 * jnp.where(inside, bend, -1.0)), 0.0)
+    return jnp.where(inside, at + slope * shift / 2, y[top]), jnp.where(inside, ts[middle] + shift, ts[top])
+
+
+def _root_mean_square(ts: Array, square: Float[Array, "T"]) -> Array:
+    """The root of the mean over time, by trapezoids."""
+    mean = jnp.sum((square[1:] + square[:-1]) * jnp.diff(ts)) / (2 * (ts[-1] - ts[0]))
+    return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0 * mean)
+
+
+def _envelope(peak: Peak) -> Envelope:
+    def top(values: Array, times: Array) -> tuple[Array, Array, Array]:
+        if np.ndim(values) != 1:
+            raise ValueError(f"an envelope is over cases, the one axis of each peak; the shape of this one is {np.shape(values)}")
+        case = jnp.argmax(jnp.where(jnp.isnan(values), -jnp.inf, values))
+        return values[case], case, times[case]
+
+    return Envelope(*top(peak.force, peak.force_time), *top(peak.torque, peak.torque_time))
