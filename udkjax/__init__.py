@@ -97,6 +97,8 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.show.player import animate_modes as animate_modes
     from udkjax.study.diagnosis import Diagnosis as Diagnosis
     from udkjax.study.diagnosis import diagnose as diagnose
+    from udkjax.study.explanation import Explanation as Explanation
+    from udkjax.study.explanation import explain as explain
     from udkjax.study.identify import Candidate as Candidate
     from udkjax.study.identify import Design as Design
     from udkjax.study.identify import Estimate as Estimate
@@ -138,6 +140,7 @@ _NAMES = {
         unique_reactions uniqueness singular_values
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
     "udkjax.study.diagnosis": "diagnose Diagnosis",
+    "udkjax.study.explanation": "explain Explanation",
     "udkjax.study.reaction_peaks": "reaction_peaks envelope",
     "udkjax.study.power_balance": "power_balance PowerBalance",
     "udkjax.study.identify": """

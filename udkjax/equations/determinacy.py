@@ -11,6 +11,7 @@ pure, and may be mapped over states (`jax.vmap`); without an `analysis` the scal
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.equations import constraints
@@ -87,6 +88,16 @@ def uniqueness(
     basis, rank = left_null_space(mechanism, t, q, analysis, rank_tol)
     share = jnp.linalg.norm(basis, axis=1)
     return Uniqueness(share <= UNIQUE_TOL, share, rank)
+
+
+def unique_direction(null_rows: np.ndarray) -> float | None:
+    """Return the only direction (rad, 0 to pi) in which a force of two components is unique; None of one that all or none are.
+
+    `null_rows` are the rows of N that belong to its components (2, k), in one unit.
+    """
+    u, sigma, _ = np.linalg.svd(np.pad(null_rows, ((0, 0), (0, 2))))
+    loose = int(np.sum(sigma > UNIQUE_TOL))
+    return float(np.arctan2(u[1, 1], u[0, 1]) % np.pi) if loose == 1 else None
 
 
 def _scales(mechanism: Mechanism, analysis: Analysis | None) -> Scales:

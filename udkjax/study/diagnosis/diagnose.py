@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.equations.determinacy import RANK_TOL, UNIQUE_TOL
+from udkjax.equations.determinacy import RANK_TOL, UNIQUE_TOL, unique_direction
 from udkjax.equations.redundancy import KinematicRows
 from udkjax.integrate.assembly import State, close, require_closed
 from udkjax.scene.joints import Revolute, Weld
@@ -89,7 +89,7 @@ def diagnose(
         redundancies=tuple(found),
         cure=_cure(mechanism, positions, usual, found) if fixes else (),
         branches=tuple(branches(mechanism, positions, here)),
-        forces=_forces(mechanism, positions, here, owners),
+        forces=_forces(mechanism, here, owners),
         singular_values=here.sigma,
         clearance=clearance(positions, here, ordinary, walk),
         timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
@@ -155,7 +155,7 @@ def _cure(mechanism: Mechanism, positions: Positions, usual: list[Configuration]
     return tuple(done)
 
 
-def _forces(mechanism: Mechanism, positions: Positions, here: Configuration, owners: list[str]) -> dict[str, JointForces]:
+def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:
     """Which multipliers are unique, by N; where one direction of a pin's force alone is, which."""
     found = {}
     for name, element in mechanism.constraints.items():
@@ -164,11 +164,6 @@ def _forces(mechanism: Mechanism, positions: Positions, here: Configuration, own
         share = np.linalg.norm(N, axis=1)
         direction = None
         if isinstance(element, Revolute | Weld):
-            u, sigma, _ = (
-                np.linalg.svd(N[:2] / positions.row_unit[own[:2], None]) if N.shape[1] else (np.eye(2), np.zeros(1), None)
-            )
-            scale = 1 / float(np.max(positions.row_unit[own[:2]]))
-            loose = int(np.sum(sigma > UNIQUE_TOL * scale))
-            direction = float(np.arctan2(u[1, 1], u[0, 1]) % np.pi) if loose == 1 else None
+            direction = unique_direction(N[:2])
         found[name] = JointForces(tuple((share <= UNIQUE_TOL).tolist()), tuple(share.tolist()), direction)
     return found

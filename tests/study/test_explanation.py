@@ -1,0 +1,112 @@
+"""The derivation for one state, against NumPy, the paper's closed form and Gauss's principle."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+
+G = 9.81
+
+
+@pytest.fixture(scope="module")
+def found():
+    return udk.explain(udk.library.parallelogram())
+
+
+def test_the_numbers_of_the_paper_s_linkage_are_those_of_its_closed_form(found, data):
+    """theta'' = -3.5 g cos(theta) / 3.05 at -45 degrees; lambda on link and ground as in the reference."""
+    row = data("seed_fivebar_parallelogram")["cases"]["rest_-45deg"]["reference"]["0"]
+    assert_allclose(found.a[[2, 5, 8]], float(row["thetadd"]), rtol=1e-12)
+    ground, coupler = (np.array(row[f"{which}_joint_force_on_link"], float) for which in ("ground", "coupler"))
+    assert_allclose(found.multipliers, np.concatenate([np.tile(-ground, 3), np.tile(-coupler, 3)]), atol=1e-10)
+    assert found.rank == 11 and not found.unique.any()
+    assert_allclose(found.a_F, [0, -G, 0] * 4)
+
+
+def test_every_symbol_is_what_numpy_makes_of_the_ones_before(found):
+    mass = np.array([1, 1, 0.1] * 3 + [2, 2, 0.2])
+    D = found.psi_q / np.sqrt(mass)
+    assert_allclose(found.mass, mass)
+    assert_allclose(found.D, D, atol=1e-15)
+    assert_allclose(found.D_plus, np.linalg.pinv(D, rcond=1e-10), atol=1e-13)
+    assert_allclose(found.singular_values, np.linalg.svd(D)[1], atol=1e-14)
+    assert_allclose(found.b, found.gamma - found.psi_q @ found.a_F, atol=1e-14)
+    assert_allclose(found.a, found.a_F + np.linalg.pinv(D, rcond=1e-10) @ found.b / np.sqrt(mass), atol=1e-12)
+    assert_allclose(found.constraint_force, mass * (found.a - found.a_F), atol=1e-12)
+    assert_allclose(found.psi_q.T @ found.null_rows, 0.0, atol=1e-14)
+    assert max(found.checks.values()) < 1e-13 and len(found.checks) == 6
+
+
+def test_gauss_s_principle_is_shown_by_what_is_feasible(found):
+    """G grows by half the square of any feasible deviation: by hand, along the linkage's one motion."""
+    along = np.array([0.5 * np.sqrt(0.5), 0.5 * np.sqrt(0.5), 1.0] * 3 + [np.sqrt(0.5), np.sqrt(0.5), 0.0])
+    assert_allclose(found.psi_q @ along, 0.0, atol=1e-15)
+
+    def gauss(a):
+        return 0.5 * np.sum(found.mass * (a - found.a_F) ** 2)
+
+    assert_allclose(gauss(found.a), found.gauss.at_a, rtol=1e-13)
+    for step in (-1.0, 1e-3, 2.0):
+        assert_allclose(gauss(found.a + step * along), found.gauss.at_a + step**2 * 3.05 / 2, rtol=1e-12)
+    assert found.gauss.free == 1 and found.gauss.slope < 1e-14
+    assert found.gauss.at_a < found.gauss.least_rival < 1.01 * found.gauss.at_a
+
+
+def test_the_text_reads_line_by_line(found):
+    text = str(found)
+    for words in (
+        "five-bar parallelogram at t = 0 s",
+        "A1 (x)  x . x . . . . . . . . .",
+        "Rank of Psi_q: 11 of 12 rows; 12 coordinates - 11 = 1 degree of freedom",
+        "B1: its force is unique only along 45 degrees",
+        "not unique",
+        "Gauss's principle",
+        "G(a) = 143.9597398",
+        "other feasible accelerations is 143.9",
+        ": more.",
+    ):
+        assert words in text
+    assert max(map(len, text.split("\n"))) < 160
+    assert found._repr_html_().startswith("<pre>")
+    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert np.shape(data["D_plus"]) == (12, 12) and data["rows"][3] == "A2 (y)" and data["rank"] == 11
+
+
+def test_a_driven_mechanism_with_rows_in_radians():
+    """Everything is decided: one feasible acceleration, all multipliers unique; Baumgarte's terms go into b."""
+    mechanism = udk.library.slider_crank(0.7)
+    found = udk.explain(mechanism)
+    assert found.rank == 9 and found.unique.all() and found.gauss.free == 0
+    text = str(found)
+    assert (
+        "a is the only one" in text and "guide (angle)" in text and "motor (row 1)" in text and "All rows are independent" in text
+    )
+    state = udk.assemble(mechanism)
+    a, multipliers = udk.accelerations(mechanism, 0.0, state.q, state.v, multipliers=True)
+    assert_allclose(found.a, np.ravel(a), atol=1e-11)
+    assert_allclose(found.multipliers, multipliers, atol=1e-10)
+    gains = udk.Baumgarte(3.0, 4.0)
+    fed = udk.explain(mechanism, stabilization=gains)
+    assert_allclose(fed.b - found.b, -found.weights * (6 * found.psi_dot + 16 * found.psi), atol=1e-12)
+    assert max(fed.checks.values()) < 1e-12
+
+
+def test_a_free_body_falls():
+    found = udk.explain(udk.Mechanism({"stone": udk.Body(2.0, 1.0)}))
+    assert_allclose(found.a, [0, -G, 0])
+    assert found.gauss.at_a == 0.0 and "Gauss" in str(found)
+
+
+def test_traced_numbers_are_refused():
+    mechanism = udk.library.parallelogram()
+
+    def ask(mass):
+        udk.explain(mechanism.with_parameters({"body.coupler.mass": mass}))
+        return mass
+
+    with pytest.raises(ValueError, match="known numbers"):
+        jax.jit(ask)(1.0)

@@ -1,0 +1,38 @@
+"""`udkjax diagnose`."""
+
+import math
+
+from udkjax.cli.common import Json, Scene, fail, load, refuse, show
+
+
+def diagnose(
+    scene: Scene, /, t: float = 0.0, t1: float | None = None, dt: float = 0.05, fixes: bool = True, json: Json = False
+) -> None:
+    """Say what depends on what in a scene and how to mend it, where it is singular, and when its rank changes along a run.
+
+    Args:
+        scene: the mechanism.
+        t: time of the configuration, for drivers (s).
+        t1: end of a run from `t` along which the rank is followed (s); by default none.
+        dt: time between two instants of the run (s); changes of the rank are located between them.
+        fixes: look for changes of joints that take redundancy away, and verify them.
+        json: write the results as JSON.
+    """
+    if t1 is not None and not 0 < dt <= t1 - t < math.inf:
+        refuse(f"from --t {t:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
+    mech, _ = load(scene)
+    import numpy as np
+
+    import udkjax as udk
+
+    run = None
+    try:
+        if t1 is not None:
+            ts = t + dt * np.arange(int((t1 - t) / dt + 1e-6) + 1)
+            run = udk.simulate(mech, ts, rtol=1e-10, atol=1e-10, throw=False)
+        found = udk.diagnose(mech, solution=run, t=t, fixes=fixes)
+    except udk.AssemblyError as problem:
+        refuse(problem)
+    show(found.to_dict(), str(found), json)
+    if run is not None and run.result:
+        fail(run.cause)
