@@ -103,12 +103,12 @@ def explain(
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005, section 3.
     """
-    if not mechanism.is_known:
+    if not mechanism.is_concrete:
         raise ValueError("explain takes known numbers; under jit and vmap take accelerations and uniqueness, which are pure")
     state = assemble(mechanism, t, state)
     analysis = analyse(mechanism)
     q, v = jnp.ravel(state.q), jnp.ravel(state.v)
-    symbols = _symbols(mechanism.bare, analysis, float(t), q, v, stabilization, rank_tolerance(mechanism))
+    symbols = _symbols(mechanism.without_origin, analysis, float(t), q, v, stabilization, rank_tolerance(mechanism))
     s = {name: np.asarray(value) for name, value in symbols.items()}
     n = len(s["a"])
     rank = int(s["rank"])

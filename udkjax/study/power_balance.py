@@ -69,7 +69,7 @@ def power_balance(
     ts, flat = jnp.asarray(solution.ts), (len(solution.ts), -1)
     q, v = (jnp.asarray(x).reshape(flat) for x in (solution.q, solution.v))
     analysis, method = analyse(mechanism), SVD() if method is None else method
-    by_row, by_force, by_joint, kinetic, potential = _powers(mechanism.bare, analysis, ts, q, v, method, stabilization)
+    by_row, by_force, by_joint, kinetic, potential = _powers(mechanism.without_origin, analysis, ts, q, v, method, stabilization)
     owners = [name for name, _ in analysis.row_names]
 
     def total(values: Array, name: str) -> Array:
