@@ -264,3 +264,29 @@ def test_a_start_for_all_records(measured):
     estimate = found(turned, data, initial_state="position")
     assert off(estimate) < 1e-9 and [name.endswith("body.rod.angle") for name in estimate.initial_state_values] == [True]
     assert float(estimate.initial_states[0].q[0, 2]) == pytest.approx(measured[1][0], abs=1e-10)
+
+
+# --- old names, and progress
+
+
+def test_old_names_of_arguments_work_with_a_warning(measured):
+    data = {"time": TS, ANGLE: measured[1]}
+    with pytest.warns(DeprecationWarning, match="identify: starts is now n_starts"):
+        estimate = found(pendulum(0.5, 0.15), data, starts=[[0.3, 0.1]])  # as arrays of guesses were given
+    assert estimate.guesses == 2 and off(estimate) < 1e-9
+    with (
+        pytest.warns(DeprecationWarning, match="identify: start is now initial_state"),
+        pytest.raises(udk.IdentificationError, match="estimate must be one of"),
+    ):
+        found(pendulum(), data, start="angle")
+
+
+def test_progress_is_that_of_every_other_function(measured, capsys):
+    data, seen = {"time": TS, ANGLE: measured[1]}, []
+    identify(pendulum(0.5, 0.15), data, NAMES, progress=seen.append)
+    assert {(state.what, state.total) for state in seen} == {("identify", None)} and len(seen) > 3
+    assert [state.done for state in seen] == list(range(1, len(seen) + 1)) and "cost" in seen[-1].message
+    identify(pendulum(0.5, 0.15), data, NAMES, progress=True)
+    assert "identify: 00:0" in capsys.readouterr().err
+    identify(pendulum(0.5, 0.15), data, NAMES, progress=False)
+    assert capsys.readouterr() == ("", "")

@@ -38,13 +38,21 @@ def test_lbfgs_ends_where_least_squares_do(noisy):
     assert fit.cost[0] == pytest.approx(squares.cost[0], rel=1e-8)
 
 
-@pytest.mark.slow
-def test_adam_ends_there_too(noisy):
+OTHERS = {
+    "adam": (optax.adam(optax.exponential_decay(0.05, 30, 0.6)), 1e-5, 1e-4),
+    "L-BFGS without line search": (optax.lbfgs(linesearch=None), 1e-6, 1e-5),
+    "L-BFGS of scipy": (None, 1e-6, 1e-5),
+}
+
+
+@pytest.mark.parametrize(("optimizer", "settled", "within"), OTHERS.values(), ids=list(OTHERS))
+def test_other_optimizers_end_there_too(noisy, optimizer, settled, within):
     problem = problem_of(noisy)
-    optimizer = optax.adam(optax.exponential_decay(0.05, 30, 0.6))
-    fit = minimize_by_gradient(GradientMethod(optimizer), problem, np.zeros((1, 2)), TOL, steps=600, settled=1e-5)
+    fit = minimize_by_gradient(GradientMethod(optimizer), problem, np.zeros((1, 2)), TOL, steps=600, settled=settled)
     squares = minimize(problem, np.zeros((1, 2)), TOL)
-    assert fit.settled[0] and np.abs(fit.z - squares.z).max() < 1e-4
+    assert fit.settled[0] and np.abs(fit.z - squares.z).max() < within
+    costs = [cost for cost, _ in fit.history]
+    assert costs == sorted(costs, reverse=True) and costs[-1] == fit.cost[0]
 
 
 def test_a_loss_of_the_users_own(noisy):

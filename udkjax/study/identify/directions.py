@@ -15,7 +15,7 @@ INVISIBLE = 1e-8
 # value is that much above the errors of the Jacobian.
 PART = 1e-3
 COEFFICIENT = 1e-5  # of the largest coefficient: zero, in directions found from differences that are good to 1e-8
-ALIKE = 1e-2  # relative: by how much factors may differ that are said to be a common one
+COMMON = 1e-2  # relative: by how much factors may differ that are called a common one
 
 
 class UnknownValues(NamedTuple):
@@ -108,7 +108,7 @@ def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Dir
     names, kinds = [values.names[k] for k in there], [values.kinds[k] for k in there]
     relative = np.array([kind != "free" and value != 0.0 for kind, value in zip(kinds, x, strict=True)])
     factors = np.where(relative, change / np.where(relative, x, 1.0), 0.0)
-    if len(there) > 1 and relative.all() and np.all(np.abs(factors / factors[0] - 1.0) < ALIKE):
+    if len(there) > 1 and relative.all() and np.all(np.abs(factors / factors[0] - 1.0) < COMMON):
         text = f"{listed(names)} by a common factor"
     else:
         reference = factors if relative.any() else coefficients[there]

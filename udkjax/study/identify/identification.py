@@ -97,7 +97,7 @@ def identify(
     Raises:
         IdentificationError: with every mistake; also where a parameter would open a loop that has more constraints than it needs.
     """
-    begun = time.perf_counter()
+    start = time.perf_counter()
     if not isinstance(n_starts, int | np.integer):  # as `starts` was, before there were `guesses`
         n_starts, guesses = 0, n_starts
     problem = build_problem(mechanism, data, parameters, settings, noise, ignore, seed, strategy, initial_state, tol)
@@ -110,7 +110,7 @@ def identify(
         found = search(problem, first, (tol, tol), 0 if guesses is not None else n_starts, seed, strategy=strategy, **choices)
         _require_finite(problem, found)
         fit, history = _refit(found, (tol, tol), choices)
-    return _estimate_of(fit, found, history, (tol, tol), residual_loss, time.perf_counter() - begun)
+    return _estimate_of(fit, found, history, (tol, tol), residual_loss, time.perf_counter() - start)
 
 
 def _first_guesses(problem: Problem, n_starts: int, guesses: ArrayLike | None) -> Float[np.ndarray, "B K"]:

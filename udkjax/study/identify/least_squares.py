@@ -7,14 +7,14 @@ same sums of squares, gradients and steps.
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.study.identify.directions import INVISIBLE
 from udkjax.study.identify.parameters import FAR
@@ -158,14 +158,14 @@ def _gauss_newton(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return sizes, cosines
 
 
-def _linear(y: Any, known: Any) -> tuple[Any, None]:
+def _linear(y: Array, known: tuple[Array, Array]) -> tuple[Array, None]:
     """Residuals around a point, from the triangle there."""
     point, T = known
     return T[:, -1] + T[:, :-1] @ (y - point), None
 
 
 @lru_cache(maxsize=32)
-def _compiled_step(method: optimistix.AbstractLeastSquaresSolver | None, K: int, sets: int) -> tuple[Any, Callable]:
+def _compiled_step(method: optimistix.AbstractLeastSquaresSolver | None, K: int, sets: int) -> tuple[PyTree, Callable]:
     """Return the first state of a method, of arrays alone, and its compiled step, of `sets` fits at once."""
     solver = method
     if solver is None:
@@ -174,14 +174,14 @@ def _compiled_step(method: optimistix.AbstractLeastSquaresSolver | None, K: int,
     given = jnp.zeros((sets, K)), (jnp.zeros((sets, K)), jnp.zeros((sets, K + 1, K + 1)))
     residual = jax.ShapeDtypeStruct((K + 1,), given[0].dtype)
 
-    def begun(y: Any, known: Any) -> Any:
+    def begin(y: Array, known: tuple[Array, Array]) -> PyTree:
         return solver.init(_linear, y, known, {}, residual, None, frozenset())
 
-    first, fixed = eqx.partition(eqx.filter_vmap(begun)(*given), eqx.is_array)
+    first, fixed = eqx.partition(eqx.filter_vmap(begin)(*given), eqx.is_array)
 
     @jax.jit
-    def step(state: Any, y: Any, trial: Any, triangles: Any) -> tuple[Any, Any, Any]:
-        def one(state: Any, y: Any, trial: Any, T: Any) -> tuple[Any, Any]:
+    def step(state: PyTree, y: Array, trial: Array, triangles: Array) -> tuple[Array, PyTree, Array]:
+        def one(state: PyTree, y: Array, trial: Array, T: Array) -> tuple[Array, PyTree]:
             state = eqx.tree_at(lambda s: s.y_eval, state, trial)
             y, state, _ = solver.step(_linear, y, (trial, T), {}, state, frozenset())
             return y, state

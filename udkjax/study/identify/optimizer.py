@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 import scipy.optimize
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from udkjax.extras import OptionalImport
 from udkjax.study.identify.directions import INVISIBLE
@@ -161,14 +161,21 @@ def _walk_by_optax(given: "optax.GradientTransformation", walk: "_LossAlongWalk"
         import optax
     optimizer = optax.with_extra_args_support(given)
     at, state = jnp.asarray(first), optimizer.init(jnp.asarray(first))
+
+    def step(at: Array, state: PyTree, value: Array, gradient: Array, **more: Callable[[Array], Array]) -> tuple[Array, PyTree]:
+        change, state = optimizer.update(gradient, state, at, value=value, grad=gradient, **more)
+        return cast(Array, optax.apply_updates(at, change)), state
+
+    try:
+        jax.eval_shape(step, at, state, jnp.zeros(()), at)
+        compiled = jax.jit(step)
+    except TypeError:  # a line search asks for the function itself: of numbers, not compiled
+        compiled = jax.disable_jit()(partial(step, value_fn=walk.differentiable))
     for _ in range(steps):
         point = walk(np.asarray(at))
         if walk.after_step():
             return
-        known = {"value": jnp.asarray(point.value), "grad": jnp.asarray(point.gradient), "value_fn": walk.differentiable}
-        with jax.disable_jit():  # a line search then asks for numbers, not for a program that could be compiled
-            change, state = optimizer.update(known["grad"], state, at, **known)
-        at = optax.apply_updates(at, change)
+        at, state = compiled(at, state, jnp.asarray(point.value), jnp.asarray(point.gradient))
 
 
 class _LossAlongWalk:

@@ -6,7 +6,7 @@ members at once.
 """
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.integrate.assembly import State, close
 from udkjax.integrate.simulate import simulate
@@ -110,7 +110,7 @@ class Predictor:
 class _Static:
     """The static argument of `_predict`: for equal ones it is compiled once."""
 
-    def __init__(self, fixed: Any, *rest: Any):
+    def __init__(self, fixed: PyTree, *rest: Hashable):
         leaves, structure = jax.tree.flatten(fixed)
         self.rest, self._key = rest, (structure, tuple(leaves), rest)
         self._hash = hash(self._key)  # stored: it takes as long as a short run
@@ -122,7 +122,7 @@ class _Static:
         return self is other or (isinstance(other, _Static) and self._key == other._key)
 
     @property
-    def fixed(self) -> Any:
+    def fixed(self) -> PyTree:
         """What is not an array, in its place."""
         structure, leaves, _ = self._key
         return jax.tree.unflatten(structure, leaves)

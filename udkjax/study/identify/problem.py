@@ -218,7 +218,7 @@ def _channels(mechanism: Mechanism, records: Sequence[Record]) -> tuple[Channel 
     found: dict[str, Channel | Quantity] = {}
     problems = []
     for record in records:
-        mine: dict[str, Key] = {}
+        own: dict[str, Key] = {}
         for text in record.values:
             try:
                 channel = _channel(mechanism, text)
@@ -226,9 +226,9 @@ def _channels(mechanism: Mechanism, records: Sequence[Record]) -> tuple[Channel 
                 problems.append(f"{record.place}{problem}")
                 continue
             name = channel.name
-            if name in mine:
-                problems.append(f"{record.place}{quoted(str(text))} and {quoted(str(mine[name]))} are the same channel")
-            mine[name] = text
+            if name in own:
+                problems.append(f"{record.place}{quoted(str(text))} and {quoted(str(own[name]))} are the same channel")
+            own[name] = text
             found.setdefault(name, channel)
     if problems:
         raise IdentificationError(problems)

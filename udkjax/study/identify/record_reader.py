@@ -173,25 +173,25 @@ class _TableReader:
 
     def check_times(self, time: str, times: np.ndarray, places: np.ndarray) -> None:
         """Note times that are missing or do not increase."""
-        mine = times[places]
-        missing = np.isnan(mine)
+        own = times[places]
+        missing = np.isnan(own)
         self.add_each(time, places[missing], lambda k: "is empty")
-        there, mine = places[~missing], mine[~missing]
-        late = np.flatnonzero(np.diff(mine) <= 0) + 1
-        before = dict(zip(there[1:], mine[:-1], strict=True)) if len(there) else {}
+        there, own = places[~missing], own[~missing]
+        late = np.flatnonzero(np.diff(own) <= 0) + 1
+        before = dict(zip(there[1:], own[:-1], strict=True)) if len(there) else {}
         self.add_each(time, there[late], lambda k: f"{times[k]:g} s does not exceed the one before, {before[k]:g} s")
 
     def record(self, label: str, places: np.ndarray, times: np.ndarray, values: ByChannel, noise: ByChannel) -> Iterator[Record]:
         """The record that some rows make, of those channels that were measured in it."""
-        mine = {name: x[places] for name, x in values.items()}
-        mine = {name: x for name, x in mine.items() if not np.isnan(x).all()}
-        if self.table.padded and mine:
-            some = np.flatnonzero(~np.isnan(np.stack(list(mine.values()))).all(0))
+        own = {name: x[places] for name, x in values.items()}
+        own = {name: x for name, x in own.items() if not np.isnan(x).all()}
+        if self.table.padded and own:
+            some = np.flatnonzero(~np.isnan(np.stack(list(own.values()))).all(0))
             inside = slice(some[0], some[-1] + 1)
-            mine, places = {name: x[inside] for name, x in mine.items()}, places[inside]
-        sigma = {name: noise[name][places] for name in mine if name in noise}
+            own, places = {name: x[inside] for name, x in own.items()}, places[inside]
+        sigma = {name: noise[name][places] for name in own if name in noise}
         try:
-            yield Record(times[places], mine, sigma, name=label)
+            yield Record(times[places], own, sigma, name=label)
         except IdentificationError as error:
             self.problems += [f"{self.table.source}: {problem}" for problem in error.problems]
 

@@ -253,7 +253,7 @@ def fit_pieces(
             history += fit.history
             if fit.settled[0]:
                 break
-        if weight > WEIGHTS[0] and not fit.settled[0]:  # held together more they would only be farther from a minimum
+        if weight > WEIGHTS[0] and not fit.settled[0]:  # with larger weights they would only be farther from a minimum
             break
     return shooting, fit._replace(history=history)
 
@@ -284,8 +284,8 @@ def _piece_tables(problem: Problem, pieces: Sequence[Piece]) -> tuple[np.ndarray
         own = problem.ts[piece.record, piece.first : piece.end + 1]
         between = np.linspace(own[-2], own[-1], length - len(own) + 2)
         ts.append(np.concatenate([own[:-2], between]))
-        mine = (record == piece.record) & (time >= piece.first) & (time <= piece.end)  # the next takes back what is its own
-        which[mine], at[mine] = p, np.where(time[mine] == piece.end, length - 1, time[mine] - piece.first)
+        own_rows = (record == piece.record) & (time >= piece.first) & (time <= piece.end)  # the next takes back what is its own
+        which[own_rows], at[own_rows] = p, np.where(time[own_rows] == piece.end, length - 1, time[own_rows] - piece.first)
     return np.stack(ts), which, at
 
 
