@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import analyse
 from udkjax.equations.constraints import bodies
-from udkjax.equations.kinds import of_each
+from udkjax.equations.structure import evaluate_by_kind
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
@@ -113,6 +113,6 @@ def _of_forces(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[Arra
 
     elements = [*mechanism.forces.values()]
     found = jnp.zeros(len(elements))
-    for kind, powers in of_each(power, mechanism, elements, bodies(q), bodies(v)):
+    for kind, powers in evaluate_by_kind(power, mechanism, elements, bodies(q), bodies(v)):
         found = found.at[kind.members].set(powers)
     return found
