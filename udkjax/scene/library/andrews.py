@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import number
+from udkjax.scene.fields import Numbers, number
 from udkjax.scene.forces import Spring, Torque
 from udkjax.scene.joints import Revolute
 from udkjax.scene.library.poses import moving
@@ -35,7 +35,7 @@ START: Mapping[str, float] = MappingProxyType(  # rad
 
 
 def andrews_squeezer(
-    torque: ArrayLike = 0.033, stiffness: ArrayLike = 4530.0, spring_length: ArrayLike = 0.07785, gravity: ArrayLike = (0.0, 0.0)
+    torque: ArrayLike = 0.033, stiffness: ArrayLike = 4530.0, spring_length: ArrayLike = 0.07785, gravity: Numbers = (0.0, 0.0)
 ) -> Mechanism:
     """Return Andrews' squeezing mechanism: seven bodies in three loops, driven by a constant torque against a stiff spring.
 
