@@ -13,6 +13,8 @@ import pytest
 # What the tests compile stays out of the user's cache; the processes of one run share theirs.
 OWN_CACHE = None if "UDKJAX_CACHE" in os.environ else tempfile.mkdtemp(prefix="udkjax-cache-")
 CACHE = os.environ.setdefault("UDKJAX_CACHE", OWN_CACHE or "")
+# XLA compiles in less than half of the time what it does not optimize; no test is about how fast that runs.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 jax.config.update("jax_compilation_cache_dir", f"{CACHE}/jax")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
