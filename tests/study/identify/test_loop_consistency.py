@@ -44,17 +44,24 @@ def linkage():
 ALL = 'joints "A1", "A2", "A3", "B1", "B2" and "B3" close a loop'
 
 
-def test_three_cranks_must_stay_equal(linkage):
-    (problem,) = loop_problems(linkage, lengths("link1", "link2", "link3"), [1.0, 1.0, 1.0], ["a", "b", "c"])
+CHOICES = [lengths("link1", "link2", "link3"), lengths(("link1", "link2", "link3"))]  # each by itself; one for all
+
+
+@pytest.fixture(scope="module")
+def problems(linkage):
+    """What is wrong with three free cranks, and with three that are tied."""
+    return [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(CHOICES, (3, 1), strict=True)]
+
+
+def test_three_cranks_must_stay_equal(problems):
+    (problem,) = problems[0]
     assert problem == f"a, b and c cannot move each by itself: {ALL} that only holds for a = b = c; tie them, or leave them fixed"
 
 
-def test_sparse_arithmetic_says_the_same(linkage, monkeypatch):
-    choices = [lengths("link1", "link2", "link3"), lengths(("link1", "link2", "link3"))]
-    plain = [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(choices, (3, 1), strict=True)]
+def test_sparse_arithmetic_says_the_same(linkage, problems, monkeypatch):
     monkeypatch.setattr(loop_consistency, "rows_of", lambda mechanism: rows_of(mechanism, large=True))
-    assert [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(choices, (3, 1), strict=True)] == plain
-    assert len(plain[0]) == 1 and plain[1] == []
+    assert [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(CHOICES, (3, 1), strict=True)] == problems
+    assert len(problems[0]) == 1 and problems[1] == []
 
 
 @pytest.mark.parametrize("groups", [(("link1", "link2"), "link3"), (("link1", "link3"), "link2")])

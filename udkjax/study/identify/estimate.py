@@ -24,13 +24,7 @@ from udkjax.study.identify.messages import IdentificationError, aligned, counted
 from udkjax.study.identify.parameters import apply_values
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.profile_likelihood import (
-    CONFIDENCE,
-    ProfileLikelihood,
-    estimated_noise,
-    profile_likelihood,
-    quantile,
-)
+from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikelihood, estimated_noise, profile_likelihood, quantile
 from udkjax.study.identify.records import labels
 from udkjax.study.identify.uncertainty import Uncertainty, Whiteness
 

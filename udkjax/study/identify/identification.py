@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from udkjax.study.identify.record_reader import Data
 
 REWEIGHTED = 2  # fits, each with the noise that the one before left
-LEAST_NOISE = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike
+NOISE_FLOOR = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike
 SAME_WEIGHTS = 1.05  # ratio of weights, compared with each other, that moves no estimate by what counts beside its error
 ROUNDING = 1e-8  # of what a channel shows: smaller residuals are errors of the integration, which need not be noise
 
@@ -150,7 +150,7 @@ def _refit(found: SearchResult, tol: Tolerances, choices: Choices) -> tuple[Fit,
     history = [*found.history, *fit.history]
     unknown = np.unique(problem.index[~problem.noise_given, 2])
     for _ in range(REWEIGHTED if len(unknown) + problem.noise_given.any() > 1 else 0):
-        if not reweigh(problem, fit.z, tol, choices["loss"], LEAST_NOISE):
+        if not reweigh(problem, fit.z, tol, choices["loss"], NOISE_FLOOR):
             break
         fit = end(fit.z)
         history += fit.history

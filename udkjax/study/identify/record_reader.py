@@ -39,11 +39,7 @@ ByChannel: TypeAlias = dict[Key, np.ndarray]
 
 
 def records_of(
-    mechanism: Mechanism,
-    data: "Data",
-    noise: Noise = None,
-    ignore: Sequence[str] = (),
-    quantities: Sequence[Quantity] = (),
+    mechanism: Mechanism, data: "Data", noise: Noise = None, ignore: Sequence[str] = (), quantities: Sequence[Quantity] = ()
 ) -> tuple[Record, ...]:
     """Read data into records, in SI units, their channels named as `channel_of` names them.
 

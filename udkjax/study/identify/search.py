@@ -106,12 +106,7 @@ def search(
 
 
 def fit_in_pieces(
-    problem: Problem,
-    z: Float[np.ndarray, "B K"],
-    tol: Tolerances,
-    report: Report,
-    method: Method = None,
-    loss: Loss = None,
+    problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, report: Report, method: Method = None, loss: Loss = None
 ) -> SearchResult | None:
     """Fit the records in pieces, from the most promising guesses until one explains them; None: none does.
 
@@ -152,12 +147,7 @@ def rank_guesses(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances)
 
 
 def fit_growing_parts(
-    problem: Problem,
-    z: Float[np.ndarray, "B K"],
-    tol: Tolerances,
-    report: Report,
-    method: Method = None,
-    loss: Loss = None,
+    problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, report: Report, method: Method = None, loss: Loss = None
 ) -> Fit:
     """Fit more and more of the records, each time from where the fits of the part before have ended."""
     parts = horizons(problem)

@@ -23,16 +23,7 @@ from jaxtyping import Float
 
 from udkjax.integrate.assembly import State
 from udkjax.study.identify.initial_states import unknowns_of_state
-from udkjax.study.identify.least_squares import (
-    COARSE_STEP,
-    FEW_STEPS,
-    FINE_STEP,
-    SOME_STEPS,
-    STEPS,
-    Fit,
-    Loss,
-    minimize_squares,
-)
+from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, FINE_STEP, SOME_STEPS, STEPS, Fit, Loss, minimize_squares
 from udkjax.study.identify.optimizer import Method, minimize
 from udkjax.study.identify.prediction import Members, Prediction, Predictor, Tolerances
 from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals
