@@ -80,6 +80,24 @@ def test_a_cams_outline_is_its_profile():
     np.testing.assert_allclose(np.hypot(x - 0.2, y), expected, atol=1e-4)  # the spline is within 1e-4 of the cosine
 
 
+def test_a_rod_that_hangs_by_its_end_is_drawn_to_its_other_end():
+    rod = udk.library.compound_pendulum(length=1.4)
+    heavy = rod.with_parameters({f"body.{rod.body_names[0]}.inertia": 3.0})
+    for mech, ends in ((rod, (-0.7, 0.7)), (heavy, (-0.7, 0.0))):
+        every = marks(mech, mech.q0[None])
+        (link,) = (mark for mark in every if mark["kind"] == "link")
+        np.testing.assert_allclose(sorted(np.array(link["points"])[:, 0]), ends, atol=1e-12)
+        assert ("disc" in {mark["kind"] for mark in every}) == (mech is heavy)
+
+
+def test_bodies_are_drawn_through_further_points(slider_crank, run):
+    animation = udk.animate(slider_crank, run, measures=(), shapes={"rod": [(0.1, 0.4)]}, traces=(("rod", (0.1, 0.4)),))
+    (rod,) = (m for m in animation.data["runs"][0]["marks"] if m["kind"] == "link" and m["body"] == 1)
+    assert rod["closed"] and [0.1, 0.4] in rod["points"] and animation.data["runs"][0]["traces"] == [[1, 0.1, 0.4]]
+    with pytest.raises(ValueError, match="shapes: there is no body 'rot'"):
+        udk.animate(slider_crank, run, measures=(), shapes={"rot": [(0, 0)]})
+
+
 def test_corners_of_plates_and_ends_of_bars():
     inner = np.array([[0.0, 0], [2, 0], [0.5, 0.4], [0, 2]])  # the third is within the triangle of the others
     corners, closed = corners_of(inner)

@@ -95,7 +95,8 @@ def animate(
     *,
     measures: Sequence[str] | Mapping[str, Any] = ("violation", "energy", "rank"),
     reactions: bool = False,
-    traces: Sequence[str] | None = None,
+    traces: Sequence[str | tuple[str, Any]] | None = None,
+    shapes: Mapping[str, Any] | None = None,
     title: str | None = None,
 ) -> Animation:
     """Show the motion of a mechanism, or several motions side by side and in step.
@@ -107,7 +108,9 @@ def animate(
         measures: what a strip shows over time: any of "violation" (m; radians as an arc of the characteristic length), "energy"
             and "rank", or {"torque (N m)": array} for values of your own, of several runs {"torque (N m)": {label: array}}.
         reactions: draw the forces of the joints as arrows; of redundant joints, the shares of least norm.
-        traces: joints or bodies (their centres of mass) whose paths are drawn; by default the pins that move, up to eight.
+        traces: joints, bodies (their centres of mass) or points of bodies, ("coupler", (x, y)), whose paths are drawn; by default
+            the pins that move, up to eight.
+        shapes: points (n, 2) of bodies by name, in their own frames (m), through which these are drawn, too.
         title: by default the mechanism's name.
 
     Returns:
@@ -128,7 +131,7 @@ def animate(
                 f"run {label!r} has q of shape {np.shape(run.q)}, not ({np.shape(run.ts)[-1]}, {len(one.bodies)}, 3): "
                 'give members of a batch one by one under labels, {"a": jax.tree.map(lambda x: x[0], batch)}'
             )
-        found.append((one, *run_record(one, run, label, measures, reactions, traces)))
+        found.append((one, *run_record(one, run, label, measures, reactions, traces, shapes)))
     return Animation(player_data(title or found[0][0].name or "mechanism", found))
 
 

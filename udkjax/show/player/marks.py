@@ -24,7 +24,7 @@ mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How large a pin or
     torque    body, at, sign                a constant torque
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -54,12 +54,25 @@ Mark = dict[str, Any]
 Poses = Float[np.ndarray, "T bodies 3"]
 PROFILE_POINTS = 180  # of a cam's outline
 SAME_PLACE = 1e-9  # of the largest coordinate: attachments that are closer are one point
+ROD = 0.01  # of the inertia: how near to that of a uniform rod it must be for one to be drawn
 MARGIN = 0.08  # of the length of a mechanism: how far a rail goes beyond what slides on it
 
 
-def marks(mechanism: Mechanism, poses: Float[ArrayLike, "T bodies 3"]) -> list[Mark]:
-    """Return the marks of a mechanism, the farthest first; `poses` are all those that it will be drawn in."""
-    drawing = _Drawing(mechanism, np.asarray(poses, float))
+def marks(mechanism: Mechanism, poses: Float[ArrayLike, "T bodies 3"], shapes: Mapping[str, Any] | None = None) -> list[Mark]:
+    """Return the marks of a mechanism, the farthest first.
+
+    Args:
+        mechanism: what is drawn.
+        poses: all those that it will be drawn in.
+        shapes: points (n, 2) of bodies by name, in their own frames (m), through which these are drawn, too.
+
+    Raises:
+        ValueError: `shapes` names what is no body.
+    """
+    unknown = [name for name in shapes or {} if name not in mechanism.bodies]
+    if unknown:
+        raise ValueError(f"shapes: there is no body {unknown[0]!r}")
+    drawing = _Drawing(mechanism, np.asarray(poses, float), shapes or {})
     links = drawing.links()
     plates = [mark for mark in links if mark.get("closed")]
     bars = [mark for mark in links if not mark.get("closed")]
@@ -93,10 +106,14 @@ def _distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"
 class _Drawing:
     """The marks of one mechanism, in the order in which they cover one another."""
 
-    def __init__(self, mechanism: Mechanism, poses: Poses):
+    def __init__(self, mechanism: Mechanism, poses: Poses, shapes: Mapping[str, Any]):
         self.mechanism, self.poses = mechanism, poses
         self.number = {GROUND: -1, **{body: k for k, body in enumerate(mechanism.bodies)}}
         self.points = body_points(mechanism)
+        for body, points in shapes.items():
+            self.points[body] = _distinct(
+                [*map(tuple, self.points[body].tolist()), *map(tuple, np.asarray(points, float).tolist())]
+            )
         self.size = _size(self)
         self.rails: list[Mark] = []
         self.wheels: list[Mark] = []
@@ -116,13 +133,17 @@ class _Drawing:
         for body, points in self.points.items():
             if body == GROUND:
                 continue
-            k, centre = self.number[body], np.zeros((1, 2))
-            apart = len(points) == 1 and np.abs(points).max() > SAME_PLACE * self.size
-            if len(points) > 1 or apart:
-                corners, closed = corners_of(np.concatenate([points, centre]) if apart else points)
+            k, single = self.number[body], len(points) == 1
+            inertia, mass = (float(getattr(self.mechanism.bodies[body], name)) for name in ("inertia", "mass"))
+            reach = float(np.linalg.norm(points[0])) if single else 0.0
+            # A uniform rod of length 2 r has inertia m r^2 / 3: one that is held at its end is drawn to its other end.
+            rod = single and abs(3 * inertia - mass * reach**2) < ROD * mass * reach**2
+            if single and reach > SAME_PLACE * self.size:
+                points = np.concatenate([points, -points if rod else np.zeros((1, 2))])
+            if len(points) > 1:
+                corners, closed = corners_of(points)
                 found.append({"kind": "link", "body": k, "points": corners.tolist(), "closed": closed})
-            if len(points) < 2 and body not in self.shaped:
-                inertia, mass = (float(getattr(self.mechanism.bodies[body], name)) for name in ("inertia", "mass"))
+            if len(self.points[body]) < 2 and body not in self.shaped and not rod:
                 radius = min(np.sqrt(inertia / mass), self.size / 4)
                 found.append({"kind": "disc", "body": k, "at": [0.0, 0.0], "radius": radius})
         return found

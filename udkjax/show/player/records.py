@@ -53,7 +53,8 @@ def run_record(
     label: str,
     measures: Sequence[str] | Mapping[str, Any],
     with_reactions: bool,
-    traces: Sequence[str] | None,
+    traces: Sequence[str | tuple[str, Any]] | None,
+    shapes: Mapping[str, Any] | None = None,
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
     """Return one run as plain data, and its poses; a run that failed is shown as far as it came."""
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
@@ -70,7 +71,7 @@ def run_record(
         "label": label,
         "note": _cause(solution) if count < len(ts) else "",
         "bodies": list(mechanism.bodies),
-        "marks": marks(mechanism, poses),
+        "marks": marks(mechanism, poses, shapes),
         "traces": traced(mechanism, poses, traces, length),
         "time": packed(ts[shown, None], TIME_PRECISION * max(np.ptp(ts), frame)),
         "q": packed(poses.reshape(len(shown), -1), steps),
@@ -158,7 +159,7 @@ def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.nda
     }
 
 
-def traced(mechanism: Mechanism, poses: Any, wanted: Sequence[str] | None, length: float) -> list[list[float]]:
+def traced(mechanism: Mechanism, poses: Any, wanted: Sequence[str | tuple[str, Any]] | None, length: float) -> list[list[float]]:
     """Return the anchors whose paths are drawn: those of the joints and bodies that are named, or of the pins that move.
 
     Raises:
@@ -181,7 +182,12 @@ def traced(mechanism: Mechanism, poses: Any, wanted: Sequence[str] | None, lengt
     return [anchor for _, anchor in found[:MOST_TRACES]]
 
 
-def _anchor(mechanism: Mechanism, bodies: list[str], name: str) -> list[float]:
+def _anchor(mechanism: Mechanism, bodies: list[str], wanted: str | tuple[str, Any]) -> list[float]:
+    name, point = (wanted, None) if isinstance(wanted, str) else wanted
+    if point is not None:
+        if name not in bodies:
+            raise ValueError(f"trace {name!r}: there is no such body")
+        return [bodies.index(name), *np.asarray(point, float).tolist()]
     if name in bodies:
         return [bodies.index(name), 0.0, 0.0]
     points = getattr(mechanism.joints.get(name), "points", None)

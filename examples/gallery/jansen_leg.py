@@ -1,0 +1,108 @@
+"""Theo Jansen's leg in a batch: how the path of its foot depends on the length of its crank.
+
+Seven bodies, ten pins, and his "eleven holy numbers". The legs of a batch are computed together.
+"""
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+import udkjax as udk
+from udkjax.show import plots
+
+# Jansen's numbers in metres: a, l are where the crank's axle is, seen from the fixed pin; m is the crank.
+A, L, M = 0.380, 0.078, 0.150
+BARS = {"b": 0.415, "c": 0.393, "d": 0.401, "e": 0.558, "f": 0.394, "g": 0.367, "h": 0.657, "i": 0.490, "j": 0.500, "k": 0.619}
+TURN = 2 * np.pi  # s, of the crank at 1 rad/s
+
+
+def meet(p, q, a, b, left):
+    """Return the point at distances a from p and b from q, to the left or to the right of the way from p to q."""
+    way = q - p
+    square = way @ way
+    x = (square + a**2 - b**2) / (2 * square)
+    y = np.sqrt(a**2 / square - x**2) * (1 if left else -1)
+    return p + x * way + y * np.array([-way[1], way[0]])
+
+
+def leg(angle=0.0, rate=1.0):
+    """Return the leg with its crank at an angle (rad), driven at a constant rate (rad/s)."""
+    axle, fixed = np.zeros(2), np.array([-A, -L])
+    crank = M * np.array([np.cos(angle), np.sin(angle)])
+    top = meet(crank, fixed, BARS["j"], BARS["b"], left=False)
+    low = meet(crank, fixed, BARS["k"], BARS["c"], left=True)
+    side = meet(fixed, top, BARS["d"], BARS["e"], left=True)
+    knee = meet(side, low, BARS["f"], BARS["g"], left=False)
+    foot = meet(low, knee, BARS["i"], BARS["h"], left=True)
+    shapes = {  # each body through its points; of two it is a bar, of three a plate
+        "crank": (axle, crank),
+        "upper bar": (crank, top),
+        "upper plate": (fixed, top, side),
+        "lower bar": (crank, low),
+        "inner bar": (fixed, low),
+        "outer bar": (side, knee),
+        "foot": (low, knee, foot),
+    }
+    centres = {name: np.mean(points, axis=0) for name, points in shapes.items()}
+    bodies = {}
+    for name, points in shapes.items():
+        size = np.linalg.norm(np.subtract(points[0], points[-1]))
+        bodies[name] = udk.Body(size, size**3 / 12, centres[name])  # 1 kg/m
+
+    def pin(one, two, at):
+        return udk.Revolute((one, two), [at - centres.get(one, 0.0), at - centres.get(two, 0.0)])
+
+    joints = {
+        "O": pin("ground", "crank", axle),
+        "A1": pin("crank", "upper bar", crank),
+        "A2": pin("crank", "lower bar", crank),
+        "B": pin("upper bar", "upper plate", top),
+        "P1": pin("ground", "upper plate", fixed),
+        "P2": pin("ground", "inner bar", fixed),
+        "C1": pin("lower bar", "inner bar", low),
+        "C2": pin("lower bar", "foot", low),
+        "D": pin("upper plate", "outer bar", side),
+        "E": pin("outer bar", "foot", knee),
+    }
+    motor = udk.Driver(("ground", "crank"), "angle", udk.Polynomial([0.0, rate]))
+    mech = udk.Mechanism(bodies, joints, {"motor": motor}, name="Jansen's leg")
+    return mech, foot - centres["foot"]
+
+
+def path(q, mech, point):
+    """Return where the foot is (m) at coordinates q (..., bodies, 3)."""
+    x, y, angle = np.moveaxis(np.asarray(q)[..., mech.body_names.index("foot"), :], -1, 0)
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([x + cos * point[0] - sin * point[1], y + sin * point[0] + cos * point[1]], axis=-1)
+
+
+def make():
+    """Return how flat the steps are, the player of one leg, and the feet's paths of all."""
+    mech, point = leg()
+    ts = np.linspace(0.0, TURN, 121)
+    cranks = np.array([0.12, 0.135, M, 0.16])
+
+    def motion(crank):
+        return udk.simulate(udk.with_length(mech, "crank", crank), ts, throw=False).q
+
+    paths = {f"crank {1e3 * crank:g} mm": path(q, mech, point) for crank, q in zip(cranks, jax.vmap(motion)(cranks), strict=True)}
+    figure = Figure(figsize=(7, 3.8), layout="constrained")
+    plots.draw_coupler_curves(figure.subplots(), paths)
+    walk = paths[f"crank {1e3 * M:g} mm"]
+    low = walk[:, 1] < walk[:, 1].min() + 0.02
+    facts = {
+        "part of a turn in which the foot is on the ground": float(low.mean()),
+        "length of a step (m)": float(np.ptp(walk[low, 0])),
+        "the foot comes back to where it was within (m)": float(np.abs(walk[-1] - walk[0]).max()),
+    }
+    sol = udk.simulate(mech, ts)
+    animation = udk.animate(
+        mech, sol, measures={"height of the foot (m)": walk[:, 1]}, traces=(("foot", point), "E"), shapes={"foot": [point]}
+    )
+    return facts, {"motion": animation, "paths": figure}
+
+
+if __name__ == "__main__":
+    facts, shown = make()
+    print(facts)
+    shown["motion"].save("jansen_leg.html")

@@ -1,0 +1,31 @@
+"""A scissor lift comes down under its platform, with two constraints more than it needs.
+
+Its platform's guide is overconstrained; the motion is that of a single freedom, and the energy stays what it was.
+"""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import udkjax as udk
+from udkjax.show import plots
+
+
+def make():
+    """Return what is redundant and how well energy is kept, the player, and the energies."""
+    mech = udk.library.scissor_lift(3, angle=1.1)
+    sol = udk.simulate(mech, np.linspace(0.0, 0.8, 121))
+    found, parts = udk.analyse(mech), udk.energy(mech, sol)
+    figure = Figure(figsize=(7, 3.2), layout="constrained")
+    plots.draw_energy(figure.subplots(), sol.ts, parts)
+    facts = {
+        "redundant rows": float(len(found.redundant)),
+        "degrees of freedom": float(found.degrees_of_freedom or 0),
+        "largest change of energy (J)": float(np.abs(parts.total - parts.total[0]).max()),
+    }
+    return facts, {"motion": udk.animate(mech, sol, measures=("rank", "energy"), traces=("head",)), "energy": figure}
+
+
+if __name__ == "__main__":
+    facts, shown = make()
+    print(facts)
+    shown["motion"].save("scissor_lift.html")

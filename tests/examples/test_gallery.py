@@ -1,0 +1,47 @@
+"""The examples of the gallery run, and what they claim is so."""
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from examples.gallery import __main__ as gallery
+
+ROOT = Path(__file__).parents[2]
+FACTS = {  # of each example, what must be true of the numbers that it prints
+    "five_bar": lambda projected, rate: projected < 1e-12 and rate < 0.05,
+    "excavator": lambda taken: taken > 0,
+    "jansen_leg": lambda flat, step, back: 0.4 < flat < 0.7 and step > 0.5 and back < 1e-9,
+    "peaucellier": lambda off, length: off < 1e-12 and length > 1,
+    "scissor_lift": lambda rows, freedoms, drift: rows == 2 and freedoms == 1 and drift < 1e-4,
+    "dwell_cam": lambda rest, lift, off: rest > 1 / 3 and abs(lift - 0.15) < 1e-3 and off < 1e-3,
+    "planetary_gear": lambda ratio, willis: abs(ratio - willis) < 1e-12,
+    "identification": lambda off, *_: off < 3,
+    "double_pendulum_map": lambda members, over, calm, failed: members == 2500 and over > 0.1 and calm == 0 and failed == 0,
+    "neural_friction": lambda after, before, law: after < 0.1 * before and law < 0.4,
+}
+FAST = ("peaucellier",)
+
+
+def test_every_script_is_in_the_gallery_and_is_tested():
+    scripts = {path.stem for path in (ROOT / "examples" / "gallery").glob("*.py")} - {"__main__"}
+    assert scripts == set(gallery.NAMES) == set(FACTS)
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in FAST else pytest.mark.slow) for n in gallery.NAMES])
+def test_an_example_shows_what_it_says(name, tmp_path):
+    example = gallery.make(name, tmp_path)
+    assert FACTS[name](*example["facts"].values()), example["facts"]
+    assert (tmp_path / f"{name}.html").stat().st_size < 300_000
+    for file in example["files"]:
+        assert (tmp_path / file).read_bytes().startswith(b"\x89PNG")
+    assert example["title"] in gallery.page([example]) and import_module(f"examples.gallery.{name}").__doc__
+
+
+def test_the_pictures_of_the_page_are_there_and_small():
+    folder = ROOT / "docs" / "gallery"
+    text = (folder / "index.md").read_text(encoding="utf-8")
+    pictures = [part.split(")")[0] for part in text.split("](") if part.split(")")[0].endswith(".png")]
+    assert len(pictures) >= 10 and all((folder / picture).exists() for picture in pictures)
+    assert sum(path.stat().st_size for path in folder.glob("*.png")) < 1_000_000
+    assert all(f"## {import_module(f'examples.gallery.{name}').__doc__.splitlines()[0]}" in text for name in gallery.NAMES)
