@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import closing, redundancy
+from udkjax.equations import closing, dense_rows, redundancy, scales, sparse_rows
 
 
 def test_a_duplicated_joint_is_named():
@@ -34,12 +34,12 @@ def test_the_length_is_that_of_the_longest_arm_wherever_the_origin_is():
 
 def test_what_the_rows_are_measured_by():
     """A row in metres changes by L where its body moves by L; one in radians by one; a gear's by its radius."""
-    scales = udk.analyse(udk.library.planetary_gear()).scales
+    gear = udk.analyse(udk.library.planetary_gear()).scales
     names = udk.analyse(udk.library.planetary_gear()).row_names
     block = udk.Mechanism({"block": udk.Body(1.0, 0.04)}, {"rail": udk.Prismatic(["ground", "block"], np.zeros((2, 2)), 0.0)})
     assert_allclose(udk.analyse(block).scales.rows, [0.2, 1.0])
     assert_allclose(udk.analyse(block).scales.weights, [1.0, 0.2])
-    assert len(names) == len(scales.rows)
+    assert len(names) == len(gear.rows)
 
 
 def test_masses_and_loads_decide_nothing_about_rows(monkeypatch):
@@ -80,27 +80,30 @@ print(udk.analyse(mechanism).redundant_rows, udk.accelerations(mechanism, 0.0, m
     assert_allclose(float(found[1]), -3.5 * 9.81 * np.cos(-np.pi / 4) / 3.05, rtol=1e-12)
 
 
-THRESHOLDS = [(closing, "CLOSED"), (closing, "ROUNDING"), (closing, "STRIDE"), (redundancy, "RANK_TOL"), (redundancy, "CLEAR")]
+MODULES = closing, dense_rows, redundancy, scales, sparse_rows
+DENSE = ["CLOSED", "ROUNDING", "STRIDE", "DEPENDENT", "CLEAR", "NEGLIGIBLE", "WANDER", "RANK_TOL", "ORDINARY_MASS_RATIO"]
+SPARSE = ["NO_PIVOT", "CLEAR", "NEGLIGIBLE"]
 
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
-@pytest.mark.parametrize(("module", "name"), THRESHOLDS, ids=[name for _, name in THRESHOLDS])
-def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, module, name, factor):
-    """The same rows are redundant, and what closed closes, to rounding."""
-    scenes = {
-        kind: getattr(udk.library, kind)()
-        for kind in ("parallelogram", "scissor_lift", "planetary_gear", "peaucellier", "excavator")
-    }
+@pytest.mark.parametrize(
+    ("name", "large"), [*((name, False) for name in DENSE), *((name, True) for name in SPARSE)], ids=lambda x: str(x)
+)
+def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, name, large, factor):
+    """As many rows are redundant, and what closed closes, to rounding."""
+    scenes = {kind: getattr(udk.library, kind)() for kind in ("parallelogram", "scissor_lift", "planetary_gear")}
     expected = {kind: udk.analyse(mechanism).redundant for kind, mechanism in scenes.items()}
-    monkeypatch.setattr(module, name, factor * getattr(module, name))
-    if module is closing and hasattr(redundancy, name):
-        monkeypatch.setattr(redundancy, name, factor * getattr(redundancy, name))
+    homes = [module for module in MODULES if hasattr(module, name)]
+    assert homes
+    for module in homes:
+        monkeypatch.setattr(module, name, factor * getattr(module, name))
+    choose = redundancy.rows_of
+    monkeypatch.setattr(redundancy, "rows_of", lambda mechanism: choose(mechanism, large))
     for kind, mechanism in scenes.items():
         rows = redundancy.redundant_rows(mechanism)
         assert rows is not None and len(rows) == len(expected[kind])
-        scales = udk.analyse(mechanism).scales
-        off = mechanism.q0.ravel() + 1e-3 * scales.coordinates(3 * len(mechanism.bodies)) * np.cos(np.arange(mechanism.q0.size))
-        *_, psi, psi_dot, _ = closing.DenseRows(mechanism, scales).assembled(
-            0.0, np.asarray(off), np.asarray(mechanism.v0).ravel()
-        )
-        assert np.max(np.abs(psi) / np.asarray(scales.rows)) < 1e-11 and np.abs(psi_dot).max() < 1e-9
+        own = scales.known_scales(mechanism)
+        off = mechanism.q0.ravel() + 1e-3 * own.coordinates(3 * len(mechanism.bodies)) * np.cos(np.arange(mechanism.q0.size))
+        closer = sparse_rows.SparseRows(mechanism) if large else dense_rows.DenseRows(mechanism, own)
+        *_, psi, psi_dot, _ = closer.assembled(0.0, np.asarray(off), np.asarray(mechanism.v0).ravel())
+        assert np.max(np.abs(psi) / np.asarray(own.rows)) < 1e-11 and np.abs(psi_dot).max() < 1e-9

@@ -14,11 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.scalar_programs import scene_programs
-from udkjax.equations.scales import Scales, rank_tolerance
-from udkjax.equations.structure import leaves_as_scalars
-from udkjax.expressions import Program
-from udkjax.scene.mechanism import Mechanism
+from udkjax.equations.scales import Scales
 
 # Of the scene's scales: what counts as closed. Rounding leaves 1e-15; a scene that cannot be closed leaves what its lengths are
 # wrong by.
@@ -98,71 +94,9 @@ def close_position(rows: Rows, t: Any, q: Any, xp: Any = jnp) -> Any:
     return loop(unfinished, lambda state: (*damped_step(rows, t, state[0], xp), state[2] + 1), (q, xp.asarray(True), 0))[0]
 
 
-class Truncated(NamedTuple):
-    """D^+ = V S^+ U^T by NumPy, as `pinv.SVD` has it."""
-
-    u: np.ndarray
-    inverse: np.ndarray
-    vt: np.ndarray
-    rank: int
-
-    @classmethod
-    def of(cls, D: np.ndarray, tol: float) -> "Truncated":
-        """The pseudoinverse of a matrix; of one that is not finite, not a number."""
-        if not np.all(np.isfinite(D)):  # of which NumPy refuses a decomposition
-            D, tol = np.zeros_like(D), np.nan
-        u, sigma, vt = np.linalg.svd(D, full_matrices=False)
-        kept = ~(sigma <= tol * sigma[0])
-        return cls(u, np.where(kept, 1 / np.where(kept, sigma, 1.0), 0.0) + 0.0 * tol, vt, int(kept.sum()))
-
-    def __matmul__(self, b: np.ndarray) -> np.ndarray:
-        return self.vt.T @ (self.inverse * (self.u.T @ b))
-
-
-class DenseRows:
-    """The rows of a mechanism with known numbers, evaluated by NumPy on the scene's programs. The metric is M^(-1/2)."""
-
-    def __init__(self, mechanism: Mechanism, scales: Scales):
-        self.scales = jax.tree.map(np.asarray, scales)
-        self._programs = scene_programs(mechanism)
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(mechanism)]
-        self._constants = self._programs.prologue([*map(float, leaves_as_scalars(leaves)), 0.0, 0.0])
-        self.count, self.size = self._programs.pattern.shape
-        self.names = self._programs.equations.row_names
-        self.root = self._run(self._programs.closure_terms, 0.0, np.zeros(self.size), np.zeros(self.size))[-self.size :]
-        self.metric, self._tol = self.root, float(rank_tolerance(mechanism))
-
-    def _run(self, program: Program, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return np.array(program([*self._constants, t, *q.tolist(), *v.tolist()]), float)
-
-    def violation(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Psi and Psi_dot."""
-        return self._run(self._programs.psi, t, q, v), self._run(self._programs.psi_dot, t, q, v)
-
-    def residual(self, t: float, q: np.ndarray) -> np.ndarray:
-        return self._run(self._programs.psi, t, q, q) / self.scales.rows
-
-    def jacobian(self, t: float, q: np.ndarray) -> np.ndarray:
-        """Psi_q (m, n)."""
-        values = self._run(self._programs.closure_terms, t, q, q)[: self._programs.pattern.slots]
-        return self._programs.pattern.dense(values, np) / self.root
-
-    def plus(self, t: float, q: np.ndarray) -> Truncated:
-        """D^+ of weighted rows in the metric."""
-        return Truncated.of(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
-
-    def correction(self, t: float, q: np.ndarray) -> np.ndarray:
-        return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._run(self._programs.psi, t, q, q)))
-
-    def assembled(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
-        """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
-        if not self.count:
-            return q, v, *self.violation(t, q, v), 0
-        q = close_position(self, t, q, np)
-        plus = self.plus(t, q)
-        for _ in range(2):  # the second removes the rounding errors of the first
-            v = v - self.metric * (plus @ (self.scales.weights * self._run(self._programs.psi_dot, t, q, v)))
-        return q, v, *self.violation(t, q, v), plus.rank
+def driver_time_step(scales: Scales) -> float:
+    """The time (s) by which drivers move on from one position to the next: they turn about as far as the random motion."""
+    return STRIDE / float(scales.rate) if scales.rate > 0.0 else 0.0
 
 
 class TracedRows(NamedTuple):

@@ -24,7 +24,7 @@ from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 from udkjax.scene.fields import number
 
-ITERATIONS = 10  # Newton's, from a prediction that is good: three or four are usual
+NEWTON_STEPS = 10  # Newton's, from a prediction that is good: three or four are usual
 
 
 class CoordinatePartitioning(Formulation):
@@ -114,7 +114,7 @@ def _completed(held: Partitioned, t: Any, q: Vector, v: Vector) -> tuple[Vector,
 
     def unfinished(state):
         _, change, k = state
-        return (k < ITERATIONS) & (change > tol)
+        return (k < NEWTON_STEPS) & (change > tol)
 
     def step(state):
         q, _, k = state

@@ -8,58 +8,19 @@ the right choice where the other vanishes, and the motion tells which. All of it
 compiled for it.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from udkjax.equations.closing import STRIDE, DenseRows, close_position, is_closed
-from udkjax.equations.scales import known_scales
+from udkjax.equations.closing import STRIDE
+from udkjax.equations.dense_rows import NEGLIGIBLE, KinematicRows
 from udkjax.equations.structure import is_large
 from udkjax.scene.mechanism import Mechanism
 
-if TYPE_CHECKING:
-    from udkjax.equations.sparse_rows import SparseRows
-
-# Relative to the largest singular value, with rows of length one, at a closed position: redundant rows leave rounding errors,
-# rows that are merely close to a singular configuration leave more.
-RANK_TOL = 1e-8
-CLEAR = 1e-4
 SAMPLES = 24  # positions to look at where the first shows rows that depend on each other
+MANY = 300  # rows of a scene of which a third of the positions is looked at, since each of them takes the longer
+WANDER = 0.3  # of the direction of the random motion: how much of it is new at each position
 ORDINARY = 0.05  # a position counts as ordinary if its smallest singular value is this part of the largest
-
-
-class Position(NamedTuple):
-    """A closed position as the analysis sees it: the singular value decomposition of D with rows of length one."""
-
-    t: float
-    q: np.ndarray
-    u: np.ndarray
-    sigma: np.ndarray
-    vt: np.ndarray
-
-    @property
-    def rank(self) -> int:
-        return int(np.sum(self.sigma > RANK_TOL * self.sigma[0]))
-
-    @property
-    def clear(self) -> bool:
-        """Whether the rank is beyond doubt: near a singular configuration small residuals are large distances from closure."""
-        return bool(np.all((self.sigma <= RANK_TOL * self.sigma[0]) | (self.sigma > CLEAR * self.sigma[0])))
-
-    @property
-    def smallest(self) -> float:
-        """The smallest singular value that counts, relative to the largest."""
-        return float(self.sigma[self.rank - 1] / self.sigma[0])
-
-    def along(self, heading: np.ndarray) -> np.ndarray:
-        """The part of a motion that the constraints allow."""
-        free = self.vt[self.rank :]
-        return free.T @ (free @ heading)
-
-    @property
-    def null_space(self) -> np.ndarray:
-        """The combinations of rows that vanish, (rows, redundant)."""
-        return self.u[:, self.rank :]
 
 
 @np.errstate(all="ignore")  # what is not finite does not close
@@ -84,21 +45,21 @@ def positions_of(rows: Any, q: np.ndarray) -> list[Any]:
     found = [first]
     random = np.random.default_rng(0)
     heading = random.standard_normal(rows.size)
-    for k in range(rows.samples):
-        full = [p for p in found if p.clear and p.rank == rows.count]
+    for k in range(SAMPLES if rows.count <= MANY else SAMPLES // 3):
+        full = [p for p in found if p.is_clear and p.rank == rows.count]
         if full:
             return full[:1]
         last = found[-1]
-        heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(rows.size) / np.sqrt(rows.size)
-        heading = last.along(heading)  # onward, so that the motion gets around
+        heading = heading / np.linalg.norm(heading) + WANDER * random.standard_normal(rows.size) / np.sqrt(rows.size)
+        heading = last.tangent_part(heading)  # onward, so that the motion gets around
         step = rows.metric * heading
         moved = last.q + STRIDE * step / max(rows.scales.size(step, np), 1e-300)
-        position = rows.close(rows.tick * (k + 1), moved)
-        if position is None or not position.clear or not np.any(heading):  # stuck: jump
-            heading = random.standard_normal(rows.size)
-            position = rows.close(rows.tick * (k + 1), first.q + STRIDE * rows.metric * random.uniform(-1.0, 1.0, rows.size))
+        position = rows.close(rows.driver_time_step * (k + 1), moved)
+        if position is None or not position.is_clear or not np.any(heading):  # stuck: jump
+            heading, jump = random.standard_normal(rows.size), random.uniform(-1.0, 1.0, rows.size)
+            position = rows.close(rows.driver_time_step * (k + 1), first.q + STRIDE * rows.metric * jump)
         found.extend([] if position is None else [position])
-    found = [p for p in found if p.clear]
+    found = [p for p in found if p.is_clear]
     if not found or (len(found) == 1 and found[0] is first and first.rank < rows.size):
         return []
     rank = max(p.rank for p in found)
@@ -122,13 +83,13 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
     position = rows.close(0.0, np.asarray(q, float).ravel()) if rows.count else None
     if position is None:
         return ()
-    involved = np.asarray((abs(position.null_space) > 1e-6).sum(axis=1)).ravel() > 0
+    involved = np.asarray((abs(position.null_space) > NEGLIGIBLE).sum(axis=1)).ravel() > 0
     names = [name for (name, _), part in zip(rows.names, involved, strict=True) if part]
     return tuple(dict.fromkeys(names))
 
 
-def rows_of(mechanism: Mechanism, large: bool | None = None) -> "KinematicRows | SparseRows":
-    """Psi and D of a mechanism with known numbers: dense, or for large scenes sparse."""
+def rows_of(mechanism: Mechanism, large: bool | None = None) -> Any:
+    """Psi and D of a mechanism with known numbers: `KinematicRows`, or for large scenes `SparseRows`."""
     if not (is_large(mechanism) if large is None else large):
         return KinematicRows(mechanism)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
@@ -150,39 +111,3 @@ def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
         chosen.append(row)
         null_spaces = [N @ np.linalg.svd(N[row : row + 1])[2][1:].T for N in null_spaces]
     return tuple(sorted(chosen))
-
-
-class KinematicRows(DenseRows):
-    """The rows of a mechanism with known numbers in a metric without masses: (A, A, 1) for each body, A the longest arm."""
-
-    samples = SAMPLES
-
-    def __init__(self, mechanism: Mechanism):
-        super().__init__(mechanism, known_scales(mechanism))
-        self.metric = np.tile([float(self.scales.arm), float(self.scales.arm), 1.0], self.size // 3)
-        self.tick = tick(self.scales)
-
-    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
-        D = self.jacobian(t, q) * self.metric
-        length = np.linalg.norm(D, axis=1)
-        length[length == 0.0] = 1.0
-        return self._run(self._programs.psi, t, q, q), length, D / length[:, None]
-
-    def parts_of(self, positions: list[Position]) -> list[tuple[np.ndarray, list[Position]]]:
-        """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""
-        return [(np.arange(self.count), positions)]
-
-    def close(self, t: float, q: np.ndarray) -> Position | None:
-        """Return a closed position near q, or None."""
-        q = close_position(self, t, q, np)
-        psi, _, D = self.at(t, q)
-        still = np.zeros_like(q)
-        if not np.all(np.isfinite(D)) or not is_closed(self.scales, q, still, psi, 0 * psi, np):
-            return None
-        return Position(t, q, *np.linalg.svd(D))
-
-
-def tick(scales: Any) -> float:
-    """The time (s) by which drivers move on from one position to the next: they turn about as far as the random motion."""
-    return STRIDE / float(scales.rate) if scales.rate > 0.0 else 0.0

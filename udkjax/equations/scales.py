@@ -23,7 +23,7 @@ from udkjax.scene.mechanism import Mechanism
 # Relative to the largest singular value of D: far above rounding and drift, far below the singular values of a mechanism in
 # ordinary positions. With the states returned to the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
 RANK_TOL = 1e-4
-ORDINARY = 100.0  # the ratio of masses up to which that holds: see `rank_tolerance`
+ORDINARY_MASS_RATIO = 100.0  # up to which that holds: see `rank_tolerance`
 
 
 class Scales(eqx.Module):
@@ -167,4 +167,4 @@ def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:
     xp: Any = np if known else jnp  # while something else is traced, jnp would trace what is known, too
     masses = [xp.asarray(mass) for mass in masses]
     ratio = reduce(xp.minimum, masses) / reduce(xp.maximum, masses)
-    return jax.lax.stop_gradient(number(RANK_TOL * xp.minimum(1.0, xp.sqrt(ORDINARY * ratio))))
+    return jax.lax.stop_gradient(number(RANK_TOL * xp.minimum(1.0, xp.sqrt(ORDINARY_MASS_RATIO * ratio))))

@@ -16,21 +16,18 @@ from scipy.sparse import coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from udkjax.equations.closing import close_position, is_closed
+from udkjax.equations.closing import close_position, driver_time_step, is_closed
+from udkjax.equations.dense_rows import CLEAR, NEGLIGIBLE
 from udkjax.equations.loop_programs import loop_programs
-from udkjax.equations.redundancy import SAMPLES, tick
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
 from udkjax.equations.structure import leaves_as_vector
 from udkjax.pinv.sparse import minimum_degree
 from udkjax.scene.mechanism import Mechanism
 
-# Squares of lengths: what rounding leaves of a dependent row; and what is beyond doubt, as CLEAR in redundancy.py.
-NOTHING = 1e-11
-CLEAR = 1e-8
-NEGLIGIBLE = 1e-6  # of a combination of rows of length one: what does not count as being part of it
+# A pivot is the square of a length. Up to here it is what rounding leaves of a dependent row: the default of `pinv.Elimination`.
+NO_PIVOT = float(np.finfo(float).eps) ** (2 / 3)
 DAMPING = RANK_TOL**2  # of D D^T in closing: what truncation at `RANK_TOL` is to singular values
-COLUMNS = 64  # solved for at a time
-MANY = 300  # rows: of larger scenes a third of the positions, since each of them takes the longer
+COLUMNS = 64  # of a null space that are solved for at a time, which bounds the memory of their dense form
 
 
 class SparsePosition(NamedTuple):
@@ -40,25 +37,25 @@ class SparsePosition(NamedTuple):
     q: np.ndarray
     D: Any  # sparse
     pivots: np.ndarray  # of the rows, in their own order
-    kept: np.ndarray  # the rows that something remains of
-    dropped: np.ndarray
+    independent: np.ndarray  # rows with a pivot
+    dependent: np.ndarray  # rows without one
 
     @property
     def rank(self) -> int:
-        return len(self.kept)
+        return len(self.independent)
 
     @property
-    def clear(self) -> bool:
+    def is_clear(self) -> bool:
         """Whether the rank is beyond doubt."""
-        return bool(np.all(self.pivots[self.kept] > CLEAR))
+        return bool(np.all(self.pivots[self.independent] > CLEAR**2))
 
     @property
     def smallest(self) -> float:
-        """The shortest remainder of a row that is kept."""
-        return float(np.sqrt(self.pivots[self.kept].min(initial=1.0)))
+        """The shortest remainder of an independent row."""
+        return float(np.sqrt(self.pivots[self.independent].min(initial=1.0)))
 
-    def along(self, heading: np.ndarray) -> np.ndarray:
-        """The part of a motion that the constraints allow."""
+    def tangent_part(self, heading: np.ndarray) -> np.ndarray:
+        """The part of a displacement that the constraints allow."""
         solve = splu(csc_array(self.D @ self.D.T + DAMPING * eye_array(self.D.shape[0])), **_SYMMETRIC).solve
         for _ in range(2):
             heading = heading - self.D.T @ solve(self.D @ heading)
@@ -66,19 +63,19 @@ class SparsePosition(NamedTuple):
 
     @property
     def null_space(self) -> Any:
-        """The combinations of rows that vanish, (rows, redundant)."""
-        rows, count = self.D.shape[0], len(self.dropped)
+        """The left null space of D: combinations of rows that vanish, (rows, redundant)."""
+        rows, count = self.D.shape[0], len(self.dependent)
         if not count:
             return csc_array((rows, 0))
-        kept = self.D[self.kept]
-        solve = splu(csc_array(kept @ kept.T), **_SYMMETRIC).solve
+        independent = self.D[self.independent]
+        solve = splu(csc_array(independent @ independent.T), **_SYMMETRIC).solve
         parts = []
         for start in range(0, count, COLUMNS):
-            dropped = self.dropped[start : start + COLUMNS]
-            right = (kept @ self.D[dropped].T).toarray()
-            found = np.zeros((rows, len(dropped)))
-            found[self.kept] = -solve(right)
-            found[dropped, np.arange(len(dropped))] = 1.0
+            dependent = self.dependent[start : start + COLUMNS]
+            right = (independent @ self.D[dependent].T).toarray()
+            found = np.zeros((rows, len(dependent)))
+            found[self.independent] = -solve(right)
+            found[dependent, np.arange(len(dependent))] = 1.0
             found[np.abs(found) < NEGLIGIBLE] = 0.0
             parts.append(coo_array(found))
         return csc_array(_beside(parts, rows))
@@ -96,20 +93,19 @@ def _beside(parts: list[Any], rows: int) -> Any:
 class SparseRows:
     """Psi and D of a mechanism with known numbers; D sparse. The metric is M^(-1/2), or, to look for redundant rows, (A, A, 1).
 
-    The interface is that of `closing.DenseRows` and of `redundancy.KinematicRows`.
+    The interface is that of `DenseRows` and of `KinematicRows`.
     """
 
     def __init__(self, mechanism: Mechanism, kinematic: bool = False):
         self._programs = programs = loop_programs(mechanism)
         self.count, self.size = programs.row_count, programs.coordinate_count
         self.names = programs.row_names
-        self.samples = SAMPLES if self.count <= MANY else SAMPLES // 3
         self.scales = jax.tree.map(np.asarray, known_scales(mechanism))
         root = 1 / np.sqrt(mass_of(mechanism, np))
         arm = float(self.scales.arm)
         self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
         self._stretch = self.metric / root
-        self.tick = tick(self.scales)
+        self.driver_time_step = driver_time_step(self.scales)
         self._evaluate = programs.geometry(leaves_as_vector(jax.tree.leaves(mechanism)), np)
 
     @cached_property
@@ -173,8 +169,8 @@ class SparseRows:
 
     def _position(self, t: float, q: np.ndarray, D: csr_array) -> SparsePosition:
         pivots = remainders(csr_array(D @ D.T), self._order)
-        beyond = pivots > NOTHING
-        return SparsePosition(t, q, D, pivots, np.flatnonzero(beyond), np.flatnonzero(~beyond))
+        has_pivot = pivots > NO_PIVOT
+        return SparsePosition(t, q, D, pivots, np.flatnonzero(has_pivot), np.flatnonzero(~has_pivot))
 
 
 def remainders(gram: csr_array, order: list[int]) -> np.ndarray:
@@ -190,7 +186,7 @@ def remainders(gram: csr_array, order: list[int]) -> np.ndarray:
     for j, below in enumerate(column):
         pivot = below.pop(j, 0.0)
         pivots[order[j]] = pivot
-        if pivot <= NOTHING:
+        if pivot <= NO_PIVOT:
             continue
         rows = sorted(below)
         for n, k in enumerate(rows):
@@ -222,5 +218,5 @@ def parts(positions: list[SparsePosition]) -> list[tuple[np.ndarray, list[Part]]
 def _part(position: SparsePosition, members: np.ndarray) -> Part:
     touched = position.D[members]
     u, sigma, _ = np.linalg.svd(touched[:, np.unique(touched.indices)].toarray())
-    rank = len(members) - int(np.isin(members, position.dropped).sum())
+    rank = len(members) - int(np.isin(members, position.dependent).sum())
     return Part(float(sigma[rank - 1] / sigma[0]) if rank else 1.0, u[:, rank:])

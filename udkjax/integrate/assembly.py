@@ -25,13 +25,13 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.closing import (
     CLOSED,
     ITERATIONS,
-    DenseRows,
     TracedRows,
     close_position,
     damped_step,
     is_closed,
 )
 from udkjax.equations.constraints import psi
+from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large

@@ -48,7 +48,7 @@ def clearance(positions: Positions, at: Configuration, rank: int, walk: bool = T
     sigma = at.sigma[rank - 1]
     slope = np.linalg.norm([_slope(positions, at, direction, rank) for direction in at.right.T]) if at.right.size else 0.0
     estimate = float(sigma / slope) if slope > SLOPE_STEP * sigma else np.inf
-    driven = at.right.shape[1] == 0 and positions.rows.tick > 0.0
+    driven = at.right.shape[1] == 0 and positions.rows.driver_time_step > 0.0
     nearest, searched = (None, 0.0) if not walk or not (at.right.shape[1] == 1 or driven) else _search(positions, at, rank)
     return Clearance(float(sigma / at.sigma[0]), estimate, nearest, searched)
 
@@ -100,7 +100,7 @@ def _kinked(sigma: list[float]) -> bool:
 
 
 def _step(positions: Positions, at: Configuration, heading: np.ndarray, step: float, side: float) -> Configuration | None:
-    t = at.t if heading.any() else at.t + side * positions.rows.tick * step
+    t = at.t if heading.any() else at.t + side * positions.rows.driver_time_step * step
     return positions.displaced(at, heading, step, t)
 
 

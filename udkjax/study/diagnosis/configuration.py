@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.equations.closing import STRIDE
-from udkjax.equations.redundancy import KinematicRows
+from udkjax.equations.dense_rows import KinematicRows
 
 STEP = 0.1  # of the characteristic length, and rad: from one position to the next of a neighbourhood
 POSITIONS = 12  # of a neighbourhood
@@ -87,7 +87,7 @@ class Positions:
             heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(len(heading)) / np.sqrt(len(heading))
             allowed = last.right @ (last.right.T @ heading)
             size = np.linalg.norm(allowed)
-            t += self.rows.tick * STEP / STRIDE
+            t += self.rows.driver_time_step * STEP / STRIDE
             direction = allowed / size if size > 0.0 else allowed
             moved = self.displaced(last, direction, STEP, t) or self.displaced(last, direction, STEP, last.t)
             if moved is None or self.distance(moved, last) < MOVED * STEP:

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.determinacy import RANK_TOL, UNIQUE_TOL, unique_direction
-from udkjax.equations.redundancy import KinematicRows
 from udkjax.integrate.assembly import State, close, require_closed
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from udkjax.equations.redundancy import KinematicRows
+from udkjax.equations.dense_rows import KinematicRows
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Angle, Prismatic, Revolute, Slot, Weld

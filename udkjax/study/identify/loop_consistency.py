@@ -19,7 +19,8 @@ from jaxtyping import Array
 from scipy.sparse import csr_array
 
 from udkjax.equations.analysis import analyse
-from udkjax.equations.redundancy import ORDINARY, KinematicRows, chosen_rows, positions_of, rows_of
+from udkjax.equations.dense_rows import KinematicRows
+from udkjax.equations.redundancy import ORDINARY, chosen_rows, positions_of, rows_of
 from udkjax.equations.sparse_rows import SparseRows
 from udkjax.scene.checks import quoted
 from udkjax.scene.fields import Numbers

@@ -1,0 +1,84 @@
+"""No two modules import each other, neither inside functions nor for types; a folder imports only from floors below it.
+
+The floors themselves, and which libraries belong to which, are in test_package.py.
+"""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+import udkjax
+
+ROOT = Path(udkjax.__file__).parent
+
+# Sets of modules that import each other still. The list only shrinks: one that is gone must be taken out.
+KNOWN = {frozenset(f"udkjax.study.sweep.{name}" for name in ("chunk", "cutting", "fingerprint", "local", "member", "plan"))}
+
+
+def modules(root: Path) -> dict[str, Path]:
+    """Every module below `root`, by its full name; a package stands for its `__init__`."""
+    found = {}
+    for file in sorted(root.rglob("*.py")):
+        parts = [root.name, *file.relative_to(root).with_suffix("").parts]
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    return found
+
+
+def imported(file: Path, name: str, known: dict[str, Path]) -> set[str]:
+    """The modules that one imports, anywhere in its text: at its top, inside functions, for types."""
+    package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+    found = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")
+            base = ".".join([*parts[: len(parts) - node.level + 1], *([node.module] if node.module else [])])
+            base = base if node.level else node.module or ""
+            found |= {f"{base}.{alias.name}" if f"{base}.{alias.name}" in known else base for alias in node.names}
+    return {module for module in found if module in known and module != name}
+
+
+def circles(root: Path) -> set[frozenset[str]]:
+    """The sets of modules that import each other, directly or by way of others."""
+    known = modules(root)
+    # The package itself names everything that is public, for type checkers, and loads it when it is asked for.
+    names = [name for name in known if name != root.name]
+    place = {name: k for k, name in enumerate(names)}
+    edges = [(place[n], place[m]) for n in names for m in imported(known[n], n, known) if m in place]
+    row, column = np.array(edges, int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(row)), (row, column)), shape=(len(names), len(names)))
+    _, label = connected_components(graph, connection="strong")
+    sets = [frozenset(n for n, k in zip(names, label, strict=True) if k == j) for j in np.unique(label)]
+    return {found for found in sets if len(found) > 1}
+
+
+def test_no_modules_import_each_other():
+    assert circles(ROOT) == KNOWN
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from package.other import thing",
+        "from package import other",
+        "import package.other",
+        "from . import other",
+        "def late():\n    from .other import thing",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from package.other import thing",
+    ],
+)
+def test_a_circle_is_found_wherever_it_hides(tmp_path, line):
+    root = tmp_path / "package"
+    root.mkdir()
+    (root / "__init__.py").write_text("")
+    (root / "one.py").write_text(line)
+    (root / "other.py").write_text("from package.third import thing")
+    (root / "third.py").write_text("")
+    assert circles(root) == set()
+    (root / "third.py").write_text("import package.one")
+    assert circles(root) == {frozenset({"package.one", "package.other", "package.third"})}

@@ -1,0 +1,153 @@
+"""Psi and D of a small mechanism with known numbers, by NumPy on the scene's programs: nothing is compiled for it.
+
+With them a mechanism is closed, and its redundant rows are found (redundancy.py).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from udkjax.equations.closing import close_position, driver_time_step, is_closed
+from udkjax.equations.scalar_programs import scene_programs
+from udkjax.equations.scales import Scales, known_scales, rank_tolerance
+from udkjax.equations.structure import leaves_as_scalars
+from udkjax.expressions import Program
+from udkjax.scene.mechanism import Mechanism
+
+# Singular values of D with rows of length one at a closed position, relative to the largest. Up to half of the digits a singular
+# value counts as zero: redundant rows leave rounding errors. From `CLEAR` on it does not; the rank of a position with one in
+# between, which is merely close to a singular configuration, is in doubt.
+DEPENDENT = float(np.sqrt(np.finfo(float).eps))
+CLEAR = 1e-4
+NEGLIGIBLE = 1e-6  # of a combination of rows of length one: a share of a row below it is rounding
+
+
+class TruncatedPseudoinverse(NamedTuple):
+    """D^+ = V S^+ U^T by NumPy, as `pinv.SVD` has it."""
+
+    u: np.ndarray
+    inverse: np.ndarray
+    vt: np.ndarray
+    rank: int
+
+    @classmethod
+    def of(cls, D: np.ndarray, tol: float) -> "TruncatedPseudoinverse":
+        """Return the pseudoinverse of a matrix; NaN of one that is not finite."""
+        if not np.all(np.isfinite(D)):  # NumPy refuses to decompose it
+            D, tol = np.zeros_like(D), np.nan
+        u, sigma, vt = np.linalg.svd(D, full_matrices=False)
+        counts = ~(sigma <= tol * sigma[0])
+        return cls(u, np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0) + 0.0 * tol, vt, int(counts.sum()))
+
+    def __matmul__(self, b: np.ndarray) -> np.ndarray:
+        return self.vt.T @ (self.inverse * (self.u.T @ b))
+
+
+class DenseRows:
+    """The rows of a mechanism with known numbers, evaluated by NumPy on the scene's programs. The metric is M^(-1/2)."""
+
+    def __init__(self, mechanism: Mechanism, scales: Scales):
+        self.scales = jax.tree.map(np.asarray, scales)
+        self._programs = scene_programs(mechanism)
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(mechanism)]
+        self._constants = self._programs.prologue([*map(float, leaves_as_scalars(leaves)), 0.0, 0.0])
+        self.count, self.size = self._programs.pattern.shape
+        self.names = self._programs.equations.row_names
+        self.root = self._run(self._programs.closure_terms, 0.0, np.zeros(self.size), np.zeros(self.size))[-self.size :]
+        self.metric, self._tol = self.root, float(rank_tolerance(mechanism))
+
+    def _run(self, program: Program, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.array(program([*self._constants, t, *q.tolist(), *v.tolist()]), float)
+
+    def violation(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Psi and Psi_dot."""
+        return self._run(self._programs.psi, t, q, v), self._run(self._programs.psi_dot, t, q, v)
+
+    def residual(self, t: float, q: np.ndarray) -> np.ndarray:
+        return self._run(self._programs.psi, t, q, q) / self.scales.rows
+
+    def jacobian(self, t: float, q: np.ndarray) -> np.ndarray:
+        """Psi_q (m, n)."""
+        values = self._run(self._programs.closure_terms, t, q, q)[: self._programs.pattern.slots]
+        return self._programs.pattern.dense(values, np) / self.root
+
+    def plus(self, t: float, q: np.ndarray) -> TruncatedPseudoinverse:
+        """D^+ of weighted rows in the metric."""
+        return TruncatedPseudoinverse.of(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
+
+    def correction(self, t: float, q: np.ndarray) -> np.ndarray:
+        return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._run(self._programs.psi, t, q, q)))
+
+    def assembled(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
+        """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
+        if not self.count:
+            return q, v, *self.violation(t, q, v), 0
+        q = close_position(self, t, q, np)
+        plus = self.plus(t, q)
+        for _ in range(2):  # the second removes the rounding errors of the first
+            v = v - self.metric * (plus @ (self.scales.weights * self._run(self._programs.psi_dot, t, q, v)))
+        return q, v, *self.violation(t, q, v), plus.rank
+
+
+class Position(NamedTuple):
+    """A closed position as the analysis sees it: the singular value decomposition of D with rows of length one."""
+
+    t: float
+    q: np.ndarray
+    u: np.ndarray
+    sigma: np.ndarray
+    vt: np.ndarray
+
+    @property
+    def rank(self) -> int:
+        return int(np.sum(self.sigma > DEPENDENT * self.sigma[0]))
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the rank is beyond doubt: near a singular configuration small residuals are large distances from closure."""
+        return bool(np.all((self.sigma <= DEPENDENT * self.sigma[0]) | (self.sigma > CLEAR * self.sigma[0])))
+
+    @property
+    def smallest(self) -> float:
+        """The smallest singular value that counts, relative to the largest."""
+        return float(self.sigma[self.rank - 1] / self.sigma[0])
+
+    def tangent_part(self, heading: np.ndarray) -> np.ndarray:
+        """The part of a displacement that the constraints allow."""
+        free = self.vt[self.rank :]
+        return free.T @ (free @ heading)
+
+    @property
+    def null_space(self) -> np.ndarray:
+        """The left null space of D: an orthonormal basis of the combinations of rows that vanish, (rows, redundant)."""
+        return self.u[:, self.rank :]
+
+
+class KinematicRows(DenseRows):
+    """The rows of a mechanism with known numbers in a metric without masses: (A, A, 1) for each body, A the longest arm."""
+
+    def __init__(self, mechanism: Mechanism):
+        super().__init__(mechanism, known_scales(mechanism))
+        self.metric = np.tile([float(self.scales.arm), float(self.scales.arm), 1.0], self.size // 3)
+        self.driver_time_step = driver_time_step(self.scales)
+
+    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
+        D = self.jacobian(t, q) * self.metric
+        length = np.linalg.norm(D, axis=1)
+        length[length == 0.0] = 1.0
+        return self._run(self._programs.psi, t, q, q), length, D / length[:, None]
+
+    def parts_of(self, positions: list[Position]) -> list[tuple[np.ndarray, list[Position]]]:
+        """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""
+        return [(np.arange(self.count), positions)]
+
+    def close(self, t: float, q: np.ndarray) -> Position | None:
+        """Return a closed position near q, or None."""
+        q = close_position(self, t, q, np)
+        psi, _, D = self.at(t, q)
+        still = np.zeros_like(q)
+        if not np.all(np.isfinite(D)) or not is_closed(self.scales, q, still, psi, 0 * psi, np):
+            return None
+        return Position(t, q, *np.linalg.svd(D))
