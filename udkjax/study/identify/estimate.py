@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from udkjax.deprecation import renamed_attributes
 from udkjax.extras import OptionalImport
+from udkjax.html import html_table
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.solution import scene_text, versions
 from udkjax.scene.checks import quoted, suggestion
@@ -222,12 +223,10 @@ class Estimate:
         return "\n".join([*lines, self.message])
 
     def _repr_html_(self) -> str:
-        header, *cells = self._cells()
-        row = lambda tag, texts: f"<tr>{''.join(f'<{tag}>{html.escape(text)}</{tag}>' for text in texts)}</tr>"  # noqa: E731
-        facts = "".join(f"<br>{html.escape(f'{name}: {text}')}" for name, text in self._facts().items())
-        message = "<br>".join(map(html.escape, self.message.splitlines()))
-        table = f"<table>{row('th', header)}{''.join(row('td', texts) for texts in cells)}</table>"
-        return f"<p>{html.escape(self._head())}</p>{table}<p>{message}{facts}</p>"
+        heads, *cells = self._cells()
+        facts = [f"{name}: {text}" for name, text in self._facts().items()]
+        remarks = "".join(f"<br>{html.escape(text)}" for text in [*facts, *self.message.splitlines()])
+        return html_table(self._head(), heads, cells) + f"<p>{remarks.removeprefix('<br>')}</p>"
 
     def __repr__(self) -> str:
         return f"Estimate({', '.join(f'{name}: {value:.6g}' for name, value in self.parameters.items())})"
