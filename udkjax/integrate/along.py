@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
-from jax.extend.core import Primitive, set_current_trace
+from jax.extend.core import Literal, Primitive, new_jaxpr_eqn, no_effects, set_current_trace
 from jax.interpreters import ad, batching, mlir, partial_eval
 
 Parts = Callable[..., tuple[list[Any], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
@@ -28,6 +28,7 @@ def along(
     A batch of up to `few` directions at one place is so many directions for `run`, and of any other `seen` is mapped; where it is
     None, both are mapped over any batch. `shapes` are those of the value and of the change, where they are known.
     """
+    direction = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, direction)  # a tangent may be 1.0
     (place, way), static = eqx.partition((at, direction), eqx.is_array)
     (start, places), (ways, form) = jax.tree.flatten(place), jax.tree.flatten(way)
 
@@ -111,11 +112,15 @@ def _batched(xs: Sequence[Any], axes: Sequence[int | None], both: Both) -> tuple
 
 
 def _derivative(primals: Sequence[Any], tangents: Sequence[Any], both: Both) -> tuple[list[Any], list[Any]]:
+    return _jvp(both.seen, primals, tangents)
+
+
+def _jvp(run: Callable[..., list[Any]], primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
     moving = [not isinstance(dx, ad.Zero) for dx in tangents]
 
     def function(*some: Any) -> list[Any]:
         rest = iter(some)
-        return both.seen(*[next(rest) if m else x for x, m in zip(primals, moving, strict=True)])
+        return run(*[next(rest) if m else x for x, m in zip(primals, moving, strict=True)])
 
     some, changes = ([x for x, m in zip(xs, moving, strict=True) if m] for xs in (primals, tangents))
     found, slopes = jax.jvp(function, some, changes)
@@ -128,6 +133,35 @@ def _part(trace: Any, *xs: Any, both: Both) -> list[Any]:
         return both.seen(*xs)
 
 
+def _checkpointed(saveable: Any, unknown: Sequence[bool], there: Sequence[bool], eqn: Any) -> tuple[Any, ...]:
+    """Under `jax.checkpoint`: the value is known where only directions are not; both are found again on the way back."""
+    del saveable
+    both: Both = eqn.params["both"]
+    inputs = [x for x, t in zip(eqn.invars, there, strict=True) if not t and not isinstance(x, Literal)]
+    if any(unknown[: both.start]):
+        return None, eqn, [True] * len(eqn.outvars), [True] * len(eqn.outvars), inputs
+    value = new_jaxpr_eqn(eqn.invars[: both.start], eqn.outvars[: both.values], value_p, {"both": both}, no_effects)
+    changes = len(eqn.outvars) - both.values
+    return value, eqn, [*[False] * both.values, *[True] * changes], [True] * len(eqn.outvars), inputs
+
+
+def _value(*xs: Any, both: Both) -> list[Any]:
+    return both.seen(*xs)[: both.values]
+
+
+def _value_batched(xs: Sequence[Any], axes: Sequence[int | None], both: Both) -> tuple[list[Any], list[int]]:
+    found = jax.vmap(partial(_value, both=both), in_axes=tuple(axes))(*xs)
+    return found, [0] * len(found)
+
+
+value_p = Primitive("value_along_no_direction")
+value_p.multiple_results = True
+value_p.def_impl(_value)
+value_p.def_abstract_eval(lambda *xs, both: _avals(*xs, both=both)[: both.values])
+batching.primitive_batchers[value_p] = _value_batched
+ad.primitive_jvps[value_p] = lambda xs, dxs, both: _jvp(partial(_value, both=both), xs, dxs)
+mlir.register_lowering(value_p, mlir.lower_fun(_value))
+
 along_p = Primitive("along")
 along_p.multiple_results = True
 along_p.def_impl(lambda *xs, both: both.seen(*xs))
@@ -135,4 +169,5 @@ along_p.def_abstract_eval(_avals)
 batching.primitive_batchers[along_p] = _batched
 ad.primitive_jvps[along_p] = _derivative
 partial_eval.custom_partial_eval_rules[along_p] = _part
+partial_eval.partial_eval_jaxpr_custom_rules[along_p] = _checkpointed
 mlir.register_lowering(along_p, lambda ctx, *values, both: mlir.lower_fun(both.run)(ctx, *values))

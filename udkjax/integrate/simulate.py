@@ -26,6 +26,7 @@ from udkjax.integrate.projection import Projection
 from udkjax.integrate.simulate_events import Choices, simulate_events
 from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.native.steps import SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -39,7 +40,6 @@ MAX_EVENTS = 64
 # looks at, up to where a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
 # 2e-3 open.
 DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-3
-SMALLEST_STEP = 100.0  # ulps of the end time: below it time does not advance
 
 
 def simulate(

@@ -5,7 +5,7 @@ import numpy as np
 from udkjax.native.ir import DOUBLE, INT, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
-from udkjax.native.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS, SAME
+from udkjax.native.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS
 
 
 def aim(t: Module, f: Function, s: Lane):
@@ -56,5 +56,5 @@ def next_breakpoint(t: Module, f: Function, s: Lane, here: Value):
             at = s.due
         ahead = at > here + s.smallest
         s.t1 = f.select(ahead, f.min(at - s.smallest * ENDS_BEFORE, s.t1), s.t1)
-        passed = at <= here + s.smallest * SAME
+        passed = at <= here + s.smallest
         s.behind = f.select(passed, f.max(at + s.smallest * BEGINS_BEHIND, s.behind), s.behind)

@@ -11,21 +11,16 @@ from udkjax.native.module import Module
 from udkjax.native.power import power
 from udkjax.native.singular import is_clear, step_around, time_to_singularity
 from udkjax.native.steps import (
-    CAUTIOUS,
-    CUT,
-    DODGE,
-    DODGES,
     DONE,
     EXPECTED,
-    FORESEEN,
     GAP,
     GROW,
-    PAST,
+    NEAREST,
     POINTS,
+    RETRIES,
     RUNNING,
     SAFETY,
     SHRINK,
-    STEEPEST,
     STEP_LIMIT,
     STEP_TOO_SMALL,
     SURE,
@@ -47,9 +42,9 @@ def write_decide(t: Module):
         beside = judged & ~careful & (error < 1.0) & ~is_clear(t, f, s, s.distance) & (s.last < 0.5)
         left = time_to_singularity(t, f, s)
         past = (left > 0.0) & (left < s.h * SURE) & (s.distance * left > s.distance2 * EXPECTED * (s.h - left))
-        beside = beside & ~(past & is_clear(t, f, s, s.distance, PAST))
-        dodge = (doubt | beside) & far_from_here & (s.dodged < float(DODGES)) & ~begin
-        s.where(judged, dodged=where(dodge, s.dodged + 1.0, 0.0))
+        beside = beside & ~(past & (s.distance > NEAREST))
+        dodge = (doubt | beside) & far_from_here & (s.retries < float(RETRIES)) & ~begin
+        s.where(judged, retries=where(dodge, s.retries + 1.0, where(error < 1.0, 0.0, s.retries)))
         doubt = doubt & ~dodge
         s.doubt = where(doubt, yes, 0.0)
         judged = judged & ~doubt
@@ -68,13 +63,13 @@ def write_decide(t: Module):
     order, step = t.method.order, s.t1 - s.T3
     size = where(f.is_finite(error), f.max(error, 1e-30), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
-    foreseen = size * f.min(rate / s.rate, STEEPEST)
+    foreseen = size * (rate / s.rate)  # the error of a step as long, where errors grow as they did (Gustafsson 1994)
     steep = accept & (foreseen > 1.0)
-    aim = where(steep, foreseen * (SAFETY**order / FORESEEN), size)
+    aim = where(steep, foreseen, size)
     factor = power(f, aim, -1.0 / order) * SAFETY
     factor = f.max(factor, where(accept & ~steep, yes, SHRINK))
     factor = f.min(factor, where(accept, f.const(GROW, DOUBLE, f.width), SAFETY))
-    h = where(judged, step * where(dodge, f.const(DODGE, DOUBLE, f.width), factor), s.h)
+    h = where(judged, step * where(dodge, f.const(SAFETY, DOUBLE, f.width), factor), s.h)
     h = where(again, s.h, h)
     failed = judged & ~accept & stepped & ~again
     if t.doubts:
@@ -103,8 +98,8 @@ def write_decide(t: Module):
     s.where(accept & stepped, rate=rate)
     first = s.tried < 0.0
     if t.plan.breaks:
-        h = where(accept & stepped & (step < s.h * CUT), f.max(h, s.h), h)
-        h = where(begun & (tried > 0.0), s.h * CAUTIOUS, h)
+        h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
+        h = where(begun & (tried > 0.0), s.h * SAFETY, h)
         s.where(begun, rate=inf, distance0=inf, distance1=inf)
         s.where(judged, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
         s.where(accept & (s.lands > 0.5), steps=-1.0)

@@ -58,7 +58,7 @@ LANE_NUMBERS = (  # numbers of each lane; `call` and `ways` are addresses
         "rate",
         "code",
         "doubt",
-        "dodged",
+        "retries",
         "tried",
         "accepted",
         "evaluations",

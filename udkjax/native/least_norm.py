@@ -16,7 +16,7 @@ ROUNDING = 1e-15  # cosines of angles between rows that are orthogonal but for r
 def least_norm() -> Function:
     """`least_norm(D (m, n), b (m), x (n), m, n, tol, rank)`: x = D^+ b, and the rank of D. D and b are turned."""
     arguments = [(POINTER, "D"), (POINTER, "b"), (POINTER, "x"), (INT, "m"), (INT, "n"), (DOUBLE, "tol"), (POINTER, "rank")]
-    f = Function(LEAST_NORM, arguments, rare=True)
+    f = Function(LEAST_NORM, arguments)
     D, b, x, m, n, tol, rank = (f.given[name] for _, name in arguments)
 
     def dot(i: Value, j: Value) -> Value:

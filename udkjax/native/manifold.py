@@ -6,7 +6,7 @@ from typing import Any
 from udkjax.native.ir import DOUBLE, INT, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
-from udkjax.native.steps import FAR, NEWTON_STEPS, NOTHING_LEFT, OUTPUT_STEPS, TURNED, USELESS
+from udkjax.native.steps import FAR, NEWTON_STEPS, OUTPUT_STEPS, USELESS
 
 
 def newton(t: Module, f: Function, s: Lane, steps: int, which: str = "judged"):
@@ -63,8 +63,7 @@ def velocity_tolerance(t: Module, f: Function, s: Lane, name: str) -> Value:
 def project_output(t: Module, f: Function, s: Lane, which: str):
     """Return X q and X v to the manifold, as X q and O v; `violated` is how far they are from it."""
     if t.plan.projected:
-        tolerance = velocity_tolerance(t, f, s, "X v")
-        threshold = f.min(f.max(TURNED / tolerance, NOTHING_LEFT), USELESS)
+        threshold = f.const(USELESS, DOUBLE, f.width)
         if not t.doubts:
             threshold = None
 

@@ -15,7 +15,7 @@ from udkjax.native.program import Place, numbered, write
 from udkjax.native.steps import POINTS
 
 # Once a run, beside singularities, or where a piece may end.
-RARE = ("leave", "solve", "finish_members", "begin", "arrive_carefully", "accelerate_carefully", "equation_terms", "psi_dot")
+RARE = ("leave", "finish_members", "begin", "arrive_carefully", "accelerate_carefully", "equation_terms", "psi_dot")
 
 
 class Module:

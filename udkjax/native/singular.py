@@ -3,12 +3,12 @@
 from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
-from udkjax.native.steps import BEFORE, LONGEST, NEAREST, SHORTEST
+from udkjax.native.steps import BEFORE, NEAREST, SAFETY, SHRINK
 
 
-def is_clear(t: Module, f: Function, s: Lane, distance: Value, rounding: float = BEFORE) -> Value:
+def is_clear(t: Module, f: Function, s: Lane, distance: Value) -> Value:
     """Whether a step as long as the one that is tried may begin so far away from singular configurations."""
-    return (distance > NEAREST) & (distance * distance * distance * s.tolerance > s.h * s.omega * rounding)
+    return (distance > NEAREST) & (distance * distance * distance * s.tolerance > s.h * s.omega * BEFORE)
 
 
 def time_to_singularity(t: Module, f: Function, s: Lane) -> Value:
@@ -21,11 +21,8 @@ def time_to_singularity(t: Module, f: Function, s: Lane) -> Value:
 
 
 def step_around(t: Module, f: Function, s: Lane, left: Value, step: Value, otherwise: Value) -> Value:
-    """In place of a step that failed, one with its nodes far from the singular configuration ahead."""
+    """In place of a step that failed, one that has the configuration ahead in the middle of a wide gap between its nodes."""
     low, high = (float(x) for x in t.method.clearings)
     share = left / step
-    across = left / f.select(share < low, f.const(low, DOUBLE, f.width), high)
-    clear = is_clear(t, f, s, s.distance2 * low * step / left)
-    up_to = f.select((share < 1.0 + low) & clear, left - step * low, step)
-    found = f.select(share < high, across, up_to)
-    return f.select((found > step * SHORTEST) & (found < step * LONGEST), found, otherwise)
+    found = left / f.select(share < low, f.const(low, DOUBLE, f.width), high)
+    return f.select((found > step * SHRINK) & (found < step * SAFETY), found, otherwise)

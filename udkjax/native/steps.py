@@ -1,39 +1,28 @@
 """The numbers that steps are chosen by, for machine code and whatever steps as it does."""
 
-# Of the step's size. With 0.9 every tenth step of an ordinary run is rejected, and most runs take 4 to 15 % more at equal error.
+# The step controller: a step is SAFETY times as long as one whose error would be the tolerance, and between SHRINK and GROW times
+# as long as the one before (the usual bounds). With 0.9 every tenth step of an ordinary run is rejected, and most runs take 4 to
+# 15 % more at equal error. A step behind a breakpoint and one that is tried again for the sake of a pivot are as much shorter.
 SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
-# Where errors grow, a step as long as the one before may be foreseen to fail. It is made so short that its error should be
-# this much of the tolerance, errors growing by this factor at most. At equal error most runs take up to 8 % fewer right-hand
-# sides, those of linkages that swing to and fro 15 %.
-FORESEEN, STEEPEST = 0.5, 100.0
-# Of the step before a breakpoint: the first behind it. The outputs in it have states on one side alone, and so larger errors.
-CAUTIOUS = 0.5
-CUT = 0.9  # of the step that was planned: one less long was cut short
 
-# What a step that failed is shortened to, where it is not known when the configuration is reached; how often in a row.
-DODGE, DODGES = 0.8, 3
-SHORTEST, LONGEST = 0.2, 0.95  # of a step, one that is taken in its place
-# Rounding errors of accelerations are about a unit of rounding over the third power of the distance, in the scene's own units.
-# A step's velocity has a small part of them, which must be less than the tolerance. Where the configuration is still ahead of the
-# end of a step, seven times as far away: close to it are many nodes of the next one, and outputs in a next one that is ten times
-# as long, as after a step that was made shorter, have a hundred times as much of them.
-PAST, BEFORE = 1e-16, 3e-14
-# Elimination trusts no pivot that is closer than 1e-3 (`BRANCH_TOL`), and shorter steps that begin so close would get shorter and
-# shorter: they have no stage where it does.
+# Steps near singular configurations. Distances are the smallest pivot of D D^T relative to its diagonal, as a root.
+RETRIES = 3  # of a step that meets a pivot which elimination must not trust, before it is taken with care
+# Elimination trusts no pivot that is closer than 1e-3 (`BRANCH_TOL`); from here on a step has no stage where it does.
 NEAREST = 1.5e-3
-# Of a step: a configuration that is expected by then lies behind its end, though it is expected a little too early, by up to a
-# tenth of a step. More than the larger of `Method.clearings`. Where it is far away, it may be expected by three tenths too early,
-# and just be ahead of the end: less than this much of the distance that the end should have by then.
+# Rounding errors of accelerations are about a unit of rounding over the third power of the distance, in the scene's own units;
+# what a step's velocity has of them must be less than the tolerance.
+BEFORE = 3e-14
+# Of a step: a configuration that is expected by then lies behind its end, though it is expected a little too early, by up to
+# a tenth of a step. Where it is far away, it may be expected by three tenths too early, and just be ahead of the end: less than
+# this much of the distance that the end should have by then.
 SURE, EXPECTED = 0.85, 0.3
 
-# Breakpoints.
-UNIT = 0.01  # of the smallest step: what times are rounded by
-ENDS_BEFORE, BEGINS_BEHIND = (
-    2 * UNIT,
-    UNIT,
-)  # of the smallest step: how far away from a breakpoint a step ends, and the next one begins
+# Breakpoints: a step ends two units of rounding of the time before one, and the next begins a unit behind it. Those that are
+# nearer to one another than the smallest step count as one.
+SMALLEST_STEP = 100.0  # units of rounding of the end time: below it time does not advance
+UNIT = 1 / SMALLEST_STEP  # of the smallest step
+ENDS_BEFORE, BEGINS_BEHIND = 2 * UNIT, UNIT
 GAP = ENDS_BEFORE + BEGINS_BEHIND
-SAME = 0.5  # of the smallest step: breakpoints that are so close count as one
 
 # Pieces of the state.
 EDGE = 1e-7  # of a step: how long the one across is. What another piece does to a step is the square of the part that is there
@@ -58,11 +47,9 @@ AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one lo
 # less exact than their tolerance says.
 TAKEN_BACK = 1e-3
 
-# A pivot, relative to its row's diagonal entry of D D^T: below are rounding errors; Newton's method corrects those above.
-NOTHING_LEFT = 1e-14
-# Over the pivot: by how much rounding errors turn the velocities that a row allows (rad; up to a third of that in the paper's
-# linkage). Rows of larger pivots than the second are of use to linkages that turn back there, however small the tolerance.
-TURNED, USELESS = 1e-15, 1e-8
+# A pivot, relative to its row's diagonal entry of D D^T: below the first is rounding; rows of outputs whose pivots are below the
+# second, the root of a unit of rounding, stay as they were interpolated: rounding errors would turn their velocities.
+NOTHING_LEFT, USELESS = 1e-14, 1e-8
 
 # Of the rank threshold: what steps with care take for theirs. They begin on the constraint manifold, unless states are not
 # projected, and only those beside singular configurations take it. Rows that count as redundant there and are not leave what they

@@ -1,0 +1,185 @@
+"""Runs by machine code compose with every transformation of JAX, and what is compiled is kept safely on disk."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import udkjax as udk
+from udkjax.native import machine
+
+TS = np.array([0.0, 0.3, 0.6])
+PENDULUM = udk.library.compound_pendulum()
+KNOWN = udk.analyse(PENDULUM)
+INERTIAS = jnp.array([0.3, 0.35, 0.4, 0.45])
+
+
+def angle(inertia, rtol=1e-10):
+    """The angle of the rod after 0.6 s, of its moment of inertia."""
+    mechanism = PENDULUM.with_parameters({"body.rod.inertia": inertia})
+    run = udk.simulate(mechanism, TS, udk.State(PENDULUM.q0, PENDULUM.v0), rtol=rtol, atol=1e-10, throw=False, analysis=KNOWN)
+    return run.q[-1, 0, 2]
+
+
+@pytest.fixture(scope="module")
+def values():
+    """One by one, by compiled programs."""
+    run = jax.jit(angle)
+    return np.array([run(x) for x in INERTIAS])
+
+
+@pytest.fixture(scope="module")
+def slopes():
+    """By differences of eighth order."""
+    weights = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
+    run = jax.jit(lambda x: jax.lax.map(angle, x))
+    return np.array([weights @ np.asarray(run(x + 4e-3 * np.arange(-4, 5))) / 4e-3 for x in INERTIAS])
+
+
+def scanned(xs):
+    return jax.lax.scan(lambda carry, x: (carry, angle(x)), 0.0, xs)[1]
+
+
+WAYS = {
+    "eager": lambda xs: jnp.stack([angle(x) for x in xs]),
+    "vmap": jax.vmap(angle),
+    "jit of vmap": jax.jit(jax.vmap(angle)),
+    "vmap of vmap": lambda xs: jax.vmap(jax.vmap(angle))(xs.reshape(2, 2)).ravel(),
+    "map": lambda xs: jax.lax.map(angle, xs),
+    "scan": jax.jit(scanned),
+    "checkpoint": jax.vmap(jax.checkpoint(angle)),  # pyright: ignore[reportPrivateImportUsage]
+}
+
+
+@pytest.mark.parametrize("run", WAYS.values(), ids=WAYS)
+def test_every_way_gives_the_same_values(run, values):
+    """To rounding; to the last bit where a member runs alone, or in a program of its own."""
+    assert_allclose(run(INERTIAS), values, rtol=0, atol=1e-13)
+
+
+SLOPES = {
+    "jvp": lambda xs: jnp.stack([jax.jvp(angle, (x,), (1.0,))[1] for x in xs]),
+    "grad": jax.vmap(jax.grad(angle)),
+    "jacfwd": lambda xs: jnp.diag(jax.jacfwd(jax.vmap(angle))(xs)),
+    "jacrev": lambda xs: jnp.diag(jax.jacrev(jax.vmap(angle))(xs)),
+    "vmap of jacfwd": jax.vmap(jax.jacfwd(angle)),
+    "grad of map": lambda xs: jax.grad(lambda xs: jnp.sum(jax.lax.map(angle, xs)))(xs),
+    "grad of scan": lambda xs: jax.grad(lambda xs: jnp.sum(scanned(xs)))(xs),
+    "grad of checkpoint": jax.vmap(jax.grad(jax.checkpoint(angle))),  # pyright: ignore[reportPrivateImportUsage]
+}
+
+
+@pytest.mark.parametrize("run", SLOPES.values(), ids=SLOPES)
+def test_every_way_gives_the_same_slopes(run, slopes):
+    assert_allclose(jax.jit(run)(INERTIAS), slopes, rtol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("second", [jax.hessian, lambda f: jax.jacrev(jax.grad(f))], ids=["hessian", "jacrev of grad"])
+def test_second_derivatives_are_those_of_differences(second):
+    slope = jax.jit(jax.grad(angle))
+    expected = (slope(0.41) - slope(0.39)) / 0.02
+    assert_allclose(jax.jit(second(lambda x: angle(x[0])))(jnp.array([0.4]))[0, 0], expected, rtol=1e-3)
+
+
+def test_threads_share_machine_code(values):
+    run = jax.jit(angle)
+    for way in (angle, run):
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(way, [*INERTIAS] * 4))
+        assert_array_equal(np.asarray(found), np.tile(values, 4))
+
+
+def test_a_member_does_not_depend_on_its_neighbours():
+    """To the last bit, beside others, in another lane, and beside one that fails."""
+    run = jax.jit(jax.vmap(angle, (0, 0)))
+    xs, tols = jnp.linspace(0.3, 0.5, 11), jnp.logspace(-4, -10, 11)
+    found = run(xs, tols)
+    assert_array_equal(run(xs[::-1], tols[::-1])[::-1], found)
+    assert_array_equal(run(xs, tols.at[1:].set(1e-3))[0], found[0])
+    broken = run(xs.at[5].set(jnp.nan), tols)
+    assert np.isnan(broken[5])
+    assert_array_equal(np.delete(broken, 5), np.delete(found, 5))
+
+
+SHARDED = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import AxisType, PartitionSpec as P
+from test_composition import INERTIAS, angle
+assert len(jax.devices()) == 2
+mesh = jax.make_mesh((2,), ("members",), axis_types=(AxisType.Auto,))
+run = jax.shard_map(jax.vmap(angle), mesh=mesh, in_specs=P("members"), out_specs=P("members"), check_vma=False)
+slope = jax.shard_map(jax.vmap(jax.grad(angle)), mesh=mesh, in_specs=P("members"), out_specs=P("members"), check_vma=False)
+xs = jnp.concatenate([INERTIAS, INERTIAS + 0.01])
+np.testing.assert_allclose(jax.jit(run)(xs), jax.vmap(angle)(xs), rtol=0, atol=1e-13)
+np.testing.assert_allclose(jax.jit(slope)(xs), jax.vmap(jax.grad(angle))(xs), rtol=1e-9)
+"""
+
+
+def test_devices_run_shards():
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": os.path.dirname(__file__)}
+    subprocess.run([sys.executable, "-c", SHARDED], env=environment, check=True, timeout=300)
+
+
+# --- object code on disk
+
+TEXT = "define void @answer(ptr %x) {\n  store double 4.2e1, ptr %x\n  ret void\n}\n"
+
+
+def answer(text: str = TEXT) -> float:
+    library, x = machine.library(text, ["answer"]), np.zeros(1)
+    machine.function(library["answer"], machine.ctypes.c_void_p)(x.ctypes.data)
+    return float(x[0])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("UDKJAX_CACHE", str(tmp_path))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "spoil", [lambda data: data[:-7], lambda data: b"", lambda data: data[:60] + b"\0" + data[61:], lambda data: b"\0" * 99]
+)
+def test_a_file_that_is_not_whole_is_made_again(folder, spoil):
+    assert answer() == 42.0
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(spoil(whole))
+    assert answer() == 42.0
+    assert file.read_bytes() == whole
+
+
+def test_the_folder_stays_bounded(folder, monkeypatch):
+    monkeypatch.setattr(machine, "KEPT_FILES", 3)
+    for k in range(5):
+        assert answer(TEXT.replace("4.2e1", f"{k}.0")) == k
+    assert len(list(folder.iterdir())) == 3
+
+
+def test_a_folder_that_cannot_be_written_is_no_obstacle(folder, monkeypatch):
+    (folder / "file").write_bytes(b"")
+    monkeypatch.setenv("UDKJAX_CACHE", str(folder / "file" / "cache"))
+    assert answer() == 42.0
+
+
+MANY = """
+from test_composition import TEXT, answer
+for k in range(20):
+    assert answer(TEXT.replace("4.2e1", f"{k}.0")) == k
+"""
+
+
+def test_processes_share_the_folder(folder):
+    """Several make and read the same files at once."""
+    environment = {**os.environ, "UDKJAX_CACHE": str(folder), "PYTHONPATH": os.path.dirname(__file__)}
+    processes = [subprocess.Popen([sys.executable, "-c", MANY], env=environment) for _ in range(2)]
+    assert [p.wait(timeout=300) for p in processes] == [0, 0]
+    assert len(list(folder.iterdir())) == 20
