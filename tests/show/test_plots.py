@@ -110,10 +110,10 @@ TS = np.linspace(0, 1, 5)
 
 def test_singular_values_and_their_threshold(axes):
     values = np.array([3.0, 2.0, 1.0, 1e-17]) * np.ones((5, 1))
-    assert plots.draw_singular_values(axes, TS, values, rank_tol=1e-4, least=2) is axes
+    assert plots.draw_singular_values(axes, TS, values, rank_tol=1e-4, least=2, unit="kg$^{-1/2}$") is axes
     np.testing.assert_allclose(line(axes, "σ4")[:, 1], 1e-17)
     np.testing.assert_allclose(line(axes, "threshold")[:, 1], 3e-4)
-    assert axes.get_yscale() == "log" and "kg" in axes.get_ylabel() and axes.get_xlabel() == "time (s)"
+    assert axes.get_yscale() == "log" and axes.get_ylabel() == "singular value (kg$^{-1/2}$)" and axes.get_xlabel() == "time (s)"
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["σ3", "σ4", "threshold"]
 
 
@@ -157,7 +157,8 @@ def test_heat_maps_and_failure_maps(axes, sweep_data):
 
 def test_reactions_and_their_uniqueness(axes):
     load = np.array([[3.0, 4.0, 0.0]] * 5)
-    assert plots.draw_reactions(axes, TS, {"A": {"link": load}, "B": {"link": 2 * load}}, {"A": True, "B": False}) is axes
+    unique = {"A": {"link": load >= 0}, "B": {"link": load > 3}}
+    assert plots.draw_reactions(axes, TS, {"A": {"link": load}, "B": {"link": 2 * load}}, unique) is axes
     np.testing.assert_allclose(line(axes, "A")[:, 1], 5)
     np.testing.assert_allclose(line(axes, "B (not unique)")[:, 1], 10)
     assert axes.lines[1].get_linestyle() == ":" and axes.get_ylabel() == "force of a joint (N)"

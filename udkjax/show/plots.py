@@ -37,7 +37,7 @@ __all__ = ["COLOURS", "apart", "attachments", "legend", "outline", "placed", "tr
 
 WIDE = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
 ROUNDING = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
-SMALLEST = 1e-18  # kg^(-1/2): singular values below it are drawn as it
+SMALLEST = 1e-18  # singular values below it are drawn as it
 RANK_SHIFT = 0.06  # between the ranks of several runs
 LINEAR = 1e-6  # m, rad: a displacement of a mode at which its points move as its derivative says
 SAME_ANGLE = 1e-6  # rad: curves closer than the width of a line share it
@@ -129,9 +129,12 @@ def draw_energy(axes: Axes, ts: ArrayLike, parts: Energy) -> Axes:
 
 
 def draw_singular_values(
-    axes: Axes, ts: ArrayLike, values: Float[ArrayLike, "T k"], rank_tol: float | None = None, least: int = 3
+    axes: Axes, ts: ArrayLike, values: Float[ArrayLike, "T k"], rank_tol: float | None = None, least: int = 3, unit: str = ""
 ) -> Axes:
-    """Draw the `least` smallest singular values of D in colours and the others in grey; dashed: rank_tol times the largest."""
+    """Draw the `least` smallest singular values in colours and the others in grey; dashed: rank_tol times the largest.
+
+    `unit`: that of D is kg$^{-1/2}$; those of `udk.singular_values` have none.
+    """
     values = np.maximum(np.asarray(values, float), SMALLEST)
     count = values.shape[1]
     first = max(count - least, 0)
@@ -142,7 +145,7 @@ def draw_singular_values(
         axes.semilogy(ts, values[:, k], style, color=COLOURS[(k - first) % len(COLOURS)], lw=1.3, label=f"σ{k + 1}")
     if rank_tol is not None:
         axes.semilogy(ts, rank_tol * values[:, 0], color="black", lw=0.8, ls=(0, (6, 3)), label="threshold")
-    axes.set(xlabel="time (s)", ylabel="singular value of D (kg$^{-1/2}$)")
+    axes.set(xlabel="time (s)", ylabel=f"singular value ({unit})" if unit else "singular value")
     legend(axes)
     return plain(axes)
 
@@ -197,7 +200,7 @@ def draw_reactions(
     axes: Axes,
     ts: ArrayLike,
     loads: Mapping[str, Mapping[str, ArrayLike]],
-    unique: Mapping[str, bool] | None = None,
+    unique: Mapping[str, Mapping[str, ArrayLike]] | None = None,
 ) -> Axes:
     """Draw the size of the force of each joint over time.
 
@@ -205,12 +208,13 @@ def draw_reactions(
         axes: where.
         ts: times (s).
         loads: what `udk.reactions` returned: by joint and body, force x, force y (N) and torque (N m).
-        unique: of joints by name, whether the equations decide their force. Of those that are not unique, which are dotted,
-            the share of least norm is drawn: other shares would move the mechanism alike.
+        unique: what `udk.unique_reactions` returned. Of forces that are not unique at all times, which are dotted, the share of
+            least norm is drawn: other shares would move the mechanism alike.
     """
     for k, (joint, bodies) in enumerate(loads.items()):
-        force = np.linalg.norm(np.asarray(next(iter(bodies.values())), float)[:, :2], axis=1)
-        known = unique is None or unique.get(joint, True)
+        body, load = next(iter(bodies.items()))
+        force = np.linalg.norm(np.asarray(load, float)[:, :2], axis=1)
+        known = unique is None or bool(np.asarray(unique[joint][body])[:, :2].all())
         style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "ls": (DASHES[k % 3] if known else ":")}
         axes.plot(np.asarray(ts), force, lw=1.3, label=joint if known else f"{joint} (not unique)", **style)
     axes.set(xlabel="time (s)", ylabel="force of a joint (N)")

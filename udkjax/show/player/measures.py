@@ -5,15 +5,15 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.equations import analyse, energy, reactions, violation
-from udkjax.equations.scales import rank_tolerance
-from udkjax.equations.udwadia_kalaba import D
+from udkjax.equations import Analysis, analyse, energy, reactions, singular_values, violation
+from udkjax.equations.determinacy import RANK_TOL
 from udkjax.scene import GROUND, Mechanism
 
-ROUNDING = 1e-17  # m, rad: below any violation; drawn in place of zero, which has no logarithm
+ROUNDING = 1e-17  # below any violation (m, rad) or singular value but zero; drawn in place of zero, which has no logarithm
 
 
 class Measure(NamedTuple):
@@ -50,32 +50,24 @@ def measures_of(mechanism: Mechanism, solution: Any, wanted: Sequence[str] | Map
     return found
 
 
-def singular_values(mechanism: Mechanism, solution: Any) -> Float[np.ndarray, "T k"]:
-    """Return the singular values of D = Psi_q M^(-1/2) at each output time, the largest first (kg^(-1/2)).
-
-    Rows in radians are weighted by the characteristic length, so that all have one unit; k is the lesser of rows and coordinates.
-    """
-    weights = analyse(mechanism).scales.weights
-    if len(weights) == 0:
-        return np.zeros((len(solution.ts), 0))
-    matrices = _matrices(mechanism.without_origin, solution.ts, solution.q, weights)
-    finite = np.isfinite(matrices).all((1, 2))
-    found = np.full((len(matrices), min(matrices.shape[1:])), np.nan)
-    found[finite] = np.linalg.svd(matrices[finite], compute_uv=False)
-    return found
+def singular_values_over_time(mechanism: Mechanism, solution: Any) -> Float[np.ndarray, "T k"]:
+    """Return the singular values of the scaled Jacobian (`udkjax.singular_values`) at each output time, the largest first."""
+    values = np.array(_singular_values(mechanism, analyse(mechanism), solution.ts, solution.q))
+    values[~np.isfinite(np.asarray(solution.q)).all((1, 2))] = np.nan
+    return values
 
 
-def rank(mechanism: Mechanism, values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
-    """Return how many `singular_values` are above the package's rank tolerance times the largest; NaN where they are NaN."""
+def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
+    """Return how many singular values are above `RANK_TOL` of the largest, in each row; not a number where these are none."""
     if values.shape[1] == 0:
         return np.zeros(len(values))
-    count = (values > float(rank_tolerance(mechanism)) * values[:, :1]).sum(axis=1).astype(float)
+    count = (values > RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
     return np.where(np.isfinite(values[:, 0]), count, np.nan)
 
 
 @eqx.filter_jit
-def _matrices(mechanism: Mechanism, ts: Any, q: Any, weights: Any) -> Any:
-    return jax.vmap(lambda t, q: D(mechanism, t, q, weights))(ts, q)
+def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: Any, q: Any) -> Any:
+    return jax.vmap(lambda t, q: singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
 
 
 def _violation(mechanism: Mechanism, solution: Any) -> list[Measure]:
@@ -95,13 +87,12 @@ def _energy(mechanism: Mechanism, solution: Any) -> list[Measure]:
 
 
 def _rank(mechanism: Mechanism, solution: Any) -> list[Measure]:
-    values = singular_values(mechanism, solution)
-    count = rank(mechanism, values)
+    values = singular_values_over_time(mechanism, solution)
+    count = rank_of(values)
     found = [Measure("rank", "", count)]
     usual = int(np.nanmax(count, initial=0))
     if usual:
-        least = np.maximum(values[:, usual - 1], 1e-18)
-        found.append(Measure(f"singular value {usual}", "kg^-1/2", least, log=True))
+        found.append(Measure(f"singular value {usual}", "", np.maximum(values[:, usual - 1], ROUNDING), log=True))
     return found
 
 

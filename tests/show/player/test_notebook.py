@@ -1,0 +1,107 @@
+"""The widget in JupyterLab, in headless Chromium: it appears, plays, and follows Python."""
+
+import json
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+CELLS = (
+    "import sys; sys.path.insert(0, {root!r})\n"
+    "import numpy as np, udkjax as udk\n"
+    "from tests.show.player.conftest import slider_crank_run\n"
+    "run = slider_crank_run(np.linspace(0, 2, 81))\n"
+    "widget = udk.animate(udk.library.slider_crank(), run, measures=()).widget()\n"
+    "widget",
+    "udk.animate(udk.library.slider_crank(), run, measures=())",
+    "widget.time = 1.25",
+    "widget.time",
+)
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """JupyterLab with a notebook, and its address."""
+    pytest.importorskip("jupyterlab", reason="jupyterlab is not installed: pip install 'udkjax[browser]'")
+    pytest.importorskip("anywidget", reason="anywidget is not installed: pip install 'udkjax[notebook]'")
+    folder = tmp_path_factory.mktemp("lab")
+    root = str(Path(__file__).parents[3])
+    cells = [
+        {
+            "cell_type": "code",
+            "id": f"c{k}",
+            "metadata": {},
+            "outputs": [],
+            "execution_count": None,
+            "source": text.format(root=root),
+        }
+        for k, text in enumerate(CELLS)
+    ]
+    kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
+    (folder / "motion.ipynb").write_text(json.dumps({"nbformat": 4, "nbformat_minor": 5, "metadata": kernel, "cells": cells}))
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        port = found.getsockname()[1]
+    options = [
+        "--no-browser",
+        "--allow-root",
+        "--IdentityProvider.token=",
+        f"--ServerApp.port={port}",
+        "--ServerApp.ip=127.0.0.1",
+    ]
+    options += [f"--ServerApp.root_dir={folder}"]
+    log = (folder / "log").open("w")
+    server = subprocess.Popen([sys.executable, "-m", "jupyterlab", *options], cwd=folder, stdout=log, stderr=log)
+    address = f"http://127.0.0.1:{port}"
+    try:
+        for _ in range(120):
+            try:
+                urllib.request.urlopen(f"{address}/api/status", timeout=2)
+                break
+            except OSError:
+                time.sleep(0.5)
+        else:
+            pytest.fail(f"JupyterLab did not start: {(folder / 'log').read_text()[-2000:]}")
+        yield address
+    finally:
+        server.terminate()
+        server.wait(20)
+        log.close()
+
+
+def test_the_widget_plays_in_jupyterlab(browser, lab):
+    page = browser.new_page(viewport={"width": 1200, "height": 1000})
+    problems = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.goto(f"{lab}/doc/tree/motion.ipynb")
+    page.locator(".jp-Notebook").wait_for(timeout=60_000)
+    page.get_by_text("| Idle").wait_for(timeout=60_000)  # the kernel is there
+
+    def run_cell(k):
+        page.locator(".jp-Notebook .jp-CodeCell").nth(k).locator(".cm-content").click()
+        page.keyboard.press("Control+Enter")
+
+    run_cell(0)
+    widget = page.locator(".jp-Notebook .jp-CodeCell").nth(0)
+    widget.get_by_role("button", name="play").wait_for(timeout=90_000)
+    player = "[...document.querySelectorAll('*')].find(e => e.player).player"
+    assert page.evaluate(f"{player}.time") == 0
+    widget.get_by_role("button", name="play").click()
+    page.wait_for_function(f"{player}.time > 0.1")
+    widget.get_by_role("button", name="pause").click()
+    run_cell(2)  # Python moves the player
+    page.wait_for_function(f"Math.abs({player}.time - 1.25) < 1e-9")
+    page.evaluate(f"{player}.seek(0.75)")  # and the player tells Python
+    page.wait_for_timeout(500)
+    run_cell(3)
+    page.get_by_text("0.75", exact=True).wait_for(timeout=20_000)
+    run_cell(1)  # an animation shows itself as a widget, too
+    page.wait_for_function("[...document.querySelectorAll('*')].filter(e => e.player).length === 2", timeout=60_000)
+    assert not [problem for problem in problems if "player" in problem.lower()], problems
+    page.close()
