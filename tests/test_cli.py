@@ -14,7 +14,7 @@ from tests.command_line import udkjax
 from udkjax.cli import COMMANDS, common
 from udkjax.extras import MissingExtraError
 from udkjax.integrate import Result
-from udkjax.study.sweep.cluster import ClusterError
+from udkjax.study.sweep.executors import ClusterError
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PARALLELOGRAM = EXAMPLES / "parallelogram.toml"

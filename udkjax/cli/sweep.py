@@ -55,7 +55,7 @@ def sweep(
     mech, text = load(scene)
     arguments = _arguments(grid)
 
-    from udkjax.study.sweep.cluster import ClusterError
+    from udkjax.study.sweep.executors import ClusterError
     from udkjax.study.sweep.layout import SweepError
     from udkjax.study.sweep.store import StoreError
 
@@ -132,7 +132,7 @@ def _client(engine: str, scheduler: str | None) -> Iterator[Any]:
     if engine != "dask" and scheduler is None:
         yield None
         return
-    from udkjax.study.sweep.cluster import started
+    from udkjax.study.sweep.executors import started
 
     with started(scheduler) as client:
         yield client

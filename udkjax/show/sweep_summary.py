@@ -8,9 +8,10 @@ import numpy as np
 from udkjax.integrate import Result
 from udkjax.show.summary import plural, table
 from udkjax.show.sweep_figures import RESULT, scalars
+from udkjax.study.sweep.chunk import bytes_per_member, variables_of
 from udkjax.study.sweep.dry_run import Estimate
 from udkjax.study.sweep.plan import Plan
-from udkjax.study.sweep.progress import duration
+from udkjax.study.sweep.sweep_progress import duration
 
 
 def estimate_summary(plan: Plan, estimate: Estimate) -> str:
@@ -20,7 +21,7 @@ def estimate_summary(plan: Plan, estimate: Estimate) -> str:
     computing, compiling = duration(estimate.computing), duration(estimate.compiling)
     lines = {
         "members": f"{estimate.members}: {shape}",
-        "kept of each": f"{plan.bytes_per_member} bytes: {', '.join(plan.variables)}",
+        "kept of each": f"{bytes_per_member(plan)} bytes: {', '.join(variables_of(plan))}",
         "programs": plural(estimate.groups, "program") + tried,
         "chunks": f"{estimate.chunks}",
         "dataset": size(estimate.kept),

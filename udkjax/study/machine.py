@@ -1,8 +1,10 @@
-"""What a time was measured on."""
+"""The machine: how many programs it runs side by side, and what a time was measured on."""
 
 import os
 import platform
 from pathlib import Path
+
+import jax
 
 CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
 MEMBERS = 64  # of a chunk, on them
@@ -11,6 +13,15 @@ MEMBERS = 64  # of a chunk, on them
 def cores() -> int:
     """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def concurrent_chunks() -> int:
+    """How many chunks are computed at a time.
+
+    One CPU device runs as many programs side by side as it has cores; several devices share each chunk.
+    """
+    devices = jax.local_devices()
+    return cores() if len(devices) == 1 and devices[0].platform in CHUNKED else 1
 
 
 def machine() -> str:

@@ -1,13 +1,12 @@
 """How far a long computation is, reported the same way by every function that has a `progress` argument."""
 
-import shutil
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, TextIO, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 PATIENCE = 2.0  # s: a computation that takes no longer needs no line to say so
 TERMINAL_INTERVAL, FILE_INTERVAL = 0.2, 15.0  # s between two states of a line that is written over, and of one that cannot be
@@ -132,34 +131,3 @@ class _Line:
         with self.lock:
             if self.bar is not None:
                 self.bar.close()
-
-
-# --- what sweeps still use
-
-OFTEN = 0.2  # s between two looks of what is written over
-QUIET = 15.0  # s between lines where they cannot be written over
-
-
-class Line:
-    """A line of a stream (default: standard error) that says how far something is."""
-
-    def __init__(self, stream: TextIO | None = None):
-        self.stream = sys.stderr if stream is None else stream
-        self.notebook = type(self.stream).__module__.startswith("ipykernel")
-        self.over = self.notebook or self.stream.isatty()
-        self._said, self._width = float("-inf"), 0
-
-    def due(self, often: float = OFTEN) -> bool:
-        """Whether it is time to say something again."""
-        return time.monotonic() - self._said >= (often if self.over else QUIET)
-
-    def say(self, text: str, last: bool = False) -> None:
-        """Say something in place of what was said before; `last`: nothing more will be."""
-        self._said = time.monotonic()
-        if not self.over:
-            print(text, file=self.stream, flush=True)
-            return
-        if not self.notebook:  # a line that goes on in the next cannot be written over
-            text = text[: shutil.get_terminal_size().columns - 1]
-        print(f"\r{text:<{self._width}}", end="\n" if last else "", file=self.stream, flush=True)
-        self._width = len(text)

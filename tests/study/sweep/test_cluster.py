@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from udkjax.extras import MissingExtraError
-from udkjax.study.sweep import cluster
-from udkjax.study.sweep.cluster import ClusterError, dask
+from udkjax.study.sweep import executors as cluster
+from udkjax.study.sweep.executors import ClusterError, dask
 from udkjax.study.sweep.plan import Chunk
 
 dask_config = pytest.importorskip("dask.config", reason="dask is not installed: pip install 'udkjax[dask]'")

@@ -5,8 +5,8 @@ import sys
 
 import numpy as np
 
-from udkjax.study.sweep import disk
-from udkjax.study.sweep.disk import packed, unpacked, write_whole
+from udkjax.study.sweep import store as disk
+from udkjax.study.sweep.store import packed, unpacked, write_whole
 
 
 def test_an_archive_with_any_bit_changed_or_cut_off_is_none(tmp_path):

@@ -10,7 +10,7 @@ from udkjax.study.sweep import dry_run
 from udkjax.study.sweep.dry_run import estimate
 
 GROUPS = [SimpleNamespace(index=k, members=np.arange(1000 * k, 1000 * k + 1000)) for k in range(5)]
-PLAN: Any = SimpleNamespace(size=5000, bytes_per_member=100, groups=GROUPS, chunks=lambda memory: [None] * 7)
+PLAN: Any = SimpleNamespace(size=5000, groups=GROUPS)
 
 
 @pytest.fixture
@@ -27,7 +27,9 @@ def tried(monkeypatch):
     monkeypatch.setattr(dry_run, "run", run)
     monkeypatch.setattr(dry_run, "program", lambda plan, group: SimpleNamespace(piece=64, lanes=64, devices=[None]))
     monkeypatch.setattr(dry_run, "time", SimpleNamespace(perf_counter=lambda: clock.now))
-    monkeypatch.setattr(dry_run, "workers", lambda: 2)
+    monkeypatch.setattr(dry_run, "concurrent_chunks", lambda: 2)
+    monkeypatch.setattr(dry_run, "bytes_per_member", lambda plan: 100)
+    monkeypatch.setattr(dry_run, "cut_chunks", lambda plan, memory: [None] * 7)
     return seen
 
 

@@ -9,8 +9,7 @@ from scipy import stats
 
 import udkjax as udk
 from udkjax.study.quantities import Angle, Length, Scaled
-from udkjax.study.sweep.axes import Axis, Zipped
-from udkjax.study.sweep.designs import LatinHypercube, Sobol
+from udkjax.study.sweep.axes import Axis, LatinHypercube, Sobol, Zipped
 from udkjax.study.sweep.grid import load_grid, loads_grid
 from udkjax.study.sweep.reading import GridError
 

@@ -8,7 +8,8 @@ import scipy.stats
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.sweep.designs import spread
+from udkjax.study.sweep.axes import spread
+from udkjax.study.sweep.fingerprint import fingerprint
 from udkjax.study.sweep.layout import laid_out
 from udkjax.study.sweep.plan import planned
 
@@ -119,25 +120,25 @@ def test_gains_are_varied_of_a_stabilization_that_has_some(linkage):
 
 
 def test_the_fingerprint_tells_what_decides_the_results(linkage):
-    def fingerprint(values=(1e-4, 1e-6), measure: object = "final", mechanism=linkage, factor=2.0, **settings):
+    def of(values=(1e-4, 1e-6), measure: object = "final", mechanism=linkage, factor=2.0, **settings):
         length = udk.Axis([1.0], of=lambda m, x: m.with_parameters({"body.coupler.mass": factor * x}))
-        return planned(mechanism, {"rtol": values, "x": length}, TS, measure, **settings).fingerprint()
+        return fingerprint(planned(mechanism, {"rtol": values, "x": length}, TS, measure, **settings))
 
     def last(power):
         return {"angle": lambda m, s: s.q[-1, 0, 2] ** power}
 
-    base = fingerprint()
-    assert fingerprint() == base
-    assert fingerprint(measure=last(2)) == fingerprint(measure=last(2)) != fingerprint(measure=last(3))
+    base = of()
+    assert of() == base
+    assert of(measure=last(2)) == of(measure=last(2)) != of(measure=last(3))
     others = [
-        fingerprint((1e-4, 1e-7)),
-        fingerprint(measure="counts"),
-        fingerprint(mechanism=udk.library.parallelogram(mass=1.5)),
-        fingerprint(factor=3.0),
-        fingerprint(atol=1e-9),
-        fingerprint(method=udk.SVD()),
-        fingerprint(method=udk.SVD(1e-8)),
-        fingerprint(stabilization=udk.Baumgarte(2.0)),
-        fingerprint(derivatives=["body.link1.mass"]),
+        of((1e-4, 1e-7)),
+        of(measure="counts"),
+        of(mechanism=udk.library.parallelogram(mass=1.5)),
+        of(factor=3.0),
+        of(atol=1e-9),
+        of(method=udk.SVD()),
+        of(method=udk.SVD(1e-8)),
+        of(stabilization=udk.Baumgarte(2.0)),
+        of(derivatives=["body.link1.mass"]),
     ]
     assert all(base != other for other in others) and all(a != b for a, b in pairwise(others))

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from udkjax.study.sweep import disk, store
+from udkjax.study.sweep import store
 from udkjax.study.sweep.plan import Chunk
 from udkjax.study.sweep.store import Memory, Store, StoreError, opened
 
@@ -151,7 +151,7 @@ def test_two_processes_do_not_write_the_same_sweep(tmp_path):
 def test_what_was_being_written_when_the_process_died_is_removed(tmp_path):
     with Store(tmp_path, FINGERPRINT) as kept:
         kept.write(CHUNKS[0], data(CHUNKS[0]))
-    torn = tmp_path / "chunks" / f"000001-abc.npz.123{disk.UNFINISHED}"
+    torn = tmp_path / "chunks" / f"000001-abc.npz.123{store.UNFINISHED}"
     torn.write_bytes(b"half")
     with Store(tmp_path, FINGERPRINT) as kept:
         assert not torn.exists()

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.study.sweep.chunk import program, run
-from udkjax.study.sweep.cutting import SECONDS, _cut, lane_steps
+from udkjax.study.sweep.cutting import SECONDS, _cut, cut_chunks, lane_steps
 from udkjax.study.sweep.dataset import NOT_COMPUTED, assemble
 from udkjax.study.sweep.plan import planned
 
@@ -46,7 +46,7 @@ def plan(pendulum, reference):
 
 @pytest.fixture(scope="module")
 def finished(plan):
-    return [(chunk.members, run(plan, chunk)) for chunk in plan.chunks()]
+    return [(chunk.members, run(plan, chunk)) for chunk in cut_chunks(plan)]
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_what_is_not_finished_is_marked(plan, finished):
 
 def test_copies_of_a_plan_share_its_program(plan, finished, compilations):
     copy = pickle.loads(pickle.dumps(plan))
-    chunk = plan.chunks()[0]
+    chunk = cut_chunks(plan)[0]
     again = {}
     assert compilations(lambda: again.update(run(copy, chunk))) == []
     for name, values in finished[0][1].items():
@@ -126,7 +126,7 @@ def test_chunks_are_cut_by_work_and_by_memory():
 
 
 def test_all_members_are_in_one_chunk_each(plan):
-    chunks = plan.chunks(memory=1)
+    chunks = cut_chunks(plan, memory=1)
     assert sorted(itertools.chain(*(chunk.members.tolist() for chunk in chunks))) == list(range(plan.size))
     assert [chunk.index for chunk in chunks] == list(range(len(chunks)))
 

@@ -15,6 +15,7 @@ import udkjax as udk
 from udkjax.integrate.assembly import close
 from udkjax.study.exact import exact_coordinates
 from udkjax.study.sweep.chunk import program, run
+from udkjax.study.sweep.cutting import cut_chunks
 from udkjax.study.sweep.plan import planned
 
 LINKS = ("link1", "link2", "link3")
@@ -22,12 +23,13 @@ DEVICES = 8
 SCRIPT = """
 import re, sys
 import jax, numpy as np, udkjax as udk
+from udkjax.study.sweep.cutting import cut_chunks
 from udkjax.study.sweep.chunk import program, run
 from udkjax.study.sweep.plan import planned
 
 axes = {"mass": udk.Axis(np.linspace(1.0, 3.0, 20), of="body.rod.mass"), "rtol": np.geomspace(1e-10, 1e-4, 30)}
 plan = planned(udk.library.compound_pendulum(), axes, [0.0, 3.0])
-parts = [{"members": chunk.members, **run(plan, chunk)} for chunk in plan.chunks()]
+parts = [{"members": chunk.members, **run(plan, chunk)} for chunk in cut_chunks(plan)]
 found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 np.savez(sys.argv[1], **{name: values[np.argsort(found["members"])] for name, values in found.items()})
 own = program(plan, plan.groups[0])
@@ -109,7 +111,7 @@ def spread():
 @pytest.mark.slow
 def test_lanes_are_busy_and_a_sweep_takes_what_a_plain_batch_takes(spread):
     """Tolerances from 1e-3 to 1e-10: in the order of the design, less than half of the lanes are busy."""
-    own, chunks = program(spread, spread.groups[0]), spread.chunks()
+    own, chunks = program(spread, spread.groups[0]), cut_chunks(spread)
     members = np.concatenate([chunk.members for chunk in chunks])
     steps = np.concatenate([run(spread, chunk)["steps"] for chunk in chunks]).reshape(-1, 64)
     unordered = np.empty(spread.size)
@@ -141,7 +143,7 @@ def test_lanes_are_busy_and_a_sweep_takes_what_a_plain_batch_takes(spread):
 
 @pytest.mark.slow
 def test_members_of_a_random_design_are_as_by_themselves(spread):
-    (chunk, *_) = spread.chunks(memory=1)
+    (chunk, *_) = cut_chunks(spread, memory=1)
     found = run(spread, chunk)
     mass, length, angle, tol = (column.values for column in spread.columns)
     for k, member in enumerate(chunk.members[:3].tolist()):

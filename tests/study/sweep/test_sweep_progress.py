@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from udkjax.integrate import Result
-from udkjax.study.sweep import progress
+from udkjax.study.progress import reporting
+from udkjax.study.sweep import sweep_progress
 from udkjax.study.sweep.plan import Chunk
-from udkjax.study.sweep.progress import Status, Watch, duration, teller
+from udkjax.study.sweep.sweep_progress import SweepProgress, Watch, duration
 
 CHUNKS = [Chunk(k, 0, np.arange(4 * k, 4 * k + 4), 2.0 if k == 3 else 1.0) for k in range(5)]
 
@@ -26,21 +27,24 @@ def clock(monkeypatch):
             return self.now
 
     clock = Clock()
-    monkeypatch.setattr(progress, "time", clock)
-    monkeypatch.setattr("udkjax.study.progress.time", clock)
+    monkeypatch.setattr(sweep_progress, "time", clock)
     return clock
 
 
 def test_a_sweep_is_followed(clock):
-    seen: list[Status] = []
+    seen: list[SweepProgress] = []
     watch = Watch(20, CHUNKS[1:], seen.append, [0, 0, Result.drift, 0])
-    assert seen[-1] == Status(20, 4, 0.0, None, None, {"drift": 1})
+    assert seen[-1] == SweepProgress("sweep", 4, 20, 0.0, "failed: 1 drift", failures={"drift": 1})
     clock.now += 8  # of which most went into a compilation
     watch(CHUNKS[2], {**result(Result.step_limit), "steps": np.array([3, 9, 7, 1])}, 7.5)
-    assert seen[-1] == Status(20, 8, 8.0, 0.5, None, {"drift": 1, "step_limit": 1}, (9, 9), (2, 7.5))
+    state = seen[-1]
+    assert (state.done, state.seconds, state.rate, state.left) == (8, 8.0, 0.5, None)
+    assert (state.failures, state.slowest, state.slowest_chunk) == ({"drift": 1, "step_limit": 1}, (9, 9), (2, 7.5))
     clock.now += 2
     watch(CHUNKS[1], {**result(Result.drift), "steps": np.array([3, 9, 7, 1])}, 2.0)
-    assert seen[-1] == Status(20, 12, 10.0, 0.8, 6.0, {"drift": 2, "step_limit": 1}, (9, 9), (2, 7.5))
+    state = seen[-1]
+    assert (state.done, state.seconds, state.rate, state.left) == (12, 10.0, 0.8, 6.0)
+    assert (state.failures, state.slowest, state.slowest_chunk) == ({"drift": 2, "step_limit": 1}, (9, 9), (2, 7.5))
     clock.now += 4
     watch(CHUNKS[4], {**result(), "steps": np.array([3, 9, 7, 10])})
     assert seen[-1].left == 6.0 and seen[-1].slowest == (19, 10) and seen[-1].slowest_chunk == (2, 7.5)
@@ -53,25 +57,14 @@ def test_a_sweep_is_followed(clock):
     assert str(seen[-1]).startswith("20 of 20 members (100 %); 1.07 a second; 15 s; failed")
 
 
-@pytest.mark.parametrize(("terminal", "lines", "shown"), [(True, 1, 5), (False, 3, 3)])
-def test_it_is_shown_on_one_line_of_a_terminal_and_on_a_few_of_a_log(clock, streams, terminal, lines, shown):
-    stream = streams(terminal)
-    watch = Watch(20, CHUNKS, teller(None, stream))
-    for chunk in CHUNKS:
-        clock.now += 10
-        watch(chunk, result())
-    text = "".join(stream)
-    assert text.count("\n") == lines and text.count(" of 20 members") == shown
-    assert text.split("\r")[-1].splitlines()[-1].startswith("20 of 20 members")
-
-
-def test_nothing_is_said_where_it_is_asked_for_or_soon_over(clock, capsys):
-    for progress_, pause in ((False, 10.0), (None, 0.1)):
-        watch = Watch(20, CHUNKS, teller(progress_))
-        for chunk in CHUNKS:
-            clock.now += pause
-            watch(chunk, result())
-    assert capsys.readouterr() == ("", "")
+def test_it_is_reported_as_everything_else_is(capsys):
+    for option, says in ((False, False), (True, True)):
+        with reporting(option, 20, "sweep") as report:
+            watch = Watch(20, CHUNKS, report.show)
+            for chunk in CHUNKS:
+                watch(chunk, result(Result.drift))
+        out, err = capsys.readouterr()
+        assert out == "" and ("sweep: 100%" in err and "failed: 5 drift" in err) == says
 
 
 def test_a_duration_in_words():

@@ -7,7 +7,8 @@ are, nor on how a sweep is cut into chunks.
 
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from jaxtyping import Int
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.solution import Result
 from udkjax.study.machine import CHUNKED, MEMBERS
+from udkjax.study.sweep.layout import SweepError
 from udkjax.study.sweep.measures import Named, guessed
 from udkjax.study.sweep.member import END, RESULT, STEPS, Kept, Recipe
 from udkjax.study.sweep.plan import Chunk, Group, Plan, Variable
@@ -198,3 +200,26 @@ def _per(units: str, by: str, plan: Plan) -> str:
     below = next((column.units for column in plan.columns if column.name == by), None)
     below = units_of(plan.mechanism, by) if below is None else below
     return "" if not units or not below or "," in units else f"{units}/({below})"
+
+
+@lru_cache(maxsize=8)
+def variables_of(plan: Plan) -> Mapping[str, Variable]:
+    """What is stored of each member: names, dimensions, units. `result`, `end_time` and `steps` are always among them.
+
+    Where mechanisms have other bodies, the dimension "body" has all of them, and any other is as long as the longest.
+    """
+    found: dict[str, Variable] = {}
+    for group in plan.groups:
+        for name, variable in described(plan, group).items():
+            other = found.setdefault(name, variable)
+            if len(other.shape) != len(variable.shape):
+                raise SweepError([f"measure {name!r} has {other.shape} entries for some members and {variable.shape} for others"])
+            longest = map(max, other.shape, variable.shape)
+            shape = tuple(len(plan.bodies) if d == "body" else size for d, size in zip(variable.dims, longest, strict=True))
+            found[name] = Variable(other.dims, shape, other.dtype, other.units, other.long_name)
+    return found
+
+
+def bytes_per_member(plan: Plan) -> int:
+    """What the stored variables of one member take."""
+    return sum(int(np.prod(v.shape)) * v.dtype.itemsize for v in variables_of(plan).values())

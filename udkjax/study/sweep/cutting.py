@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udkjax.pinv import Auto, Elimination
-from udkjax.study.sweep.chunk import program
-from udkjax.study.sweep.local import workers
+from udkjax.study.machine import concurrent_chunks
+from udkjax.study.sweep.chunk import bytes_per_member, program
 from udkjax.study.sweep.member import STEPS
 from udkjax.study.sweep.plan import Chunk, Group, Plan
 
+MEMORY = 2**30  # bytes that members in computation take at most, by default
 PILOT = 256  # members of a sample: 4 for each coefficient of a polynomial of second degree in nine axes
 WORTH = 8  # a sample is run of groups that are so many times as large
 SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
@@ -27,16 +28,19 @@ STEPS_GUESSED = 300.0
 WIDE = 8.0  # an axis of positive values that differ by more than this factor is taken by its logarithm
 
 
-def chunks(plan: Plan, memory: int) -> list[Chunk]:
-    """Return the chunks of a plan; see `Plan.chunks`."""
+def cut_chunks(plan: Plan, memory: int = MEMORY) -> list[Chunk]:
+    """Cut the members of a plan into chunks of at most `memory` bytes and a few seconds of work, those alike in cost together.
+
+    The same on every machine of a kind: where the cost is not known beforehand, a sample of the members is run.
+    """
     found: list[Chunk] = []
     for group in plan.groups:
         own = program(plan, group)
         steps = expected_steps(plan, group)
         order = np.argsort(-steps, kind="stable")
-        most = max(1, memory // (SHARE * max(1, plan.bytes_per_member)))
+        most = max(1, memory // (SHARE * max(1, bytes_per_member(plan))))
         seconds = steps[order] * _seconds_per_step(plan, group)
-        enough = max(LEAST, float(seconds.sum()) / (TURNS * workers()))
+        enough = max(LEAST, float(seconds.sum()) / (TURNS * concurrent_chunks()))
         for part in _cut(seconds, own.piece * len(own.devices), most, min(SECONDS, enough)):
             found.append(Chunk(len(found), group.index, group.members[order[part]], float(seconds[part].sum())))
     return found

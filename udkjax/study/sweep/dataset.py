@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.study.sweep.axes import Column, Dimension
-from udkjax.study.sweep.chunk import program
+from udkjax.study.sweep.chunk import program, variables_of
 from udkjax.study.sweep.cutting import lane_steps
 from udkjax.study.sweep.member import RESULT, STEPS
 from udkjax.study.sweep.plan import Plan, Variable
@@ -27,7 +27,7 @@ def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[
     """
     import xarray
 
-    variables = plan.variables
+    variables = variables_of(plan)
     places = _places(plan)
     flat = {name: np.full((plan.size, *v.shape), _nothing(name, v), v.dtype) for name, v in variables.items()}
     taken = room = 0
@@ -82,7 +82,7 @@ def _coordinates(plan: Plan) -> dict[str, Any]:
     for dimension in plan.dimensions:
         for column in dimension.columns:
             found |= _coordinate(dimension, column)
-    along = {dim for variable in plan.variables.values() for dim in variable.dims}
+    along = {dim for variable in variables_of(plan).values() for dim in variable.dims}
     if "time" in along:
         scaled = any(not callable(column.of) and "t1" in column.of for column in plan.columns)
         fractions = (plan.ts - plan.ts[0]) / (plan.ts[-1] - plan.ts[0])

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from udkjax.study.sweep.chunk import program, run
-from udkjax.study.sweep.cutting import lane_steps
-from udkjax.study.sweep.local import workers
+from udkjax.study.machine import concurrent_chunks
+from udkjax.study.sweep.chunk import bytes_per_member, program, run
+from udkjax.study.sweep.cutting import MEMORY, cut_chunks, lane_steps
 from udkjax.study.sweep.member import STEPS
 from udkjax.study.sweep.plan import Chunk, Group, Plan
 
@@ -30,7 +30,7 @@ class Estimate:
     computing: float  # s
 
 
-def estimate(plan: Plan, memory: int = 2**30) -> Estimate:
+def estimate(plan: Plan, memory: int = MEMORY) -> Estimate:
     """Run a sample of some groups of a plan, and say what all of it will take.
 
     A sample takes a few seconds, most of them to compile. A lane waits for the slowest of its sample, but in the sweep members
@@ -40,10 +40,10 @@ def estimate(plan: Plan, memory: int = 2**30) -> Estimate:
     chosen = [plan.groups[k] for k in np.unique(np.linspace(0, count - 1, min(count, GROUPS)).astype(int))]
     tried = [_tried(plan, group) for group in chosen]
     compiling = count * float(np.mean([seconds for seconds, _ in tried]))
-    computing = plan.size * float(np.mean([seconds for _, seconds in tried])) / workers()
-    kept = plan.size * plan.bytes_per_member
+    computing = plan.size * float(np.mean([seconds for _, seconds in tried])) / concurrent_chunks()
+    kept = plan.size * bytes_per_member(plan)
     used = _resident() + min(memory, kept) + kept
-    return Estimate(plan.size, count, len(tried), len(plan.chunks(memory)), kept, used, compiling, computing)
+    return Estimate(plan.size, count, len(tried), len(cut_chunks(plan, memory)), kept, used, compiling, computing)
 
 
 def _tried(plan: Plan, group: Group) -> tuple[float, float]:

@@ -1,8 +1,9 @@
-"""What decides the results of a sweep, as JSON takes it."""
+"""What decides the results of a sweep, as JSON takes it, and how two of them differ, in words."""
 
+import difflib
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -10,11 +11,13 @@ import jax
 import numpy as np
 
 from udkjax.integrate.solution import Solution, scene_text, versions
+from udkjax.scene.checks import shown
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import Column
 from udkjax.study.sweep.measures import Measure
 from udkjax.study.sweep.plan import Plan
 
+MOST_LINES = 12  # lines of a text, and entries of a list, that are spelled out
 SHORT = 64  # numbers that are spelled out; of more, how many, the first, the last, and a digest
 STATS = ("steps", "accepted", "rejected", "right_hand_sides", "projections")
 
@@ -97,3 +100,56 @@ def _value(value: Any) -> Any:
 
 def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
+
+
+# --- differences
+
+
+def differences(before: Any, now: Any, path: str = "") -> list[str]:
+    """Return one line for each difference between two JSON values: its path, what was there, what is there now.
+
+    Of texts of several lines, such as scenes, the lines that differ are shown.
+    """
+    return list(_between(before, now, path))
+
+
+def _between(before: Any, now: Any, path: str) -> Iterator[str]:
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in {**before, **now}:
+            place = f"{path}.{key}" if path else key
+            if key not in now:
+                yield f"{place}: was {shown(before[key])}, is no longer there"
+            elif key not in before:
+                yield f"{place}: was not there, is {shown(now[key])}"
+            else:
+                yield from _between(before[key], now[key], place)
+    elif isinstance(before, list) and isinstance(now, list):
+        yield from _lists(before, now, path)
+    elif isinstance(before, str) and isinstance(now, str) and "\n" in before + now:
+        yield from _texts(before, now, path)
+    elif not _same(before, now):
+        yield f"{path}: was {shown(before)}, is {shown(now)}"
+
+
+def _lists(before: list, now: list, path: str) -> Iterator[str]:
+    if len(before) != len(now):
+        yield f"{path}: was {shown(before)} ({len(before)} entries), is {shown(now)} ({len(now)} entries)"
+        return
+    found = [line for k, pair in enumerate(zip(before, now, strict=True)) for line in _between(*pair, f"{path}[{k}]")]
+    yield from found[:MOST_LINES]
+    if len(found) > MOST_LINES:
+        yield f"{path}: and {len(found) - MOST_LINES} more"
+
+
+def _texts(before: str, now: str, path: str) -> Iterator[str]:
+    compared = list(difflib.unified_diff(before.splitlines(), now.splitlines(), lineterm="", n=0))
+    lines = [line for line in compared[2:] if not line.startswith("@@")]  # the first two name files
+    for line in lines[:MOST_LINES]:
+        yield f"{path}: {'was' if line[0] == '-' else 'is'} {line[1:]}"
+    if len(lines) > MOST_LINES:
+        yield f"{path}: and {len(lines) - MOST_LINES} more lines"
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Equal; not a number is itself, and truth values are no numbers."""
+    return isinstance(a, bool) == isinstance(b, bool) and (a == b or (a != a and b != b))

@@ -13,8 +13,7 @@ from udkjax.extras import OptionalImport
 from udkjax.scene.checks import quoted, shown, suggestion
 from udkjax.study.choices import CHOICES
 from udkjax.study.quantities import Angle, Length, Scaled
-from udkjax.study.sweep.axes import Axis, Zipped
-from udkjax.study.sweep.designs import LatinHypercube, Random, Sobol
+from udkjax.study.sweep.axes import Axis, LatinHypercube, Random, Sobol, Zipped
 from udkjax.study.sweep.reading import GridError, Reader, key_of
 
 TOP = ("t0", "t1", "dt", "ts", "measures", "derivatives", "reference", "axes", "settings", "design")

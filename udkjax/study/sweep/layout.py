@@ -13,8 +13,7 @@ from udkjax.pinv import Auto
 from udkjax.scene.checks import SceneError, quoted, shown, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.parameters import parameters_of, split
-from udkjax.study.sweep.axes import CHOICES, Axis, Column, Dimension, Zipped, labels_of
-from udkjax.study.sweep.designs import Design, spread
+from udkjax.study.sweep.axes import CHOICES, Axis, Column, Design, Dimension, Zipped, labels_of, spread
 from udkjax.study.units import NUMBERS, units_of
 
 MEMBER = "member"  # the dimension of a design

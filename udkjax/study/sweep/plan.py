@@ -14,8 +14,7 @@ from jaxtyping import Int
 from udkjax.equations.analysis import analyse
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.sweep.axes import Column, Dimension, structure_of
-from udkjax.study.sweep.designs import Design
+from udkjax.study.sweep.axes import Column, Design, Dimension, structure_of
 from udkjax.study.sweep.layout import SweepError, check_settings, check_tangents, laid_out
 from udkjax.study.sweep.measures import Measure, measures_of
 
@@ -123,47 +122,6 @@ class Plan:
     def bodies(self) -> tuple[str, ...]:
         """The bodies of all mechanisms, in their order."""
         return tuple(dict.fromkeys(name for group in self.groups for name in self.choice(group, "mechanism").body_names))
-
-    @cached_property
-    def variables(self) -> Mapping[str, Variable]:
-        """What is kept of each member: names, dimensions, units. `result`, `end_time` and `steps` are always among them.
-
-        Where mechanisms have other bodies, the dimension "body" has all of them, and any other is as long as the longest.
-        """
-        from udkjax.study.sweep.chunk import described  # computing knows plans
-
-        found: dict[str, Variable] = {}
-        for group in self.groups:
-            for name, variable in described(self, group).items():
-                other = found.setdefault(name, variable)
-                if len(other.shape) != len(variable.shape):
-                    raise SweepError(
-                        [f"measure {name!r} has {other.shape} entries for some members and {variable.shape} for others"]
-                    )
-                longest = map(max, other.shape, variable.shape)
-                shape = tuple(len(self.bodies) if d == "body" else size for d, size in zip(variable.dims, longest, strict=True))
-                found[name] = Variable(other.dims, shape, other.dtype, other.units, other.long_name)
-        return found
-
-    @property
-    def bytes_per_member(self) -> int:
-        """What the kept variables of one member take."""
-        return sum(int(np.prod(v.shape)) * v.dtype.itemsize for v in self.variables.values())
-
-    def chunks(self, memory: int = 2**30) -> list[Chunk]:
-        """Cut the members into chunks of at most `memory` bytes and a few seconds of work, those alike in cost together.
-
-        The same on every machine of a kind: where the cost is not known beforehand, a sample of the members is run.
-        """
-        from udkjax.study.sweep.cutting import chunks  # which runs the sample, and so knows plans
-
-        return chunks(self, memory)
-
-    def fingerprint(self) -> dict[str, Any]:
-        """Everything that decides the results, as JSON takes it: two plans of one fingerprint give the same dataset."""
-        from udkjax.study.sweep.fingerprint import fingerprint
-
-        return fingerprint(self)
 
 
 def planned(

@@ -7,9 +7,11 @@ its name only when all of it is on the disk, and carries its SHA-256. No list sa
 import abc
 import dataclasses
 import hashlib
+import io
 import json
 import os
 import socket
+import struct
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,11 +20,12 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from udkjax.study.sweep.differences import differences
-from udkjax.study.sweep.disk import UNFINISHED, packed, unpacked, write_whole
+from udkjax.study.sweep.fingerprint import differences
 from udkjax.study.sweep.plan import Chunk
 
 FORMAT = 1
+UNFINISHED = ".unfinished"  # what a file's name ends with while it is written
+DIGEST = 64  # characters of a SHA-256
 MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
 MEMBERS, KEPT = "members", "kept/"  # in a file: whom its numbers belong to, and what goes before the names of these
 
@@ -180,3 +183,43 @@ def opened(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Any]) -
 def _name(index: int, members: np.ndarray) -> str:
     """Name a chunk's file by its place and by whom it holds, so that it replaces no other."""
     return f"{index:06d}-{hashlib.sha256(members.astype('<i8').tobytes()).hexdigest()[:12]}.npz"
+
+
+# --- files that are whole: each is there as it was written, or it is not there
+
+
+def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Return an NPZ archive of the arrays whose comment is the SHA-256 of everything before it."""
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **arrays)
+    body = stream.getvalue()[:-2]  # a ZIP archive ends with the length of its comment, and the comment
+    return body + struct.pack("<H", DIGEST) + hashlib.sha256(body).hexdigest().encode()
+
+
+def unpacked(content: bytes) -> dict[str, np.ndarray] | None:
+    """Return the arrays of an archive that `packed` made, or None where a bit of it is not as it was."""
+    body, length, digest = content[: -DIGEST - 2], content[-DIGEST - 2 : -DIGEST], content[-DIGEST:]
+    if length != struct.pack("<H", DIGEST) or digest != hashlib.sha256(body).hexdigest().encode():
+        return None
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        return dict(archive)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file so that, whenever the process or the machine stops, it is there as it was before, or all of it is."""
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
+    try:
+        with open(unfinished, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
+    if hasattr(os, "O_DIRECTORY"):  # where folders can be opened, their entries have to reach the disk too
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)

@@ -5,18 +5,19 @@ from typing import Any
 
 from udkjax.extras import require
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.sweep import local
-from udkjax.study.sweep.cluster import dask
+from udkjax.study.progress import ProgressOption, reporting
+from udkjax.study.sweep.axes import Design
+from udkjax.study.sweep.cutting import MEMORY, cut_chunks
 from udkjax.study.sweep.dataset import assemble
-from udkjax.study.sweep.designs import Design
+from udkjax.study.sweep.executors import dask, devices
+from udkjax.study.sweep.fingerprint import fingerprint
 from udkjax.study.sweep.layout import SweepError
 from udkjax.study.sweep.member import RESULT
 from udkjax.study.sweep.plan import Chunk, Plan, planned
-from udkjax.study.sweep.progress import Watch, teller
 from udkjax.study.sweep.store import left, opened
+from udkjax.study.sweep.sweep_progress import Watch
 
 ENGINES = ("auto", "devices", "dask")
-MEMORY = 2**30  # bytes
 
 
 def sweep(
@@ -32,7 +33,7 @@ def sweep(
     client: Any = None,
     out: Any = None,
     memory: int = MEMORY,
-    progress: Any = None,
+    progress: ProgressOption = None,
     **settings: Any,
 ) -> Any:
     """Simulate a mechanism for all combinations of the values of some axes; return an xarray Dataset.
@@ -56,7 +57,8 @@ def sweep(
     nothing is raised for it. Members are computed in lanes, ordered by the steps that they are expected to take, on all devices
     or cores of the machine; `engine="dask"` on the workers of a `client` of dask.distributed instead. `out` names a folder in
     which finished chunks are kept: the same sweep again goes on from there. `memory` (bytes) bounds what members in computation
-    take. `progress`: None shows a line, False nothing, and a function gets each `Status`.
+    take. `progress`: None shows a line where it takes longer than two seconds, True at once, False never; a function
+    gets a `SweepProgress` after each chunk.
 
     Raises `SweepError`, which lists every mistake in the arguments.
     """
@@ -65,16 +67,17 @@ def sweep(
     require("xarray")
     plan = planned(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
     compute = _engine(engine, client)
-    with opened(out, plan.fingerprint() if out is not None else {}) as kept:
+    with opened(out, fingerprint(plan) if out is not None else {}) as kept:
         done, codes = kept.done(RESULT)
-        chunks = left(plan.chunks(memory), done) if len(done) < plan.size else []
-        watch = Watch(plan.size, chunks, teller(progress), codes)
-        for chunk, data, seconds in compute(plan, chunks):
-            kept.write(chunk, data)
-            watch(chunk, data, seconds)
+        with reporting(progress, plan.size, "sweep") as report:
+            todo = left(cut_chunks(plan, memory), done) if len(done) < plan.size else []
+            watch = Watch(plan.size, todo, report.show, codes)
+            for chunk, data, seconds in compute(plan, todo):
+                kept.write(chunk, data)
+                watch(chunk, data, seconds)
         return assemble(plan, kept.finished())
 
 
 def _engine(engine: str, client: Any) -> Callable[[Plan, Sequence[Chunk]], Generator[Any, None, None]]:
     """What computes chunks: a client that is given is there to be used."""
-    return dask(client) if engine == "dask" or (engine == "auto" and client is not None) else local.devices
+    return dask(client) if engine == "dask" or (engine == "auto" and client is not None) else devices

@@ -1,8 +1,9 @@
-"""Chunks of a sweep as tasks of dask.distributed: on as many workers as there are, whichever of them are lost."""
+"""What computes the chunks of a sweep: this machine's devices or cores, or the workers of dask.distributed."""
 
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import versions
-from udkjax.study.machine import cores
+from udkjax.study.machine import concurrent_chunks, cores
 from udkjax.study.sweep import chunk as computing
 from udkjax.study.sweep.plan import Chunk, Plan
 
@@ -19,6 +20,29 @@ Done = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, what it gave, and 
 RETRIES = 2  # of a chunk that raised: on another worker there may be memory, or room on the disk
 AHEAD = 2  # tasks for each thread of the cluster, so that none waits for the next; more would only fill the workers' memory
 AT_LEAST = 16  # tasks, so that a cluster that grows by what is asked of it sees that something is
+
+
+def devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
+    """Compute chunks, and hand each over when it is done."""
+    waiting, width = deque(chunks), concurrent_chunks()
+    with ThreadPoolExecutor(width, thread_name_prefix="sweep") as pool:
+        running = set()
+        try:
+            while waiting or running:
+                while waiting and len(running) < width:
+                    running.add(pool.submit(_timed, plan, waiting.popleft()))
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield future.result()
+        finally:
+            for future in running:
+                future.cancel()
+
+
+def _timed(plan: Plan, chunk: Chunk) -> Done:
+    begun = time.perf_counter()
+    data = computing.run(plan, chunk)
+    return chunk, data, time.perf_counter() - begun
 
 
 class ClusterError(RuntimeError):

@@ -1,0 +1,127 @@
+"""How far a sweep is: who is done, who failed, who was slowest, and how long the rest will take."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from udkjax.integrate.solution import Result
+from udkjax.study.progress import Progress
+from udkjax.study.sweep.plan import Chunk
+
+STEPS = "steps"  # the variable by which members are compared
+
+
+@dataclass(frozen=True)
+class SweepProgress(Progress):
+    """How far a sweep is: `done` of `total` members, those of an earlier run that it goes on with among them.
+
+    Attributes:
+        rate: members a second, in this run; None until something is done.
+        remaining: time that the rest takes (s), by the work that is left; None until it can be said.
+        failures: how many members ended with which `Result`, successes left out.
+        slowest: the member that took most steps, and how many; None where steps are not stored.
+        slowest_chunk: the chunk that took longest, and how long (s).
+    """
+
+    rate: float | None = None
+    remaining: float | None = None
+    failures: Mapping[str, int] = field(default_factory=dict)
+    slowest: tuple[int, int] | None = None
+    slowest_chunk: tuple[int, float] | None = None
+
+    @property
+    def left(self) -> float | None:
+        return self.remaining
+
+    def __str__(self) -> str:
+        part = 100 * self.done / self.total if self.total else 100.0
+        time_left = duration(self.seconds) if self.left is None or self.done == self.total else f"{duration(self.left)} left"
+        rate = [] if self.rate is None else [f"{self.rate:.3g} a second"]
+        return "; ".join([f"{self.done:g} of {self.total:g} members ({part:.0f} %)", *rate, time_left, self.message])
+
+
+class Watch:
+    """Follow a sweep of so many members, of which the chunks `left` are still to be computed; an earlier run ended with `codes`.
+
+    `show` is called with the `SweepProgress` at the start and after each chunk.
+    """
+
+    def __init__(self, members: int, left: Sequence[Chunk], show: Callable[[SweepProgress], Any], codes: ArrayLike = ()):
+        self.show = show
+        self.work, self.work_done, self.new = sum(chunk.work for chunk in left), 0.0, 0
+        self.begun = time.monotonic()
+        self.first: tuple[float, float] | None = None  # when the first chunk came, and its work: a compilation was part of it
+        failures = _failed({}, codes)
+        done = members - sum(len(chunk.members) for chunk in left)
+        self.state = SweepProgress("sweep", done, members, 0.0, _message(failures), failures=failures)
+        self.show(self.state)
+
+    def __call__(self, chunk: Chunk, data: Mapping[str, np.ndarray], seconds: float | None = None) -> None:
+        """Note that a chunk is done, what it gave, and how long it took (s) where that is known."""
+        before, now = self.state, time.monotonic()
+        self.new += len(chunk.members)
+        self.work_done += chunk.work
+        self.first = self.first or (now, self.work_done)
+        failures = _failed(before.failures, data["result"])
+        slowest = _slower(before.slowest, chunk.members, data.get(STEPS))
+        slowest_chunk = _slower(before.slowest_chunk, [chunk.index], seconds)
+        self.state = SweepProgress(
+            before.what,
+            before.done + len(chunk.members),
+            before.total,
+            now - self.begun,
+            _message(failures, slowest, slowest_chunk),
+            self.new / max(now - self.begun, 1e-9),
+            self._left(now),
+            failures,
+            slowest,
+            slowest_chunk,
+        )
+        self.show(self.state)
+
+    def _left(self, now: float) -> float | None:
+        """How long the rest takes (s), by the pace since the first chunk came."""
+        assert self.first is not None
+        since, work = now - self.first[0], self.work_done - self.first[1]
+        return since / work * (self.work - self.work_done) if work > 0 else None
+
+
+def _message(
+    failures: Mapping[str, int], slowest: tuple[int, int] | None = None, slowest_chunk: tuple[int, float] | None = None
+) -> str:
+    failed = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in failures.items())
+    said = [f"failed: {failed}" if failed else "none failed"]
+    said += [] if slowest_chunk is None else ["slowest chunk {}: {:.1f} s".format(*slowest_chunk)]
+    said += [] if slowest is None else ["slowest member {}: {} steps".format(*slowest)]
+    return "; ".join(said)
+
+
+def _failed(before: Mapping[str, int], codes: ArrayLike) -> dict[str, int]:
+    """Add to the numbers of members that ended with each `Result`; successes are left out."""
+    found = Counter(before)
+    for code, count in zip(*np.unique(np.asarray(codes, int), return_counts=True), strict=True):
+        if code != Result.successful:
+            found[Result(code).name] += int(count)
+    return dict(found)
+
+
+def _slower(before: tuple[int, Any] | None, who: ArrayLike, values: ArrayLike | None) -> tuple[int, Any] | None:
+    """Return the largest of the values and whose it is, unless one before was as large."""
+    if values is None:
+        return before
+    values = np.atleast_1d(values)
+    most = int(np.argmax(values))
+    return before if before is not None and before[1] >= values[most] else (int(np.asarray(who)[most]), values[most].item())
+
+
+def duration(seconds: float) -> str:
+    """Say how long something takes."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
