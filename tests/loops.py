@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.expressions.loops import ADD, LEAST, Clear, Loop, LoopProgram, Slot
+from udkjax.expressions.loop_program import ADD, LEAST, Clear, Loop, LoopProgram, Slot
 
 
 def run(program: LoopProgram, arrays: dict[str, np.ndarray]) -> None:

@@ -105,5 +105,5 @@ def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, name
         own = scales.known_scales(mechanism)
         off = mechanism.q0.ravel() + 1e-3 * own.coordinates(3 * len(mechanism.bodies)) * np.cos(np.arange(mechanism.q0.size))
         closer = sparse_rows.SparseRows(mechanism) if large else dense_rows.DenseRows(mechanism, own)
-        *_, psi, psi_dot, _ = closer.assembled(0.0, np.asarray(off), np.asarray(mechanism.v0).ravel())
+        *_, psi, psi_dot, _ = closer.assemble(0.0, np.asarray(off), np.asarray(mechanism.v0).ravel())
         assert np.max(np.abs(psi) / np.asarray(own.rows)) < 1e-11 and np.abs(psi_dot).max() < 1e-9

@@ -115,7 +115,7 @@ def test_other_solvers_have_both_modes(solver, slopes):
         assert_allclose(jax.jit(mode(f))(x), slopes[of_pendulum](x), rtol=1e-4)
 
 
-def assembled(x):
+def assemble(x):
     """What assembly makes of a rough guess of a redundant linkage: of the first link's angle, and the second link's length."""
     mechanism = LINKAGE.with_parameters({"body.link1.angle": x[0], "body.coupler.mass": x[1]})
     state = udk.assemble(mechanism, throw=False)

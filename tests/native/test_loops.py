@@ -14,9 +14,9 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scales import known_scales
-from udkjax.expressions.loops import Clear, Loop
+from udkjax.expressions.loop_program import Clear, Loop
 from udkjax.native.loops import LoopWriter
-from udkjax.pinv.block_order import eliminations
+from udkjax.pinv.elimination_order import order_blocks
 from udkjax.pinv.rank_policy import RankPolicy
 
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
@@ -251,7 +251,7 @@ def test_the_code_does_not_grow_with_the_scene():
 
 def test_blocks_that_are_alike_are_eliminated_in_a_run():
     holds = [{2 * k, 2 * k + 1} for k in range(8)] + [{2 * k + 1, 2 * k + 2} for k in range(7)]
-    found = eliminations([2] * 15, holds)
+    found = order_blocks([2] * 15, holds)
     seen: list[int] = []
     for e in found:
         for k, later in zip(e.blocks, e.later, strict=True):

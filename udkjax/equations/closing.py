@@ -115,7 +115,7 @@ class TracedRows(NamedTuple):
         plus, psi, root = self.equations.linearized_position(t, q)
         return -root * (plus @ psi)
 
-    def assembled(self, close: Callable[[Any, Any, Any], Any], t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def assemble(self, close: Callable[[Any, Any, Any], Any], t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
         """Return q closed by `close`, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
         if not self.equations.constrained:
             return q, v, *self.equations.violation(t, q, v), 0

@@ -79,7 +79,7 @@ class DenseRows:
     def correction(self, t: float, q: np.ndarray) -> np.ndarray:
         return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._run(self._programs.psi, t, q, q)))
 
-    def assembled(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
+    def assemble(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
         """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
         if not self.count:
             return q, v, *self.violation(t, q, v), 0

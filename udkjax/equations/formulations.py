@@ -32,18 +32,18 @@ class Formulation(eqx.Module):
         """The equations of a system, solved in this way."""
 
 
-class Solved(Formulation):
+class PointwiseFormulation(Formulation):
     """A formulation that is a way to solve for a at a given state, and nothing else."""
 
-    def of(self, equations: AbstractSystem) -> "Formulated":
-        return Formulated(equations, self)
+    def of(self, equations: AbstractSystem) -> "FormulatedSystem":
+        return FormulatedSystem(equations, self)
 
     @abstractmethod
     def solve(self, M: Float[Array, "n n"], F: Vector, A: Float[Array, "m n"], c: Float[Array, "m"]) -> Vector:
         """a of M a + A^T lambda = F, A a = c."""
 
 
-class Augmented(Solved):
+class Augmented(PointwiseFormulation):
     """Accelerations and multipliers at once:
 
         [ M  A^T ] [   a    ]   [ F ]
@@ -73,7 +73,7 @@ class Augmented(Solved):
         return method.solve(matrix, right).x[: len(F)]
 
 
-class NullSpaceQR(Solved):
+class NullSpaceQR(PointwiseFormulation):
     """Equations of motion along the null space of A, by pivoted QR: with A^T = Q R, Q = (Q_1, N) orthogonal,
 
         a_p = Q_1 R_1^(-T) c,        N^T M N z = N^T (F - M a_p),        a = a_p + N z.
@@ -89,7 +89,7 @@ class NullSpaceQR(Solved):
 
     def solve(self, M, F, A, c):
         if not len(A):
-            return along(M, F, jnp.eye(len(F)), jnp.zeros_like(F))
+            return null_space_accelerations(M, F, jnp.eye(len(F)), jnp.zeros_like(F))
         threshold = self.rank_tol * jnp.linalg.norm(A, axis=1).max()
         q, r, order, rank = complete_qr(A.T, threshold)
         inside = jnp.arange(len(order)) < rank
@@ -97,10 +97,10 @@ class NullSpaceQR(Solved):
         z = solve_triangular(triangle, jnp.where(inside, c[order], 0), trans=1)
         a_p = q[:, : len(order)] @ z
         null = jnp.where(jnp.arange(len(F)) < rank, 0, q)
-        return along(M, F, null, a_p)
+        return null_space_accelerations(M, F, null, a_p)
 
 
-class NullSpaceSVD(Solved):
+class NullSpaceSVD(PointwiseFormulation):
     """Equations of motion along the null space of A, by singular values: with A = U S V^T, V = (V_1, N),
 
         a_p = V_1 S_1^(-1) U_1^T c,        N^T M N z = N^T (F - M a_p),        a = a_p + N z.
@@ -115,16 +115,16 @@ class NullSpaceSVD(Solved):
 
     def solve(self, M, F, A, c):
         if not len(A):
-            return along(M, F, jnp.eye(len(F)), jnp.zeros_like(F))
+            return null_space_accelerations(M, F, jnp.eye(len(F)), jnp.zeros_like(F))
         u, sigma, vt = jnp.linalg.svd(A, full_matrices=True)
         size = len(sigma)
-        kept = beyond(sigma, self.rank_tol * sigma[0])
-        a_p = vt[:size].T @ (jnp.where(kept, 1 / jnp.where(kept, sigma, 1), 0) * (u[:, :size].T @ c))
-        null = jnp.where(jnp.arange(len(F)) < kept.sum(), 0, vt.T)
-        return along(M, F, null, a_p)
+        counts = beyond(sigma, self.rank_tol * sigma[0])
+        a_p = vt[:size].T @ (jnp.where(counts, 1 / jnp.where(counts, sigma, 1), 0) * (u[:, :size].T @ c))
+        null = jnp.where(jnp.arange(len(F)) < counts.sum(), 0, vt.T)
+        return null_space_accelerations(M, F, null, a_p)
 
 
-def along(M: Float[Array, "n n"], F: Vector, N: Float[Array, "n k"], a_p: Vector) -> Vector:
+def null_space_accelerations(M: Float[Array, "n n"], F: Vector, N: Float[Array, "n k"], a_p: Vector) -> Vector:
     """a = a_p + N z with N^T M N z = N^T (F - M a_p). The columns of N are independent; those that are zero do not count."""
     projected = N.T @ M @ N
     missing = jnp.all(N == 0, axis=0)
@@ -132,7 +132,7 @@ def along(M: Float[Array, "n n"], F: Vector, N: Float[Array, "n k"], a_p: Vector
     return a_p + N @ z
 
 
-class Rewritten(AbstractSystem):
+class WrappedSystem(AbstractSystem):
     """Equations of motion around others, with the accelerations found in another way.
 
     At constant rank they are the same function, so their derivatives are those of the equations inside.
@@ -163,11 +163,11 @@ class Rewritten(AbstractSystem):
         return self.equations.constrained
 
 
-class Formulated(Rewritten):
+class FormulatedSystem(WrappedSystem):
     """A formulation for given states. Projection, and the rows that it leaves out, are those of the equations inside."""
 
     equations: AbstractSystem
-    formulation: Solved
+    formulation: PointwiseFormulation
 
     def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
         return _accelerations(self, t, q, v)
@@ -180,7 +180,7 @@ class Formulated(Rewritten):
 
 
 @eqx.filter_custom_jvp
-def _accelerations(formulated: Formulated, t: Any, q: Vector, v: Vector) -> Vector:
+def _accelerations(formulated: FormulatedSystem, t: Any, q: Vector, v: Vector) -> Vector:
     """In the scene's own units, in which coordinates, rows and masses are of order one: thresholds of the rank are relative."""
     M, F, A, c = formulated.matrices(t, q, v)
     scales = getattr(formulated.equations, "scales", None)

@@ -26,7 +26,7 @@ from functools import cached_property, lru_cache
 
 from udkjax.equations.scalar_programs import EliminationPrograms
 from udkjax.expressions import Differential, Graph, Program, Scalar, frontier
-from udkjax.expressions.derivative import Row, accumulate, common_factors, product
+from udkjax.expressions.differential import Row, accumulate, common_factors, product
 
 
 class ImplicitDerivative(ABC):
@@ -112,7 +112,7 @@ class AccelerationDerivative(ImplicitDerivative):
 
     def _forward(self, tangents: Sequence[Scalar]) -> list[Scalar]:
         programs, graph = self.programs, self.programs.graph
-        known = self.differential.along({s.index: t for s, t in zip(self.differential.inputs, tangents, strict=True)})
+        known = self.differential.forward({s.index: t for s, t in zip(self.differential.inputs, tangents, strict=True)})
         scaled = {k: t * self.factors.get(k, 1.0) for k, t in known.items()}
         direct, turned = ([product(row, known, graph) for row in rows] for rows in (self.direct, self.turned))
         residual = [product(row, scaled, graph) for row in self.residual]
@@ -130,7 +130,7 @@ class AccelerationDerivative(ImplicitDerivative):
         seeds = _differences(w, programs.jt(u))
         for row, seed in (*zip(self.turned, seeds, strict=True), *zip(self.direct, w, strict=True)):
             accumulate(found, row, seed)
-        return self.differential.back(found)
+        return self.differential.reverse(found)
 
 
 class ProjectionDerivative(ImplicitDerivative):
@@ -148,17 +148,17 @@ class ProjectionDerivative(ImplicitDerivative):
     def _prepare(self):
         e, independent = self.programs.equations, self.programs.independent_rows
         state = {s.index for s in (*e.q, *e.v)}
-        self.along = [s for s in self.inputs if s.index not in state] + [*e.q, *e.v]  # q and v change, whatever else does
+        self.variables = [s for s in self.inputs if s.index not in state] + [*e.q, *e.v]  # q and v change, whatever else does
         self.rows = [e.psi_q[i] for i in independent]
         self.psi, self.psi_dot = [e.psi[i] for i in independent], [e.psi_dot[i] for i in independent]
-        self.d_psi = self._differential(self.psi, self.along)
-        self.d_psi_dot = self._differential(self.psi_dot, self.along)
+        self.d_psi = self._differential(self.psi, self.variables)
+        self.d_psi_dot = self._differential(self.psi_dot, self.variables)
 
     def _forward(self, tangents: Sequence[Scalar]) -> list[Scalar]:
         programs, e, zero = self.programs, self.programs.equations, self.programs.graph.constant(0.0)
         known = {s.index: t for s, t in zip(self.inputs, tangents, strict=True)}
         for x, d, outputs in ((e.q, self.d_psi, self.psi), (e.v, self.d_psi_dot, self.psi_dot)):
-            tangents_of_rows = d.along(known)
+            tangents_of_rows = d.forward(known)
             residual = [product(d.row(s), tangents_of_rows, programs.graph) for s in outputs]
             before, dy = [known.get(s.index, zero) for s in x], programs.solve_gram(residual, dropping=True)
             known |= {s.index: t for s, t in zip(x, _differences(before, programs.minv_jt(dy)), strict=True)}
@@ -173,7 +173,7 @@ class ProjectionDerivative(ImplicitDerivative):
             found: Row = {}
             for output, seed in zip(outputs, u, strict=True):
                 accumulate(found, d.row(output), -seed)
-            for s, cotangent in zip(self.along, d.back(found), strict=True):
+            for s, cotangent in zip(self.variables, d.reverse(found), strict=True):
                 total[s.index] = total[s.index] + cotangent if s.index in total else cotangent
         return [total[s.index] for s in self.inputs]
 

@@ -13,9 +13,9 @@ import numpy as np
 from udkjax.equations.loop_layout import DROP_TOL, ENTRIES, RIGHT, SAFE_TOL, ConstraintGroup, arrays_of_solve
 from udkjax.equations.loop_terms import LoopTerms, Parts, dot
 from udkjax.expressions import Scalar
-from udkjax.expressions.loops import ADD, LEAST, Clear, KernelWriter, Loop
-from udkjax.pinv.block_order import Elimination, eliminations
-from udkjax.pinv.sparse import absolute, greater, where
+from udkjax.expressions.loop_program import ADD, LEAST, Clear, KernelWriter, Loop
+from udkjax.expressions.selection import absolute, greater, where
+from udkjax.pinv.elimination_order import Fronts, order_blocks
 
 
 def triangle(i: int, j: int) -> int:
@@ -37,7 +37,7 @@ class BlockElimination:
         self._elements = [(group, i) for group in layout.eliminated for i in range(len(group.members))]
         self._sizes = [len(group.rows) for group, _ in self._elements]
         bodies = [set(group.bodies[:, i].tolist()) for group, i in self._elements]
-        self.order: list[Elimination] = eliminations(self._sizes, bodies)
+        self.order: list[Fronts] = order_blocks(self._sizes, bodies)
         self._diagonals = [layout.reserve("gram", p + p * (p + 1) // 2) for p in self._sizes]
         self._position = {k: j for j, k in enumerate(k for e in self.order for k in e.blocks)}
         self._off_diagonal_start, self._off_diagonal = layout.sizes["gram"], {}
@@ -62,10 +62,10 @@ class BlockElimination:
         yield Clear("ratio", 0, 1, np.inf)
         for e in self.order:
 
-            def write(w: KernelWriter, e: Elimination = e):
-                _eliminate(w, e.size, e.sizes)
+            def write(w: KernelWriter, e: Fronts = e):
+                _eliminate(w, e.size, e.later_sizes)
 
-            yield Loop(self.terms.kernel(("eliminate", e.size, e.sizes), write), self._front_table(e))
+            yield Loop(self.terms.kernel(("eliminate", e.size, e.later_sizes), write), self._front_table(e))
 
     def solve(self, solve: int = 0) -> Parts:
         """x = (D D^T)^(-1) right, and jt_x = D^T x."""
@@ -78,16 +78,16 @@ class BlockElimination:
         yield Clear(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
         for e in self.order:
 
-            def forward(w: KernelWriter, e: Elimination = e):
-                _substitute_forward(w, e.size, e.sizes)
+            def forward(w: KernelWriter, e: Fronts = e):
+                _substitute_forward(w, e.size, e.later_sizes)
 
-            yield Loop(self.terms.kernel(("forward", e.size, e.sizes), forward), self._front_table(e), names)
+            yield Loop(self.terms.kernel(("forward", e.size, e.later_sizes), forward), self._front_table(e), names)
         for e in reversed(self.order):
 
-            def backward(w: KernelWriter, e: Elimination = e):
-                _substitute_backward(w, e.size, e.sizes)
+            def backward(w: KernelWriter, e: Fronts = e):
+                _substitute_backward(w, e.size, e.later_sizes)
 
-            yield Loop(self.terms.kernel(("backward", e.size, e.sizes), backward), self._front_table(e)[::-1], names)
+            yield Loop(self.terms.kernel(("backward", e.size, e.later_sizes), backward), self._front_table(e)[::-1], names)
 
     def safe(self) -> Loop:
         """Whether all pivots exceed `safe_tol`."""
@@ -172,7 +172,7 @@ class BlockElimination:
         key: Hashable = ("product", g, r, h, s)
         return self.terms.kernel(key, write)
 
-    def _front_table(self, e: Elimination) -> np.ndarray:
+    def _front_table(self, e: Fronts) -> np.ndarray:
         """The table of fronts of the same sizes.
 
         Its columns: where the block's factors and its right-hand side begin; of each later block that it meets, the block of both

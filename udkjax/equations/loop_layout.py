@@ -21,7 +21,7 @@ from udkjax.equations.element_programs import (
 )
 from udkjax.equations.structure import ElementKind, element_kinds
 from udkjax.expressions import Scalar
-from udkjax.expressions.loops import KernelWriter
+from udkjax.expressions.loop_program import KernelWriter
 from udkjax.scene.mechanism import Mechanism
 
 # Columns of the table of bodies: where the coordinates of each, its sine and cosine, and its constants begin.

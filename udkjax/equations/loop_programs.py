@@ -33,7 +33,7 @@ from udkjax.equations.loop_layout import (
 from udkjax.equations.loop_terms import LoopTerms, Parts
 from udkjax.equations.structure import structure
 from udkjax.expressions.loop_derivative import LoopDerivative
-from udkjax.expressions.loops import Clear, Kernel, KernelWriter, Loop, LoopProgram, by_arrays
+from udkjax.expressions.loop_program import Clear, Kernel, KernelWriter, Loop, LoopProgram, evaluate_loops
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
@@ -309,7 +309,7 @@ class LoopPrograms:
 
     def _constants_by_arrays(self, numbers: Any, xp: Any) -> Any:
         arrays = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(self.constants))}
-        return by_arrays(self.prologue, arrays, xp)["constants"]
+        return evaluate_loops(self.prologue, arrays, xp)["constants"]
 
     def geometry(self, numbers: Any, xp: Any) -> Callable[[Any, Any, Any], tuple[Any, Any, Any]]:
         """Return a function of t, q and v, of the numbers of the scene: Psi, Psi_dot and the entries of D at `d_entries`."""
@@ -348,7 +348,7 @@ class LoopPrograms:
 
         def run(t: Any, q: Any, v: Any) -> dict[str, Any]:
             given = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v}
-            return by_arrays(program, blank | given, xp)
+            return evaluate_loops(program, blank | given, xp)
 
         return run
 

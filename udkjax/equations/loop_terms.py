@@ -25,7 +25,7 @@ from udkjax.equations.loop_layout import (
     arrays_of_solve,
 )
 from udkjax.expressions import Graph, Scalar, trace
-from udkjax.expressions.loops import ADD, Clear, Kernel, KernelWriter, Loop
+from udkjax.expressions.loop_program import ADD, Clear, Kernel, KernelWriter, Loop
 
 Parts = Iterator[Loop | Clear]
 Write = Callable[[KernelWriter], None]

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, Vector
 from udkjax.equations.closing import STRIDE
-from udkjax.equations.formulations import Formulation, Rewritten, along
+from udkjax.equations.formulations import Formulation, WrappedSystem, null_space_accelerations
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
@@ -45,7 +45,7 @@ class CoordinatePartitioning(Formulation):
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
 
-    def of(self, equations: AbstractSystem) -> "Partitioned":
+    def of(self, equations: AbstractSystem) -> "PartitionedSystem":
         if not isinstance(equations, MechanismSystem):
             raise ValueError("CoordinatePartitioning takes a Mechanism: a ConstrainedSystem may have nonholonomic constraints")
         if equations.stabilized:
@@ -53,13 +53,13 @@ class CoordinatePartitioning(Formulation):
                 "with CoordinatePartitioning the constraints hold at every stage: Baumgarte has nothing to feed back. "
                 "Take stabilization=None or Projection()"
             )
-        return Partitioned(equations, self)
+        return PartitionedSystem(equations, self)
 
 
-class Partitioned(Rewritten):
+class PartitionedSystem(WrappedSystem):
     """The equations of motion of the independent coordinates of a mechanism.
 
-    Without a partition held, it is chosen at each state anew.
+    Without a partition fixed, it is chosen at each state anew.
     """
 
     equations: MechanismSystem
@@ -72,26 +72,26 @@ class Partitioned(Rewritten):
 
     def rates(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """v and a at the state that the independent coordinates and velocities determine."""
-        held = self.fix_partition(t, q, v)
-        closed, v = _completed(held, t, q, v)
+        fixed = self.fix_partition(t, q, v)
+        closed, v = _complete(fixed, t, q, v)
         # Farther from where the step predicts it, it might be another assembly of the mechanism: a shorter step is taken.
         near = self.equations.size(closed - q) <= STRIDE
-        return jnp.where(near, v, jnp.nan), _accelerations(held, t, closed, v)
+        return jnp.where(near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Solve the constraints for what is dependent."""
-        return _completed(self.fix_partition(t, q, v), t, q, v)
+        return _complete(self.fix_partition(t, q, v), t, q, v)
 
-    def fix_partition(self, t: Any, q: Vector, v: Vector) -> "Partitioned":
+    def fix_partition(self, t: Any, q: Vector, v: Vector) -> "PartitionedSystem":
         """With the partition that pivoting chooses here."""
         if self.dependent is not None:
             return self
         D = self.equations.weighted(t, q)[0]
         if not len(D):
-            return Partitioned(self.equations, self.formulation, jnp.zeros(len(q), bool))
+            return PartitionedSystem(self.equations, self.formulation, jnp.zeros(len(q), bool))
         _, _, order, rank = complete_qr(D, self.formulation.rank_tol * jnp.linalg.norm(D, axis=0).max())
         dependent = jnp.zeros(len(q), bool).at[order].set(jnp.arange(len(order)) < rank)
-        return Partitioned(self.equations, self.formulation, jax.lax.stop_gradient(dependent))
+        return PartitionedSystem(self.equations, self.formulation, jax.lax.stop_gradient(dependent))
 
     @property
     def independent(self) -> Any:
@@ -102,13 +102,13 @@ class Partitioned(Rewritten):
         return SVD(self.formulation.rank_tol).plus(jnp.where(self.dependent, D, 0))
 
 
-# Derivatives. Where the partition is held, Psi(t, q_d, q_i) = 0 makes q_d a function of the rest. One Newton step from a state
+# Derivatives. Where the partition is fixed, Psi(t, q_d, q_i) = 0 makes q_d a function of the rest. One Newton step from a state
 # that is closed changes nothing but the tangents, and gives those of that function.
 
 
 @jax.custom_jvp
-def _completed(held: Partitioned, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    if not held.constrained:
+def _complete(fixed: PartitionedSystem, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    if not fixed.constrained:
         return q, v
     tol = jnp.sqrt(jnp.finfo(q.dtype).eps)  # Newton's method squares it in the step that it does not take any more
 
@@ -118,52 +118,52 @@ def _completed(held: Partitioned, t: Any, q: Vector, v: Vector) -> tuple[Vector,
 
     def step(state):
         q, _, k = state
-        ahead = _newton(held, t, q)
-        return ahead, held.equations.size(ahead - q), k + 1
+        ahead = _newton(fixed, t, q)
+        return ahead, fixed.equations.size(ahead - q), k + 1
 
     q, change, _ = jax.lax.while_loop(unfinished, step, (q, jnp.array(jnp.inf, q.dtype), 0))
     q = jnp.where(change <= tol, q, jnp.nan)
-    return q, _velocity(held, t, q, v)
+    return q, _velocity(fixed, t, q, v)
 
 
-@_completed.defjvp
+@_complete.defjvp
 def _(primals, tangents):
-    held, t, q, v = primals
-    closed, rate = _completed(held, t, q, v)
+    fixed, t, q, v = primals
+    closed, rate = _complete(fixed, t, q, v)
 
-    def correct(held, t, q, v):
-        start = jnp.where(held.dependent, jax.lax.stop_gradient(closed), q)
-        q = _newton(held, t, start)
-        return q, _velocity(held, t, q, jnp.where(held.dependent, jax.lax.stop_gradient(rate), v))
+    def correct(fixed, t, q, v):
+        start = jnp.where(fixed.dependent, jax.lax.stop_gradient(closed), q)
+        q = _newton(fixed, t, start)
+        return q, _velocity(fixed, t, q, jnp.where(fixed.dependent, jax.lax.stop_gradient(rate), v))
 
-    return (closed, rate), jax.jvp(correct, (held, t, q, v), tangents)[1]
-
-
-def _newton(held: Partitioned, t: Any, q: Vector) -> Vector:
-    D, psi, root = held.equations.weighted(t, q)
-    return jnp.where(held.dependent, q - root * (held._plus(D) @ psi), q)  # the rest stays to the bit
+    return (closed, rate), jax.jvp(correct, (fixed, t, q, v), tangents)[1]
 
 
-def _velocity(held: Partitioned, t: Any, q: Vector, v: Vector) -> Vector:
-    D, _, root = held.equations.weighted(t, q)
-    rate = held.equations.scales.weights * held.violation(t, q, v)[1]
-    return jnp.where(held.dependent, v - root * (held._plus(D) @ rate), v)
+def _newton(fixed: PartitionedSystem, t: Any, q: Vector) -> Vector:
+    D, psi, root = fixed.equations.weighted(t, q)
+    return jnp.where(fixed.dependent, q - root * (fixed._plus(D) @ psi), q)  # the rest stays to the bit
+
+
+def _velocity(fixed: PartitionedSystem, t: Any, q: Vector, v: Vector) -> Vector:
+    D, _, root = fixed.equations.weighted(t, q)
+    rate = fixed.equations.scales.weights * fixed.violation(t, q, v)[1]
+    return jnp.where(fixed.dependent, v - root * (fixed._plus(D) @ rate), v)
 
 
 @jax.custom_jvp
-def _accelerations(held: Partitioned, t: Any, q: Vector, v: Vector) -> Vector:
-    M, F, A, c = held.matrices(t, q, v)
+def _accelerations(fixed: PartitionedSystem, t: Any, q: Vector, v: Vector) -> Vector:
+    M, F, A, c = fixed.matrices(t, q, v)
     if not len(A):
         return F / jnp.diag(M)
-    root, w = 1 / jnp.sqrt(jnp.diag(M)), held.equations.scales.weights
+    root, w = 1 / jnp.sqrt(jnp.diag(M)), fixed.equations.scales.weights
     A, c = w[:, None] * A, w * c
-    plus = held._plus(A * root)
-    free = jnp.diag(jnp.where(held.dependent, 0.0, 1.0))
-    return along(M, F, free - root[:, None] * (plus @ (A @ free)), root * (plus @ c))
+    plus = fixed._plus(A * root)
+    free = jnp.diag(jnp.where(fixed.dependent, 0.0, 1.0))
+    return null_space_accelerations(M, F, free - root[:, None] * (plus @ (A @ free)), root * (plus @ c))
 
 
 @_accelerations.defjvp
 def _(primals, tangents):
     """At constant rank the accelerations are those of the Udwadia-Kalaba equation."""
-    plain = lambda held, *state: held.equations.accelerations(*state)  # noqa: E731
+    plain = lambda fixed, *state: fixed.equations.accelerations(*state)  # noqa: E731
     return _accelerations(*primals), jax.jvp(plain, primals, tangents)[1]

@@ -7,8 +7,9 @@ from typing import Any
 from udkjax.equations.scalar_equations import ScalarEquations, scalar_equations
 from udkjax.equations.structure import structure
 from udkjax.expressions import Program, Scalar, frontier
+from udkjax.expressions.selection import all_of
 from udkjax.pinv.rank_policy import RankPolicy
-from udkjax.pinv.sparse import Factors, Row, all_of, factorize, multipliers, pattern, transpose_times
+from udkjax.pinv.sparse import Row, SparseFactors, factorize, multipliers, pattern, transpose_times
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -186,7 +187,7 @@ class EliminationPrograms(ScenePrograms):
 
     @cached_property
     def tangent_part(self) -> Program:
-        """Of changes of q and v, which it takes after v: what projection leaves, without dependent rows; `Factors.distance`."""
+        """What projection leaves of changes of q and v (after v), without dependent rows; `SparseFactors.distance`."""
         return self._program("tangent_part", self.changes)
 
     @cached_property
@@ -221,7 +222,7 @@ class EliminationPrograms(ScenePrograms):
             found += self._corrected(change, residual, dropping)
         return found
 
-    def _safe(self, factors: Factors) -> Scalar:
+    def _safe(self, factors: SparseFactors) -> Scalar:
         return all_of(factors.above(self.safe_tol) if self.policy.reports else [], self.graph)
 
 

@@ -21,7 +21,7 @@ from udkjax.equations.dense_rows import CLEAR, NEGLIGIBLE
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
 from udkjax.equations.structure import leaves_as_vector
-from udkjax.pinv.sparse import minimum_degree
+from udkjax.pinv.elimination_order import minimum_degree
 from udkjax.scene.mechanism import Mechanism
 
 # A pivot is the square of a length. Up to here it is what rounding leaves of a dependent row: the default of `pinv.Elimination`.
@@ -150,7 +150,7 @@ class SparseRows:
             return None
         return self._position(t, q, D)
 
-    def assembled(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
+    def assemble(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
         """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
         if not self.count:
             return q, v, np.zeros(0), np.zeros(0), 0

@@ -1,8 +1,8 @@
 """Graphs of scalar expressions, recorded once: what is structurally zero vanishes, what is repeated is computed once."""
 
-from udkjax.expressions.derivative import Differential as Differential
-from udkjax.expressions.derivative import cotangents as cotangents
-from udkjax.expressions.derivative import tangents as tangents
+from udkjax.expressions.differential import Differential as Differential
+from udkjax.expressions.differential import cotangents as cotangents
+from udkjax.expressions.differential import tangents as tangents
 from udkjax.expressions.emit import Program as Program
 from udkjax.expressions.emit import frontier as frontier
 from udkjax.expressions.emit import operations as operations

@@ -8,10 +8,10 @@ from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
-from udkjax.expressions.derivative import cotangents, tangents
+from udkjax.expressions.differential import cotangents, tangents
 from udkjax.expressions.emit import Program
 from udkjax.expressions.graph import Scalar
-from udkjax.expressions.loops import ADD, SET, Clear, Kernel, Loop, LoopProgram, Slot
+from udkjax.expressions.loop_program import ADD, SET, Clear, Kernel, Loop, LoopProgram, Slot
 
 TANGENT, COTANGENT = "d_", "bar_"
 

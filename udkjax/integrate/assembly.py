@@ -131,12 +131,12 @@ def close(
 def _assembled_at_once(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> Any:
     """q and v closed, what is left of Psi and Psi_dot, and the rank of D, of known numbers."""
     if not is_large(mechanism):  # for which it takes longer to compile anything
-        return DenseRows(mechanism, scales).assembled(t, q, v)
+        return DenseRows(mechanism, scales).assemble(t, q, v)
     if by_native.closes(mechanism):
         return by_native.closed_at_once(mechanism, scales, rank_tolerance(mechanism), t, q, v)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 
-    return SparseRows(mechanism).assembled(t, q, v)
+    return SparseRows(mechanism).assemble(t, q, v)
 
 
 # How each mechanism that still exists was last assembled: who simulates it again need not close it again.
@@ -153,7 +153,7 @@ def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State 
 
 
 def _assembled(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
-    return TracedRows(prepare(mechanism, SVD(), analysis=analysis)).assembled(_closed, t, q, v)
+    return TracedRows(prepare(mechanism, SVD(), analysis=analysis)).assemble(_closed, t, q, v)
 
 
 class Assembly(Function):

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.partitioning import Partitioned
+from udkjax.equations.partitioning import PartitionedSystem
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
@@ -190,7 +190,7 @@ def _simulate(
     equations = equations_of(mechanism, method, baumgarte, formulation, analysis)
     if xp is np:  # each operation of JAX on known numbers would be a program to compile
         equations, closure, state, dt0 = jax.tree.map(_by_numpy, (equations, closure, state, dt0))
-    projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, Partitioned))
+    projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, PartitionedSystem))
     if state is None:
         assert closure is not None
         state, closed = closure.state, xp.asarray(closure.is_closed)

@@ -8,7 +8,7 @@ from typing import Any
 
 from udkjax.equations.loop_programs import LoopPrograms
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
-from udkjax.expressions.loops import Clear, LoopProgram
+from udkjax.expressions.loop_program import Clear, LoopProgram
 from udkjax.native.closing import POSITION, VELOCITY, Closing
 from udkjax.native.closing_derivatives import Along, Back
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from udkjax.equations.implicit_derivative import acceleration_derivative, projection_derivative
 from udkjax.equations.loop_programs import DifferentiableProgram, LoopPrograms
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
-from udkjax.expressions.loops import Clear, LoopProgram
+from udkjax.expressions.loop_program import Clear, LoopProgram
 from udkjax.native.program import Place, numbered
 
 SUFFIXES = {"accelerations": "", "projection": "_projection", "position": "_position", "velocity": "_velocity"}

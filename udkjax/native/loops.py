@@ -1,10 +1,10 @@
-"""Programs of loops (expressions/loops.py) as LLVM functions."""
+"""Programs of loops (expressions/loop_program.py) as LLVM functions."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from udkjax.expressions.loops import ADD, LEAST, Clear, Kernel, LoopProgram, Slot
+from udkjax.expressions.loop_program import ADD, LEAST, Clear, Kernel, LoopProgram, Slot
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.program import Place, Writer, as_stored
 

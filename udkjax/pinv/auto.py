@@ -4,7 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.pinv.rule import Dense, number
-from udkjax.pinv.svd import SVD, Factors
+from udkjax.pinv.svd import SVD, SVDFactors
 
 # A pivot relative to the diagonal entry of its row is the square of a distance from dependence, and elimination loses its digits
 # by the reciprocal: 1e-6 leaves ten. Crossing singular configurations goes as well with 1e-5 and with 1e-7; singular values are
@@ -27,11 +27,11 @@ class Auto(Dense):
         """The method that it turns to."""
         return SVD(self.rank_tol, self.relative)
 
-    def factor(self, D: Float[Array, "m n"]) -> Factors:
+    def factor(self, D: Float[Array, "m n"]) -> SVDFactors:
         return self.rank_revealing.factor(D)
 
-    def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+    def apply(self, factors: SVDFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         return self.rank_revealing.apply(factors, b)
 
-    def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+    def apply_transpose(self, factors: SVDFactors, c: Float[Array, "n"]) -> Float[Array, "m"]:
         return self.rank_revealing.apply_transpose(factors, c)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.pinv.rule import Dense, beyond, dot
 
 
-class Factors(NamedTuple):
+class EliminationFactors(NamedTuple):
     """D and S, with D^+ = D^T S."""
 
     D: Float[Array, "m n"]
@@ -31,7 +31,7 @@ class Elimination(Dense):
     stays well below it, and what lies below it has lost most of its digits.
     """
 
-    def factor(self, D: Float[Array, "m n"]) -> Factors:
+    def factor(self, D: Float[Array, "m n"]) -> EliminationFactors:
         gram = dot(D, D.T)
         length = jnp.sqrt(jnp.diagonal(gram))
         unit = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
@@ -47,13 +47,13 @@ class Elimination(Dense):
         inner = _inverse(inner[again])[:, jnp.argsort(again)]
         both = jnp.where(kept[:, None], dot(inverse.T, dot(inverse, dot(inner.T, dot(inner, C.T)))), 0.0)
         back = jnp.argsort(order)
-        return Factors(D, both[back][:, back], jnp.sum(kept))
+        return EliminationFactors(D, both[back][:, back], jnp.sum(kept))
 
-    def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+    def apply(self, factors: EliminationFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         x = dot(factors.D.T, dot(factors.S, b))
         return x + dot(factors.D.T, dot(factors.S, b - dot(factors.D, x)))  # refined once: S was made of explicit inverses
 
-    def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+    def apply_transpose(self, factors: EliminationFactors, c: Float[Array, "n"]) -> Float[Array, "m"]:
         y = dot(factors.S.T, dot(factors.D, c))
         return y + dot(factors.S.T, dot(factors.D, c - dot(factors.D.T, y)))
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.pinv.orthogonal import Factors, Orthogonal, PivotedQR, divide
+from udkjax.pinv.orthogonal import Orthogonal, OrthogonalFactors, PivotedQR, divide
 from udkjax.pinv.rule import beyond, dot
 
 
@@ -19,10 +19,10 @@ class GramSchmidt(Orthogonal):
 
     twice: bool = eqx.field(static=True, default=True)
 
-    def factor(self, D: Float[Array, "m n"]) -> Factors:
+    def factor(self, D: Float[Array, "m n"]) -> OrthogonalFactors:
         q, r, _, rank = gram_schmidt(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()), self.twice)
         z, u, order, _ = gram_schmidt(r.T, jnp.zeros((), D.dtype), self.twice)  # the rank is decided: leave out zero rows only
-        return Factors(divide(u[:, order], z.T, rank).T, q[:, order], rank)
+        return OrthogonalFactors(divide(u[:, order], z.T, rank).T, q[:, order], rank)
 
 
 def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: bool) -> PivotedQR:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 from udkjax.pinv.rule import Dense, beyond, dot
 
 
-class Factors(NamedTuple):
+class GrevilleFactors(NamedTuple):
     """D^+ itself."""
 
     plus: Float[Array, "n m"]
@@ -30,7 +30,7 @@ class Greville(Dense):
     the result wrong by any factor.
     """
 
-    def factor(self, D: Float[Array, "m n"]) -> Factors:
+    def factor(self, D: Float[Array, "m n"]) -> GrevilleFactors:
         rows, columns = D.shape
         eps = float(jnp.finfo(D.dtype).eps)
         threshold = self.threshold(D, jnp.linalg.norm(D, axis=1).max(), default=eps ** (1 / 3))
@@ -47,10 +47,10 @@ class Greville(Dense):
 
         start = jnp.zeros((columns, rows), D.dtype), jnp.array(0)
         (plus, rank), _ = jax.lax.scan(append, start, (D, jnp.eye(rows, dtype=D.dtype)))
-        return Factors(plus, rank)
+        return GrevilleFactors(plus, rank)
 
-    def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+    def apply(self, factors: GrevilleFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         return dot(factors.plus, b)
 
-    def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+    def apply_transpose(self, factors: GrevilleFactors, c: Float[Array, "n"]) -> Float[Array, "m"]:
         return dot(factors.plus.T, c)

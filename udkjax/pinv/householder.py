@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.pinv.orthogonal import Factors, Orthogonal, PivotedQR, divide
+from udkjax.pinv.orthogonal import Orthogonal, OrthogonalFactors, PivotedQR, divide
 from udkjax.pinv.rule import beyond, dot
 
 
@@ -20,7 +20,7 @@ class Householder(Orthogonal):
     Error of the order of eps cond(D).
     """
 
-    def factor(self, D: Float[Array, "m n"]) -> Factors:
+    def factor(self, D: Float[Array, "m n"]) -> OrthogonalFactors:
         columns = D.shape[1]
         q, r, order, rank = pivoted_qr(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()))
         divided = divide(r[:, order], jnp.hstack([r, q.T]), rank)
@@ -28,7 +28,7 @@ class Householder(Orthogonal):
         pivots = jax.nn.one_hot(order, columns, dtype=D.dtype, axis=0) * (jnp.arange(len(order)) < rank)  # E
         null = jnp.where(pivots.any(axis=1), 0, jnp.eye(columns, dtype=D.dtype) - dot(pivots, g))
         v = pivoted_qr(null, jnp.zeros((), D.dtype)).q
-        return Factors(pivots - dot(v, dot(v.T, pivots)), basic.T, rank)
+        return OrthogonalFactors(pivots - dot(v, dot(v.T, pivots)), basic.T, rank)
 
 
 def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:

@@ -18,7 +18,7 @@ class PivotedQR(NamedTuple):
     rank: Int[Array, ""]
 
 
-class Factors(NamedTuple):
+class OrthogonalFactors(NamedTuple):
     """D^+ = Z Q^T."""
 
     z: Float[Array, "n k"]
@@ -29,10 +29,10 @@ class Factors(NamedTuple):
 class Orthogonal(Dense):
     """A method whose factors are Z and Q, one of them with the triangle divided out."""
 
-    def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+    def apply(self, factors: OrthogonalFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         return dot(factors.z, dot(factors.q.T, b))
 
-    def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+    def apply_transpose(self, factors: OrthogonalFactors, c: Float[Array, "n"]) -> Float[Array, "m"]:
         return dot(factors.q, dot(factors.z.T, c))
 
 

@@ -7,13 +7,13 @@ says that the row depends on them; it is dropped, and counted out of the rank.
 """
 
 from collections.abc import Sequence
-from heapq import heapify, heappop, heappush
 from typing import Any, NamedTuple
 
 import numpy as np
-from jax import lax
 
 from udkjax.expressions import Graph, Scalar
+from udkjax.expressions.selection import absolute, greater, larger, where
+from udkjax.pinv.elimination_order import minimum_degree
 
 Row = dict[int, Scalar]
 
@@ -59,34 +59,7 @@ def pattern(rows: Sequence[Row], columns: int) -> tuple[Pattern, list[Scalar]]:
     return Pattern((len(rows), columns), tuple(entries)), values
 
 
-def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
-    """Order rows so that eliminating D D^T fills little: always the row that meets the fewest others.
-
-    Of several the one that waits for the fewest before it (ties: the first): what does not wait is computed side by side.
-    """
-    meets: dict[int, set[int]] = {}
-    for i, row in enumerate(rows):
-        for k in row:
-            meets.setdefault(k, set()).add(i)
-    near = [set().union(*(meets[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
-    order: list[int] = []
-    wait = [0] * len(rows)  # how many others, one after the other, come before
-    queue, left = [(len(others), 0, i) for i, others in enumerate(near)], set(range(len(rows)))
-    heapify(queue)
-    while left:
-        *known, i = heappop(queue)
-        if i not in left or known != [len(near[i]), wait[i]]:  # counted anew since
-            continue
-        left.remove(i)
-        order.append(i)
-        for k in near[i]:
-            near[k] = (near[k] | near[i]) - {i, k}
-            wait[k] = max(wait[k], wait[i] + 1)
-            heappush(queue, (len(near[k]), wait[k], k))
-    return order
-
-
-class Factors(NamedTuple):
+class SparseFactors(NamedTuple):
     """L diag(p) L^T, factorized in the given order."""
 
     order: list[int]
@@ -107,10 +80,10 @@ class Factors(NamedTuple):
         return one / graph.sqrt(times[0]) if times else graph.constant(np.inf)
 
 
-def factorize(rows: Sequence[Row], graph: Graph, drop: Scalar | None = None) -> Factors:
-    """D D^T = L diag(p) L^T. A pivot that does not exceed `drop` times its row's diagonal entry takes its row out.
+def factorize(rows: Sequence[Row], graph: Graph, drop_tol: Scalar | None = None) -> SparseFactors:
+    """D D^T = L diag(p) L^T. A pivot that does not exceed `drop_tol` times its row's diagonal entry takes its row out.
 
-    Zero stands for its reciprocal. Without `drop` no pivot is looked at, and no other waits for that.
+    Zero stands for its reciprocal. Without `drop_tol` no pivot is looked at, and no other waits for that.
     """
     order = minimum_degree([set(row) for row in rows])
     place = {row: j for j, row in enumerate(order)}
@@ -126,11 +99,11 @@ def factorize(rows: Sequence[Row], graph: Graph, drop: Scalar | None = None) -> 
                 if place[j] <= place[i]:
                     target = column[place[j]]
                     target[place[i]] = target.get(place[i], zero) + rows[i][k] * rows[j][k]
-    return Factors(order, column, *eliminate(column, len(rows), graph, drop))
+    return SparseFactors(order, column, *eliminate(column, len(rows), graph, drop_tol))
 
 
 def eliminate(
-    column: list[dict[int, Scalar]], count: int, graph: Graph, drop: Scalar | None = None
+    column: list[dict[int, Scalar]], count: int, graph: Graph, drop_tol: Scalar | None = None
 ) -> tuple[list[Scalar], list[tuple[Scalar, Scalar]]]:
     """Eliminate the first rows of a symmetric matrix, given by the columns of its lower triangle.
 
@@ -142,7 +115,7 @@ def eliminate(
     inverse, pivots = [], []
     for j in range(count):
         d = column[j].get(j, zero)
-        inverse.append(one / d if drop is None else where(greater(d, diagonal[j] * drop), one / d, zero))
+        inverse.append(one / d if drop_tol is None else where(greater(d, diagonal[j] * drop_tol), one / d, zero))
         pivots.append((d, diagonal[j]))
         below = sorted(i for i in column[j] if i > j)
         lower = {i: column[j][i] * inverse[j] for i in below}
@@ -154,7 +127,7 @@ def eliminate(
     return inverse, pivots
 
 
-def multipliers(factors: Factors, b: Sequence[Scalar]) -> list[Scalar]:
+def multipliers(factors: SparseFactors, b: Sequence[Scalar]) -> list[Scalar]:
     """y with D D^T y = b, zero where a row was dropped."""
     y = backward(factors.lower, factors.inverse_pivots, forward(factors.lower, [b[i] for i in factors.order]))
     result: list[Scalar] = [b[0]] * len(b)
@@ -189,39 +162,3 @@ def transpose_times(rows: Sequence[Row], y: Sequence[Scalar], columns: int, zero
         for k, entry in row.items():
             x[k] = x[k] + entry * multiplier
     return x
-
-
-def absolute(a: Scalar) -> Scalar:
-    """|a|."""
-    return a.graph.apply(lax.abs_p, {}, (a,), a.node.dtype, np.abs)
-
-
-def greater(a: Scalar, b: Scalar) -> Scalar:
-    """a > b."""
-    return a.graph.apply(lax.gt_p, {}, (a, b), bool, np.greater)
-
-
-def at_least(a: Scalar, b: Scalar) -> Scalar:
-    """a >= b."""
-    return a.graph.apply(lax.ge_p, {}, (a, b), bool, np.greater_equal)
-
-
-def larger(a: Scalar, b: Scalar) -> Scalar:
-    """max(a, b)."""
-    return a.graph.apply(lax.max_p, {}, (a, b), a.node.dtype, np.maximum)
-
-
-def where(condition: Scalar, yes: Scalar, no: Scalar) -> Scalar:
-    """One of two scalars."""
-    if condition.constant is not None:
-        return yes if condition.constant else no
-    return yes.graph.apply(lax.select_n_p, {}, (condition, no, yes), yes.node.dtype, lambda c, n, y: y if c else n)
-
-
-def all_of(conditions: Sequence[Scalar], graph: Graph) -> Scalar:
-    """Whether all conditions hold."""
-    result = graph.constant(True, bool)
-    for c in conditions:
-        if c.constant is not True:
-            result = c if result.constant is True else result.graph.apply(lax.and_p, {}, (result, c), bool, np.logical_and)
-    return result

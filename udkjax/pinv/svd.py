@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from udkjax.pinv.rule import Dense, beyond, dot
 
 
-class Factors(NamedTuple):
+class SVDFactors(NamedTuple):
     """D^+ = V S^+ U^T."""
 
     u: Float[Array, "m k"]
@@ -23,13 +23,13 @@ class SVD(Dense):
     Error of the order of eps cond(D), cond over the kept singular values.
     """
 
-    def factor(self, D: Float[Array, "m n"]) -> Factors:
+    def factor(self, D: Float[Array, "m n"]) -> SVDFactors:
         u, sigma, vt = jnp.linalg.svd(D, full_matrices=False)
         kept = beyond(sigma, self.threshold(D, sigma[0]))
-        return Factors(u, jnp.where(kept, 1 / jnp.where(kept, sigma, 1), 0), vt.T, kept.sum())
+        return SVDFactors(u, jnp.where(kept, 1 / jnp.where(kept, sigma, 1), 0), vt.T, kept.sum())
 
-    def apply(self, factors: Factors, b: Float[Array, "m"]) -> Float[Array, "n"]:
+    def apply(self, factors: SVDFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         return dot(factors.v, factors.inverse * dot(factors.u.T, b))
 
-    def apply_transpose(self, factors: Factors, c: Float[Array, "n"]) -> Float[Array, "m"]:
+    def apply_transpose(self, factors: SVDFactors, c: Float[Array, "n"]) -> Float[Array, "m"]:
         return dot(factors.u, factors.inverse * dot(factors.v.T, c))

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.pinv.householder import pivoted_qr
-from udkjax.pinv.orthogonal import Factors, Orthogonal, divide
+from udkjax.pinv.orthogonal import Orthogonal, OrthogonalFactors, divide
 
 
 class Varga(Orthogonal):
@@ -16,7 +16,7 @@ class Varga(Orthogonal):
     Error of the order of eps cond(D): orthogonal transformations only.
     """
 
-    def factor(self, D: Float[Array, "m n"]) -> Factors:
+    def factor(self, D: Float[Array, "m n"]) -> OrthogonalFactors:
         q, r, _, rank = pivoted_qr(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()))
         z, u, order, _ = pivoted_qr(r.T, jnp.zeros((), D.dtype))  # the rank is decided: leave out zero rows only
-        return Factors(divide(u[:, order], z.T, rank).T, q[:, order], rank)
+        return OrthogonalFactors(divide(u[:, order], z.T, rank).T, q[:, order], rank)

@@ -4,7 +4,7 @@ A differential is a combination of those of the inputs, d f = sum (df/dx) dx, ke
 are expressions of the same graph, so that what they share with the function, a cosine, say, is one node, and what is zero
 vanishes. They hold for any number of directions at once, and transposed for reverse mode: neither is taken through the nodes.
 
-An opaque node (an array primitive) is a station on the way: what it returns counts as further inputs, whose differentials
+What an opaque node (an array primitive, `call`) returns counts as further inputs, whose differentials
 follow from those of its arguments by JAX's own rule for the primitive, forward or transposed.
 """
 
@@ -31,9 +31,9 @@ class Differential:
         self.graph, self.inputs = graph, list(inputs)
         given = {s.index for s in (*self.inputs, *fixed)}
         self._rows: dict[int, Row] = {s.index: {s.index: graph.constant(1.0, s.node.dtype)} for s in self.inputs}
-        self._stations: dict[int, list[int]] = {}  # opaque nodes that move, and their results
+        self._calls: dict[int, list[int]] = {}  # opaque nodes that move, and their results
         for index in graph.needed((s.index for s in outputs), given):
-            row = self._differentiated(index)
+            row = self._differentiate(index)
             if row:
                 self._rows[index] = row
 
@@ -42,27 +42,27 @@ class Differential:
         row = self._rows.get(output.index, {})
         return row if output.sign > 0 else {k: -p for k, p in row.items()}
 
-    def along(self, tangents: Mapping[int, Scalar]) -> Row:
+    def forward(self, tangents: Mapping[int, Scalar]) -> Row:
         """From the tangents of inputs, by index, those of everything that rows refer to. An input without one does not move."""
         known = {k: t for k, t in tangents.items() if not t.is_zero}
-        for station, results in self._stations.items():
-            arguments = [product(self.row(a), known, self.graph) for a in self.graph.nodes[station].arguments]
-            known.update(_pushed(self.graph, station, results, arguments))
+        for call, results in self._calls.items():
+            arguments = [product(self.row(a), known, self.graph) for a in self.graph.nodes[call].arguments]
+            known.update(_push_forward(self.graph, call, results, arguments))
         return known
 
-    def back(self, cotangents: Row) -> list[Scalar]:
+    def reverse(self, cotangents: Row) -> list[Scalar]:
         """From the cotangents of everything that rows refer to, by index, those of the inputs."""
         known = dict(cotangents)
-        for station, results in reversed(self._stations.items()):
+        for call, results in reversed(self._calls.items()):
             seeds = {k: known.pop(k) for k in results if k in known}
             if seeds:
-                arguments = self.graph.nodes[station].arguments
-                pulled = _pulled(self.graph, station, seeds, [bool(self.row(a)) for a in arguments])
+                arguments = self.graph.nodes[call].arguments
+                pulled = _pull_back(self.graph, call, seeds, [bool(self.row(a)) for a in arguments])
                 for argument, cotangent in zip(arguments, pulled, strict=True):
                     accumulate(known, self.row(argument), cotangent)
         return [known.get(s.index, self.graph.constant(0.0, s.node.dtype)) for s in self.inputs]
 
-    def _differentiated(self, index: int) -> Row:
+    def _differentiate(self, index: int) -> Row:
         graph, node = self.graph, self.graph.nodes[index]
         if node.kind in ("input", "constant", "call") or not np.issubdtype(node.dtype, np.floating):
             return {}
@@ -70,10 +70,10 @@ class Differential:
             (call,) = node.arguments
             if not any(self.row(a) for a in call.node.arguments):
                 return {}
-            self._stations.setdefault(call.index, []).append(index)
+            self._calls.setdefault(call.index, []).append(index)
             return {index: graph.constant(1.0, node.dtype)}
         if node.kind == "apply" and node.detail.primitive.name == "select_n":
-            return self._chosen(node)
+            return self._differentiate_choice(node)
         result: Row = {}
         for k, argument in enumerate(node.arguments):
             row = self.row(argument)
@@ -81,7 +81,7 @@ class Differential:
                 accumulate(result, row, _partial(graph, index, node, k))
         return {k: p for k, p in result.items() if not p.is_zero}
 
-    def _chosen(self, node: Node) -> Row:
+    def _differentiate_choice(self, node: Node) -> Row:
         which, *cases = node.arguments
         rows, zero = [self.row(a) for a in cases], self.graph.constant(0.0, node.dtype)
         parts = {k: (which, *(row.get(k, zero) for row in rows)) for row in rows for k in row}
@@ -93,7 +93,7 @@ class Differential:
 def tangents(graph: Graph, outputs: Sequence[Scalar], seeds: Mapping[Scalar, Scalar]) -> list[Scalar]:
     """The directional derivatives of outputs, `seeds` being the tangents of inputs. What has no seed does not move."""
     differential = Differential(graph, outputs, list(seeds))
-    known = differential.along({s.index: t if s.sign > 0 else -t for s, t in seeds.items()})
+    known = differential.forward({s.index: t if s.sign > 0 else -t for s, t in seeds.items()})
     return [product(differential.row(s), known, graph) for s in outputs]
 
 
@@ -102,7 +102,7 @@ def cotangents(graph: Graph, outputs: Sequence[Scalar], seeds: Sequence[Scalar],
     differential, found = Differential(graph, outputs, inputs), {}
     for output, seed in zip(outputs, seeds, strict=True):
         accumulate(found, differential.row(output), seed)
-    return [c if s.sign > 0 else -c for c, s in zip(differential.back(found), inputs, strict=True)]
+    return [c if s.sign > 0 else -c for c, s in zip(differential.reverse(found), inputs, strict=True)]
 
 
 def product(row: Row, known: Mapping[int, Scalar], graph: Graph) -> Scalar:
@@ -177,9 +177,9 @@ def _slope(detail: Details, dtypes: tuple, k: int) -> Any:
     return jax.make_jaxpr(slope)(*(jax.ShapeDtypeStruct((), d) for d in dtypes))
 
 
-def _pushed(graph: Graph, station: int, results: Sequence[int], tangents: Sequence[Scalar]) -> Row:
+def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Sequence[Scalar]) -> Row:
     """The tangents of what an opaque node returns."""
-    node = graph.nodes[station]
+    node = graph.nodes[call]
     arrays, dots = _arrays(node, node.arguments), _arrays(node, tangents)
     moving = [k for k, dot in enumerate(dots) if any(not s.is_zero for s in dot.flat)]
     if not moving:
@@ -187,26 +187,26 @@ def _pushed(graph: Graph, station: int, results: Sequence[int], tangents: Sequen
     wanted = _outputs(graph, results)
 
     def pushed(arrays, dots):
-        return jax.jvp(_of(node.detail, arrays, moving, wanted), [arrays[k] for k in moving], dots)[1]
+        return jax.jvp(_restrict(node.detail, arrays, moving, wanted), [arrays[k] for k in moving], dots)[1]
 
     jaxpr = jax.make_jaxpr(pushed)(_structs(arrays), _structs([dots[k] for k in moving]))
     found = dict(zip(wanted, read(graph, jaxpr, [*arrays, *(dots[k] for k in moving)]), strict=True))
-    return {k: _picked(graph, k, found) for k in results if not _picked(graph, k, found).is_zero}
+    return {k: _pick(graph, k, found) for k in results if not _pick(graph, k, found).is_zero}
 
 
-def _pulled(graph: Graph, station: int, seeds: Row, moves: Sequence[bool]) -> list[Scalar]:
+def _pull_back(graph: Graph, call: int, seeds: Row, moves: Sequence[bool]) -> list[Scalar]:
     """The cotangents of the arguments of an opaque node, from those of what it returns."""
-    node = graph.nodes[station]
+    node = graph.nodes[call]
     arrays, wanted = _arrays(node, node.arguments), _outputs(graph, list(seeds))
     moving = [k for k, flags in enumerate(_arrays(node, moves)) if flags.any()]
-    shapes = jax.eval_shape(lambda *a: _of(node.detail, a, [], wanted)(), *_structs(arrays))
+    shapes = jax.eval_shape(lambda *a: _restrict(node.detail, a, [], wanted)(), *_structs(arrays))
     cts = [np.full(s.shape, graph.constant(0.0, s.dtype), object) for s in shapes]
     for k, seed in seeds.items():
         output, flat = graph.nodes[k].detail
         cts[wanted.index(output)].reshape(-1)[flat] = seed
 
     def pulled(arrays, cts):
-        return jax.vjp(_of(node.detail, arrays, moving, wanted), *(arrays[k] for k in moving))[1](cts)
+        return jax.vjp(_restrict(node.detail, arrays, moving, wanted), *(arrays[k] for k in moving))[1](cts)
 
     jaxpr = jax.make_jaxpr(pulled)(_structs(arrays), list(shapes))
     result = [np.full(a.shape, graph.constant(0.0), object) for a in arrays]
@@ -215,7 +215,7 @@ def _pulled(graph: Graph, station: int, seeds: Row, moves: Sequence[bool]) -> li
     return [s for array in result for s in array.flat]
 
 
-def _of(detail: Details, arrays: Sequence[Any], moving: Sequence[int], wanted: Sequence[int]) -> Any:
+def _restrict(detail: Details, arrays: Sequence[Any], moving: Sequence[int], wanted: Sequence[int]) -> Any:
     """An array primitive as a function of some of its arguments, with some of its results."""
 
     def function(*some):
@@ -233,7 +233,7 @@ def _outputs(graph: Graph, results: Sequence[int]) -> list[int]:
     return sorted({graph.nodes[k].detail[0] for k in results})
 
 
-def _picked(graph: Graph, k: int, found: Mapping[int, np.ndarray]) -> Scalar:
+def _pick(graph: Graph, k: int, found: Mapping[int, np.ndarray]) -> Scalar:
     output, flat = graph.nodes[k].detail
     return found[output].flat[flat]  # pyright: ignore[reportReturnType]
 

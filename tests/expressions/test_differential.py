@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 
 from udkjax.expressions import Differential, Graph, Program, cotangents, tangents, trace
-from udkjax.expressions.derivative import common_factors
+from udkjax.expressions.differential import common_factors
 
 X, Y = np.array([0.3, -0.7, 1.1]), np.array([0.5, 0.9, -0.4])
 FUNCTIONS = {

@@ -95,7 +95,7 @@ class LoopProgram(NamedTuple):
         return found.union(*({part.array(x) for x in part.kernel.arrays} for part in self.parts if isinstance(part, Loop)))
 
 
-def by_arrays(program: LoopProgram, arrays: dict[str, Any], xp: Any) -> dict[str, Any]:
+def evaluate_loops(program: LoopProgram, arrays: dict[str, Any], xp: Any) -> dict[str, Any]:
     """The arrays as a program leaves them, all rows of a loop at once, by NumPy or JAX: none may take anything from another."""
     found = dict(arrays)
     for part in program.parts:
