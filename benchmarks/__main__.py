@@ -16,6 +16,7 @@ NAMES = (
     "scaling",
     "sweep",
     "identification",
+    "uniqueness",
     "peers",
 )
 

@@ -9,7 +9,18 @@ import pytest
 
 benchmarks = pytest.importorskip("benchmarks", reason="not in a source tree")
 
-from benchmarks import batch, gradients, identification, integrators, measurements, right_hand_side, sweep, table, trajectory  # noqa: E402
+from benchmarks import (  # noqa: E402
+    batch,
+    gradients,
+    identification,
+    integrators,
+    measurements,
+    right_hand_side,
+    sweep,
+    table,
+    trajectory,
+    uniqueness,
+)
 from benchmarks.__main__ import main  # noqa: E402
 from benchmarks.common import Compiled, Work, alternate, at_equal_error, frontier, ratio  # noqa: E402
 from benchmarks.scripts import by_cholesky, by_pinv  # noqa: E402
@@ -23,6 +34,12 @@ def test_right_hand_side(tmp_path, capsys):
     assert "udkjax Elimination" in names and names[0] == "script, jnp.linalg.pinv"
     assert all(row["us"] > 0 for row in written["figures"])
     assert "udkjax Elimination" in capsys.readouterr().out
+
+
+def test_uniqueness():
+    """The scripts are held against the package inside."""
+    figures = uniqueness.main(smoke=True)
+    assert [row["name"] for row in figures][-1] == "udkjax, vmap" and all(row["us"] > 0 for row in figures)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from udkjax.equations.analysis import analyse
 from udkjax.integrate import Solution
 from udkjax.scene import Mechanism
 from udkjax.study.accuracy import Accuracy
+from udkjax.study.row_labels import plural, row_label
 
 
 def check_summary(mech: Mechanism, check) -> str:
@@ -14,7 +15,7 @@ def check_summary(mech: Mechanism, check) -> str:
         "constraint rows": f"{check.rows} in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}",
         "rank": f"{check.rank}",
         "degrees of freedom": f"{check.degrees_of_freedom}",
-        "redundant rows": ", ".join(row_name(mech, *row) for row in check.redundant) or "none",
+        "redundant rows": ", ".join(row_label(mech, *row) for row in check.redundant) or "none",
     }
     if check.dependent:
         lines["depend on each other"] = ", ".join(check.dependent)
@@ -58,19 +59,7 @@ def trust(accuracy: Accuracy) -> dict[str, str]:
     return lines
 
 
-def row_name(mech: Mechanism, constraint: str, row: int) -> str:
-    """Name one row of a constraint, such as `B2 (y)`."""
-    rows = {"Revolute": "xy", "Weld": ("x", "y", "angle"), "Prismatic": ("across", "angle")}
-    known = rows.get(type(mech.constraints[constraint]).__name__)
-    return f"{constraint} ({known[row]})" if known else f"{constraint} (row {row + 1})"
-
-
 def table(title: str, lines: dict[str, str]) -> str:
     """Lay out names and values below a title."""
     width = max(map(len, lines))
     return "\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in lines.items())])
-
-
-def plural(count: int, noun: str) -> str:
-    """Say how many there are."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"

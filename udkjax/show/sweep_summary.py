@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from udkjax.integrate import Result
-from udkjax.show.summary import plural, table
+from udkjax.show.summary import table
 from udkjax.show.sweep_figures import RESULT, scalars
+from udkjax.study.row_labels import plural
 from udkjax.study.sweep.chunk import bytes_per_member, variables_of
 from udkjax.study.sweep.dry_run import Estimate
 from udkjax.study.sweep.plan import Plan
