@@ -87,11 +87,15 @@ def test_micrometres_bounce_alike():
     assert np.abs(small.events.time[:8] * 1e3 - large.events.time[:8]).max() < 1e-10
 
 
+def swing(lower, restitution, ts, rtol=1e-11):
+    """The pendulum, from rest beside its pin, with a stop."""
+    stop = udk.JointLimit("A", lower=lower, restitution=restitution)
+    return udk.simulate(PENDULUM, ts, rtol=rtol, atol=rtol, events=stop, max_events=ROOM)
+
+
 def test_pendulum_bounces_off_a_stop_as_elliptic_integrals_say():
     e, w = 0.95, np.sqrt(2 * SWING)
-    sol = udk.simulate(
-        PENDULUM, TS * 2.4, rtol=1e-11, atol=1e-11, events=udk.JointLimit("A", lower=-np.pi / 2, restitution=e), max_events=ROOM
-    )
+    sol = swing(-np.pi / 2, e, TS * 2.4)
     speeds = w * e ** np.arange(1, ROOM)  # after each impact; away and back takes half a period
     times = ellipk(0.5) / np.sqrt(SWING) + np.append(0.0, np.cumsum(2 * ellipk(speeds**2 / (4 * SWING)) / np.sqrt(SWING)))
     count = int(sol.events.count)
@@ -99,6 +103,149 @@ def test_pendulum_bounces_off_a_stop_as_elliptic_integrals_say():
     assert np.abs(sol.events.time - times[:count]).max() < 1e-10
     assert np.abs(sol.events.v_after[:, 0, 2] - speeds[:count]).max() < 1e-9
     assert np.abs(sol.events.q_before[:, 0, 2] + np.pi / 2).max() < 1e-12
+
+
+@pytest.mark.parametrize("depth", [1e-4, 1e-8])
+def test_what_touches_hits_and_what_does_not_does_not(depth):
+    """A swing to -pi and a stop that much before or behind it: between two times of the grid it goes there and back."""
+    hit, miss = swing(-np.pi + depth, 1.0, TS / 4), swing(-np.pi - depth, 1.0, TS / 4)
+    assert hit.events.count >= 1 and miss.events.count == 0
+    half = 2 * ellipk(0.5) / np.sqrt(SWING)
+    early = np.sqrt(2 * depth / SWING)  # with the acceleration that it has there
+    assert abs(float(hit.events.time[0]) - (half - early)) < 0.01 * early
+    assert abs(float(hit.events.q_before[0, 0, 2]) + np.pi - depth) < 1e-12
+
+
+def test_stop_of_a_redundant_mechanism():
+    """The paper's linkage swings as a pendulum, 3.05 theta'' = -3.5 g cos(theta), whichever link has the stop."""
+    mech, e, square = udk.library.parallelogram(), 0.8, 3.5 * G / 3.05
+    sol = udk.simulate(
+        mech, TS / 2, rtol=1e-11, atol=1e-11, events=udk.JointLimit("A2", lower=-np.pi / 2, restitution=e), max_events=ROOM
+    )
+    k = np.sin(np.pi / 8)  # from rest at -45 degrees
+    speeds = 2 * k * np.sqrt(square) * e ** np.arange(1, ROOM)
+    away = 2 * ellipk(speeds**2 / (4 * square)) / np.sqrt(square)
+    times = ellipk(k**2) / np.sqrt(square) + np.append(0.0, np.cumsum(away))
+    count = int(sol.events.count)
+    assert count >= 4 and sol.settings["engine"] == "native"
+    assert np.abs(sol.events.time - times[:count]).max() < 1e-10
+    assert np.abs(sol.events.v_after[:, :3, 2] - speeds[:count, None]).max() < 1e-9
+    assert np.abs(udk.violation(mech, sol)).max() < 1e-12
+
+
+def table(t, at):
+    """How high the ball is above a table that shakes."""
+    return at["ball"].y - 0.1 * jnp.sin(15.0 * t)
+
+
+def test_a_contact_lets_go_where_it_would_have_to_pull():
+    """Of a shaking table, which throws the ball where its acceleration is -g; and catches it again."""
+    ball = BALL.with_parameters({"body.ball.position": [0.0, 0.0], "body.ball.velocity": [0.0, 1.5]})
+    events = [
+        udk.Event(table, udk.Impact(0.0), name="table"),
+        udk.Event(lambda t, at: at["ball"].vy, udk.Log(), direction=-1, name="top"),
+        udk.Event(lambda t, at: t - 0.5, udk.Stop(), name="end"),
+    ]
+    sol = udk.simulate(ball, TS[:5], events=events, max_events=8)
+    names = [sol.events.names[k] for k in sol.events.index]
+    thrown = np.arcsin(G / (0.1 * 15**2)) / 15
+    v = 1.5 * np.cos(15 * thrown)
+    assert names[:3] == ["table rests", "table lets go", "top"] and names[-1] == "end" and names[3] == "table"
+    assert float(sol.events.time[0]) == 0.0
+    assert abs(float(sol.events.time[1]) - thrown) < 1e-9
+    assert np.abs(sol.events.v_after[1, 0] - np.array([0, v, 0])).max() < 1e-9
+    assert abs(float(sol.events.of("top")[0]) - (thrown + v / G)) < 1e-9
+    assert sol.result == udk.Result.event_stop and abs(float(sol.time) - 0.5) < 1e-15
+    t = float(sol.events.of("table")[0])
+    assert abs(0.1 * np.sin(15 * thrown) + v * (t - thrown) - G / 2 * (t - thrown) ** 2 - 0.1 * np.sin(15 * t)) < 1e-9
+    assert np.isnan(sol.q[3:]).all() and np.isfinite(sol.q[:3]).all()
+
+
+# A ball flies into the tip of a pendulum, is caught there by a joint, and where the pendulum passes -60 degrees its pin is cut.
+CATCH = udk.Mechanism(
+    {
+        "link": udk.Body(1.0, 0.1, position=(0.0, -0.5), angle=-np.pi / 2),
+        "ball": udk.Body(0.5, 0.05, position=(-1.0, -1.0 + G / 72), velocity=(6.0, 0.0)),
+    },
+    {"A": udk.Revolute(("ground", "link"), [[0, 0], [-0.5, 0]])},
+)
+CAUGHT = [
+    udk.Event(
+        lambda t, at: at["link"].point((0.5, 0)).x - at["ball"].x,
+        udk.Attach(udk.Weld(("link", "ball"), [[0.5, 0], [0, 0]]), "catch"),
+        name="caught",
+    ),
+    udk.Event(lambda t, at: at["link"].angle + np.pi / 3, udk.Release("A"), name="cut"),
+]
+
+
+def test_catch_and_release():
+    """Angular momentum about the pin at the catch, energy until the cut, and free flight behind it."""
+    ts = np.linspace(0.0, 1.0, 11)
+    sol = udk.simulate(CATCH, ts, events=CAUGHT, rtol=1e-11, atol=1e-11, max_events=4)
+    caught, cut = (float(t) for t in sol.events.time)
+    assert [sol.events.names[k] for k in sol.events.index] == ["caught", "cut"] and abs(caught - 1 / 6) < 1e-12
+    inertia, moment = 0.1 + 0.25 + 0.05 + 0.5, 0.5 * 6.0 * 1.0
+    w = float(sol.events.v_after[0, 0, 2])
+    assert abs(w - moment / inertia) < 1e-11 and abs(float(sol.events.v_after[0, 1, 2]) - w) < 1e-11
+    fallen = (1.0 * 0.5 + 0.5 * 1.0) * G * (1 - np.sin(np.pi / 3))
+    w_cut = np.sqrt(w**2 - 2 * fallen / inertia)
+    assert np.abs(sol.events.v_before[1, :, 2] - w_cut).max() < 1e-9
+    q, v, d = sol.events.q_after[1], sol.events.v_after[1], 1.0 - cut
+    masses = np.array([1.0, 0.5])[:, None] / 1.5
+    centre, velocity = (masses * q[:, :2]).sum(0), (masses * v[:, :2]).sum(0)
+    end = centre + velocity * d + np.array([0, -G / 2]) * d**2
+    assert np.abs((masses * sol.q[-1, :, :2]).sum(0) - end).max() < 1e-10
+    assert np.abs(sol.q[-1, :, 2] - (q[:, 2] + w_cut * d)).max() < 1e-9
+    along = 0.5 * np.array([np.cos(sol.q[-1, 0, 2]), np.sin(sol.q[-1, 0, 2])])
+    assert np.abs(sol.q[-1, 1, :2] - sol.q[-1, 0, :2] - along).max() < 1e-12
+
+
+def test_two_at_one_instant():
+    """A ball in a corner meets both walls at once, and leaves both; two bodies are locked to one another meanwhile."""
+    mech = udk.Mechanism(
+        {
+            "ball": udk.Body(1.0, 0.1, position=(1.0, 1.0), velocity=(-1.0, -1.0)),
+            "arm": udk.Body(1.0, 0.1, position=(5.5, 0.0), velocity=(0.0, 0.25), angular_velocity=0.5),
+        },
+        {"pin": udk.Revolute(("ground", "arm"), [[5.0, 0], [-0.5, 0]])},
+        gravity=(0, 0),
+    )
+    events = [
+        udk.Contact("ball", restitution=0.5, name="floor", at_rest="stop"),
+        udk.Contact("ball", normal=(3, 0), restitution=0.25, name="wall", at_rest="stop"),
+        udk.Event(lambda t, at: at["arm"].angle - 1.0, udk.Lock("pin"), name="lock"),
+    ]
+    sol = udk.simulate(mech, TS, events=events, max_events=4)
+    assert np.abs(sol.events.time - np.array([1.0, 1.0, 2.0])).max() < 1e-11
+    assert sorted(np.asarray(sol.events.index[:2])) == [0, 1]
+    assert np.abs(sol.q[-1] - np.array([[0.25 * 7, 0.5 * 7, 0], [5 + 0.5 * np.cos(1), 0.5 * np.sin(1), 1]])).max() < 1e-10
+    assert np.abs(sol.v[-1, 1]).max() < 1e-12
+
+
+def test_a_thousand_pendulums_each_with_its_own_events():
+    speeds, ts = np.linspace(-6.0, 6.0, 1000), np.linspace(0.0, 4.0, 5)
+    stops = [
+        udk.JointLimit("A", lower=-2.0, restitution=0.5, at_rest="stop"),
+        udk.Event(lambda t, at: at["link"].angle - 1.0, udk.Stop(), name="turned"),
+    ]
+
+    def run(speed):
+        numbers = {"body.link.velocity": jnp.stack([0 * speed, speed / 2]), "body.link.angular_velocity": speed}
+        return udk.simulate(PENDULUM.with_parameters(numbers), ts, events=stops, max_events=8)
+
+    all_of_them = jax.jit(jax.vmap(run))(speeds)
+    codes, counts = np.asarray(all_of_them.code), np.asarray(all_of_them.events.count)
+    assert set(codes) == {udk.Result.successful, udk.Result.event_stop} and len(set(counts)) >= 2
+    for k in (0, 250, 999):
+        one = run(speeds[k])
+        assert one.result == codes[k] and one.events.count == counts[k]
+        assert np.allclose(one.q, all_of_them.q[k], rtol=0, atol=1e-7, equal_nan=True)
+        assert np.allclose(one.events.time, all_of_them.events.time[k, : counts[k]], rtol=0, atol=1e-8)
+        assert np.isnan(all_of_them.events.time[k, counts[k] :]).all()
+    # Those that turn over do so where energy and an elliptic integral say.
+    fast = np.flatnonzero(codes == udk.Result.event_stop)
+    assert np.abs(all_of_them.events.q_before[fast, counts[fast] - 1, 0, 2] - 1.0).max() < 1e-11
 
 
 @pytest.mark.parametrize("name", ["parallelogram", "four_bar", "n_four_bar"])
@@ -150,6 +297,50 @@ def test_gradients_of_a_bouncing_ball():
     x = jnp.array([0.8, 1.0, G])
     assert np.abs(run(x) - exact(x)).max() < 1e-11
     assert np.abs(jax.jacfwd(run)(x) - jax.jacfwd(exact)(x)).max() < 1e-10
+
+
+@pytest.mark.slow
+def test_gradients_through_catch_and_release():
+    """Forward against differences, and reverse against forward: a joint added, another released, masses and speed."""
+    ts = np.linspace(0.0, 0.6, 4)
+
+    def run(x):
+        speed, m, g = x
+        ball = {"position": jnp.stack([-1 + 0 * g, -1 + g / 2 / speed**2]), "velocity": jnp.stack([speed, 0 * speed]), "mass": m}
+        numbers = {**{f"body.ball.{name}": value for name, value in ball.items()}, "gravity": jnp.stack([0 * g, -g])}
+        sol = udk.simulate(CATCH.with_parameters(numbers), ts, events=CAUGHT, rtol=1e-11, atol=1e-11, max_events=2)
+        return jnp.concatenate([sol.events.time, sol.q[-1].ravel(), sol.v[-1].ravel(), sol.q[2].ravel()])
+
+    x, h = jnp.array([6.0, 0.5, G]), 1e-5
+    value = jax.jit(run)
+    differences = np.stack([(value(x.at[k].add(h)) - value(x.at[k].add(-h))) / (2 * h) for k in range(3)], axis=1)
+    forward = jax.jit(jax.jacfwd(run))(x)
+    assert np.abs(forward - differences).max() < 1e-6
+    w = jnp.linspace(-1.0, 1.0, len(forward))
+    assert np.abs(jax.jit(jax.grad(lambda x: run(x) @ w))(x) - w @ forward).max() < 1e-11
+
+
+@pytest.mark.slow
+def test_gradients_of_what_comes_to_rest():
+    """A pendulum that has come to rest at its stop is where the stop is, and forgets all else."""
+
+    def end(limit, restitution, speed):
+        numbers = {"body.link.velocity": jnp.stack([0 * speed, speed / 2]), "body.link.angular_velocity": speed}
+        stop = udk.JointLimit("A", lower=limit, restitution=restitution)
+        sol = udk.simulate(PENDULUM.with_parameters(numbers), TS[:20], events=stop, max_events=ROOM)
+        return sol.q[-1, 0, 2]
+
+    x = -1.0, 0.3, 0.1
+    assert np.abs(np.array(jax.grad(end, (0, 1, 2))(*x)) - np.array([1.0, 0.0, 0.0])).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_both_engines_find_the_same():
+    ts = TS[:9]
+    found = [bounce(0.8, ts, engine=engine) for engine in ("native", "diffrax")]
+    assert [sol.settings["engine"] for sol in found] == ["native", "diffrax: it was asked for"]
+    assert np.abs(found[0].events.time - found[1].events.time).max() < 1e-10
+    assert np.abs(found[0].q - found[1].q).max() < 1e-9
 
 
 @pytest.mark.parametrize(

@@ -112,10 +112,9 @@ def run_loop(hybrid: Hybrid, ts: Array, point: Point, code: Any, drift_tol: Any,
         went = jax.lax.cond(happens, lambda: nothing, lambda: _integrated(hybrid, loop, window, drift_tol))
         values = hybrid.values(_where(happens, jumped.point, went.probe))
         values = values._replace(scale=jnp.maximum(values.scale, loop.values.scale))
-        jumped = _where(loop.pending == BEGIN, _begun(hybrid, jumped, values), jumped)
-        pending = _first(_crossed(hybrid, jumped.point.phase, jumped.sides, _sign(values, hybrid.rate)))
-        jumped = jumped._replace(values=values, pending=jnp.where(jumped.running, pending, NONE))
-        loop = _where(happens, jumped, _advanced(hybrid, loop, went, values))
+        loop = jax.lax.cond(
+            happens, lambda: _settled(hybrid, loop, jumped, values), lambda: _advanced(hybrid, loop, went, values)
+        )
         more = (loop.point.t < ts[-1]) | (loop.pending >= 0)
         too_long = (loop.tallies[0] >= hybrid.max_steps) & loop.running & more
         code = jnp.where(too_long, Result.step_limit, loop.code)
@@ -123,6 +122,13 @@ def run_loop(hybrid: Hybrid, ts: Array, point: Point, code: Any, drift_tol: Any,
 
     loop = jax.lax.while_loop(lambda loop: loop.running, body, state)
     return _finished(loop, ts)
+
+
+def _settled(hybrid: Hybrid, loop: Loop, jumped: Loop, values: Values) -> Loop:
+    """After an event, or at the start: with what happens at once."""
+    new = jax.lax.cond(loop.pending == BEGIN, lambda: _begun(hybrid, jumped, values), lambda: jumped)
+    pending = _first(_crossed(hybrid, new.point.phase, new.sides, _sign(values, hybrid.rate)))
+    return new._replace(values=values, pending=jnp.where(new.running, pending, NONE))
 
 
 def _begun(hybrid: Hybrid, loop: Loop, values: Values) -> Loop:

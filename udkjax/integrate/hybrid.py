@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.scales import Scales
@@ -239,10 +240,15 @@ class Hybrid(eqx.Module):
                 for is_new, a, b in zip(taken, new, added, strict=True)
             )
             adds = jnp.any(jnp.stack(taken))
-            q1, v1 = self._in(after, lambda p, *x: self._textbook(p, x[-1]).project(*x[:-1]), t, q, v, added)
+            q1, v1 = self._in(after, self._closed, t, q, v, added)
             blocked = blocked | (adds & (undifferentiated(self.scales.size(q1 - q)) > OPEN))
             q, v = jnp.where(adds, q1, q), jnp.where(adds, v1, v)
         return Jumped(Point(t, q, v, after, added), blocked)
+
+    def _closed(self, phase: int, t: Any, q: Any, v: Any, added: Any) -> tuple[Array, Array]:
+        """A state that a phase allows. Velocities jump to it, so that the derivatives are not those of a small correction."""
+        equations = self._textbook(phase, added)
+        return uk.project(equations.mechanism, t, q, v, equations.method, equations.weights)
 
     @property
     def restituting(self) -> np.ndarray:
