@@ -13,23 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.element_programs import ConstraintPrograms
 from udkjax.equations.loop_elimination import BlockElimination
-from udkjax.equations.loop_layout import (
-    BODIES,
-    BODY_CONSTANTS,
-    COMPLIANCE,
-    COORDINATES,
-    DROP_TOL,
-    GAINS,
-    OWN_CONSTANTS,
-    ROOT,
-    SAFE_TOL,
-    WEIGHT,
-    ElementGroup,
-    Layout,
-    abstract_mechanism,
-)
+from udkjax.equations.loop_layout import COORDINATES, DROP_TOL, Layout, abstract_mechanism
+from udkjax.equations.loop_prologue import write_prologue
 from udkjax.equations.loop_terms import LoopTerms, Parts
 from udkjax.equations.structure import structure
 from udkjax.expressions.loop_derivative import LoopDerivative
@@ -192,41 +178,7 @@ class LoopPrograms:
     @cached_property
     def prologue(self) -> LoopProgram:
         """`constants`, from `numbers`: all numbers of the scene, the gains, `drop_tol` and `safe_tol`."""
-        layout, scene = self._layout, KernelWriter()
-        copies = [(GAINS + k, self._number_count + k) for k in range(layout.gains)]
-        copies += [(k, self._number_count + layout.gains + k) for k in (DROP_TOL, SAFE_TOL)]
-        copies += [(layout.gravity + k, int(place)) for k, place in enumerate(np.ravel(self._places.gravity))]
-        for to, place in copies:
-            scene.write(scene.read("numbers", None, place), "constants", None, to)
-        body = KernelWriter()
-        for k in range(2):
-            mass = body.read("numbers", k)
-            root = body.graph.sqrt(body.graph.constant(1.0) / mass)
-            for start, value in ((ROOT, root), (COMPLIANCE, root * root), (WEIGHT, body.graph.constant(1.0) / root)):
-                body.write(value, "constants", 2, start + k)
-        bodies = [[int(b.mass), int(b.inertia), layout.of_body(k)] for k, b in enumerate(self._places.bodies.values())]
-        parts = [Loop(scene.kernel(), np.zeros((1, 1), int)), Loop(body.kernel(), np.array(bodies).reshape(-1, 3))]
-        constraints, forces = list(self._places.constraints.values()), list(self._places.forces.values())
-        parts += [self._group_constants(group, constraints) for group in layout.constraints]
-        parts += [self._group_constants(group, forces) for group in layout.forces]
-        return LoopProgram(parts)
-
-    def _group_constants(self, group: ElementGroup, elements: Sequence[Any]) -> Loop:
-        programs, table = group.programs, group.table
-        members = [jax.tree.leaves(elements[i]) for i in group.members]
-        starts = np.array([[np.ravel(x)[0] if np.size(x) else 0 for x in leaves] for leaves in members], int)
-        w, columns = KernelWriter(programs.graph), table.shape[1]
-        for k, leaf in enumerate(programs.leaves):
-            for place, s in enumerate(leaf.flat):
-                w.bind(s, "numbers", columns + k, place)
-        if isinstance(programs, ConstraintPrograms):
-            for k, s in enumerate(programs.roots):
-                w.bind(s, "constants", BODIES + 3 * (k // 2) + BODY_CONSTANTS, ROOT + k % 2)
-            for k, s in enumerate([*programs.gains, *programs.gravity]):
-                w.bind(s, "constants", None, (GAINS if self._layout.gains else self._layout.gravity) + k)
-        for k, s in enumerate(programs.constants):
-            w.write(s, "constants", OWN_CONSTANTS, k)
-        return Loop(w.kernel(), np.concatenate([table, starts.reshape(len(members), -1)], 1))
+        return write_prologue(self._layout, self._places, self._number_count)
 
     # --- parts of programs
 

@@ -1,0 +1,73 @@
+"""The prologue of a large scene: what depends on the numbers of the scene alone, computed once a run."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from udkjax.equations.element_programs import ConstraintPrograms
+from udkjax.equations.loop_layout import (
+    BODIES,
+    BODY_CONSTANTS,
+    COMPLIANCE,
+    DROP_TOL,
+    GAINS,
+    OWN_CONSTANTS,
+    ROOT,
+    SAFE_TOL,
+    WEIGHT,
+    ElementGroup,
+    Layout,
+)
+from udkjax.expressions.loop_program import KernelWriter, Loop, LoopProgram
+from udkjax.scene.mechanism import Mechanism
+
+
+def write_prologue(layout: Layout, places: Mechanism, number_count: int) -> LoopProgram:
+    """Write the program from the array `numbers` to `constants`.
+
+    Args:
+        layout: Where the constants lie.
+        places: The scene, with the place of each number in `numbers` instead of the number.
+        number_count: How many numbers the scene has; behind them are the gains, `drop_tol` and `safe_tol`.
+
+    Returns:
+        Loops over the bodies and over the elements of each group.
+    """
+    scene = KernelWriter()
+    copies = [(GAINS + k, number_count + k) for k in range(layout.gains)]
+    copies += [(k, number_count + layout.gains + k) for k in (DROP_TOL, SAFE_TOL)]
+    copies += [(layout.gravity + k, int(place)) for k, place in enumerate(np.ravel(places.gravity))]
+    for to, place in copies:
+        scene.write(scene.read("numbers", None, place), "constants", None, to)
+    body = KernelWriter()
+    for k in range(2):
+        mass = body.read("numbers", k)
+        root = body.graph.sqrt(body.graph.constant(1.0) / mass)
+        for start, value in ((ROOT, root), (COMPLIANCE, root * root), (WEIGHT, body.graph.constant(1.0) / root)):
+            body.write(value, "constants", 2, start + k)
+    bodies = [[int(b.mass), int(b.inertia), layout.of_body(k)] for k, b in enumerate(places.bodies.values())]
+    parts = [Loop(scene.kernel(), np.zeros((1, 1), int)), Loop(body.kernel(), np.array(bodies).reshape(-1, 3))]
+    constraints, forces = list(places.constraints.values()), list(places.forces.values())
+    parts += [_group_constants(layout, group, constraints) for group in layout.constraints]
+    parts += [_group_constants(layout, group, forces) for group in layout.forces]
+    return LoopProgram(parts)
+
+
+def _group_constants(layout: Layout, group: ElementGroup, elements: Sequence[Any]) -> Loop:
+    programs, table = group.programs, group.table
+    members = [jax.tree.leaves(elements[i]) for i in group.members]
+    starts = np.array([[np.ravel(x)[0] if np.size(x) else 0 for x in leaves] for leaves in members], int)
+    w, columns = KernelWriter(programs.graph), table.shape[1]
+    for k, leaf in enumerate(programs.leaves):
+        for place, s in enumerate(leaf.flat):
+            w.bind(s, "numbers", columns + k, place)
+    if isinstance(programs, ConstraintPrograms):
+        for k, s in enumerate(programs.roots):
+            w.bind(s, "constants", BODIES + 3 * (k // 2) + BODY_CONSTANTS, ROOT + k % 2)
+        for k, s in enumerate([*programs.gains, *programs.gravity]):
+            w.bind(s, "constants", None, (GAINS if layout.gains else layout.gravity) + k)
+    for k, s in enumerate(programs.constants):
+        w.write(s, "constants", OWN_CONSTANTS, k)
+    return Loop(w.kernel(), np.concatenate([table, starts.reshape(len(members), -1)], 1))
