@@ -37,7 +37,7 @@ import udkjax as udk
 from experiments.common import described, panels, tracked
 from experiments.parts.stepping import by_tolerance
 from udkjax.equations import prepare
-from udkjax.integrate.by_diffrax import derivative
+from udkjax.integrate.diffrax_engine import derivative
 from udkjax.show.plots import COLOURS
 from udkjax.study.exact import pendulum
 

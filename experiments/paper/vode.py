@@ -17,7 +17,7 @@ from scipy.integrate import ode
 from udkjax.equations import Baumgarte
 from udkjax.equations.quantities import equations_of
 from udkjax.integrate import Result
-from udkjax.integrate.by_diffrax import derivative
+from udkjax.integrate.diffrax_engine import derivative
 from udkjax.scene import Mechanism
 
 NAME = "VODE"

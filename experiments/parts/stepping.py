@@ -13,9 +13,9 @@ import optimistix as optx
 import udkjax as udk
 from udkjax.equations import prepare
 from udkjax.integrate.bdf import BDF
-from udkjax.integrate.by_diffrax import derivative
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import Counting, evaluations
+from udkjax.integrate.diffrax_engine import derivative
 from udkjax.integrate.multistep import Multistep, Tolerances
 
 GROWTH = 1.1  # of the steps of the start; beyond 1.127 the formula of order five is unstable

@@ -12,7 +12,7 @@ from jaxtyping import Float
 import udkjax as udk
 from experiments.parts.linkage import parallelogram, start
 from udkjax.equations import prepare
-from udkjax.integrate.by_diffrax import derivative
+from udkjax.integrate.diffrax_engine import derivative
 from udkjax.integrate.solution import Result
 from udkjax.pinv import Pseudoinverse
 from udkjax.study.identify.least_squares import Fit, minimize_squares

@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.equations import equations_of
-from udkjax.integrate.by_diffrax import derivative
 from udkjax.integrate.constrained import Constrained
+from udkjax.integrate.diffrax_engine import derivative
 from udkjax.study import exact_coordinates
 
 FORMULATIONS = {

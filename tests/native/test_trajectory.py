@@ -79,14 +79,14 @@ def served(monkeypatch, request):
         monkeypatch.setattr(structure, "LARGE", 0)
         monkeypatch.setattr(analysis, "_analyses", analysis._Cache())  # what is found by loops is not left to other tests
     seen, module = [], sys.modules["udkjax.integrate.simulate"]
-    reason = module.unserved
+    reason = module.reason_for_diffrax
 
-    def unserved(*given):
+    def reason_for_diffrax(*given):
         why = reason(*given)
         seen.append(not why)
         return why
 
-    monkeypatch.setattr(module, "unserved", unserved)
+    monkeypatch.setattr(module, "reason_for_diffrax", reason_for_diffrax)
     yield seen
     if "served" not in inspect.signature(request.function).parameters:
         assert all(seen)

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.integrate.adams_order import SMALLEST, TINY, Errors, Pace, after_step, begin, factor
 from udkjax.integrate.differences import HIGHEST, DifferenceInterpolation, Formula, formula
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.multistep import Multistep, check_orders, field, from_controller, scale, steered
-from udkjax.integrate.undifferentiated import undifferentiated
 
 STRICTER = 8.0  # than the tolerance: the errors of its many short steps add up
 LOST = 0.05  # a step that so small a part of the one planned has to replace begins again with order one
@@ -88,7 +88,7 @@ class Adams(Multistep):
         finite = jnp.all(jnp.isfinite(y1))
         y1 = jnp.where(finite, y1, jnp.nan)  # what the controller is prepared for
 
-        size, estimates = _sizes(self.root_finder, unravel, y0, unravel(y1)), undifferentiated(rule)
+        size, estimates = _sizes(self.root_finder, unravel, y0, unravel(y1)), stop_gradients(rule)
         below = jnp.stack([d, d + star[k - 1], d + star[k - 1] + star[jnp.maximum(k - 2, 0)]])
         same, lower, lowest = estimates.errors[jnp.maximum(k - jnp.arange(3), 0)] * size(below)
         error = estimates.gains(k) * size(d[None])[0]
@@ -116,7 +116,7 @@ class Adams(Multistep):
         rows, one = self.max_order + 2, jnp.array(1)
         phi = jnp.zeros((rows, len(y)), y.dtype).at[0].set(f)
         return History(
-            h * jnp.arange(rows), phi, y, jnp.array(True), one, begin(undifferentiated(h)), jnp.ones_like(h), evaluations
+            h * jnp.arange(rows), phi, y, jnp.array(True), one, begin(stop_gradients(h)), jnp.ones_like(h), evaluations
         )
 
     def _newest(self, f: Callable, t0: Any, h: Any, y: Any, state: History, made_jump: Any) -> tuple[History, Any]:
@@ -137,7 +137,7 @@ class Adams(Multistep):
         if self.corrector == "pece":
             return f(y) - slope, jnp.array(True), jnp.array(1), state.rate
         k = state.pace.order
-        c, weight = rule.h * rule.g[k], undifferentiated(rule).gains(k)
+        c, weight = rule.h * rule.g[k], stop_gradients(rule).gains(k)
 
         def iterate(carry, _):
             d, change, rate, done, calls = carry
@@ -148,7 +148,7 @@ class Adams(Multistep):
             done = done | (changed * jnp.minimum(rate, 1.0) <= ITERATION_SHARE)
             return (now, changed, rate, done, calls), None
 
-        expected = undifferentiated(state.rate * rule.h / state.ages[1])  # the rate is proportional to the step
+        expected = stop_gradients(state.rate * rule.h / state.ages[1])  # the rate is proportional to the step
         start = (jnp.zeros_like(y), jnp.zeros_like(weight), expected, jnp.array(False), jnp.array(0))
         (d, _, rate, found, calls), _ = jax.lax.scan(iterate, start, length=self.root_find_max_steps)
         return d, found, calls, rate
@@ -162,7 +162,7 @@ def _field(terms: Any, args: Any, unravel: Callable) -> Callable:
 
 def _sizes(tolerances: Any, unravel: Callable, y0: Any, y1: Any) -> Callable:
     """The norms of the rows of a matrix, relative to what a step may err."""
-    tolerances, y0, y1 = undifferentiated((tolerances, y0, y1))
+    tolerances, y0, y1 = stop_gradients((tolerances, y0, y1))
     allowed = scale(tolerances, y0, y1)
     size = jax.vmap(lambda x: STRICTER * tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))
-    return lambda rows: size(undifferentiated(rows))
+    return lambda rows: size(stop_gradients(rows))

@@ -36,8 +36,8 @@ from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large
 from udkjax.equations.textbook import prepare
-from udkjax.integrate import by_native
-from udkjax.integrate.derivatives import Function, Linear, Mask, those
+from udkjax.integrate import native_engine
+from udkjax.integrate.derivatives import Function, Linear, Mask, select
 from udkjax.pinv import SVD
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -132,8 +132,8 @@ def _assembled_at_once(mechanism: Mechanism, scales: Scales, t: float, q: np.nda
     """q and v closed, what is left of Psi and Psi_dot, and the rank of D, of known numbers."""
     if not is_large(mechanism):  # for which it takes longer to compile anything
         return DenseRows(mechanism, scales).assemble(t, q, v)
-    if by_native.closes(mechanism):
-        return by_native.closed_at_once(mechanism, scales, rank_tolerance(mechanism), t, q, v)
+    if native_engine.closes(mechanism):
+        return native_engine.closed_at_once(mechanism, scales, rank_tolerance(mechanism), t, q, v)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 
     return SparseRows(mechanism).assemble(t, q, v)
@@ -147,7 +147,7 @@ _latest: dict[int, tuple[Any, float, Closure | None]] = {}
 def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State | None) -> Closure:
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
-    close = _by_machine_code if by_native.closes(mechanism) else _assembled
+    close = _by_machine_code if native_engine.closes(mechanism) else _assembled
     q, v, psi, psi_dot, rank = close(mechanism, analysis, number(t), q, v)
     return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales)
 
@@ -184,14 +184,14 @@ class Assembly(Function):
             return super().forward(xs, moving, vs, run)
         rest = iter(vs)
         change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in moving])
-        return list(by_native.closed_along(guess, _those_of(which), _those_of(change)))
+        return list(native_engine.closed_along(guess, _native_inputs(which), _native_inputs(change)))
 
     def backward(self, xs: list[Array], moving: Mask, ws: list[Array], run: Any) -> list[Array]:
         guess, which = self._native(xs, moving)
         if guess is None:
             return super().backward(xs, moving, ws, run)
-        found = by_native.closed_back(guess, _those_of(which), *ws)
-        pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_those_of(which), found)), strict=True)
+        found = native_engine.closed_back(guess, _native_inputs(which), *ws)
+        pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_native_inputs(which), found)), strict=True)
         return [bar for m, bar in pairs if m is True]
 
     def _native(self, xs: list[Array], moving: Mask) -> tuple[Any, Any]:
@@ -199,12 +199,12 @@ class Assembly(Function):
         which = jax.tree.unflatten(self.tree, moving)
         mechanism, analysis, t, q, v = self.guess(xs)
         others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
-        if self.is_plain or others or not by_native.closes(mechanism):
+        if self.is_plain or others or not native_engine.closes(mechanism):
             return None, None
         return (mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v), which
 
 
-def _those_of(tree: Any) -> tuple[Any, Any, Any]:
+def _native_inputs(tree: Any) -> tuple[Any, Any, Any]:
     """Of a mechanism, an analysis, t, q and v: what machine code has derivatives along."""
     mechanism, _, _, q, v = tree
     return mechanism, q, v
@@ -219,7 +219,7 @@ def _by_machine_code(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v
 @eqx.filter_custom_jvp
 def _closed_by_code(function: Assembly, xs: list[Array]) -> tuple[Any, Any, Any, Any, Any]:
     mechanism, analysis, t, q, v = function.guess(xs)
-    return by_native.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
+    return native_engine.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
 
 
 @_closed_by_code.def_jvp
@@ -228,7 +228,7 @@ def _(primals, tangents):
     found = _closed_by_code(function, xs)
     moving = tuple(dx is not None for dx in tangents[1])
     linear = Linear(function=function, xs=xs, run=(), moving=moving)
-    return found, (*linear.applied(those(tangents[1], moving)), None, None, None)
+    return found, (*linear.applied(select(tangents[1], moving)), None, None, None)
 
 
 def _known(tree: Any) -> bool:

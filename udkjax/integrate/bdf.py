@@ -12,8 +12,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from udkjax.integrate import newton
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.multistep import Multistep, check_orders, field, from_controller, scale, steered
-from udkjax.integrate.undifferentiated import undifferentiated
 
 HIGHEST = 5  # the formula of order six is of little use, the seventh unstable
 STRICTER = 8.0  # than the tolerance: the errors of many steps add up, and near a jump they grow
@@ -127,7 +127,7 @@ class BDF(Multistep):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         unravel = ravel_pytree(y0)[1]
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
-        tolerances, h = undifferentiated(self.root_finder), t1 - t0
+        tolerances, h = stop_gradients(self.root_finder), t1 - t0
         state = self._history(terms, t0, t1, y0, args, solver_state, made_jump)
         retried = h < (1 - 1e-3) * state.planned
         k = jnp.where(h < LOST * state.planned, 1, state.order)
@@ -143,7 +143,7 @@ class BDF(Multistep):
 
         size = _Size(tolerances.norm, unravel, ravel_pytree(scale(tolerances, y0, y0))[0], STRICTER * error / NEWTON_SHARE)
         equation = newton.Implicit(terms, args, unravel, t1, predicted, v, h / gamma)
-        e, found, kept = newton.solve(equation, undifferentiated(size), state.newton, self.root_find_max_steps)
+        e, found, kept = newton.solve(equation, stop_gradients(size), state.newton, self.root_find_max_steps)
         e = jnp.where(found, e, 0.0)
 
         j = i[:, None]  # new differences: phi[j] = y1 - (the sum of the parts before j), taken from e so that little cancels
@@ -152,14 +152,14 @@ class BDF(Multistep):
         y1 = unravel(phi[0])
 
         weighed = _Size(tolerances.norm, unravel, ravel_pytree(scale(tolerances, y0, y1))[0], STRICTER)
-        errors = undifferentiated(_errors(k, h / psi, phi, weighed).at[1].set(error * weighed(e)))
+        errors = stop_gradients(_errors(k, h / psi, phi, weighed).at[1].set(error * weighed(e)))
         accept = found & (errors[1] <= 1)
         factor, order, wait = self._choose(k, errors, state.wait, retried)
         shrink = jnp.minimum(_factor(errors[1], k, SAME), jnp.where(retried, SMALLEST, 1.0))
         points = jnp.minimum(state.points + 1, self.max_order + 1)
         order = jnp.maximum(order, jnp.minimum(self.min_order, points))
         times = jnp.concatenate([t1[None], state.times[:-1]])
-        new = State(times, phi, points, order, wait, undifferentiated(h * factor), kept)
+        new = State(times, phi, points, order, wait, stop_gradients(h * factor), kept)
         y_error = steered(tolerances, y0, y1, accept, jnp.where(accept, factor, shrink))
         y_error = jax.tree.map(lambda x: jnp.where(found, x, jnp.inf), y_error)
         through = jnp.where((i <= k)[:, None], phi, 0.0)

@@ -27,17 +27,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.integrate import by_native
-from udkjax.integrate.along import along
-from udkjax.integrate.problem import Problem, Raw
-from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.integrate import native_engine
+from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.integrate.split_jvp import split_jvp
 
 Mask = tuple[bool, ...]  # of a list of arrays: those that have tangents
-SMOOTH = tuple(Raw._fields.index(name) for name in ("q", "v", "y"))  # of `Raw`: what has derivatives
+SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives
 
 
-def differentiable(problem: Problem, native: bool) -> Raw:
-    """Integrate a problem by machine code or by diffrax, with derivatives of any order; of `Raw`, q, v and y have some.
+def differentiable(problem: Problem, native: bool) -> IntegratorOutput:
+    """Integrate a problem by machine code or by diffrax, with derivatives of any order of q, v and y.
 
     None are taken along numbers that do not depend on what is differentiated.
     """
@@ -47,7 +47,7 @@ def differentiable(problem: Problem, native: bool) -> Raw:
 
 
 @eqx.filter_custom_jvp
-def _run(function: "Run", xs: list[Array]) -> Raw:
+def _run(function: "Run", xs: list[Array]) -> IntegratorOutput:
     return function.fast(xs)
 
 
@@ -55,28 +55,28 @@ def _run(function: "Run", xs: list[Array]) -> Raw:
 def _(primals, tangents):
     moving = tuple(dx is not None for dx in tangents[1])
     if not any(moving):
-        return _run(*primals), Raw(*[None] * len(Raw._fields))
+        return _run(*primals), IntegratorOutput(*[None] * len(IntegratorOutput._fields))
     shapes = eqx.filter_eval_shape(_run, *primals)
 
     def in_parts(at: Any, *directions: list[Array]) -> tuple[list[Any], ...]:
         """The run, and linear maps of the directions."""
-        raw = at[0].recorded(undifferentiated(at[1]), moving)
+        raw = at[0].recorded(stop_gradients(at[1]), moving)
         linear = Linear(function=at[0], xs=at[1], run=raw, moving=moving)
         return list(_as_run(*at, raw)), *(linear.applied(direction) for direction in directions)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
         """Both by forward mode."""
         function, xs = at
-        raw, change = function.pushed(xs, moving, direction)
+        raw, change = function.run_and_jvp(xs, moving, direction)
         return list(raw), change
 
     known = list(shapes), [shapes[k] for k in SMOOTH]
-    raw, change = along(in_parts, at_once, primals, those(tangents[1], moving), None, known)
-    return Raw(*raw), Raw(*[change[SMOOTH.index(k)] if k in SMOOTH else None for k in range(len(raw))])
+    raw, change = split_jvp(in_parts, at_once, primals, select(tangents[1], moving), None, known)
+    return IntegratorOutput(*raw), IntegratorOutput(*[change[SMOOTH.index(k)] if k in SMOOTH else None for k in range(len(raw))])
 
 
 @eqx.filter_custom_jvp
-def _as_run(function: "Run", xs: list[Array], raw: Raw) -> Raw:
+def _as_run(function: "Run", xs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
     """What a run left, with the derivatives of the run."""
     del function, xs
     return raw
@@ -86,7 +86,7 @@ def _as_run(function: "Run", xs: list[Array], raw: Raw) -> Raw:
 def _(primals, tangents):
     *at, raw = primals
     if all(dx is None for dx in tangents[1]):
-        return raw, Raw(*[None] * len(raw))
+        return raw, IntegratorOutput(*[None] * len(raw))
     return raw, eqx.filter_jvp(_run, tuple(at), tuple(tangents[:2]))[1]
 
 
@@ -102,7 +102,7 @@ class Function(eqx.Module):
 
     def pull(self, xs: list[Array], moving: Mask, ws: list[Array]) -> list[Array]:
         """J^T w, of those of x that are moving: w^T J e for each unit vector e. Forward mode of it is JAX's, too."""
-        some = those(xs, moving)
+        some = select(xs, moving)
         units = jnp.eye(sum(x.size for x in some))
         shapes = [x.shape for x in some]
         row = lambda e: jnp.vdot(_flat(ws), _flat(_change(self, xs, moving, _split(e, shapes))[1]))  # noqa: E731
@@ -145,13 +145,13 @@ class Run(Function):
     def plain(self) -> "Run":
         return replace(self, native=False)
 
-    def fast(self, xs: list[Array]) -> Raw:
+    def fast(self, xs: list[Array]) -> IntegratorOutput:
         """By machine code, which has no derivatives, if that serves."""
         problem = self.problem(xs)
-        return by_native.solve(problem) if self.native else _by_diffrax(problem)
+        return native_engine.solve(problem) if self.native else _integrate_by_diffrax(problem)
 
     def forward(self, xs: list[Array], moving: Mask, vs: list[Array], run: Any) -> list[Array]:
-        return super().forward(xs, moving, vs, run) if run is None else self.pushed(xs, moving, vs)[1]
+        return super().forward(xs, moving, vs, run) if run is None else self.run_and_jvp(xs, moving, vs)[1]
 
     def backward(self, xs: list[Array], moving: Mask, ws: list[Array], run: Any) -> list[Array]:
         if run is None:
@@ -159,37 +159,37 @@ class Run(Function):
         problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
         if self._is_native(xs, moving):
             q, v, y = ws
-            found = by_native.pulled(problem, which, jnp.concatenate([q, v], axis=1), y)
+            found = native_engine.vjp(problem, which, jnp.concatenate([q, v], axis=1), y)
             pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
             return [bar for m, bar in pairs if m is True]
 
         def function(some: list[Array]) -> list[Array]:
-            raw = _by_diffrax(self.problem(replaced(xs, moving, some)), "RecursiveCheckpointAdjoint")
+            raw = _integrate_by_diffrax(self.problem(replaced(xs, moving, some)), "RecursiveCheckpointAdjoint")
             return [raw[k] for k in SMOOTH]
 
-        return jax.vjp(function, those(xs, moving))[1](ws)[0]
+        return jax.vjp(function, select(xs, moving))[1](ws)[0]
 
-    def pushed(self, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[Raw, list[Array]]:
+    def run_and_jvp(self, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
         """The run, and the change of its states along v, of those of x that are moving: by machine code, if that serves."""
         if self._is_native(xs, moving):
             rest, which = iter(vs), jax.tree.unflatten(self.tree, moving)
             change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in moving])
-            raw, found = by_native.pushed(self.problem(xs), which, change)
+            raw, found = native_engine.jvp(self.problem(xs), which, change)
             return raw, list(found)
-        raw, change = _change(lambda xs: _by_diffrax(self.problem(xs)), xs, moving, vs)
+        raw, change = _change(lambda xs: _integrate_by_diffrax(self.problem(xs)), xs, moving, vs)
         return raw, [change[k] for k in SMOOTH]
 
-    def recorded(self, xs: list[Array], moving: Mask) -> Raw:
+    def recorded(self, xs: list[Array], moving: Mask) -> IntegratorOutput:
         """The run, by the machine code of its reverse mode, if that serves: no other is compiled."""
         if self._is_native(xs, moving):
-            return by_native.recorded(self.problem(xs), jax.tree.unflatten(self.tree, moving))
-        return _by_diffrax(self.problem(xs))
+            return native_engine.recorded(self.problem(xs), jax.tree.unflatten(self.tree, moving))
+        return _integrate_by_diffrax(self.problem(xs))
 
     def _is_native(self, xs: list[Array], moving: Mask) -> bool:
-        return self.native and by_native.serves_derivatives(jax.tree.unflatten(self.tree, moving))
+        return self.native and native_engine.serves_derivatives(jax.tree.unflatten(self.tree, moving))
 
     def __call__(self, xs: list[Array]) -> list[Array]:
-        raw = _by_diffrax(self.problem(xs))
+        raw = _integrate_by_diffrax(self.problem(xs))
         return [raw[k] for k in SMOOTH]
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
@@ -213,9 +213,9 @@ class Along(Function):
         of_x, of_v = moving[: len(xs)], moving[len(xs) :]
         either = tuple(a or b for a, b in zip(of_x, self.moving, strict=True))
         found, change = _change(lambda xs: self.of.pull(xs, either, ws), xs, self.moving, vs)
-        change = those(change, tuple(x for x, e in zip(of_x, either, strict=True) if e))
-        found = those(found, tuple(m for m, e in zip(self.moving, either, strict=True) if e))
-        return [*change, *those(found, of_v)]
+        change = select(change, tuple(x for x, e in zip(of_x, either, strict=True) if e))
+        found = select(found, tuple(m for m, e in zip(self.moving, either, strict=True) if e))
+        return [*change, *select(found, of_v)]
 
     def parts(self, xs: list[Array]) -> tuple[list[Array], list[Array]]:
         return xs[: len(self.moving)], xs[len(self.moving) :]
@@ -238,16 +238,16 @@ class Back(Along):
         if any(of_x):
             found += _change(lambda xs: self.of.pull(xs, of_x, bars), xs, self.moving, directions)[1]
         if any(of_w):
-            found += those(_change(self.of, xs, self.moving, directions)[1], of_w)
+            found += select(_change(self.of, xs, self.moving, directions)[1], of_w)
         return found
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        return [x.shape for x in those(self.parts(xs)[0], self.moving)]
+        return [x.shape for x in select(self.parts(xs)[0], self.moving)]
 
 
 def _change(function: Callable, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[Any, Any]:
     """f(x), and its change along v, of those of x that are moving, by forward mode."""
-    return jax.jvp(lambda *some: function(replaced(xs, moving, some)), those(xs, moving), vs)
+    return jax.jvp(lambda *some: function(replaced(xs, moving, some)), select(xs, moving), vs)
 
 
 # --- the linear map
@@ -269,7 +269,7 @@ class Linear(eqx.Module):
     @property
     def inputs(self) -> list[tuple[int, ...]]:
         """The shapes of what it is applied to."""
-        return self.function.shapes(self.xs) if self.transposed else [x.shape for x in those(self.xs, self.moving)]
+        return self.function.shapes(self.xs) if self.transposed else [x.shape for x in select(self.xs, self.moving)]
 
     def applied(self, vs: list[Array]) -> list[Array]:
         return _split(_bind(self, _flat(vs)), self.T.inputs)
@@ -298,7 +298,7 @@ def _derivative(primals, tangents):
     dxs = [*at.xs, *parts]
     moving = tuple(dx is not None for dx in dxs)
     further = Linear(kind(function.plain, linear.moving), [*linear.xs, *_split(vector, linear.inputs)], None, moving)
-    return found, _bind(further, _flat(those(dxs, moving)))
+    return found, _bind(further, _flat(select(dxs, moving)))
 
 
 @eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
@@ -314,7 +314,7 @@ def _bind(linear: Linear, vector: Array) -> Array:
     return eqxi.filter_primitive_bind(_linear_p, linear, vector)
 
 
-def those(xs: Sequence[Any], which: Mask) -> list[Any]:
+def select(xs: Sequence[Any], which: Mask) -> list[Any]:
     """Those that are marked."""
     return [x for x, m in zip(xs, which, strict=True) if m]
 
@@ -334,9 +334,9 @@ def _split(vector: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
     return [part.reshape(shape) for part, shape in zip(jnp.split(vector, ends), shapes, strict=True)]
 
 
-def _by_diffrax(problem: Problem, adjoint: str = "ForwardMode") -> Raw:
+def _integrate_by_diffrax(problem: Problem, adjoint: str = "ForwardMode") -> IntegratorOutput:
     import diffrax
 
-    from udkjax.integrate.by_diffrax import by_diffrax
+    from udkjax.integrate.diffrax_engine import integrate_by_diffrax
 
-    return by_diffrax(problem, getattr(diffrax, adjoint)())
+    return integrate_by_diffrax(problem, getattr(diffrax, adjoint)())

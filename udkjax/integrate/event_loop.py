@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.integrate.hybrid import ZERO, ZERO_RATE, ZERO_RATE_2, Hybrid, Point, Values
-from udkjax.integrate.problem import Raw
+from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
 from udkjax.native.steps import DONE, NOT_FINITE, STEP_LIMIT
 
@@ -408,7 +408,7 @@ def _bisected(is_before: Any, low: Any, high: Any) -> Any:
     return (low + high) / 2
 
 
-def _failure(raw: Raw, good: Array) -> Array:
+def _failure(raw: IntegratorOutput, good: Array) -> Array:
     code = jnp.where(raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
     code = jnp.where(raw.status == NOT_FINITE, Result.not_finite, code)
     return jnp.where(raw.status == DONE, Result.drift, code)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.integrate.derivatives import replaced, those
+from udkjax.integrate.derivatives import replaced, select
 from udkjax.integrate.event_loop import run_loop
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.hybrid import ZERO_RATE, Hybrid, Point
 from udkjax.integrate.solution import Result
-from udkjax.integrate.undifferentiated import undifferentiated
 
 
 class Trace(NamedTuple):
@@ -82,9 +82,9 @@ def _(primals, tangents):
 
     def replayed(*some: Array) -> tuple[Array, ...]:
         hybrid, start = numbers.combined(replaced(xs, moving, some))
-        return replay(hybrid, start, undifferentiated(found))
+        return replay(hybrid, start, stop_gradients(found))
 
-    change = jax.jvp(replayed, those(xs, moving), those(tangents[1], moving))[1]
+    change = jax.jvp(replayed, select(xs, moving), select(tangents[1], moving))[1]
     return found, Trace(*change, *(None for _ in found[len(change) :]))
 
 
@@ -104,7 +104,7 @@ OUTPUTS = 32  # of one piece
 
 def replay(hybrid: Hybrid, start: Start, found: Trace) -> tuple[Array, ...]:
     """What is smooth in a run that is known, as a function with its first derivatives."""
-    ts, T, K = undifferentiated(start.ts), len(start.ts), len(found.event_time)
+    ts, T, K = stop_gradients(start.ts), len(start.ts), len(found.event_time)
     width = min(OUTPUTS, T)
     pieces = K + -(-T // (width - 1)) + 2
     first = Point(ts[0], start.q, start.v, jnp.array(0), hybrid.phases.first_added())
@@ -174,7 +174,7 @@ def _jumped(hybrid: Hybrid, index: Array, point: Point, before: Array, again: Ar
     rate = values.rate[k]
     if any(row >= 0 for rows in hybrid.phases.tables.held for row in rows):
         rate = jnp.where(k >= E, hybrid.rate_of_pressure(k % E, point, values.a), rate)
-    h, rate = values.h[k] - undifferentiated(values.h[k]), undifferentiated(rate)
+    h, rate = values.h[k] - stop_gradients(values.h[k]), stop_gradients(rate)
     moves = jnp.abs(rate) > ZERO_RATE * values.scale[k] * hybrid.rate
     # What happens again at the same instant, where the condition stands still, happens when the first event does.
     shift = jnp.where(moves, -h / jnp.where(moves, rate, 1.0), jnp.where(again, before, 0.0))
@@ -191,4 +191,4 @@ def _nothing(n: int, K: int) -> Any:
 
 def _valued(x: Array, value: Array) -> Array:
     """A known value, with the derivatives of x."""
-    return x + undifferentiated(jnp.where(jnp.isfinite(value), value, x) - x)
+    return x + stop_gradients(jnp.where(jnp.isfinite(value), value, x) - x)

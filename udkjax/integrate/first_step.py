@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.integrate.gradients import stop_gradients
 
 
 def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, unit: Array) -> Array:
@@ -11,7 +11,7 @@ def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, un
 
     As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off.
     """
-    y, slope, span, rtol, atol, unit = undifferentiated((y, slope, span, rtol, atol, unit))
+    y, slope, span, rtol, atol, unit = stop_gradients((y, slope, span, rtol, atol, unit))
     scale = atol * unit + rtol * jnp.abs(y)
     size, rate = jnp.max(jnp.abs(y) / scale, initial=0.0), jnp.max(jnp.abs(slope) / scale, initial=0.0)
     ordinary = jnp.isfinite(rate) & (rate > 0) & (size > 0)

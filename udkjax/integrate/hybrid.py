@@ -14,13 +14,13 @@ from udkjax.equations.quantities import equations_of
 from udkjax.equations.scales import Scales
 from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate import by_native
+from udkjax.integrate import native_engine
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.events import Event, Impact, Stop, frames_of, sees_velocity
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.impact import jump
 from udkjax.integrate.phases import Phases
-from udkjax.integrate.problem import Problem, Raw
-from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.joints import Joint
 
@@ -94,27 +94,27 @@ class Hybrid(eqx.Module):
         """Why machine code cannot integrate each phase; empty where it can."""
         first, added = self.phases.mechanisms[0], self.phases.first_added()
         q, v = first.q0.ravel(), first.v0.ravel()
-        return tuple(self._unserved(k, jnp.zeros(2), q, v, added) for k in range(len(self.phases.mechanisms)))
+        return tuple(self._reason_for_diffrax(k, jnp.zeros(2), q, v, added) for k in range(len(self.phases.mechanisms)))
 
     def first_problem(self) -> Problem:
         """That of the first phase, for what does not depend on its state."""
         first = self.phases.mechanisms[0]
         return self.problem(0, jnp.zeros(2), first.q0.ravel(), first.v0.ravel(), self.phases.first_added())
 
-    def _unserved(self, phase: int, ts: Any, q: Any, v: Any, added: Any) -> str:
+    def _reason_for_diffrax(self, phase: int, ts: Any, q: Any, v: Any, added: Any) -> str:
         if self.engine == "diffrax":
             return "it was asked for"
-        return by_native.unserved(self.problem(phase, ts, q, v, added))
+        return native_engine.reason_for_diffrax(self.problem(phase, ts, q, v, added))
 
-    def flow(self, ts: Any, point: Point, derivatives: bool) -> Raw:
+    def flow(self, ts: Any, point: Point, derivatives: bool) -> IntegratorOutput:
         """Integrate from a state, over times from its own on."""
 
-        def of(phase: int, ts: Any, q: Any, v: Any, added: Any) -> Raw:
-            native = not self._unserved(phase, ts, q, v, added)
+        def of(phase: int, ts: Any, q: Any, v: Any, added: Any) -> IntegratorOutput:
+            native = not self._reason_for_diffrax(phase, ts, q, v, added)
             problem = self.problem(phase, ts, q, v, added)
             if derivatives or not native:
                 return differentiable(problem, native)
-            return by_native.solve(problem)
+            return native_engine.solve(problem)
 
         return self._in(point.phase, of, ts, point.q, point.v, point.added)
 
@@ -165,7 +165,7 @@ class Hybrid(eqx.Module):
             by_v = jax.jacfwd(self.conditions, 2)(t, q, v)
             size = jnp.maximum(size, jnp.max(jnp.abs(by_v) * jnp.maximum(unit * self.rate, jnp.abs(v)), axis=1))
         force = self.scales.mass * self.scales.length * self.rate**2
-        scale = undifferentiated(jnp.append(size, zeros + force))
+        scale = stop_gradients(jnp.append(size, zeros + force))
         return Values(jnp.append(g, pressure), jnp.append(g_dot, zeros), jnp.append(g_ddot, zeros), by_q, a, scale)
 
     def accelerations(self, point: Point) -> Array:
@@ -241,7 +241,7 @@ class Hybrid(eqx.Module):
             )
             adds = jnp.any(jnp.stack(taken))
             q1, v1 = self._in(after, self._closed, t, q, v, added)
-            blocked = blocked | (adds & (undifferentiated(self.scales.size(q1 - q)) > OPEN))
+            blocked = blocked | (adds & (stop_gradients(self.scales.size(q1 - q)) > OPEN))
             q, v = jnp.where(adds, q1, q), jnp.where(adds, v1, v)
         return Jumped(Point(t, q, v, after, added), blocked)
 

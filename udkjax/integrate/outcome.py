@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.abstract_system import AbstractSystem
-from udkjax.integrate.problem import Raw
+from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
 from udkjax.native.steps import AHEAD, DONE, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
 
@@ -16,7 +16,7 @@ from udkjax.native.steps import AHEAD, DONE, NOT_FINITE, STEP_LIMIT, STEP_TOO_SM
 class Run(eqx.Module):
     """A run as the integrator leaves it."""
 
-    raw: Raw
+    raw: IntegratorOutput
     ts: Float[Array, "T"]
     closed: Bool[Array, ""]
     missed: Bool[Array, ""]  # the closed state takes rows that the method leaves out
@@ -59,7 +59,7 @@ def _drift(run: Run, code: Array, xp: Any) -> tuple[Array, Array, Bool[Array, "T
     return xp.where(drifted, Result.drift, code), xp.where(drifted, run.ts[first], run.raw.t), reached
 
 
-def counts(raw: Raw, projected: bool, outputs: int, xp: Any = jnp) -> dict[str, Any]:
+def counts(raw: IntegratorOutput, projected: bool, outputs: int, xp: Any = jnp) -> dict[str, Any]:
     """Count steps and what follows from them; right-hand sides are -1 where they are not known."""
     return {
         "steps": raw.tried,

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations.abstract_system import AbstractSystem
-from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.integrate.gradients import stop_gradients
 
 
 class Problem(eqx.Module):
@@ -34,10 +34,10 @@ class Problem(eqx.Module):
         one = jnp.ones(len(self.q))
         if self.length is not None:
             one = jnp.where(np.arange(len(self.q)) % 3 == 2, one, self.length)
-        return undifferentiated((one, one * self.rate))
+        return stop_gradients((one, one * self.rate))
 
 
-class Raw(NamedTuple):
+class IntegratorOutput(NamedTuple):
     """A run as an integrator leaves it: `status` is one of those above, from `DONE` on."""
 
     q: Any  # (T, n), not yet reached ones of any value

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
-from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.native.steps import TAKEN_BACK
 
 
@@ -24,7 +24,7 @@ def project(equations: AbstractSystem, t: Any, y: Float[Array, "2n"]) -> Float[A
 
 def lasting(equations: AbstractSystem, t: Any, q: Array, v: Array, dq: Array, dv: Array) -> TangentPart:
     """The errors dq and dv of a step that ends in q and v, with what projection takes back of them counted by `TAKEN_BACK`."""
-    equations, t, q, v, dq, dv = undifferentiated((equations, t, q, v, dq, dv))
+    equations, t, q, v, dq, dv = stop_gradients((equations, t, q, v, dq, dv))
     left = equations.tangent_part(t, q, v, dq, dv)
     return TangentPart(left.dq + TAKEN_BACK * (dq - left.dq), left.dv + TAKEN_BACK * (dv - left.dv))
 
@@ -33,7 +33,7 @@ def violation(equations: AbstractSystem, t: Any, y: Float[Array, "2n"]) -> Float
     """The largest of any row of Psi over its scale, also of those that the method leaves out."""
     if not equations.constrained:
         return jnp.zeros(())
-    equations, t, y = undifferentiated((equations, t, y))
+    equations, t, y = stop_gradients((equations, t, y))
     return equations.violation_size(equations.violation(t, *jnp.split(y, 2))[0])
 
 

@@ -18,14 +18,14 @@ from udkjax.equations.partitioning import PartitionedSystem
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
-from udkjax.integrate.by_native import known, rows_kept, unserved
 from udkjax.integrate.derivatives import differentiable
+from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.native_engine import known, reason_for_diffrax, rows_kept
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.simulate_events import Choices, simulate_events
 from udkjax.integrate.solution import SimulationError, Solution
-from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.native.steps import SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.fields import number
@@ -202,13 +202,13 @@ def _simulate(
     q, v = xp.ravel(xp.asarray(state.q)), xp.ravel(xp.asarray(state.v))
     numbers: Any = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v, xp))
     problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, breakpoints=mechanism.breakpoints)
-    why = "it was asked for" if engine == "diffrax" else unserved(problem, adjoint, meter)
+    why = "it was asked for" if engine == "diffrax" else reason_for_diffrax(problem, adjoint, meter)
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
     if xp is np and why:
         return None
     if adjoint is not None or meter is not None:
-        raw = by_diffrax(problem, adjoint, meter)
+        raw = integrate_by_diffrax(problem, adjoint, meter)
     else:
         raw = known(problem) if xp is np else differentiable(problem, native=not why)
     missed = xp.array(False) if why or closure is None else closed & (closure.rank > rows_kept(problem))
@@ -216,7 +216,7 @@ def _simulate(
     q, v = xp.where(later, raw.q, q), xp.where(later, raw.v, v)
     ends: Any = (raw, ts, closed, missed, drift_tol)
     seen = Run(*ends)
-    code, time, reached = outcome(seen if xp is np else undifferentiated(seen), xp)
+    code, time, reached = outcome(seen if xp is np else stop_gradients(seen), xp)
     q, v = (xp.where(reached[:, None], y, xp.nan).reshape(-1, *np.shape(state.q)) for y in (q, v))
     stats = counts(raw, projected, len(ts), xp)
     chosen = (
@@ -246,7 +246,7 @@ def _units(analysis: Analysis | None, ts: Any, v: Any, xp: Any) -> tuple[Any, An
         return None, xp.ones(())
     scales = analysis.scales if xp is jnp else jax.tree.map(np.asarray, analysis.scales)
     units = scales.length, xp.maximum(xp.maximum(scales.rate, scales.size(v, xp)), 1 / (ts[-1] - ts[0]))
-    return units if xp is np else undifferentiated(units)
+    return units if xp is np else stop_gradients(units)
 
 
 def _times(ts: ArrayLike | Sequence[float]) -> Float[Array, "T"]:
@@ -269,11 +269,11 @@ def _step(dt0: ArrayLike | None) -> Array | None:
     return dt0
 
 
-def by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
-    """As in by_diffrax.py: diffrax is imported where it is asked for, since that takes as long as all of JAX."""
-    from udkjax.integrate.by_diffrax import by_diffrax
+def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
+    """As in diffrax_engine.py: diffrax is imported where it is asked for, since that takes as long as all of JAX."""
+    from udkjax.integrate.diffrax_engine import integrate_by_diffrax
 
-    return by_diffrax(problem, adjoint, meter)
+    return integrate_by_diffrax(problem, adjoint, meter)
 
 
 def _adjoint(adjoint: Any) -> Any:

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from udkjax.integrate import by_native
+from udkjax.integrate import native_engine
 from udkjax.integrate.event_run import Start, Trace, trace
 from udkjax.integrate.events import Event, Events, expanded
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.hybrid import Hybrid
 from udkjax.integrate.phases import Phases, phases_of
 from udkjax.integrate.solution import Result, Solution
-from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -81,7 +81,7 @@ def _run(arrays: Any, static: Any) -> tuple[Trace, Any]:
     q, v = jnp.ravel(jnp.asarray(state.q)), jnp.ravel(jnp.asarray(state.v))
     scales = phases.analyses[0].scales
     rate = jnp.maximum(jnp.maximum(scales.rate, scales.size(v)), 1 / (ts[-1] - ts[0]))
-    length, rate = undifferentiated((scales.length, rate))
+    length, rate = stop_gradients((scales.length, rate))
     ulp = np.finfo(float).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
     hybrid = Hybrid(
         phases,
@@ -105,7 +105,7 @@ def _run(arrays: Any, static: Any) -> tuple[Trace, Any]:
         raise ValueError(f'engine="native" cannot: {next(filter(None, reasons))}. engine="auto" takes diffrax instead')
     code = jnp.where(closed, Result.successful, Result.could_not_assemble)
     if not reasons[0] and closure is not None:  # the closed state may take rows that the analysis says are redundant
-        code = jnp.where(closed & (closure.rank > by_native.rows_kept(hybrid.first_problem())), Result.drift, code)
+        code = jnp.where(closed & (closure.rank > native_engine.rows_kept(hybrid.first_problem())), Result.drift, code)
     return trace(hybrid, Start(ts, q, v, code, choices.drift_tol), choices.max_events), reasons
 
 

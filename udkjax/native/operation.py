@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from udkjax.equations.loop_programs import LoopPrograms
 from udkjax.native import machine
+from udkjax.native.backpropagation import Reverse
 from udkjax.native.closing import Closing
 from udkjax.native.closing_by_loops import ClosingByLoops, ForwardByLoops, ReverseByLoops
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
@@ -27,7 +28,6 @@ from udkjax.native.layout import INFO, INPUTS, OUTPUTS, Plan
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
 from udkjax.native.trajectory import Trajectory
-from udkjax.native.walk import Reverse
 
 FEW = 2  # members up to which one follows another: eight lanes take as long as two members
 

@@ -15,9 +15,9 @@ from udkjax.equations.scalar_programs import EliminationPrograms, elimination_pr
 from udkjax.equations.scales import Scales
 from udkjax.equations.structure import is_large, leaves_as_scalars
 from udkjax.equations.textbook import TextbookEquations
-from udkjax.integrate.problem import Problem, Raw
+from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.tableau import is_explicit, method_of
-from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS, SETTINGS
 from udkjax.native.operation import Kind, Tableau, compiled, native_p, shapes_of, written
 from udkjax.native.program import UnsupportedError
@@ -113,7 +113,7 @@ def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: An
         "breaks": xp.zeros(0),
     }
     arrays = [xp.asarray(given[name], float)[None] for name in INPUTS]
-    return arrays if xp is np else undifferentiated(arrays)
+    return arrays if xp is np else stop_gradients(arrays)
 
 
 def _closing(mechanism: Mechanism, moving: tuple[bool, ...] | None = None, mode: str = "closing") -> Kind:
@@ -124,7 +124,7 @@ def _closing(mechanism: Mechanism, moving: tuple[bool, ...] | None = None, mode:
 # --- problems
 
 
-def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
+def reason_for_diffrax(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
     """Why machine code cannot integrate a problem; empty where it can."""
     equations = problem.equations
     if adjoint is not None:
@@ -152,19 +152,19 @@ def unserved(problem: Problem, adjoint: Any = None, meter: Any = None) -> str:
     return ""
 
 
-def known(problem: Problem) -> Raw:
-    """Integrate a problem whose numbers are all known, without tracing anything: `Raw` of NumPy's arrays."""
+def known(problem: Problem) -> IntegratorOutput:
+    """Integrate a problem whose numbers are all known, without tracing anything: `IntegratorOutput` of NumPy's arrays."""
     kind, inputs = _kind(problem), _inputs(problem, xp=np)
     return _raw(compiled(kind, 1)(inputs, shapes_of(inputs, kind, len(problem.ts))))
 
 
-def solve(problem: Problem) -> Raw:
+def solve(problem: Problem) -> IntegratorOutput:
     """Integrate one problem; under vmap, as many as there are, in lanes."""
     return _raw(native_p.bind(*_inputs(problem), kind=_kind(problem), times=len(problem.ts)))
 
 
-def recorded(problem: Any, moving: Any) -> Raw:
-    """Integrate a problem by the code that `pulled` takes: no other is compiled."""
+def recorded(problem: Any, moving: Any) -> IntegratorOutput:
+    """Integrate a problem by the code that `vjp` takes: no other is compiled."""
     kind, n, times = _kind(problem, _moving(problem, moving), "reverse"), len(problem.q), len(problem.ts)
     none = jnp.zeros((0, times, 2 * n)), jnp.zeros((0, 2 * n))
     return _raw(native_p.bind(*_inputs(problem, kind.code), *none, kind=kind, times=times)[: len(OUTPUTS)])
@@ -205,7 +205,7 @@ def _gains(baumgarte: Any) -> list[Any]:
     return [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
 
 
-def pushed(problem: Any, moving: Any, change: Any) -> tuple[Raw, tuple[Array, Array, Array]]:
+def jvp(problem: Any, moving: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is moving."""
     kind = _kind(problem, _moving(problem, moving), "forward")
     constants, arrays = _constants(problem.equations, kind.code)
@@ -223,7 +223,7 @@ def pushed(problem: Any, moving: Any, change: Any) -> tuple[Raw, tuple[Array, Ar
     return _raw(found), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
 
 
-def pulled(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
+def vjp(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
     """The cotangents of what is `moving`, from those of the states at the output times (T, 2n) and of the end (2n,)."""
     kind = _kind(problem, _moving(problem, moving), "reverse")
     bars = [ys[None], end[None]]
@@ -294,17 +294,17 @@ def _inputs(problem: Any, code: Any = None, xp: Any = jnp) -> list[Any]:
         "breaks": xp.zeros(0) if problem.breakpoints is None else problem.breakpoints,
     }
     arrays = [xp.asarray(given[name], float)[None] for name in INPUTS]
-    return arrays if xp is np else undifferentiated(arrays)
+    return arrays if xp is np else stop_gradients(arrays)
 
 
 def _vector(parts: Sequence[Any], xp: Any) -> Any:
     return xp.concatenate([xp.ravel(xp.asarray(x, float)) for x in parts])
 
 
-def _raw(found: Sequence[Any]) -> Raw:
+def _raw(found: Sequence[Any]) -> IntegratorOutput:
     q, v, violation, info = (x[0] for x in found)
     code, t, tried, accepted, evaluations, written = (info[k] for k in range(len(INFO)))
     number = np.arange(len(q))
     reached = (number <= written) & (number < len(q) - 1) | (code == DONE)
     counts = (x.astype(int) for x in (tried, accepted, evaluations))
-    return Raw(q, v, violation, reached, code.astype(int), t, info[len(INFO) :], *counts)
+    return IntegratorOutput(q, v, violation, reached, code.astype(int), t, info[len(INFO) :], *counts)

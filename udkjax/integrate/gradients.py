@@ -8,6 +8,6 @@ import jax
 Tree = TypeVar("Tree")
 
 
-def undifferentiated(tree: Tree) -> Tree:
+def stop_gradients(tree: Tree) -> Tree:
     """Return the same values, of no interest to any derivative."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)

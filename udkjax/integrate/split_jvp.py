@@ -20,7 +20,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 Parts = Callable[..., tuple[list[Any], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
 
 
-def along(
+def split_jvp(
     seen: Parts, run: Parts, at: Any, direction: Any, few: int | None = 1, shapes: tuple[list[Any], list[Any]] | None = None
 ) -> tuple[list[Any], ...]:
     """The value at `at` and its change along `direction`, trees of arrays: by `run`; transformations see what `seen` does.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.integrate.along import along
+from udkjax.integrate.split_jvp import split_jvp
 
 FEW = 3
 
@@ -30,7 +30,7 @@ def sine(x):
 
 @sine.defjvp
 def _(primals, tangents):
-    (value,), (change,) = along(parts, marked, list(primals), list(tangents), FEW)
+    (value,), (change,) = split_jvp(parts, marked, list(primals), list(tangents), FEW)
     return value, change
 
 
@@ -103,5 +103,5 @@ def test_what_is_no_array_is_handed_on():
         assert at["name"] == "sine"
         return parts([at["x"]], *directions)
 
-    (value,), (change,) = jax.jit(lambda x, dx: along(named, named, {"name": "sine", "x": x}, [dx]))(X, jnp.ones(2))
+    (value,), (change,) = jax.jit(lambda x, dx: split_jvp(named, named, {"name": "sine", "x": x}, [dx]))(X, jnp.ones(2))
     np.testing.assert_allclose([value, change], [np.sin(X), np.cos(X)])

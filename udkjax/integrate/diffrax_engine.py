@@ -12,17 +12,17 @@ from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
 from udkjax.integrate.first_step import first_step
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.outcome import stopped
-from udkjax.integrate.problem import Problem, Raw
+from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import project_all, violation
 from udkjax.integrate.tableau import is_explicit
-from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.native.steps import DONE, GROW, SAFETY, SHRINK, STEP_LIMIT, STEP_TOO_SMALL
 
 
-def by_diffrax(
+def integrate_by_diffrax(
     problem: Problem, adjoint: diffrax.AbstractAdjoint | None = None, meter: diffrax.AbstractProgressMeter | None = None
-) -> Raw:
+) -> IntegratorOutput:
     """Integrate one problem with any solver of diffrax (default Dopri8), in reverse mode by checkpoints unless said otherwise."""
     ts, y0 = problem.ts, jnp.concatenate([problem.q, problem.v])
     run = diffrax.diffeqsolve(
@@ -55,7 +55,7 @@ def by_diffrax(
     right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (problem.h is None))  # one chooses the first step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
     q, v = jnp.split(ys, 2, axis=1)
-    return Raw(q, v, violated, reached, status, t_end[0], end[0], *steps, right_hand_sides)
+    return IntegratorOutput(q, v, violated, reached, status, t_end[0], end[0], *steps, right_hand_sides)
 
 
 def derivative(t: Any, y: Float[Array, "2n"], equations: AbstractSystem) -> Float[Array, "2n"]:
@@ -64,8 +64,8 @@ def derivative(t: Any, y: Float[Array, "2n"], equations: AbstractSystem) -> Floa
 
 
 def _first_step(problem: Problem, y0: Array) -> Array:
-    ts, equations, unit = problem.ts, undifferentiated(problem.equations), jnp.concatenate(problem.units())
-    return first_step(y0, derivative(ts[0], undifferentiated(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol, unit)
+    ts, equations, unit = problem.ts, stop_gradients(problem.equations), jnp.concatenate(problem.units())
+    return first_step(y0, derivative(ts[0], stop_gradients(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol, unit)
 
 
 def _controller(problem: Problem) -> Any:
@@ -88,4 +88,4 @@ class _FrozenSteps(diffrax.PIDController):
 
     def adapt_step_size(self, *args: Any, **kwargs: Any) -> Any:
         keep, t0, t1, *rest = super().adapt_step_size(*args, **kwargs)
-        return keep, t0, t0 + undifferentiated(t1 - t0), *rest
+        return keep, t0, t0 + stop_gradients(t1 - t0), *rest
