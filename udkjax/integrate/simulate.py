@@ -63,38 +63,57 @@ def simulate(
     events: Any = None,
     max_events: int = MAX_EVENTS,
 ) -> Solution:
-    """Integrate the motion of a mechanism; return its states at the times `ts` (T,), in s. The motion starts at ts[0].
-
-    Without `state` the scene's initial guess is assembled; a given state is taken as it is, and a `Closure` that assembly gave
-    before as one that was found here. `method` is any pseudoinverse
-    (default `Auto`), `stabilization` is `Projection()`, a `Baumgarte` or None, `solver` any diffrax solver for ordinary
-    differential equations (default Dopri8: of those measured in benchmarks/ the fastest at equal error, but for the tightest
-    tolerances through singular configurations). `rtol` and `atol` hold for every coordinate and velocity: x may err by
-    rtol |x| + atol L, an angle by rtol |angle| + atol, their rates by 1/T of that, with L the characteristic length of the
-    mechanism (`analyse`) and T the shortest of its characteristic time, the time in which its initial velocities move it by L,
-    and the span of `ts`. So the same tolerances mean the same accuracy at any scale. (L = T = 1 for a `ConstrainedSystem`.)
-    `dt0` is the first step that is tried, in s; by default it is chosen. `formulation` finds the accelerations in
-    another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`, `NullSpaceSVD` or `CoordinatePartitioning`;
-    `method` then serves projection and derivatives. `progress=True` prints how far the run is. `analysis` is that of `analyse`,
-    by default made here; a mechanism all of whose numbers are traced needs one to be fast.
+    """Integrate the equations of motion q'' = a(t, q, q') of a mechanism; return its states at output times.
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
-    vmap as well. It has derivatives of any order, forward and reverse; those beyond the first take the time of a hundred runs and
-    minutes to compile. There are two engines. "native" is machine code made of the scene's expressions, on the CPU: explicit
-    Runge-Kutta methods with elimination, under vmap in lanes that step each on its own. "diffrax" is `diffrax.diffeqsolve`: every
-    solver, adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` says which it
-    was, and why.
+    vmap as well. The result has derivatives of any order, forward and reverse; those beyond the first take the time of a hundred
+    runs and minutes to compile. A violation of Psi above `drift_tol` at an output time ends the solution there.
 
-    `events` are what happens where a condition crosses zero: `Event`, `JointLimit`, `Contact`, one or a list of them, with
-    actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`; up to `max_events` happen. They are located to rounding,
-    whatever `ts` is, and the run starts anew behind each; several at one instant happen one after the other. An output at the
-    very time of an event is the state after it. `Solution.events` holds times and states before and after; `Result` says
-    whether one of them ended the run. Both engines serve them, and batches: each member has its own events and its own code.
-    Such runs have first derivatives, forward and reverse, through the times of the events (saltation), but none by `ts`.
+    Args:
+        mechanism: the mechanism, or a `ConstrainedSystem`.
+        ts: output times (T,) in s, increasing; the motion starts at ts[0].
+        state: the initial `State`, taken as it is, or the `Closure` of an assembly. By default the scene's guess is assembled.
+        rtol: relative tolerance of every coordinate and velocity.
+        atol: tolerance relative to the mechanism's own scales: x may err by rtol |x| + atol L, an angle by rtol |angle| + atol,
+            their rates by 1/T of that, with L the characteristic length (`analyse`) and T the shortest of the characteristic
+            time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. So the same tolerances
+            mean the same accuracy at any scale. L = T = 1 for a `ConstrainedSystem`.
+        method: the pseudoinverse; by default `Auto()`.
+        stabilization: `Projection()`, a `Baumgarte`, or None.
+        solver: any diffrax solver for ordinary differential equations; by default Dopri8, of those measured in benchmarks/ the
+            fastest at equal error, but for the tightest tolerances through singular configurations.
+        adjoint: an adjoint of diffrax; by default derivatives are those of JAX.
+        max_steps: the largest number of steps that are tried.
+        drift_tol: the largest violation of Psi, of L or in rad.
+        dt0: the first step that is tried, in s; by default it is chosen.
+        formulation: finds the accelerations in another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`,
+            `NullSpaceSVD` or `CoordinatePartitioning`; `method` then serves projection and derivatives.
+        throw: whether a run that does not reach its end raises; where numbers are traced, it never does.
+        progress: True prints how far the run is; a progress meter of diffrax is used as it is.
+        analysis: that of `analyse`, by default made here; a mechanism all of whose numbers are traced needs one to be fast.
+        engine: "native" is machine code made of the scene's expressions, on the CPU: explicit Runge-Kutta methods with
+            elimination, under vmap in lanes that step each on its own. "diffrax" is `diffrax.diffeqsolve`: every solver,
+            adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` says which it
+            was, and why.
+        events: what happens where a condition crosses zero: `Event`, `JointLimit`, `Contact`, one or a list of them, with
+            actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. They are located to rounding, whatever `ts` is, and
+            the run starts anew behind each; several at one instant happen one after the other. Both engines serve them, and
+            batches: each member has its own events. Such runs have first derivatives, forward and reverse, through the times of
+            the events (saltation), but none by `ts`.
+        max_events: how many events may happen.
 
-    A run that does not reach its end raises `SimulationError`, which carries the solution; with `throw=False`, or when numbers
-    are traced, `Solution.result` tells instead. A violation of Psi above `drift_tol` (of L, or rad) at an output time ends the
-    solution there. A guess that cannot be closed raises `AssemblyError`.
+    Returns:
+        A `Solution` with q and v (T, bodies, 3): x, y in m and angle in rad, and their rates. `Solution.result` tells how the
+        run ended, `Solution.events` the times of events with the states before and after; an output at the very time of an
+        event is the state after it.
+
+    Raises:
+        SimulationError: the run does not reach its end; it carries the solution.
+        AssemblyError: the initial guess cannot be closed.
+        ValueError: an argument is of no use, or the engine that is asked for cannot do what is asked.
+
+    Source:
+        D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.
     """
     ts = _times(ts)
     if state is None and isinstance(mechanism, ConstrainedSystem):
