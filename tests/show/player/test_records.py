@@ -141,13 +141,21 @@ def test_measures_are_those_of_the_equations(slider_crank, run):
 def test_arrows_are_the_reactions():
     mech = udk.library.compound_pendulum(0.3)
     run = SimpleNamespace(ts=np.zeros(1), q=np.asarray(mech.q0)[None], v=np.zeros((1, 1, 3)))
-    anchors, forces = reaction_arrows(mech, run)
+    anchors, forces, unique = reaction_arrows(mech, run)
     (name,) = mech.joints
     expected = udk.reactions(mech, run)[name][mech.body_names[0]][0, :2]
     np.testing.assert_allclose(forces[0, 0], expected)
-    assert anchors[0][0] == 0 and np.linalg.norm(forces) > 1
+    assert anchors[0][0] == 0 and np.linalg.norm(forces) > 1 and unique == [True]
     arrows = udk.animate(mech, run, measures=(), reactions=True).data["runs"][0]["reactions"]
     assert arrows["usual"] == pytest.approx(np.linalg.norm(expected))
+
+
+def test_arrows_say_which_forces_redundant_joints_share():
+    mech = udk.library.parallelogram()
+    run = SimpleNamespace(ts=np.zeros(1), q=np.asarray(mech.q0)[None], v=np.zeros((1, 4, 3)))
+    assert reaction_arrows(mech, run)[2] == [False] * 6  # how the three links share the coupler's weight along them is open
+    arrows = udk.animate(mech, run, measures=(), reactions=True).data["runs"][0]["reactions"]
+    assert arrows["unique"] == [False] * 6
 
 
 def test_a_run_that_failed_is_shown_as_far_as_it_came(slider_crank, run):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.equations import Analysis, analyse, energy, reactions, singular_values, violation
+from udkjax.equations import Analysis, analyse, energy, reactions, singular_values, unique_reactions, violation
 from udkjax.equations.determinacy import RANK_TOL
 from udkjax.scene import GROUND, Mechanism
 
@@ -99,15 +99,17 @@ def _rank(mechanism: Mechanism, solution: Any) -> list[Measure]:
 MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank}
 
 
-def reaction_arrows(mechanism: Mechanism, solution: Any) -> tuple[list[list[float]], Float[np.ndarray, "T joints 2"]]:
-    """Return the anchors [body, x, y] of the joints and drivers that put forces on bodies, and these forces (N, ground axes).
+def reaction_arrows(mechanism: Mechanism, solution: Any) -> tuple[list[list[float]], Float[np.ndarray, "T joints 2"], list[bool]]:
+    """Return what the arrows of reactions need, for each joint and driver that puts a force on a body.
 
-    The force is that on the joint's second body, or, where this is the ground, on the first one. Of redundant constraints it is
-    the share of least norm.
+    Returns:
+        Anchors [body, x, y]; forces (N, ground axes) on the second body, or, where this is the ground, on the first one, of
+        redundant constraints the share of least norm; and whether they are unique throughout the run.
     """
-    loads = reactions(mechanism, solution)
+    loads, known = reactions(mechanism, solution), unique_reactions(mechanism, solution)
     bodies = list(mechanism.bodies)
-    anchors, forces = [], []
+    alive = np.isfinite(np.asarray(solution.q)).all((1, 2))
+    anchors, forces, unique = [], [], []
     for name, constraint in mechanism.constraints.items():
         points = getattr(constraint, "points", None)
         if points is None or getattr(constraint, "coordinate", "") == "angle":
@@ -116,4 +118,5 @@ def reaction_arrows(mechanism: Mechanism, solution: Any) -> tuple[list[list[floa
         body, point = constraint.bodies[side], np.asarray(points, float)[side]
         anchors.append([bodies.index(body), *point.tolist()])
         forces.append(np.asarray(loads[name][body])[:, :2])
-    return anchors, np.stack(forces, axis=1) if forces else np.zeros((len(solution.ts), 0, 2))
+        unique.append(bool(np.asarray(known[name][body])[alive, :2].all()))
+    return anchors, np.stack(forces, axis=1) if forces else np.zeros((len(solution.ts), 0, 2)), unique

@@ -133,6 +133,8 @@ const THEMES = {
   },
 };
 
+const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
+
 /** A colour on the way to another one: t from 0 to 1. */
 function mix(one, two, t) {
   const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
@@ -430,9 +432,9 @@ class Painter {
     this.line([[x, y], corner(wide), corner(-wide)], 0, colour, {closed: true, fill: colour});
   }
 
-  arrow([x0, y0], [x1, y1], colour) {
+  arrow([x0, y0], [x1, y1], colour, dash = []) {
     const angle = Math.atan2(y1 - y0, x1 - x0), length = Math.hypot(x1 - x0, y1 - y0), back = Math.min(5 * this.pt, length);
-    this.line([[x0, y0], [x1 - back * Math.cos(angle), y1 - back * Math.sin(angle)]], 2.2, colour);
+    this.line([[x0, y0], [x1 - back * Math.cos(angle), y1 - back * Math.sin(angle)]], 2.2, colour, {dash});
     if (length > 2 * this.pt) this.head([x1, y1], angle, colour);
   }
 
@@ -502,13 +504,13 @@ class Painter {
 
   /** Arrows of forces, and one whose force is told. An arrow that would be longer than three times the usual one is cut. */
   reactions(run, t, width, height) {
-    const forces = run.force(t), {anchors, usual} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
+    const forces = run.force(t), {anchors, usual, unique} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
     anchors.forEach((anchor, k) => {
       const [x, y] = this.anchor(anchor), fx = forces[2 * k] / usual, fy = forces[2 * k + 1] / usual;
       const size = length * Math.min(1, 3 / Math.hypot(fx, fy));
-      if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour);
+      if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour, unique[k] ? [] : NOT_UNIQUE);
     });
-    const told = nice(usual / 2), y = height - 14, words = `${short(told)} N`;
+    const told = nice(usual / 2), y = height - 14, words = `${short(told)} N${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
     this.text(words, [width - 14, y], colour, {align: "right", size: 11 / Math.max(1, this.pt)});
     const end = width - 14 - this.context.measureText(words).width - 7;
     this.arrow([end - length * told / usual, y], [end, y], colour);

@@ -16,7 +16,7 @@ runs       a list of
     frame          s, the typical time between two instants
     mode           instead of these: {q: numbers, shape: numbers, frequency: Hz or null}
     measures       a list of {name, unit, log, values: single precision}
-    reactions      {anchors, usual (N), force: packed table of T rows, x and y of each anchor}, or null
+    reactions      {anchors, usual (N), unique: booleans, force: packed table of T rows, x and y of each anchor}, or null
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -85,13 +85,13 @@ def run_record(
         "reactions": None,
     }
     if with_reactions:
-        anchors, forces = reaction_arrows(mechanism, solution)
+        anchors, forces, unique = reaction_arrows(mechanism, solution)
         forces = np.nan_to_num(forces[shown])
         largest = np.linalg.norm(forces, axis=2).max(axis=1, initial=0.0)
         usual = float(np.quantile(largest, USUAL)) or float(largest.max(initial=0.0))
         if usual > 0:
             table = packed(forces.reshape(len(shown), -1), FORCE_PRECISION * usual)
-            record["reactions"] = {"anchors": anchors, "usual": usual, "force": table}
+            record["reactions"] = {"anchors": anchors, "usual": usual, "unique": unique, "force": table}
     return record, poses
 
 
