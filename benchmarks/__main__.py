@@ -12,6 +12,7 @@ NAMES = (
     "trajectory",
     "batch",
     "gradients",
+    "mechanisms",
     "startup",
     "scaling",
     "sweep",

@@ -99,6 +99,9 @@ def _claims() -> Iterable[Claim]:
         yield Claim(f"identified from within 50 %, {case}: share right to 1e-8", "identification", 0.95, reached, True)
         covered = value("covered", name=case, protocol="1 % noise")
         yield Claim(f"identified with 1 % noise, {case}: share within two errors", "identification", 0.93, covered, True)
+    for name in ("udkjax: q, q', q'' in a batch", "udkjax: kinematics() in a batch"):
+        rate = value("per_second", name=name)
+        yield Claim(f"{name}: closed positions of a four-bar a second and core", "mechanisms", 1e6, rate, True)
     for name, target in STARTS.items():
         yield Claim(f"start: {name}, s", "startup", target, value("seconds", name=name))
 

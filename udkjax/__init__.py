@@ -95,8 +95,14 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.show.player import Animation as Animation
     from udkjax.show.player import animate as animate
     from udkjax.show.player import animate_modes as animate_modes
+    from udkjax.study.branches import branches as branches
+    from udkjax.study.continuation import Reached as Reached
     from udkjax.study.diagnosis import Diagnosis as Diagnosis
     from udkjax.study.diagnosis import diagnose as diagnose
+    from udkjax.study.drive import Coordinate as Coordinate
+    from udkjax.study.equilibrium import Equilibrium as Equilibrium
+    from udkjax.study.equilibrium import equilibria as equilibria
+    from udkjax.study.equilibrium import equilibrium as equilibrium
     from udkjax.study.explanation import Explanation as Explanation
     from udkjax.study.explanation import explain as explain
     from udkjax.study.identify import Candidate as Candidate
@@ -112,6 +118,16 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.study.identify import design_experiment as design_experiment
     from udkjax.study.identify import identify as identify
     from udkjax.study.identify import length as length
+    from udkjax.study.inverse_dynamics import Effort as Effort
+    from udkjax.study.inverse_dynamics import InverseDynamics as InverseDynamics
+    from udkjax.study.inverse_dynamics import feed_forward as feed_forward
+    from udkjax.study.inverse_dynamics import inverse_dynamics as inverse_dynamics
+    from udkjax.study.kinematics import Kinematics as Kinematics
+    from udkjax.study.kinematics import Travel as Travel
+    from udkjax.study.kinematics import kinematics as kinematics
+    from udkjax.study.kinematics import travel as travel
+    from udkjax.study.modes import Modes as Modes
+    from udkjax.study.modes import modes as modes
     from udkjax.study.power_balance import PowerBalance as PowerBalance
     from udkjax.study.power_balance import power_balance as power_balance
     from udkjax.study.reaction_peaks import envelope as envelope
@@ -123,6 +139,11 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.study.sweep import SweepError as SweepError
     from udkjax.study.sweep import Zipped as Zipped
     from udkjax.study.sweep import sweep as sweep
+    from udkjax.study.transmission import Workspace as Workspace
+    from udkjax.study.transmission import coupler_curve as coupler_curve
+    from udkjax.study.transmission import mechanical_advantage as mechanical_advantage
+    from udkjax.study.transmission import transmission_angle as transmission_angle
+    from udkjax.study.transmission import workspace as workspace
 
 _MODULES = {"pinv": "udkjax.pinv", "equations": "udkjax.equations", "library": "udkjax.scene.library"}
 _NAMES = {
@@ -148,6 +169,14 @@ _NAMES = {
         design_experiment Candidate Design""",
     "udkjax.show.player": "animate animate_modes Animation",
     "udkjax.study.sweep": "sweep Axis Zipped Sobol LatinHypercube Random SweepError",
+    "udkjax.study.branches": "branches",
+    "udkjax.study.continuation": "Reached",
+    "udkjax.study.drive": "Coordinate",
+    "udkjax.study.equilibrium": "equilibria equilibrium Equilibrium",
+    "udkjax.study.inverse_dynamics": "feed_forward inverse_dynamics Effort InverseDynamics",
+    "udkjax.study.modes": "modes Modes",
+    "udkjax.study.kinematics": "kinematics Kinematics travel Travel",
+    "udkjax.study.transmission": "coupler_curve mechanical_advantage transmission_angle workspace Workspace",
     "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }
 _RENAMED: dict[str, str] = {}  # old public names and what they are now, with their module: see udkjax.deprecation

@@ -15,6 +15,7 @@ from benchmarks import (  # noqa: E402
     identification,
     integrators,
     measurements,
+    mechanisms,
     right_hand_side,
     sweep,
     table,
@@ -176,3 +177,16 @@ def test_candidates_take_turns():
     times = alternate({"a": f, "b": f}, (jnp.ones(2),), 3)
     assert [len(t) for t in times.values()] == [3, 3]
     assert ratio([2.0, 4.0, 60.0], [1.0, 2.0, 3.0]) == 2.0
+
+
+def test_the_scripts_of_mechanisms_agree():
+    values = mechanisms.START + np.linspace(0.0, 1.0, 5)
+    np.testing.assert_allclose(mechanisms.by_fsolve(values), mechanisms.rocker(values), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_mechanisms():
+    """Which are held against each other inside."""
+    figures = mechanisms.main(smoke=True)
+    assert all(row.get("per_second", row.get("ms")) > 0 for row in figures)
+    assert {"SciPy's fsolve", "udkjax: kinematics() in a batch"} <= {row["name"] for row in figures}

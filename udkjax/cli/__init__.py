@@ -11,7 +11,21 @@ from importlib.metadata import version
 
 from udkjax.cli.exits import exit_codes
 
-COMMANDS = ("report", "simulate", "animate", "sweep", "identify", "check", "diagnose", "explain", "doctor")
+COMMANDS = (
+    "report",
+    "simulate",
+    "animate",
+    "sweep",
+    "identify",
+    "kinematics",
+    "inverse",
+    "statics",
+    "modes",
+    "check",
+    "diagnose",
+    "explain",
+    "doctor",
+)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -25,6 +25,7 @@ from udkjax.native.closing_by_loops import ClosingByLoops, ForwardByLoops, Rever
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
 from udkjax.native.ffi import handler
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS, Plan
+from udkjax.native.marching import Marching
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
 from udkjax.native.trajectory import Trajectory
@@ -40,7 +41,7 @@ class Kind(NamedTuple):
     projected: bool
     breaks: bool
     moving: tuple[bool, ...] | None = None  # of a run with derivatives: of which constants
-    mode: str = "run"  # or "forward", or "reverse"
+    mode: str = "run"  # or "forward", "reverse", "closing" and its derivatives, "marching"
 
 
 class Tableau:
@@ -66,8 +67,10 @@ CLOSING_BY_LOOPS: dict[str, Any] = {"closing forward": ForwardByLoops, "closing 
 def written(kind: Kind, width: int) -> Trajectory:
     """A kind of trajectory in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it."""
     loops = isinstance(kind.code, LoopPrograms)
-    if kind.mode == "closing":
-        trajectory: Trajectory = (ClosingByLoops if loops else Closing)(kind.code, machine.lanes())
+    if kind.mode == "marching":
+        trajectory: Trajectory = Marching(kind.code, width, machine.lanes())
+    elif kind.mode == "closing":
+        trajectory = (ClosingByLoops if loops else Closing)(kind.code, machine.lanes())
     elif kind.mode in CLOSING:
         trajectory = (CLOSING_BY_LOOPS if loops else CLOSING)[kind.mode](kind.code, kind.moving, machine.lanes())
     else:
@@ -142,6 +145,8 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
     n = inputs[INPUTS.index("q")].shape[1]
     members = max(x.shape[0] for x in inputs)
     shapes: list[tuple[int, ...]]
+    if kind.mode == "marching":
+        return [*[(members, times, n)] * 3, (members, 1)]
     if kind.mode.startswith("closing"):
         shapes = [(members, 2 * n), (members, 2 * inputs[INPUTS.index("rows")].shape[1]), (members, 1)]
         if kind.mode == "closing forward":

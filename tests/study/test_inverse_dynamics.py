@@ -1,0 +1,87 @@
+"""What drivers must exert, against closed forms, power and forward dynamics."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+
+
+def test_the_torque_of_a_slider_crank_is_that_of_its_closed_form():
+    """By energy: crank, rod and slider have V(s) and T = J(s) s_dot^2 / 2, so the torque is J'(s) s_dot^2 / 2 + V'(s)."""
+    r, rod, (m1, m2, m3), g, omega = 0.5, 1.5, (1.0, 1.5, 2.0), 9.81, 4.0
+    mech = udk.library.slider_crank(0.3, omega)
+    ts = np.linspace(0.0, 1.5, 16)
+    found = udk.inverse_dynamics(mech, ts)
+
+    def pose(s):
+        tilt = -jnp.arcsin(r * jnp.sin(s) / rod)
+        pin = r * jnp.stack([jnp.cos(s), jnp.sin(s)])
+        middle = pin + 0.5 * rod * jnp.stack([jnp.cos(tilt), jnp.sin(tilt)])
+        return jnp.concatenate([0.5 * pin, middle, jnp.stack([pin[0] + rod * jnp.cos(tilt), s, tilt])])
+
+    masses = jnp.array([m1, m1, m2, m2, m3, m1 * r**2 / 12, m2 * rod**2 / 12])
+    inertia = lambda s: masses @ jax.jvp(pose, (s,), (1.0,))[1] ** 2  # noqa: E731
+    potential = lambda s: g * (m1 * pose(s)[1] + m2 * pose(s)[3])  # noqa: E731
+    exact = jax.vmap(lambda s: 0.5 * jax.grad(inertia)(s) * omega**2 + jax.grad(potential)(s))(0.3 + omega * ts)
+    np.testing.assert_allclose(found.efforts["motor"], exact, atol=1e-11)
+    np.testing.assert_allclose(found.power, omega * exact, atol=1e-10)
+    assert float(jnp.max(found.residual)) < 1e-12
+
+
+def test_what_is_fed_forward_reproduces_the_motion():
+    mech = udk.library.slider_crank(0.3, 4.0)
+    h = 1 / 400
+    knots = h * np.arange(-16, 217)
+    free = udk.feed_forward(mech, udk.inverse_dynamics(mech, knots))
+    assert not free.drivers
+    ts = np.linspace(0.0, 0.5, 6)
+    exact = udk.kinematics(mech, None, ts)
+    sol = udk.simulate(free, ts, state=udk.State(exact.q[0], exact.v[0]), rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(sol.q, exact.q, atol=1e-8)
+    np.testing.assert_allclose(sol.v, exact.v, atol=1e-7)
+
+
+def test_redundant_joints_and_redundant_drivers():
+    """Three links of a parallelogram driven alike: by symmetry of the weights, equal shares; by weights, shares as 1/w."""
+    mech = udk.library.parallelogram(-0.8)
+    motion = udk.kinematics(mech, "body.link1.angle", [-0.8, -0.5, 0.6], rate=2.0, acceleration=1.0)
+    links = [f"body.link{k}.angle" for k in (1, 2, 3)]
+    one = udk.inverse_dynamics(mech, np.zeros(3), motion, links[:1])
+    # T = (3 (I + m/4) + M) s_dot^2 / 2 and V = (3 m / 2 + M) g sin s, of unit length, 3 m = 3 kg, M = 2 kg
+    s = np.array([-0.8, -0.5, 0.6])
+    exact = (3 * (0.1 + 0.25) + 2.0) * 1.0 + 3.5 * 9.81 * np.cos(s)
+    np.testing.assert_allclose(one.efforts[links[0]], exact, rtol=1e-11)
+    three = udk.inverse_dynamics(mech, np.zeros(3), motion, links, weights={links[2]: 0.5})
+    shares = np.stack([three.efforts[name] for name in links], 1)
+    np.testing.assert_allclose(shares, exact[:, None] * np.array([0.25, 0.25, 0.5]), rtol=1e-11)
+    assert float(jnp.max(three.residual)) < 1e-11
+
+
+def test_efforts_are_what_the_drivers_reactions_say():
+    """For as many drivers as degrees of freedom: -lambda of the driver's row, found by forward dynamics."""
+    mech = udk.library.slider_crank(0.3, 4.0)
+    ts = np.linspace(0.0, 0.4, 3)
+    found = udk.inverse_dynamics(mech, ts)
+    moved = found.motion
+    for k, t in enumerate(ts):
+        _, lam = udk.accelerations(mech, t, moved.q[k], moved.v[k], multipliers=True)
+        assert abs(float(found.efforts["motor"][k] + lam[-1])) < 1e-10
+
+
+def test_derivatives_of_a_torque():
+    mech = udk.library.slider_crank(0.3, 4.0)
+
+    def torque(x):
+        changed = mech.with_parameters({"body.slider.mass": x[0], "joint.P.points[0][0]": x[1]})
+        return udk.inverse_dynamics(changed, jnp.array([0.2])).efforts["motor"][0]
+
+    x, h = jnp.array([2.0, 0.25]), 1e-5
+    differences = [(torque(x.at[k].add(h)) - torque(x.at[k].add(-h))) / (2 * h) for k in range(2)]
+    np.testing.assert_allclose(jax.grad(torque)(x), differences, rtol=1e-7)
+
+
+def test_nothing_drives():
+    with pytest.raises(udk.SceneError, match="nothing drives"):
+        udk.inverse_dynamics(udk.library.four_bar(), [0.0], udk.kinematics(udk.library.four_bar(), "body.crank.angle", [1.0]))

@@ -1,0 +1,231 @@
+"""Positions over the range of a driver, against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax.study.continuation import Reached
+
+TURN = np.linspace(np.pi / 3, np.pi / 3 + 2 * np.pi, 73)
+VALUES = np.linspace(1.1, 1.5, 12)  # as many as all tests take that compile something
+CRANK_ROCKER = {"lengths": (0.5, 1.2, 0.8), "ground": 1.0}
+STUCK = (1.0, 1.5, 1.2, 2.2)  # crank, coupler, rocker, ground: not Grashof's
+
+
+def rocker_angle(crank, a, b, c, g, branch):
+    """The angle of the rocker by the diagonal of the four-bar: crank, coupler, rocker and ground are a, b, c, g."""
+    end = a * np.array([np.cos(crank), np.sin(crank)])
+    to_ground = np.array([[g], [0.0]]) - end
+    d = np.linalg.norm(to_ground, axis=0)
+    inner = np.arccos((d**2 + c**2 - b**2) / (2 * d * c))
+    return np.arctan2(-to_ground[1], -to_ground[0]) - branch * inner
+
+
+@pytest.mark.parametrize("branch", [1, -1])
+def test_a_crank_rocker_turns_once_on_each_branch_without_a_flip(branch):
+    mech = udk.library.four_bar(np.pi / 3, **CRANK_ROCKER)
+    if branch < 0:
+        b, c = CRANK_ROCKER["lengths"][1:]
+        crank, start = np.pi / 3, 0.5 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)])
+        angle = rocker_angle(np.array([crank]), 0.5, b, c, 1.0, -1)[0]
+        pin = np.array([1.0, 0.0]) + c * np.array([np.cos(angle), np.sin(angle)])
+        tilt = np.arctan2(*(pin - start)[::-1])
+        mech = mech.with_parameters(
+            {
+                "body.coupler.position": (start + pin) / 2,
+                "body.coupler.angle": tilt,
+                "body.rocker.position": (np.array([1.0, 0.0]) + pin) / 2,
+                "body.rocker.angle": angle,
+            }
+        )
+    found = udk.kinematics(mech, "body.crank.angle", TURN)
+    assert np.all(found.status == Reached.closed)
+    assert np.isnan(found.limit)
+    exact = rocker_angle(TURN, 0.5, 1.2, 0.8, 1.0, branch)
+    difference = np.asarray(found.q[:, 2, 2]) - exact
+    np.testing.assert_allclose(np.sin(difference / 2), 0.0, atol=1e-14)
+    turned = np.asarray(found.q[-1] - found.q[0])
+    np.testing.assert_allclose(turned, [[0, 0, 2 * np.pi], [0, 0, 0], [0, 0, 0]], atol=1e-14)
+
+
+def test_velocities_and_accelerations_are_the_derivatives_of_positions():
+    mech = udk.library.four_bar(np.pi / 3, **CRANK_ROCKER)
+    h = 1e-4
+    near = udk.kinematics(mech, "body.crank.angle", 1.3 + h * np.array([-1.0, 0.0, 1.0]), rate=2.0, acceleration=3.0)
+    q, v, a = (np.asarray(x) for x in (near.q, near.v[1], near.a[1]))
+    first, second = (q[2] - q[0]) / (2 * h), (q[2] - 2 * q[1] + q[0]) / h**2
+    np.testing.assert_allclose(v, 2.0 * first, atol=1e-7)
+    np.testing.assert_allclose(a, 4.0 * second + 3.0 * first, atol=1e-6)
+
+
+def test_a_linkage_stops_at_its_toggle():
+    a, b, c, g = STUCK
+    mech = udk.library.four_bar(np.pi / 3, lengths=(a, b, c), ground=g)
+    toggle = np.arccos((a**2 + g**2 - (b + c) ** 2) / (2 * a * g))
+    values = np.append(np.linspace(np.pi / 3, toggle - 1e-6, 8), [toggle - 1e-13, toggle + 1e-9, toggle + 0.1, 1.0])  # 12
+    found = udk.kinematics(mech, "body.crank.angle", values)
+    assert [Reached(int(s)) for s in found.status[-5:]] == [Reached.closed, *[found.status[-4]], *[Reached.beyond_limit] * 3]
+    assert abs(float(found.limit) - toggle) < 1e-13
+    np.testing.assert_allclose(np.sin(found.limit_q[1, 2] - found.limit_q[2, 2]), 0.0, atol=1e-7)  # in line
+    assert np.all(np.isnan(found.q[-3:]))
+    exact = rocker_angle(values[:8], a, b, c, g, 1)
+    np.testing.assert_allclose(np.sin((np.asarray(found.q[:8, 2, 2]) - exact) / 2), 0.0, atol=1e-9)
+
+
+def test_travel_has_two_ends_and_exact_derivatives():
+    a, b, c, g = STUCK
+    mech = udk.library.four_bar(np.pi / 3, lengths=(a, b, c), ground=g)
+
+    def upper(g):
+        return jnp.arccos((a**2 + g**2 - (b + c) ** 2) / (2 * a * g))
+
+    def ends(g):
+        found = udk.travel(mech.with_parameters({"joint.D.points[0][0]": g}), "body.crank.angle")
+        return jnp.stack([found.lower, found.upper])
+
+    values, slopes = jax.jvp(ends, (g,), (1.0,))
+    np.testing.assert_allclose(values, [-upper(g), upper(g)], atol=1e-13)
+    np.testing.assert_allclose(slopes, [-jax.grad(upper)(g), jax.grad(upper)(g)], atol=1e-12)
+    free = udk.travel(udk.library.four_bar(np.pi / 3, **CRANK_ROCKER), "body.crank.angle")
+    assert (float(free.lower), float(free.upper)) == (-np.inf, np.inf)
+
+
+def test_peaucellier_draws_a_straight_line():
+    mech = udk.library.peaucellier()
+    found = udk.kinematics(mech, "body.crank.angle", np.linspace(np.pi / 6, -1.5, 40))
+    assert np.all(found.reached)
+    path = found.path("AD", (0.5 * mech.joints["D"].points[0][0] * 2, 0.0))
+    x = np.asarray(path[:, 0])
+    np.testing.assert_allclose(x, x[0], atol=1e-12)
+    assert np.ptp(path[:, 1]) > 0.5
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e3])
+def test_size_does_not_matter(scale):
+    a, b, c, g = (scale * x for x in STUCK)
+    mech = udk.library.four_bar(np.pi / 3, lengths=(a, b, c), ground=g)
+    values = np.append(VALUES[:11], 2.0)
+    found = udk.kinematics(mech, "body.crank.angle", values)
+    assert [int(s) for s in found.status] == [*[Reached.closed] * 11, Reached.beyond_limit]
+    assert abs(float(found.limit) - np.arccos((a**2 + g**2 - (b + c) ** 2) / (2 * a * g))) < 1e-12
+    exact = rocker_angle(values[:11], a, b, c, g, 1)
+    np.testing.assert_allclose(np.sin((np.asarray(found.q[:11, 2, 2]) - exact) / 2), 0.0, atol=1e-13)
+
+
+REDUNDANT = {
+    "parallelogram": (lambda: udk.library.parallelogram(-0.8), "body.link1.angle", -0.8, 5.1),
+    "two-four-bar": (lambda: udk.library.n_four_bar(2), "body.link0.angle", np.pi / 2, -3.0),
+    "scissor lift": (lambda: udk.library.scissor_lift(2), "body.platform.y", 1.0, 0.4),
+}
+
+
+@pytest.mark.parametrize("name", REDUNDANT)
+def test_redundant_linkages_keep_their_branch_where_branches_meet(name):
+    make, driver, first, last = REDUNDANT[name]
+    values = np.linspace(first, last, 30)
+    found = udk.kinematics(make(), driver, values)
+    assert np.all(found.status == Reached.closed)
+    q = np.asarray(found.q)
+    if name == "scissor lift":
+        np.testing.assert_allclose(q[:, :4, 2], np.arcsin(values / 2)[:, None] * [1, -1, 1, -1], atol=1e-12)
+        return
+    links = [k for k, body in enumerate(found.bodies) if "link" in body]
+    np.testing.assert_allclose(q[:, links, 2], np.broadcast_to(values[:, None], (30, len(links))), atol=1e-9)
+    np.testing.assert_allclose(np.asarray(found.v)[:, links, 2], 1.0, atol=1e-6)
+
+
+def test_a_position_where_branches_meet_says_so():
+    values = np.linspace(-0.8, 5.1, 30)
+    values[19] = np.pi
+    found = udk.kinematics(udk.library.parallelogram(-0.8), "body.link1.angle", values)
+    assert list(np.flatnonzero(found.status)) == [19]
+    assert int(found.status[19]) == Reached.singular
+    np.testing.assert_allclose(found.q[:, 2, 2], values, atol=1e-7)
+
+
+def test_drivers_along_time_and_other_drivers_held():
+    mech = udk.library.slider_crank(0.3, 4.0, gravity=0.0)
+    ts = np.linspace(0.0, 1.0, 9)
+    along = udk.kinematics(mech, None, ts)
+    by_value = udk.kinematics(mech, "motor", 0.3 + 4.0 * ts, rate=4.0)
+    for one, other in ((along.q, by_value.q), (along.v, by_value.v), (along.a, by_value.a)):
+        np.testing.assert_allclose(one, other, atol=1e-11)
+    s = 0.3 + 4.0 * ts
+    np.testing.assert_allclose(along.q[:, 2, 0], 0.5 * np.cos(s) + np.sqrt(1.5**2 - 0.25 * np.sin(s) ** 2), atol=1e-13)
+
+
+def test_derivatives_of_positions_by_numbers_of_the_scene():
+    mech = udk.library.four_bar(np.pi / 3, **CRANK_ROCKER)
+
+    def f(g):
+        found = udk.kinematics(mech.with_parameters({"joint.D.points[0][0]": g}), "body.crank.angle", VALUES)
+        return jnp.stack([found.q[1, 2, 2], found.v[1, 2, 2], found.a[1, 2, 2]])
+
+    h, forward = 1e-5, jax.jit(jax.jacfwd(f))
+    first = np.asarray(forward(1.0))
+    np.testing.assert_allclose(first, (np.asarray(f(1.0 + h)) - np.asarray(f(1.0 - h))) / (2 * h), atol=1e-8)
+    second, reverse = jax.jit(lambda g: (jax.jacfwd(jax.jacfwd(f))(g), jax.jacrev(f)(g)))(1.0)
+    np.testing.assert_allclose(reverse, first, atol=1e-12)
+    np.testing.assert_allclose(second, (forward(1.0 + h) - forward(1.0 - h)) / (2 * h), atol=1e-7)
+
+
+def test_a_batch_has_a_code_for_each_member():
+    a, b, c, g = STUCK
+    mech = udk.library.four_bar(np.pi / 3, lengths=(a, b, c), ground=g)
+    grounds = np.linspace(1.0, 2.6, 1000)
+
+    def member(g):
+        found = udk.kinematics(mech.with_parameters({"joint.D.points[0][0]": g}), "body.crank.angle", np.linspace(1.1, 2.5, 12))
+        return found.status, found.limit
+
+    status, limit = jax.vmap(member)(grounds)
+    cosine = (a**2 + grounds**2 - (b + c) ** 2) / (2 * a * grounds)
+    turns = np.abs(cosine) > 1
+    exact = np.arccos(np.where(turns, 1.0, cosine))
+    assert np.all(status[turns | (exact > 2.5)] == Reached.closed)
+    stuck = ~turns & (exact < 2.5) & (exact > 1.1)
+    assert stuck.sum() > 100
+    assert np.all(status[stuck, -1] == Reached.beyond_limit)
+    np.testing.assert_allclose(limit[stuck], exact[stuck], atol=1e-12)
+
+
+def test_transmission_angle_and_mechanical_advantage():
+    mech = udk.library.four_bar(np.pi / 3, **CRANK_ROCKER)
+    found = udk.kinematics(mech, "body.crank.angle", TURN[:20])
+    d2 = 0.5**2 + 1.0 - 2 * 0.5 * np.cos(TURN[:20])
+    np.testing.assert_allclose(
+        np.cos(udk.transmission_angle(mech, found, "C")), (1.2**2 + 0.8**2 - d2) / (2 * 1.2 * 0.8), atol=1e-12
+    )
+    advantage = udk.mechanical_advantage(mech, found, "body.rocker.angle")
+    np.testing.assert_allclose(advantage, 1 / np.asarray(found.v[:, 2, 2]), rtol=1e-12)
+    with pytest.raises(udk.SceneError, match="pins besides"):
+        udk.transmission_angle(mech, found, "A")
+
+
+def test_the_workspace_of_two_links_is_a_ring():
+    mech = udk.library.double_pendulum()
+    one, two = mech.body_names
+    pin = mech.joints[list(mech.joints)[1]].points
+    arm = float(2 * np.linalg.norm(pin[1]))
+    first, second = np.linspace(-1.0, 1.0, 5), np.linspace(-2.0, 2.0, 7)
+    base = np.asarray(mech.q0[:, 2])
+    tip = -np.asarray(pin[1])
+    found = udk.workspace(mech, {f"body.{one}.angle": base[0] + first, f"body.{two}.angle": base[1] + second}, two, tip)
+    assert np.all(found.reached)
+    foot = next(iter(mech.joints.values())).points
+    radius = np.linalg.norm(np.asarray(found.points) - np.asarray(foot[0]), axis=-1)
+    length = float(np.linalg.norm(np.asarray(pin[0]) - np.asarray(foot[1])))
+    angle = (base[1] + second)[None, :] - (base[0] + first)[:, None]
+    np.testing.assert_allclose(radius, np.sqrt(length**2 + arm**2 + 2 * length * arm * np.cos(angle)), atol=1e-12)
+
+
+def test_what_cannot_be_driven_is_refused():
+    mech = udk.library.four_bar()
+    with pytest.raises(udk.SceneError, match='did you mean "crank"'):
+        udk.kinematics(mech, "body.crnk.angle", [1.0])
+    with pytest.raises(udk.SceneError, match="cannot be driven"):
+        udk.kinematics(mech, "body.crank.omega", [1.0])
+    with pytest.raises(udk.SceneError, match="keeps 1 degree of freedom"):
+        udk.kinematics(udk.library.double_pendulum(), f"body.{udk.library.double_pendulum().body_names[0]}.angle", [1.0])

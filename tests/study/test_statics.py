@@ -1,0 +1,163 @@
+"""Equilibria and vibration, against closed forms and a reduction to one coordinate."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import udkjax as udk
+
+LENGTHS, GROUND = (1.0, 2.5, 2.0), 2.5
+STIFFNESS, FREE_LENGTH = 60.0, 1.2
+
+
+def test_the_papers_linkage_hanging():
+    mech = udk.library.parallelogram(-1.3)
+    rest = udk.equilibrium(mech)
+    assert bool(rest.stable)
+    np.testing.assert_allclose(rest.q[:3, 2], -np.pi / 2, atol=1e-12)
+    found = udk.modes(mech, rest.state)
+    np.testing.assert_allclose(found.omega2, [3.5 * 9.81 / 3.05], rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(found.s.imag), np.sqrt(3.5 * 9.81 / 3.05) * np.array([-1.0, 1.0]), rtol=1e-12)
+    shape = np.asarray(found.shapes[0]) / float(found.shapes[0, 0, 2])
+    np.testing.assert_allclose(shape, [[0.5, 0, 1], [0.5, 0, 1], [0.5, 0, 1], [1, 0, 0]], atol=1e-10)
+
+
+def test_the_papers_linkage_standing_is_unstable():
+    mech = udk.library.parallelogram(1.4)
+    rest = udk.equilibrium(mech)
+    assert bool(rest.balanced)
+    assert not bool(rest.stable)
+    np.testing.assert_allclose(rest.omega2, [-3.5 * 9.81 / 3.05], rtol=1e-12)
+    downhill = udk.equilibrium(mech, stable=True)
+    np.testing.assert_allclose(np.cos(downhill.q[:3, 2] + np.pi / 2), 1.0, atol=1e-12)
+
+
+def spring_four_bar(stiffness=STIFFNESS, scale=1.0):
+    """A spring along the diagonal from the crank's pin to the rocker's pivot."""
+    a, b, c = (scale * x for x in LENGTHS)
+    mech = udk.library.four_bar(1.0, lengths=(a, b, c), ground=scale * GROUND, density=1.0 / scale)
+    spring = udk.Spring(("ground", "crank"), [(scale * GROUND, 0.0), (a / 2, 0.0)], stiffness, scale * FREE_LENGTH)
+    return udk.Mechanism(dict(mech.bodies), dict(mech.joints), {}, {"spring": spring}, mech.gravity)
+
+
+def reduced(guess):
+    """Equilibrium and omega^2 of one coordinate, the crank's angle, in closed form: V' = 0 and V''/J."""
+    a, b, c = LENGTHS
+
+    def pose(s):
+        end = a * jnp.stack([jnp.cos(s), jnp.sin(s)])
+        to = jnp.array([GROUND, 0.0]) - end
+        d2 = to @ to
+        x = (d2 + b**2 - c**2) / (2 * d2)
+        pin = end + x * to + jnp.sqrt(b**2 / d2 - x**2) * jnp.stack([-to[1], to[0]])
+        middles = jnp.stack([end / 2, (end + pin) / 2, (jnp.array([GROUND, 0.0]) + pin) / 2])
+        angles = jnp.stack([s, jnp.arctan2(pin[1] - end[1], pin[0] - end[0]), jnp.arctan2(pin[1], pin[0] - GROUND)])
+        return middles, angles, jnp.sqrt(d2)
+
+    m = jnp.array(LENGTHS)
+
+    def V(s):
+        middles, _, d = pose(s)
+        return 9.81 * m @ middles[:, 1] + STIFFNESS * (d - FREE_LENGTH) ** 2 / 2
+
+    s, slope, bend = guess, jax.jit(jax.grad(V)), jax.jit(jax.hessian(V))
+    for _ in range(20):
+        s = s - slope(s) / bend(s)
+    middles, angles, _ = jax.jacfwd(pose)(s)
+    J = m @ jnp.sum(middles**2, 1) + (m**3 / 12) @ angles**2
+    return float(s), float(bend(s) / J)
+
+
+def test_a_four_bar_with_a_diagonal_spring_against_its_reduction():
+    mech = spring_four_bar()
+    rest = udk.equilibrium(mech)
+    s, omega2 = reduced(float(rest.q[0, 2]))
+    assert abs(float(rest.q[0, 2]) - s) < 1e-12
+    np.testing.assert_allclose(rest.omega2, [omega2], rtol=1e-11)
+    np.testing.assert_allclose(udk.modes(mech, rest.state).omega2, [omega2], rtol=1e-11)
+
+
+def test_equilibria_from_many_starts():
+    """Both assembly branches of the four-bar, each with its equilibria: the reduction finds those of the first."""
+    mech = spring_four_bar()
+    found = udk.equilibria(mech, starts=40)
+    assert bool(found[0].stable)
+    upper = [e for e in found if np.sin(float(e.q[1, 2] - e.q[2, 2])) < 0]
+    for e in upper:
+        s, omega2 = reduced(float(e.q[0, 2]))
+        assert abs(np.sin((float(e.q[0, 2]) - s) / 2)) < 1e-11
+        np.testing.assert_allclose(e.omega2, [omega2], rtol=1e-9)
+    assert {bool(e.stable) for e in upper} == {True, False}  # along a closed curve there are as many of either
+    assert len(upper) % 2 == 0
+
+
+def test_size_does_not_matter():
+    """Scaled by 1e-6, with the same masses and stiffness times length: angles and, with g scaled too, frequencies are alike."""
+    rest, small = udk.equilibrium(spring_four_bar()), spring_four_bar(scale=1e-6)
+    small = small.with_parameters({"gravity": 1e-6 * np.array([0.0, -9.81])})
+    found = udk.equilibrium(small)
+    assert bool(found.balanced)
+    np.testing.assert_allclose(found.q[:, 2], rest.q[:, 2], atol=1e-11)
+    np.testing.assert_allclose(found.omega2, rest.omega2, rtol=1e-10)
+
+
+def test_damped_modes_are_those_of_the_quadratic_problem():
+    """A disc on a torsion spring with a damper: s = -zeta omega +- i omega sqrt(1 - zeta^2)."""
+    k, c, inertia = 5.0, 0.3, 0.2
+    mech = udk.Mechanism(
+        {"disc": udk.Body(1.0, inertia)},
+        {"pin": udk.Revolute(("ground", "disc"), [(0.0, 0.0), (0.0, 0.0)])},
+        forces=[udk.TorsionSpring(("ground", "disc"), k, damping=c)],
+    )
+    found = udk.modes(mech)
+    zeta = c / (2 * np.sqrt(k * inertia))
+    exact = np.sqrt(k / inertia) * np.array([-zeta - 1j * np.sqrt(1 - zeta**2), -zeta + 1j * np.sqrt(1 - zeta**2)])
+    np.testing.assert_allclose(found.s, exact, rtol=1e-12)
+    np.testing.assert_allclose(found.damping, zeta, rtol=1e-12)
+
+
+def test_modes_of_a_double_pendulum_and_of_a_redundant_lift():
+    mech = udk.library.double_pendulum()
+    rest = udk.equilibrium(mech, stable=True)
+    found = udk.modes(mech, rest.state)
+    for k in range(2):  # the shapes are orthogonal in M and K: here by energy, T = omega^2 V'' along the shape
+        M = np.asarray(udk.equations.mass(mech)).reshape(-1, 3)
+        assert abs(float(np.sum(M * np.asarray(found.shapes[k]) ** 2)) - 1.0) < 1e-12
+    assert abs(float(np.sum(M * np.asarray(found.shapes[0]) * np.asarray(found.shapes[1])))) < 1e-12
+    assert np.all(np.asarray(found.omega2) > 0)
+
+    def lift(stiffness):
+        mech = udk.library.scissor_lift(2)
+        spring = udk.Spring(("ground", "platform"), [(0.5, 0.0), (0.0, 0.0)], stiffness, 1.2)
+        return udk.Mechanism(dict(mech.bodies), dict(mech.joints), {}, [spring], mech.gravity)
+
+    rest = udk.equilibrium(lift(500.0))
+    # V(h) = k (h - 1.2)^2 / 2 + (5 + 4/2) g h with bars of 1 kg each whose middles rise by h/4 and 3h/4.
+    h = 1.2 - 7.0 * 9.81 / 500.0
+    assert bool(rest.stable)
+    assert abs(float(rest.q[4, 1]) - h) < 1e-11
+
+
+def test_frequencies_have_exact_derivatives():
+    """Through the equilibrium, which moves: against differences; and the pendulum's in closed form."""
+    mech = spring_four_bar()
+
+    def frequency(x):
+        changed = mech.with_parameters({"force.spring.stiffness": x[0], "body.coupler.mass": x[1], "joint.D.points[0][0]": x[2]})
+        rest = udk.equilibrium(changed)
+        found = udk.modes(changed, rest.state)
+        return jnp.stack([found.frequencies[0], found.s[1].imag])
+
+    x, h = jnp.array([STIFFNESS, 2.5, GROUND]), 1e-5
+    exact = jax.jacfwd(frequency)(x)
+    differences = np.stack([(frequency(x.at[k].add(h)) - frequency(x.at[k].add(-h))) / (2 * h) for k in range(3)], 1)
+    np.testing.assert_allclose(exact, differences, rtol=1e-6, atol=1e-8)
+
+
+def test_a_batch_of_equilibria_has_a_code_for_each_member():
+    mech = spring_four_bar()
+    stiffness = np.linspace(1.0, 100.0, 1000)
+    found = jax.vmap(lambda k: udk.equilibrium(mech.with_parameters({"force.spring.stiffness": k})))(stiffness)
+    assert found.balanced.shape == (1000,)
+    assert np.all(np.asarray(found.residual)[np.asarray(found.balanced)] <= 1e-9)
+    assert float(np.mean(found.balanced)) > 0.9

@@ -1,0 +1,39 @@
+"""How commands write arrays to a NetCDF file, with what a reader needs to trust them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from udkjax.cli.common import refuse
+
+COORDINATES = ("x", "y", "angle")
+
+
+def check_target(out: Path | None) -> None:
+    """Refuse a file that has no folder."""
+    if out is not None and not out.parent.is_dir():
+        refuse(f"there is no folder {out.parent} to write {out.name} to")
+
+
+def write(
+    out: Path | None,
+    scene: str,
+    variables: Mapping[str, tuple[Sequence[str], Any, str]],
+    coordinates: Mapping[str, Any],
+    settings: Mapping[str, Any],
+) -> None:
+    """Write variables, each its dimensions, values and unit, to a file if there is to be one, with the scene and versions."""
+    if out is None:
+        return
+    from udkjax.extras import OptionalImport
+    from udkjax.integrate.solution import versions
+
+    with OptionalImport():
+        import h5netcdf  # noqa: F401  # the engine
+        import xarray
+    import numpy as np
+
+    data = {name: (tuple(dims), np.asarray(values), {"units": unit}) for name, (dims, values, unit) in variables.items()}
+    attributes = {"scene": scene, **{f"setting_{k}": v for k, v in settings.items() if v is not None}}
+    attributes |= {f"version_{k}": v for k, v in versions().items()}
+    xarray.Dataset(data, dict(coordinates), attributes).to_netcdf(out, engine="h5netcdf")

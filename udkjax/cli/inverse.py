@@ -1,0 +1,67 @@
+"""`udkjax inverse`."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+from udkjax.cli.common import Json, Scene, fail, load, refuse, show
+from udkjax.cli.datasets import check_target, write
+
+
+def inverse(
+    scene: Scene,
+    /,
+    t1: float,
+    t0: float = 0.0,
+    dt: float = 0.01,
+    drivers: tuple[str, ...] = (),
+    out: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Find the torques and forces that the motion of a scene's drivers takes; exit with 1 where the motion is not possible.
+
+    Args:
+        scene: the mechanism, with the drivers that prescribe its motion.
+        t1: end (s).
+        t0: start (s).
+        dt: time between two instants (s).
+        drivers: who exerts: drivers or coordinates, such as body.crank.angle; by default the scene's drivers.
+        out: NetCDF file to write: effort and power (time, driver).
+        json: write the results as JSON.
+    """
+    if not 0 < dt <= t1 - t0 < math.inf:
+        refuse(f"from --t0 {t0:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
+    check_target(out)
+    mech, text = load(scene)
+    if not mech.drivers:
+        refuse("the scene has no driver that prescribes a motion")
+    import numpy as np
+
+    import udkjax as udk
+    from udkjax.show.summary import table
+
+    ts = t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)
+    try:
+        found = udk.inverse_dynamics(mech, ts, drivers=list(drivers) or None)
+    except udk.SceneError as problem:
+        refuse(problem)
+    efforts = {name: np.asarray(x) for name, x in found.efforts.items()}
+    power = np.asarray(found.power)
+    lines: dict[str, str] = {}
+    results: dict[str, Any] = {"time": ts, "efforts": efforts, "powers": found.powers, "residual": found.residual, "peaks": {}}
+    for name, x in efforts.items():
+        good = np.isfinite(x)
+        k = int(np.nanargmax(np.abs(x))) if good.any() else 0
+        rms = float(np.sqrt(np.mean(x[good] ** 2))) if good.any() else math.nan
+        results["peaks"][name] = {"effort": x[k], "time": ts[k], "rms": rms}
+        lines[name] = f"peak {x[k]:.6g} at {ts[k]:g} s, root mean square {rms:.6g} (N m or N)"
+    lines["power"] = f"{np.nanmin(power):.6g} to {np.nanmax(power):.6g} W"
+    lines["left over"] = f"{float(np.nanmax(np.asarray(found.residual))):.2e} of the loads"
+    variables = {
+        "effort": (("time", "driver"), np.stack(list(efforts.values()), 1), "N m or N"),
+        "power": (("time", "driver"), np.stack([np.asarray(x) for x in found.powers.values()], 1), "W"),
+    }
+    write(out, text, variables, {"time": ts, "driver": list(efforts)}, {})
+    show(results, table(f"{mech.name or 'mechanism'}, {t0:g} to {t1:g} s", lines), json)
+    if not np.all(np.isfinite(power)):
+        fail(f"the drivers' motion ends at {ts[np.argmin(np.isfinite(power))]:g} s: no position follows")

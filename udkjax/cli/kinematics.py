@@ -1,0 +1,106 @@
+"""`udkjax kinematics`."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+from udkjax.cli.common import Json, Scene, fail, load, refuse, show
+from udkjax.cli.datasets import COORDINATES, check_target, write
+from udkjax.extras import OptionalImport
+
+with OptionalImport():
+    import tyro
+
+
+def kinematics(
+    scene: Scene,
+    /,
+    driver: str,
+    first: Annotated[float | None, tyro.conf.arg(name="from")] = None,
+    last: Annotated[float | None, tyro.conf.arg(name="to")] = None,
+    count: int = 361,
+    rate: float = 1.0,
+    branches: bool = False,
+    out: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Drive a scene through its positions: limits of travel, positions, velocities and accelerations; exit with 1 if it stops.
+
+    Args:
+        scene: the mechanism.
+        driver: a driver of the scene, or a coordinate, such as body.crank.angle, joint.B.angle, body.slider.x.
+        first: first value (rad, m); by default the lower limit of travel, or where it starts if there is none.
+        last: last value; by default the upper limit, or one turn after the first.
+        count: how many values.
+        rate: of the driver (rad/s, m/s), for velocities and accelerations.
+        branches: find all ways to put it together for the first value, too.
+        out: NetCDF file to write: value, q, v and a (value, body, coordinate), status.
+        json: write the results as JSON.
+    """
+    if count < 1:
+        refuse(f"--count {count}: must be positive")
+    check_target(out)
+    mech, text = load(scene)
+    import numpy as np
+
+    import udkjax as udk
+    from udkjax.show.summary import table
+
+    try:
+        travel = udk.travel(mech, driver)
+        first = _default(first, float(travel.lower), _value(mech, driver))
+        last = _default(last, float(travel.upper), first + 2 * math.pi)
+        found = udk.kinematics(mech, driver, np.linspace(first, last, count), rate=rate)
+        others = udk.branches(mech, driver, first) if branches else None
+    except udk.SceneError as problem:
+        refuse(problem)
+    names = [udk.Reached(int(code)).name for code in found.status]
+    reached = int(np.sum(np.asarray(found.reached)))
+    lines = {
+        "travel": f"{float(travel.lower):.15g} to {float(travel.upper):.15g}",
+        "reached": f"{reached} of {count} values from {first:g} to {last:g}",
+    }
+    if not math.isnan(float(found.limit)):
+        lines["toggle"] = f"{float(found.limit):.15g}"
+    if "singular" in names:
+        lines["singular at"] = ", ".join(f"{float(s):g}" for s, n in zip(found.values, names, strict=True) if n == "singular")
+    if others is not None:
+        lines["branches"] = f"{len(others)} at {first:g}"
+    results: dict[str, Any] = {
+        "driver": driver,
+        "travel": [travel.lower, travel.upper],
+        "values": found.values,
+        "status": names,
+        "limit": found.limit,
+        "bodies": list(found.bodies),
+        **{name: getattr(found, name) for name in ("q", "v", "a")},
+    }
+    if others is not None:
+        results["branches"] = others
+    dims = ("value", "body", "coordinate")
+    variables = {
+        "q": (dims, found.q, "m, m, rad"),
+        "v": (dims, found.v, "m/s, m/s, rad/s"),
+        "a": (dims, found.a, "m/s2, m/s2, rad/s2"),
+        "status": (("value",), found.status, "0 closed, 1 singular, 2 beyond limit, 3 lost, 4 open"),
+    }
+    coordinates = {"value": np.asarray(found.values), "body": list(found.bodies), "coordinate": list(COORDINATES)}
+    write(out, text, variables, coordinates, {"driver": driver, "rate": rate})
+    show(results, table(f"{mech.name or 'mechanism'}, driven by {driver}", lines), json)
+    if reached < count:
+        fail(f"{count - reached} values are not reached: {names[-1].replace('_', ' ')}")
+
+
+def _default(given: float | None, limit: float, otherwise: float) -> float:
+    """The value given; else the limit, a little within; else another."""
+    if given is not None:
+        return given
+    return limit if math.isfinite(limit) else otherwise
+
+
+def _value(mech: Any, driver: str) -> float:
+    """The value of a coordinate where the mechanism starts."""
+    import udkjax as udk
+    from udkjax.study.drive import value_of
+
+    return float(value_of(mech, driver)(udk.assemble(mech).q))

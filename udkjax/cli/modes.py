@@ -1,0 +1,54 @@
+"""`udkjax modes`."""
+
+import math
+from pathlib import Path
+
+from udkjax.cli.common import Json, Scene, fail, load, show
+from udkjax.cli.datasets import COORDINATES, check_target, write
+
+
+def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None = None, json: Json = False) -> None:
+    """Find the frequencies, damping and mode shapes of a scene about its position of rest; exit with 1 where it has none.
+
+    Args:
+        scene: the mechanism; its drivers hold.
+        stable: about a stable position, downhill from the initial guess; otherwise about the nearest one.
+        t: time of drivers and loads (s).
+        out: NetCDF file to write: omega2 (mode), shape (mode, body, coordinate), and the position q (body, coordinate).
+        json: write the results as JSON.
+    """
+    check_target(out)
+    mech, text = load(scene)
+    import numpy as np
+
+    import udkjax as udk
+    from udkjax.show.summary import table
+
+    rest = udk.equilibrium(mech, t=t, stable=stable)
+    found = udk.modes(mech, rest.state, t)
+    lines = {}
+    for k, x in enumerate(np.asarray(found.omega2)):
+        omega = math.sqrt(abs(float(x)))
+        kind = f"{omega:.8g} rad/s, {omega / (2 * math.pi):.8g} Hz" if x >= 0 else f"grows as exp({omega:.8g} t)"
+        biggest = np.argmax(np.abs(np.asarray(found.shapes[k, :, 2])))
+        lines[f"mode {k + 1}"] = f"{kind}; mostly {mech.body_names[biggest]}"
+    lines["s, damped"] = ", ".join(f"{complex(s):.6g}" for s in np.asarray(found.s)) + " 1/s"
+    results = {
+        "bodies": mech.body_names,
+        "omega2": found.omega2,
+        "frequencies": found.frequencies,
+        "s": [[s.real, s.imag] for s in np.asarray(found.s)],
+        "damping": found.damping,
+        "shapes": found.shapes,
+        "q": found.q,
+        "balanced": bool(rest.balanced),
+    }
+    variables = {
+        "omega2": (("mode",), found.omega2, "1/s2"),
+        "shape": (("mode", "body", "coordinate"), found.shapes, "m, m, rad, of modal mass 1 kg"),
+        "q": (("body", "coordinate"), found.q, "m, m, rad"),
+    }
+    write(out, text, variables, {"body": list(mech.body_names), "coordinate": list(COORDINATES)}, {"t": t})
+    show(results, table(f"{mech.name or 'mechanism'}, about its position of rest", lines), json)
+    if not rest.balanced:
+        fail("it does not rest: no equilibrium was found near the initial guess")

@@ -1,0 +1,62 @@
+"""`udkjax statics`."""
+
+from pathlib import Path
+
+from udkjax.cli.common import Json, Scene, fail, load, refuse, show
+from udkjax.cli.datasets import COORDINATES, check_target, write
+
+
+def statics(
+    scene: Scene,
+    /,
+    stable: bool = False,
+    starts: int = 1,
+    seed: int = 0,
+    t: float = 0.0,
+    out: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Find where a scene rests, and whether it is stable there; exit with 1 where no position of rest was found.
+
+    Args:
+        scene: the mechanism; its drivers hold.
+        stable: go downhill to a stable position only.
+        starts: from how many positions to search; from more than one, all that are found are told.
+        seed: of these positions.
+        t: time of drivers and loads (s).
+        out: NetCDF file to write: q (equilibrium, body, coordinate), omega2 (equilibrium, mode), multiplier (equilibrium, row).
+        json: write the results as JSON.
+    """
+    if starts < 1:
+        refuse(f"--starts {starts}: must be positive")
+    check_target(out)
+    mech, text = load(scene)
+    import numpy as np
+
+    import udkjax as udk
+    from udkjax.show.summary import table
+
+    one = udk.equilibrium(mech, t=t, stable=stable) if starts == 1 else None
+    found = ([one] if one.balanced else []) if one is not None else udk.equilibria(mech, starts, seed, t)
+    lines = {}
+    for k, e in enumerate(found):
+        kind = "stable" if bool(e.stable) else "unstable"
+        angles = ", ".join(f"{name} {float(a):.6g}" for name, a in zip(mech.body_names, e.q[:, 2], strict=True))
+        lines[f"{k + 1}, {kind}"] = f"omega2 {', '.join(f'{float(x):.6g}' for x in e.omega2)} 1/s2; angles {angles}"
+    results = {
+        "bodies": mech.body_names,
+        "equilibria": [
+            {"q": e.q, "omega2": e.omega2, "stable": bool(e.stable), "multipliers": e.multipliers, "residual": e.residual}
+            for e in found
+        ],
+    }
+    if found:
+        variables = {
+            "q": (("equilibrium", "body", "coordinate"), np.stack([np.asarray(e.q) for e in found]), "m, m, rad"),
+            "omega2": (("equilibrium", "mode"), np.stack([np.asarray(e.omega2) for e in found]), "1/s2"),
+            "multiplier": (("equilibrium", "row"), np.stack([np.asarray(e.multipliers) for e in found]), "N, N m"),
+        }
+        write(out, text, variables, {"body": list(mech.body_names), "coordinate": list(COORDINATES)}, {"t": t, "starts": starts})
+    show(results, table(f"{mech.name or 'mechanism'}, at rest", lines), json)
+    if not found:
+        fail("no position of rest was found near the initial guess; try --stable, or --starts 64")

@@ -1,0 +1,103 @@
+"""Positions of a driven mechanism by machine code, as far as they are to be relied on (native/marching.py)."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from udkjax.equations.analysis import Analysis
+from udkjax.equations.closing import DenseRows
+from udkjax.equations.kinematic_programs import kinematic_programs
+from udkjax.equations.structure import is_large
+from udkjax.native.layout import INPUTS, SETTINGS
+from udkjax.native.operation import Kind, Tableau, compiled, native_p, shapes_of, written
+from udkjax.native.program import UnsupportedError
+from udkjax.native.tableau import EULER
+from udkjax.scene.mechanism import Mechanism
+
+APPROACH = 16  # steps from where the mechanism is to the first value
+
+
+class March(NamedTuple):
+    """Positions and their derivatives by the value, of which the first so many are to be relied on."""
+
+    q: Float[Array, "T n"]
+    dq: Float[Array, "T n"]
+    ddq: Float[Array, "T n"]
+    trusted: Int[Array, ""]
+
+
+def marches(mechanism: Mechanism, analysis: Analysis) -> bool:
+    """Whether machine code can follow a mechanism."""
+    if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64 or is_large(mechanism):
+        return False
+    try:
+        written(_kind(mechanism, analysis), 1)
+    except UnsupportedError:
+        return False
+    return True
+
+
+def march(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Float[Array, "T"]) -> March:
+    """Follow the positions over the values, from the closed position q at the value s. Without derivatives.
+
+    The mechanism's driver has the value for its time; `unit` is what values are measured by.
+    """
+    inputs = _inputs(mechanism, analysis, unit, s, q, values, jnp)
+    return _march(native_p.bind(*inputs, kind=_kind(mechanism, analysis), times=APPROACH + len(values)), jnp)
+
+
+def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Any) -> March:
+    """As `march`, of known numbers, by NumPy: nothing is traced or compiled for it."""
+    given = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
+    inputs, kind = _inputs(*given, s, q, values, np), _kind(mechanism, analysis)
+    return _march(compiled(kind, 1)(inputs, shapes_of(inputs, kind, APPROACH + len(values))), np)
+
+
+def psi_at_once(mechanism: Mechanism, analysis: Analysis, q: np.ndarray) -> np.ndarray:
+    """Psi (m,) in a position at the value zero, of known numbers, by NumPy."""
+    return DenseRows(mechanism, analysis.scales).violation(0.0, q, q)[0]
+
+
+def _by_numpy(x: Any) -> Any:
+    return np.asarray(x) if eqx.is_array(x) else x
+
+
+def _march(found: Any, xp: Any) -> March:
+    q, dq, ddq = (x[0, APPROACH:] for x in found[:3])
+    return March(q, dq, ddq, xp.maximum(found[3][0, 0].astype(int) - APPROACH, 0))
+
+
+def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Any, xp: Any) -> list[Any]:
+    scales, n = analysis.scales, analysis.coordinates
+    approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
+    settings = {"length": scales.length, "omega": unit, "rtol": 1.0, "atol": 1.0, "smallest": 1.0}
+    numbers = [xp.ravel(x) for x in jax.tree.leaves(_of_unit_masses(mechanism, scales.length, xp))]
+    given = {
+        "numbers": xp.concatenate([*numbers, xp.asarray([DEPENDENT, 0.0])]),
+        "ts": xp.concatenate([approach, values]),
+        "q": q,
+        "v": xp.zeros(n),
+        "settings": xp.stack([xp.asarray(settings.get(name, 0.0), float) for name in SETTINGS]),
+        "rows": scales.rows,
+        "breaks": xp.zeros(0),
+    }
+    return [xp.asarray(given[name], float)[None] for name in INPUTS]
+
+
+DEPENDENT = 1e-10  # of a row's square: what is left of one that depends on others; march ends long before
+
+
+def _of_unit_masses(mechanism: Mechanism, length: Any, xp: Any) -> Mechanism:
+    """Bodies of 1 kg with the characteristic length for radius of gyration: positions do not depend on masses."""
+    bodies = lambda m: [x for b in m.bodies.values() for x in (b.mass, b.inertia)]  # noqa: E731
+    one = xp.ones_like(length)
+    return eqx.tree_at(bodies, mechanism, [one, length**2] * len(mechanism.body_names))
+
+
+def _kind(mechanism: Mechanism, analysis: Analysis) -> Kind:
+    programs = kinematic_programs(mechanism, analysis.redundant_rows or ())
+    return Kind(programs, Tableau(EULER), projected=False, breaks=False, mode="marching")

@@ -1,0 +1,60 @@
+"""All ways in which a mechanism can be put together for one value of its driver."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.equations.analysis import Analysis
+from udkjax.integrate.assembly import State, close
+from udkjax.scene.fields import number
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.drive import Drive, drive
+from udkjax.study.positions import distinct, random_positions
+
+
+def branches(
+    mechanism: Mechanism,
+    driver: Drive,
+    value: ArrayLike,
+    starts: int = 400,
+    seed: int = 0,
+    held: Mapping[str, ArrayLike] | None = None,
+) -> Float[Array, "k bodies 3"]:
+    """Return the positions that close a mechanism, Psi(s, q) = 0, for one value s of its driver: its assembly branches.
+
+    They are those that random positions close to, each found once: none is wrong, but one may be missing. How many there can
+    be at most is known of four-bars (2) and six-bars (4 of Watt, 6 of Stephenson). The same seed gives the same result; angles
+    are within half a turn of zero, and branches in the order of the bodies' angles, the first body's first.
+
+    Args:
+        mechanism: whatever has no degree of freedom once its driver holds; its numbers must be known.
+        driver: a driver, or a coordinate by name or as a `Coordinate`, as of `kinematics`; None: all drivers.
+        value: of the driver (rad, m); of None the time (s).
+        starts: from how many positions to search.
+        seed: of these positions.
+        held: values that other drivers or coordinates hold, by name.
+
+    Raises:
+        SceneError: no such driver or coordinate, or positions do not follow from it.
+    """
+    driven = drive(mechanism, driver, 0.0, held)
+    guesses = random_positions(mechanism, starts, seed)
+    q, closed = _closed(driven.mechanism, driven.analysis, number(value), guesses)
+    kept = np.asarray(q)[distinct(q, closed, driven.analysis.scales)]
+    kept[..., 2] = np.angle(np.exp(1j * kept[..., 2]))
+    order = np.lexsort(np.round(kept[..., 2], 6).T[::-1])
+    return jnp.asarray(kept[order])
+
+
+@eqx.filter_jit
+def _closed(mechanism: Mechanism, analysis: Analysis, s: Any, guesses: Any) -> tuple[Array, Array]:
+    def one(q: Any) -> tuple[Array, Array]:
+        found = close(mechanism, s, State(q, jnp.zeros_like(q)), analysis=analysis)
+        return found.state.q, found.is_closed
+
+    return jax.vmap(one)(guesses)

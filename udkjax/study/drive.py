@@ -1,0 +1,239 @@
+"""What drives a mechanism through its positions: one coordinate, whose value takes the place of time.
+
+A mechanism whose driver prescribes `coordinate = t` has the coordinate's value s for its time: Psi(s, q) = 0 are its positions,
+Psi_dot = 0 gives dq/ds, and Psi_q a = gamma gives d2q/ds2, by the equations that serve every other mechanism.
+"""
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.constraints import psi
+from udkjax.scene.bodies import GROUND, Frame
+from udkjax.scene.checks import SceneError, quoted, suggestion
+from udkjax.scene.drivers import Driver, Motion, Polynomial
+from udkjax.scene.fields import Numbers, names, number, optional
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.mechanism import Mechanism, Origin
+from udkjax.study.identify.channels import channel_of
+
+DRIVEN = ("angle", "x", "y", "distance")
+STILL = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # the ground
+
+
+class Coordinate(eqx.Module):
+    """A coordinate of body 2 relative to body 1 that may be driven, as those of a `Driver`.
+
+    `angle`: theta2 - theta1 (rad), which counts turns; `x`, `y`: point 2 from point 1 in body 1's frame (m); `distance` (m).
+    """
+
+    bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
+    coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True, default="angle")
+    points: Float[Array, "2 2"] | None = eqx.field(converter=optional, default=None)
+
+
+Drive = str | Coordinate | None  # a driver's name, the name of a coordinate, a coordinate; or all drivers along time
+
+
+class Value(Motion):
+    """The value of a coordinate, in place of time, from an `origin` on (rad, m)."""
+
+    origin: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+
+    def __call__(self, t: Any) -> Any:
+        return self.origin + t
+
+
+class Driven(NamedTuple):
+    """A mechanism that is driven by a value s in place of time."""
+
+    mechanism: Mechanism
+    analysis: Analysis
+    name: str  # of the driver; empty where s is time itself
+    row: int  # of the driver in Psi; -1 where s is time itself
+    unit: Any  # what s is measured by: one radian, the scale of a length, the mechanism's own time
+
+    @property
+    def is_angle(self) -> bool:
+        """Whether s is an angle."""
+        return bool(self.name) and self.mechanism.drivers[self.name].coordinate == "angle"
+
+    def value(self, q: Any) -> Any:
+        """The value of the coordinate (rad, m) in a position."""
+        return psi(self.mechanism, 0.0, q)[self.row]
+
+
+def drive(mechanism: Mechanism, driver: Drive, t: ArrayLike = 0.0, held: Mapping[str, ArrayLike] | None = None) -> Driven:
+    """Return the mechanism driven by one coordinate; other drivers hold the value that they have at time t (s).
+
+    `held` gives other values, of drivers or of further coordinates, by their names. Raises `SceneError` where there is no such
+    driver or coordinate, or where positions do not follow from its value.
+    """
+    given = mechanism, driver, t, held
+    with _at_once(given):
+        return _drive(*given)
+
+
+def _drive(mechanism: Mechanism, driver: Drive, t: Any, held: Mapping[str, ArrayLike] | None) -> Driven:
+    if driver is None:
+        analysis = analyse(mechanism)
+        _require_determinate(mechanism, analysis, "all drivers")
+        rate = analysis.scales.rate
+        return Driven(mechanism.bare, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
+    for key, value in (held or {}).items():
+        mechanism = _with_driver(mechanism, *_element(mechanism, key), _constant(value))
+    name, element = _element(mechanism, driver)
+    found = _driven(mechanism, name, element, t)
+    analysis = analyse(_from_guess(found, name))
+    _require_determinate(found, analysis, driver if isinstance(driver, str) else element.coordinate)
+    row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
+    return Driven(found.bare, analysis, name, row, analysis.scales.rows[row])
+
+
+def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Any], Any]:
+    """Return the function that gives the value (rad, m) of a driver's coordinate, or of another, of q (bodies, 3)."""
+    element = element_of(mechanism, coordinate)
+    places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
+
+    def value(q: Any) -> Any:
+        return measured(element, *(STILL if k is None else _frame(q[k]) for k in places))
+
+    return value
+
+
+def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None = None) -> Mechanism:
+    """Return the mechanism that its drivers no longer hold, with these forces instead of its own if any are given."""
+    with jax.ensure_compile_time_eval():
+        origin = mechanism.origin and Origin(with_drivers(mechanism.origin.mechanism, {}))
+    return with_drivers(mechanism, {}, forces, origin)
+
+
+def _frame(q: Any) -> Frame:
+    x, y, angle = q
+    return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle))
+
+
+def measured(element: Any, *frames: Frame) -> Any:
+    """Return the value (rad, m) of a coordinate, of anything that has `bodies`, `coordinate` and `points`, from its frames."""
+    return Driver(element.bodies, element.coordinate, _constant(0.0), element.points).resolved().residual(0.0, *frames)[0]
+
+
+def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
+    """Return the coordinate of a driver, by the driver's name or its own. Raises `SceneError`."""
+    return _element(mechanism, driver)[1]
+
+
+def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
+    """Return the coordinate of a name: `body.NAME.angle`, `body.NAME(px, py).x`, `joint.NAME.angle`, or a distance.
+
+    These are names of channels, as measurements have them. Raises `SceneError`.
+    """
+    try:
+        channel = channel_of(mechanism, text)
+    except ValueError as problem:
+        drivers = ", ".join(map(quoted, mechanism.driver_names)) or "none"
+        cure = suggestion(text, mechanism.driver_names) or f"; drivers: {drivers}; coordinates: body.NAME.angle, joint.NAME.angle"
+        raise SceneError([f"{quoted(text)} is neither a driver nor a coordinate: {problem}{cure}"], mechanism.name) from None
+    if channel.quantity not in DRIVEN:
+        raise SceneError([f"{quoted(text)} cannot be driven: name an angle, x, y or a distance"], mechanism.name)
+    kind: Any = channel.quantity
+    with jax.ensure_compile_time_eval():
+        if len(channel.bodies) == 2:
+            return Coordinate(channel.bodies, kind, channel.points or None)
+        return Coordinate((GROUND, *channel.bodies), kind, [(0.0, 0.0), *channel.points])
+
+
+def _element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coordinate]:
+    if isinstance(driver, str) and driver in mechanism.drivers:
+        found = mechanism.drivers[driver]
+        return driver, Coordinate(found.bodies, found.coordinate, found.points)
+    element = coordinate_of(mechanism, driver) if isinstance(driver, str) else driver
+    return unused("value", mechanism.constraints), element
+
+
+def unused(name: str, taken: Mapping[str, Any]) -> str:
+    """Return a name that is not taken."""
+    while name in taken:
+        name += "'"
+    return name
+
+
+def _driven(mechanism: Mechanism, name: str, element: Coordinate, t: Any) -> Mechanism:
+    """With one driver of this name along its value, and the others held."""
+    known = mechanism.origin and mechanism.origin.mechanism
+    with jax.ensure_compile_time_eval():
+        origin = known and Origin(_driven(known, name, _known_element(known, name, element), _known(t, 0.0)))
+    held = {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
+    held[name] = Driver(element.bodies, element.coordinate, Value(), element.points)
+    return with_drivers(mechanism, held, origin=origin)
+
+
+def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:
+    """With one more driver, or another motion of one that is there."""
+    drivers = {**mechanism.drivers, name: Driver(element.bodies, element.coordinate, motion, element.points)}
+    known = mechanism if mechanism.is_known else mechanism.origin and mechanism.origin.mechanism
+    found = with_drivers(mechanism, drivers)
+    if known is None or found.is_known:
+        return found
+    with jax.ensure_compile_time_eval():
+        element = _known_element(known, name, element)
+        motion = _constant(value_of(known, element)(known.q0))  # rows are counted as if the guess's value were held
+        of_origin = {**known.drivers, name: Driver(element.bodies, element.coordinate, motion, element.points)}
+        return with_drivers(mechanism, drivers, origin=Origin(with_drivers(known, of_origin)))
+
+
+def with_drivers(
+    mechanism: Mechanism,
+    drivers: Mapping[str, Driver],
+    forces: Mapping[str, ForceElement] | None = None,
+    origin: Origin | None = None,
+) -> Mechanism:
+    """Return the mechanism with these drivers, and with these forces instead of its own if any are given."""
+    forces = dict(mechanism.forces) if forces is None else forces
+    bodies, joints = dict(mechanism.bodies), dict(mechanism.joints)
+    return Mechanism(bodies, joints, drivers, forces, mechanism.gravity, mechanism.name, origin)
+
+
+def _known_element(known: Mechanism, name: str, element: Coordinate) -> Coordinate:
+    """The same coordinate, with points that are not traced."""
+    if name in known.drivers:
+        return _element(known, name)[1]
+    if element.points is not None and isinstance(element.points, Tracer):
+        return Coordinate(element.bodies, element.coordinate, [(0.0, 0.0), (0.0, 0.0)])
+    return element
+
+
+def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
+    """The mechanism whose driver starts from the value in the initial guess: an analysis closes it at time zero."""
+    mechanism = mechanism if mechanism.origin is None else mechanism.origin.mechanism
+    with _at_once(mechanism):
+        value = jax.lax.stop_gradient(value_of(mechanism, name)(mechanism.q0))
+        return mechanism.with_parameters({f"driver.{name}.motion.origin": value})
+
+
+def _at_once(given: Any) -> AbstractContextManager:
+    """What is known is computed at once, also while something else is traced."""
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given))
+    return nullcontext() if traced else jax.ensure_compile_time_eval()
+
+
+def _constant(value: Numbers) -> Polynomial:
+    return Polynomial(jnp.stack([number(value)]))
+
+
+def _known(x: Any, otherwise: float) -> Any:
+    return otherwise if isinstance(x, Tracer) else x
+
+
+def _require_determinate(mechanism: Mechanism, analysis: Analysis, driven: str) -> None:
+    free = analysis.degrees_of_freedom
+    if free:
+        problem = f"driven by {driven}, it keeps {free} degree{'s' * (free > 1)} of freedom: its positions do not follow"
+        raise SceneError([f"{problem}; drive or hold the others, by drivers of the scene"], mechanism.name)

@@ -1,0 +1,196 @@
+"""Static equilibria: positions where the loads and the constraints' forces balance, F = Psi_q^T lambda, stable or not."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from udkjax.equations import loads
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.closing import HALVINGS, STRIDE
+from udkjax.integrate.assembly import State, close
+from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.pinv import SVD
+from udkjax.scene.fields import number
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.continuation import Curve, plus
+from udkjax.study.drive import Driven
+from udkjax.study.linearization import Linearization, linearize
+from udkjax.study.positions import distinct, random_positions
+from udkjax.study.sequential import sequential
+
+STEPS = 100
+BALANCED = 1e-9  # of the loads: what may be left of them along free directions; rounding leaves 1e-15
+NEUTRAL = 1e-10  # of the largest stiffness: one below it resists nothing
+
+
+class Equilibrium(eqx.Module):
+    """A position of rest. `balanced` says whether it is one; `omega2` tells whether it is stable."""
+
+    q: Float[Array, "bodies 3"]
+    multipliers: Float[Array, "m"]  # lambda of F = Psi_q^T lambda (N, N m), of least norm; rows as in `analyse`
+    omega2: Float[Array, "f"]  # (rad/s)^2: stiffness over mass along free directions, ascending; negative: it moves away
+    residual: Float[Array, ""]  # what is left of the loads along free directions, relative to them
+    balanced: Bool[Array, ""]
+
+    @property
+    def state(self) -> State:
+        """At rest there."""
+        return State(self.q, jnp.zeros_like(self.q))
+
+    @property
+    def stable(self) -> Bool[Array, ""]:
+        """Whether the potential energy has a minimum there, as all stiffnesses are positive."""
+        return self.balanced & jnp.all(self.omega2 > 0)
+
+
+def equilibrium(
+    mechanism: Mechanism, state: State | None = None, t: ArrayLike = 0.0, stable: bool = False, analysis: Analysis | None = None
+) -> Equilibrium:
+    """Return a position of rest, N^T F = 0 on Psi = 0, near a given one: N spans the directions that constraints leave free.
+
+    Newton's method with K = -F_q + (lambda^T Psi)_qq, its steps limited in length and halved until less is left of the loads.
+    Pure, jittable and batched by `vmap` (whether a member rests is in `balanced`); differentiable by every number of the
+    mechanism, where the stiffness is not singular.
+
+    Args:
+        mechanism: its drivers hold the values of time t.
+        state: where to look from; by default the initial guess.
+        t: time (s) of drivers and loads.
+        stable: go downhill only, and so to a stable equilibrium; otherwise to any that is near.
+        analysis: that of `analyse`; needed where all numbers are traced.
+
+    Returns:
+        An `Equilibrium`.
+
+    Raises:
+        ValueError: the number of degrees of freedom is not known, as all numbers are traced.
+    """
+    analysis = analyse(mechanism) if analysis is None else analysis
+    free = degrees_of_freedom(analysis)
+    t = number(t)
+    start = jnp.ravel(close(mechanism, t, state, analysis=analysis).state.q)
+    return _equilibrium(rest_curve(mechanism, analysis), analysis, t, start, free, stable)
+
+
+def equilibria(
+    mechanism: Mechanism, starts: int = 64, seed: int = 0, t: ArrayLike = 0.0, state: State | None = None
+) -> list[Equilibrium]:
+    """Return the different equilibria found from `starts` positions: the given one and random ones of the same mechanism.
+
+    Random positions turn every body by a random angle and close it again, so that all branches are tried. Not exhaustive; the
+    lowest stiffness last: the most stable first. Args as of `equilibrium`; numbers must be known.
+    """
+    analysis = analyse(mechanism)
+    guesses = random_positions(mechanism, starts, seed, state)
+    found = jax.vmap(lambda q: equilibrium(mechanism, State(q, jnp.zeros_like(q)), t, analysis=analysis))(guesses)
+    kept = [jax.tree.map(lambda x, k=k: x[k], found) for k in distinct(found.q, found.balanced, analysis.scales)]
+    return sorted(kept, key=lambda e: -float(jnp.min(e.omega2, initial=jnp.inf)))
+
+
+def degrees_of_freedom(analysis: Analysis) -> int:
+    """How many there are; raises ValueError where that is not known."""
+    free = analysis.degrees_of_freedom
+    if free is None:
+        raise ValueError(
+            "how many degrees of freedom there are is not known of traced numbers: give analysis=udkjax.analyse(mechanism)"
+        )
+    return free
+
+
+def rest_curve(mechanism: Mechanism, analysis: Analysis) -> Curve:
+    """The positions of the mechanism, with time in place of a driver's value."""
+    return Curve.of(Driven(mechanism.bare, analysis, "", -1, jnp.ones(())))
+
+
+def omega2(at: Linearization) -> Float[Array, "f"]:
+    """(rad/s)^2, ascending, of the undamped linearization."""
+    L = jnp.linalg.cholesky(at.mass)
+    A = jax.scipy.linalg.solve_triangular(L, at.stiffness, lower=True)
+    A = jax.scipy.linalg.solve_triangular(L, A.T, lower=True)
+    return jnp.linalg.eigvalsh(0.5 * (A + A.T))
+
+
+@eqx.filter_jit
+def _equilibrium(curve: Curve, analysis: Analysis, t: Any, start: Any, free: int, stable: bool) -> Equilibrium:
+    q = sequential(_settle, *undifferentiated((curve, analysis, t, start)), free, stable)
+    q = _resting(curve, analysis, t, q, free)
+    at = linearize(curve.mechanism, analysis, free, t, q)
+    left = _left(curve.mechanism, at, t, q)
+    closed = curve.is_closed(jnp.append(q, t) / curve.units)
+    return Equilibrium(q.reshape(-1, 3), at.multipliers, omega2(at), left, closed & (left <= BALANCED))
+
+
+def _left(mechanism: Any, at: Linearization, t: Any, q: Any) -> Any:
+    """N^T F relative to F, each coordinate over the root of its mass: N is orthonormal in that metric."""
+    size = jnp.linalg.norm(loads.force(mechanism, t, q, jnp.zeros_like(q)) / jnp.sqrt(loads.mass(mechanism)))
+    return jnp.linalg.norm(at.force) / jnp.where(size > 0, size, 1.0)
+
+
+def _settle(curve: Curve, analysis: Analysis, t: Any, q: Any, free: int, stable: bool) -> Any:
+    """Newton steps until nothing gets better."""
+
+    def at(q: Any) -> Linearization:
+        return linearize(curve.mechanism, analysis, free, t, q)
+
+    def body(state: Any) -> Any:
+        q, k, _ = state
+        here = at(q)
+        step = here.directions @ _towards_rest(here, stable)
+        longest = analysis.scales.size(step)
+        step = step * jnp.where(longest > STRIDE, STRIDE / jnp.where(longest > STRIDE, longest, 1.0), 1.0)
+        size = jnp.linalg.norm(here.force)
+
+        def trial(state: Any) -> Any:
+            scale, j, *_ = state
+            X, closed = curve.correct(jnp.append(q + scale * step, t) / curve.units, fixed=True)
+            new = (X * curve.units)[:-1]
+            force = loads.force(curve.mechanism, t, new, jnp.zeros_like(new))
+            # Work done on the way, by the trapezoidal rule, or what is left of the loads along free directions.
+            work = 0.5 * (loads.force(curve.mechanism, t, q, jnp.zeros_like(q)) + force) @ (new - q)
+            better = (work > 0 if stable else False) | (jnp.linalg.norm(at(new).force) < size)
+            return 0.5 * scale, j + 1, closed & better, new
+
+        def worse(state: Any) -> Any:
+            return (state[1] < HALVINGS) & ~state[2]
+
+        _, _, better, new = jax.lax.while_loop(worse, trial, (jnp.ones(()), 0, jnp.asarray(False), q))
+        return jnp.where(better, new, q), k + 1, better & (size > 0)
+
+    return jax.lax.while_loop(lambda s: (s[1] < STEPS) & s[2], body, (q, 0, jnp.asarray(free > 0)))[0]
+
+
+def _towards_rest(here: Linearization, stable: bool) -> Any:
+    """The step eta, of the linearization; only downhill, where the equilibrium is to be stable."""
+    if not stable:
+        return SVD(NEUTRAL).plus(here.stiffness) @ here.force
+    values, vectors = jnp.linalg.eigh(0.5 * (here.stiffness + here.stiffness.T))
+    values = jnp.abs(values)
+    values = jnp.maximum(values, NEUTRAL * jnp.max(values))
+    return vectors @ (vectors.T @ here.force / jnp.where(values > 0, values, 1.0))
+
+
+@eqx.filter_custom_jvp
+def _resting(curve: Curve, analysis: Analysis, t: Any, q: Any, free: int) -> Any:
+    """A position of rest, with the derivatives of one Newton step there."""
+    return q
+
+
+@_resting.def_jvp
+def _(primals, tangents):
+    curve, analysis, t, _, free = primals
+    q = _resting(*primals)
+
+    def newton(curve: Curve, t: Any) -> Any:
+        X = jnp.append(q, t) / curve.units
+        E = curve.slopes(X).at[:, -1].set(0.0)
+        closed = ((X - plus(E) @ curve.residual(X)) * curve.units)[:-1]
+        here = linearize(curve.mechanism, analysis, free, t, closed)
+        return closed + here.directions @ _towards_rest(here, False)
+
+    given = (curve, t)
+    none = jax.tree.map(jnp.zeros_like, eqx.filter(given, eqx.is_inexact_array))
+    moving = eqx.combine((tangents[0], tangents[2]), none)
+    return q, eqx.filter_jvp(newton, given, moving)[1]

@@ -1,0 +1,148 @@
+"""Inverse dynamics: the drivers' torques and forces that a prescribed motion takes, loops and redundant actuation included.
+
+A driver's row of Psi is c(q) - motion(t), so the generalized force that it exerts along its coordinate c is f = -lambda. With
+the joints' rows J and the drivers' rows C of Psi_q, the motion's equation
+
+    M a - F = J^T mu + C^T f
+
+holds for all mu and f that there are: the joints can take what lies in the range of J^T, and what is left over must be driven.
+With N a basis of the null space of J, N^T (M a - F) = (C N)^T f: one equation for each degree of freedom. Of more drivers than
+that, f is of least weighted norm, sum_i w_i f_i^2.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.equations import constraints, loads
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.scales import RANK_TOL
+from udkjax.pinv import SVD
+from udkjax.scene.checks import SceneError, quoted
+from udkjax.scene.drivers import Motion, Spline
+from udkjax.scene.fields import number, optional
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.drive import Coordinate, element_of, measured, unused, value_of, without_drivers
+from udkjax.study.free_directions import free_part
+from udkjax.study.kinematics import Kinematics, kinematics
+
+
+class InverseDynamics(eqx.Module):
+    """What each driver exerts along its coordinate on a prescribed motion."""
+
+    ts: Float[Array, "T"]  # s
+    motion: Kinematics | None  # where it was found here
+    efforts: dict[str, Float[Array, "T"]]  # by driver: torque (N m) along an angle, force (N) along a length
+    powers: dict[str, Float[Array, "T"]]  # W: effort times the coordinate's rate
+    residual: Float[
+        Array, "T"
+    ]  # the largest part of M a - F that neither joints nor drivers exert, relative to the largest of it
+
+    @property
+    def power(self) -> Float[Array, "T"]:
+        """Power (W) of all drivers together."""
+        return sum(self.powers.values(), jnp.zeros_like(self.ts))
+
+
+class Effort(ForceElement):
+    """An effort (N m, N) along a coordinate of two bodies: it does the work effort times the change of the coordinate.
+
+    `law` gives the effort at time t (s), as a `Motion` gives a value.
+    """
+
+    coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
+    law: Motion
+    points: Float[Array, "2 2"] | None = eqx.field(converter=optional, default=None)
+
+    def potential(self, t, *frames):
+        return -self.law(t) * measured(self, *frames)
+
+    @property
+    def breakpoints(self):
+        return self.law.breakpoints
+
+
+def inverse_dynamics(
+    mechanism: Mechanism,
+    ts: Float[ArrayLike, "T"],
+    motion: Any = None,
+    drivers: Sequence[str | Coordinate] | None = None,
+    weights: Mapping[str, ArrayLike] | None = None,
+) -> InverseDynamics:
+    """Return what the drivers must exert at the times ts (s) on a prescribed motion: M a - F = J^T mu + C^T f.
+
+    Pure and batched by `vmap`, with exact derivatives by every number of the mechanism, the motion's share included.
+
+    Args:
+        mechanism: its drivers prescribe the motion where none is given; F holds its force elements and gravity.
+        ts: times (s).
+        motion: anything with q, v and a (T, bodies, 3); by default that of all drivers, by `kinematics`.
+        drivers: who exerts, by names of drivers, of coordinates (`body.crank.angle`) or as `Coordinate`; by default the scene's
+            drivers. More than there are degrees of freedom share by least weighted norm.
+        weights: w_i > 0 of each driver's squared effort, by name; by default 1.
+
+    Returns:
+        An `InverseDynamics`: efforts and powers (T,) by driver, and what neither joints nor drivers can exert.
+
+    Raises:
+        SceneError: nothing drives, or a name is unknown.
+    """
+    ts = number(ts)
+    found = None
+    if motion is None:
+        motion = found = kinematics(mechanism, None, ts)
+    chosen = list(mechanism.driver_names) if drivers is None else list(drivers)
+    if not chosen:
+        raise SceneError(["nothing drives it: name coordinates that do, such as body.crank.angle"], mechanism.name)
+    named = {d if isinstance(d, str) else f"{d.coordinate} of {' and '.join(d.bodies)}": d for d in chosen}
+    unknown = [name for name in weights or {} if name not in named]
+    if unknown:
+        raise SceneError([f"weights: {quoted(name)} is not among the drivers" for name in unknown], mechanism.name)
+    w = jnp.stack([number((weights or {}).get(name, 1.0)) for name in named])
+    values = tuple(element_of(mechanism, d) for d in named.values())
+    joints = without_drivers(mechanism)
+    analysis = analyse(joints)
+    q, v, a = (jnp.asarray(x) for x in (motion.q, motion.v, motion.a))
+    efforts, rates, residual = _efforts(joints.bare, analysis, values, w, ts, q, v, a)
+    columns = {name: efforts[:, k] for k, name in enumerate(named)}
+    return InverseDynamics(ts, found, columns, {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}, residual)
+
+
+def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
+    """Return the mechanism whose drivers exert these efforts, each a natural cubic spline through the times, and hold nothing.
+
+    A spline misses an effort by some h^4, h the time between its knots, and by h^2 near its ends: let the times begin a dozen
+    knots before the run, and end as many after it. Simulated from a state of the prescribed motion it follows it.
+    """
+    elements = {name: element_of(mechanism, name) for name in found.efforts}
+    forces = dict(mechanism.forces)
+    for name, effort in found.efforts.items():
+        e = elements[name]
+        forces[unused(f"{name} effort", forces)] = Effort(e.bodies, e.coordinate, Spline(found.ts, effort), e.points)
+    return without_drivers(mechanism, forces)
+
+
+@eqx.filter_jit
+def _efforts(mechanism: Mechanism, analysis: Analysis, values: Any, w: Any, ts: Any, q: Any, v: Any, a: Any) -> Any:
+    """Efforts (T, k), rates of their coordinates (T, k), and what is left over (T,)."""
+    scales = analysis.scales
+    units, share = scales.coordinates(analysis.coordinates), 1 / jnp.sqrt(w)
+    coordinates = [value_of(mechanism, element) for element in values]
+
+    def at(t: Any, q: Any, v: Any, a: Any) -> Any:
+        q, v, a = q.ravel(), v.ravel(), a.ravel()
+        C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
+        missing = units * (loads.mass(mechanism) * a - loads.force(mechanism, t, q, v))
+        free = free_part(scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units)
+        wanted, A = free(missing), free((C * units).T * share)
+        f = share * (SVD(RANK_TOL).plus(A) @ wanted)
+        size = jnp.max(jnp.abs(missing))
+        left = jnp.max(jnp.abs(wanted - free((C * units).T @ f))) / jnp.where(size > 0, size, 1.0)
+        return f, C @ v, left
+
+    return jax.vmap(at)(ts, q, v, a)

@@ -1,0 +1,264 @@
+"""Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from udkjax.equations.analysis import analyse
+from udkjax.integrate.assembly import State, assemble
+from udkjax.integrate.march import march, march_at_once, marches, psi_at_once
+from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.scene.bodies import GROUND, Frame
+from udkjax.scene.fields import Numbers, number
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.continuation import Curve, Points, Reached, derivatives, follow, no_points, plus
+from udkjax.study.drive import Drive, Driven, drive
+
+FAR = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
+TURN = 2.0 * np.pi  # rad
+
+
+class Kinematics(eqx.Module):
+    """Positions over the values of a driver, and velocities and accelerations there; not a number where it does not get.
+
+    `status` is a `Reached` for each value. `limit` is the value at the toggle that ended it (not a number where none did), and
+    `limit_q` the position there, which has no derivative.
+    """
+
+    values: Float[Array, "T"]  # of the driver (rad, m), or of time (s)
+    q: Float[Array, "T bodies 3"]
+    v: Float[Array, "T bodies 3"]
+    a: Float[Array, "T bodies 3"]
+    rate: Float[Array, "T"]  # of the driver (1/s)
+    status: Int[Array, "T"]
+    limit: Float[Array, ""]
+    limit_q: Float[Array, "bodies 3"]
+    bodies: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def reached(self) -> Bool[Array, "T"]:
+        """Which values were reached."""
+        return self.status <= Reached.singular
+
+    @property
+    def ts(self) -> Float[Array, "T"]:
+        """The values in the place of time: a kinematic motion may stand where a `Solution` does, if its values are times."""
+        return self.values
+
+    def frame(self, body: str) -> Frame:
+        """The frame of a body, each of its numbers (T,)."""
+        if body == GROUND:
+            zero = jnp.zeros_like(self.values)
+            return Frame(zero, zero, zero, zero + 1.0, zero, zero, zero, zero)
+        k = self.bodies.index(body)
+        (x, y, angle), (vx, vy, omega) = (jnp.moveaxis(s[..., k, :], -1, 0) for s in (self.q, self.v))
+        return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
+
+    def path(self, body: str, point: Numbers = (0.0, 0.0)) -> Float[Array, "T 2"]:
+        """Return the path (m) of a point given in the body's own frame (m): a coupler curve."""
+        return jnp.stack(self.frame(body).point(number(point)), -1)
+
+
+class Travel(eqx.Module):
+    """Between which values (rad, m) a coordinate can be driven; infinite where nothing ends it.
+
+    `lower_q` and `upper_q` are the positions at the toggles; not a number where there is none.
+    """
+
+    lower: Float[Array, ""]
+    upper: Float[Array, ""]
+    lower_q: Float[Array, "bodies 3"]
+    upper_q: Float[Array, "bodies 3"]
+    status: Int[Array, "2"]  # a `Reached` of each: `beyond_limit` where a toggle was found
+
+
+def kinematics(
+    mechanism: Mechanism,
+    driver: Drive,
+    values: Float[ArrayLike, "T"],
+    state: State | None = None,
+    rate: Float[ArrayLike, "*T"] = 1.0,
+    acceleration: Float[ArrayLike, "*T"] = 0.0,
+    held: Mapping[str, ArrayLike] | None = None,
+) -> Kinematics:
+    """Return the positions Psi(s, q) = 0 of a mechanism over the values s of a driver, one after another on one branch.
+
+    With Psi_q q' = -Psi_s and Psi_q q'' = gamma, velocities are q' s_dot and accelerations q'' s_dot^2 + q' s_ddot.
+
+    The branch is that of `state`, or of the initial guess, and is followed from there by its arc length: it is kept, or the
+    motion ends, with a `status` that says why. Toggles, where the driver can get no farther, are found to rounding. Redundant
+    constraints do no harm. Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any order by every
+    number of the mechanism and by the values.
+
+    Args:
+        mechanism: whatever has one degree of freedom once its drivers hold.
+        driver: a driver of the scene, a coordinate by its name (`body.crank.angle`, `joint.B.angle`, `body.slider.x`), or a
+            `Coordinate`; None: all drivers, along the times `values`.
+        values: those of the driver (rad, m), or times (s), in the order in which they are reached.
+        state: a position on the branch; by default the initial guess, assembled.
+        rate: s_dot, for all values or each (rad/s, m/s; 1 for times).
+        acceleration: s_ddot (rad/s^2, m/s^2).
+        held: values that other drivers or coordinates hold, by name; drivers hold the one that they have at time 0.
+
+    Returns:
+        A `Kinematics`: q, v, a (T, bodies, 3) and a status for each value.
+
+    Raises:
+        SceneError: no such driver or coordinate, or positions do not follow from it.
+    """
+    values, rate, acceleration = number(values), number(rate), number(acceleration)
+    if values.ndim != 1 or not len(values):
+        raise ValueError(f"values must be a list of at least one number, not of the shape {values.shape}; batch it by jax.vmap")
+    driven, q = _start(mechanism, driver, values, state, held)
+    if is_known((driven, q, values, rate, acceleration)) and marches(driven.mechanism, driven.analysis):
+        given = np.asarray(q), np.asarray(values), np.asarray(rate), np.asarray(acceleration)
+        found = _at_once(driven, *given, mechanism.body_names)
+        if found is not None:
+            return found
+    return _kinematics(driven, q, values, rate, acceleration, mechanism.body_names)
+
+
+def travel(
+    mechanism: Mechanism, driver: str | Any, state: State | None = None, held: Mapping[str, ArrayLike] | None = None
+) -> Travel:
+    """Return between which values a coordinate can be driven: the toggles on either side, ds/dsigma = 0, to rounding.
+
+    Args and errors are those of `kinematics`. An angle that makes a whole turn has no limits. `lower` and `upper` have exact
+    derivatives by every number of the mechanism.
+    """
+    driven, q = _start(mechanism, driver, None, state, held)
+    return _travel(driven, q, TURN if driven.is_angle else FAR * driven.unit)
+
+
+def _at_once(driven: Driven, q: Any, values: Any, rate: Any, acceleration: Any, bodies: tuple[str, ...]) -> Kinematics | None:
+    """By machine code alone, and NumPy: nothing is compiled for it. None where care is needed."""
+    mechanism, analysis = driven.mechanism, driven.analysis
+    s = psi_at_once(mechanism, analysis, q)[driven.row] if driven.name else values[0]
+    found = march_at_once(mechanism, analysis, driven.unit, s, q, values)
+    if found.trusted < len(values):
+        return None
+    shape, rate = (len(values), -1, 3), np.broadcast_to(rate, values.shape)
+    q, dq, ddq = (x.reshape(shape) for x in found[:3])
+    per = rate[:, None, None]
+    a = ddq * per**2 + dq * np.broadcast_to(acceleration, values.shape)[:, None, None]
+    status, nowhere = np.zeros(len(values), int), np.full((len(bodies), 3), np.nan)
+    arrays: Any = (values, q, dq * per, a, rate, status, np.nan, nowhere)
+    values, q, v, a, rate, status, limit, limit_q = map(jnp.asarray, arrays)
+    return Kinematics(values, q, v, a, rate, status, limit, limit_q, bodies)
+
+
+def is_known(tree: Any) -> bool:
+    """Whether no number is traced."""
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+@eqx.filter_jit
+def _kinematics(driven: Driven, q: Any, values: Any, rate: Any, acceleration: Any, bodies: tuple[str, ...]) -> Kinematics:
+    points = _solved(driven, driven.value(q) if driven.name else values[0], q, values)
+    rate, acceleration = (jnp.broadcast_to(x, values.shape) for x in (rate, acceleration))
+    v = points.dq * rate[:, None]
+    a = points.ddq * rate[:, None] ** 2 + points.dq * acceleration[:, None]
+    q, v, a = (jnp.reshape(x, (len(values), -1, 3)) for x in (points.q, v, a))
+    return Kinematics(values, q, v, a, rate, points.status, points.limit, points.limit_q.reshape(-1, 3), bodies)
+
+
+@eqx.filter_jit
+def _travel(driven: Driven, q: Any, far: Any) -> Travel:
+    s = driven.value(q)
+    ways = jnp.array([-1.0, 1.0])
+    down_up = jax.vmap(lambda way: _solved(driven, s, q, jax.lax.stop_gradient(s + way * far)[None], False))(ways)
+    down, up = (jax.tree.map(lambda x, k=k: x[k], down_up) for k in (0, 1))
+    lower, upper = (jnp.where(p.status[0] == Reached.beyond_limit, p.limit, way * jnp.inf) for p, way in ((down, -1), (up, 1)))
+    lower_q, upper_q = (p.limit_q.reshape(-1, 3) for p in (down, up))
+    return Travel(lower, upper, lower_q, upper_q, jnp.stack([down.status[0], up.status[0]]))
+
+
+def _start(mechanism: Mechanism, driver: Drive, values: Any, state: State | None, held: Any) -> tuple[Driven, Any]:
+    """The mechanism driven, and the closed position that it starts from."""
+    driven = drive(mechanism, driver, 0.0, held)
+    if driver is None:
+        return driven, _assembled(driven.mechanism, values[0], state, driven.analysis)
+    q = _assembled(mechanism, 0.0, state, analyse(mechanism))
+    if held:
+        still = State(q.reshape(-1, 3), jnp.zeros((len(q) // 3, 3)))
+        q = _assembled(driven.mechanism, driven.value(q), still, driven.analysis)
+    return driven, q
+
+
+def _assembled(mechanism: Mechanism, t: Any, state: State | None, analysis: Any) -> Any:
+    return jnp.ravel(assemble(mechanism, t, state, throw=False, analysis=analysis).q)
+
+
+def _solved(driven: Driven, s: Any, q: Any, values: Any, fast: bool = True) -> Points:
+    """By machine code as far as that is to be relied on, if it may be `fast`, and with care from there on."""
+    curve = Curve.of(driven)
+    points, first = no_points(len(values), len(q)), jnp.asarray(0)
+    if fast and marches(driven.mechanism, driven.analysis):
+        found = march(*undifferentiated((driven.mechanism, driven.analysis, driven.unit, s, q, values)))
+        first, last = found.trusted, jnp.maximum(found.trusted - 1, 0)
+        some = first > 0
+        s, q = jnp.where(some, values[last], s), jnp.where(some, found.q[last], q)
+        points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=jnp.zeros_like(points.status))
+    points = follow(*undifferentiated((curve, s, q, values)), points, first)
+    there = points.status <= Reached.singular
+    safe = jnp.where(there[:, None], points.q, jax.lax.stop_gradient(q))
+    found = _with_derivatives(curve, values, safe, points.dq, points.ddq)
+    q, dq, ddq = (jnp.where(there[:, None], x, jnp.nan) for x in found)
+    limited = jnp.isfinite(points.limit)
+    X = jnp.append(jnp.where(limited, points.limit_q, jax.lax.stop_gradient(safe[0])), points.limit)
+    limit = jnp.where(limited, _limit(curve, jnp.where(jnp.isfinite(X), X, 0.0)), jnp.nan)
+    return points._replace(q=q, dq=dq, ddq=ddq, limit=limit)
+
+
+@eqx.filter_custom_jvp
+def _with_derivatives(curve: Curve, values: Any, q: Any, dq: Any, ddq: Any) -> tuple[Any, Any, Any]:
+    """Closed positions with the derivatives that the constraints give them: those of one Newton step there."""
+    return q, dq, ddq
+
+
+@_with_derivatives.def_jvp
+def _(primals, tangents):
+    curve, values, *_ = primals
+    found = _with_derivatives(*primals)
+    moving = eqx.combine(tangents[:2], jax.tree.map(_zeros, eqx.filter((curve, values), eqx.is_inexact_array)))
+    return found, _tangents(curve, values, found[0], moving)
+
+
+def _tangents(curve: Curve, values: Any, q: Any, moving: Any) -> Any:
+    def closed(curve: Curve, values: Any) -> Any:
+        return jax.vmap(lambda s, q: _newton(curve, s, q))(values, q)
+
+    return eqx.filter_jvp(closed, (curve, values), moving)[1]
+
+
+def _newton(curve: Curve, s: Any, q: Any) -> tuple[Any, Any, Any]:
+    X = jnp.append(q, s) / curve.units
+    E = curve.slopes(X)
+    q = ((X - plus(E.at[:, -1].set(0.0)) @ curve.residual(X)) * curve.units)[:-1]
+    dq, ddq, _ = derivatives(curve, s, q)
+    return q, dq, ddq
+
+
+@eqx.filter_custom_jvp
+def _limit(curve: Curve, x: Any) -> Any:
+    """The value at a toggle, which changes by as much as that of the nearest point of the curve."""
+    return x[-1]
+
+
+@_limit.def_jvp
+def _(primals, tangents):
+    curve, x = primals
+    moving = eqx.combine(tangents[0], jax.tree.map(_zeros, eqx.filter(curve, eqx.is_inexact_array)))
+    X = x / jax.lax.stop_gradient(curve.units)
+    nearest = lambda curve: ((X - plus(curve.slopes(X)) @ curve.residual(X)) * curve.units)[-1]  # noqa: E731
+    return _limit(*primals), eqx.filter_jvp(nearest, (curve,), (moving,))[1]
+
+
+def _zeros(x: Any) -> Any:
+    return jnp.zeros_like(x)

@@ -1,0 +1,61 @@
+"""A mechanism near a position of rest, in the directions that its constraints leave: masses, damping, stiffness.
+
+At rest F = Psi_q^T lambda. Near by, with q = q0 + N eta and Psi_q N = 0, the loads and the turning of the constraint forces give
+
+    N^T M N eta'' + N^T C N eta' + N^T K N eta = 0,      C = -F_v,      K = -F_q + (lambda^T Psi)_qq.
+
+The second part of K, the constraints' curvature under load, is what makes a pendulum's weight a stiffness. Among redundant
+constraints lambda is of least norm; N^T K N does not depend on that choice. No derivative is taken by differences.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.equations import constraints, loads
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.analysis import Analysis
+from udkjax.equations.scales import RANK_TOL
+from udkjax.pinv import SVD
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.free_directions import null_space
+
+
+class Linearization(NamedTuple):
+    """The reduced matrices at a position, and the directions N that they belong to."""
+
+    directions: Float[Array, "n f"]  # N, orthonormal in the metric of M
+    mass: Float[Array, "f f"]  # the unit matrix, which it stays along derivatives only to first order
+    damping: Float[Array, "f f"]
+    stiffness: Float[Array, "f f"]
+    force: Float[Array, "f"]  # N^T F: zero at rest
+    multipliers: Float[Array, "m"]  # lambda (N, N m)
+
+
+def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: Any, q: Float[Array, "n"]) -> Linearization:
+    """Return the linearization at rest in a closed position q at time t (s), of `free` degrees of freedom.
+
+    N = M^(-1/2) (I - D^+ D) V with V a basis of the null space of D here: it spans that of D nearby, too, so that derivatives of
+    whatever does not depend on the basis are exact.
+    """
+    w, root, still = analysis.scales.weights, uk.root(mechanism), jnp.zeros_like(q)
+    F = lambda q, v: loads.force(mechanism, t, q, v)  # noqa: E731
+    V = null_space(uk.D(mechanism, t, q, w), free) if mechanism.constraints else jnp.eye(len(q))
+    if mechanism.constraints:
+        D = uk.D(mechanism, t, q, w)
+        plus = SVD(RANK_TOL).plus(D)
+        N = root[:, None] * (V - plus @ (D @ V))
+        multipliers = w * (plus.T @ (root * F(q, still)))
+    else:
+        N, multipliers = root[:, None] * V, jnp.zeros(0)
+
+    def unbalanced(q: Any) -> Any:
+        pull = jax.grad(lambda q: jnp.sum(multipliers * constraints.psi(mechanism, t, q)))(q)
+        return pull - F(q, still)
+
+    K = jax.jacfwd(unbalanced)(q)
+    C = -jax.jacfwd(lambda v: F(q, v))(still)
+    M = loads.mass(mechanism)
+    return Linearization(N, N.T @ (M[:, None] * N), N.T @ C @ N, N.T @ K @ N, N.T @ F(q, still), multipliers)
