@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.closing import DenseRows
+from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.kinematic_programs import kinematic_programs
 from udkjax.equations.structure import is_large
 from udkjax.native.layout import INPUTS, SETTINGS
