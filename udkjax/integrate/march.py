@@ -52,8 +52,9 @@ def march(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, v
 
 def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Any) -> March:
     """As `march`, of known numbers, by NumPy: nothing is traced or compiled for it."""
-    given = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
-    inputs, kind = _inputs(*given, s, q, values, np), _kind(mechanism, analysis)
+    kind = _kind(mechanism, analysis)
+    mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
+    inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
     return _march(compiled(kind, 1)(inputs, shapes_of(inputs, kind, APPROACH + len(values))), np)
 
 
