@@ -86,7 +86,7 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Any, held: Mapping[str, Array
         analysis = analyse(mechanism)
         _require_determinate(mechanism, analysis, "all drivers")
         rate = analysis.scales.rate
-        return Driven(mechanism.bare, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
+        return Driven(mechanism.without_origin, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
     for key, value in (held or {}).items():
         mechanism = _with_driver(mechanism, *_element(mechanism, key), _constant(value))
     name, element = _element(mechanism, driver)
@@ -94,7 +94,7 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Any, held: Mapping[str, Array
     analysis = analyse(_from_guess(found, name))
     _require_determinate(found, analysis, driver if isinstance(driver, str) else element.coordinate)
     row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
-    return Driven(found.bare, analysis, name, row, analysis.scales.rows[row])
+    return Driven(found.without_origin, analysis, name, row, analysis.scales.rows[row])
 
 
 def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Any], Any]:

@@ -102,7 +102,7 @@ def degrees_of_freedom(analysis: Analysis) -> int:
 
 def rest_curve(mechanism: Mechanism, analysis: Analysis) -> Curve:
     """The positions of the mechanism, with time in place of a driver's value."""
-    return Curve.of(Driven(mechanism.bare, analysis, "", -1, jnp.ones(())))
+    return Curve.of(Driven(mechanism.without_origin, analysis, "", -1, jnp.ones(())))
 
 
 def omega2(at: Linearization) -> Float[Array, "f"]:

@@ -108,7 +108,7 @@ def inverse_dynamics(
     joints = without_drivers(mechanism)
     analysis = analyse(joints)
     q, v, a = (jnp.asarray(x) for x in (motion.q, motion.v, motion.a))
-    efforts, rates, residual = _efforts(joints.bare, analysis, values, w, ts, q, v, a)
+    efforts, rates, residual = _efforts(joints.without_origin, analysis, values, w, ts, q, v, a)
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     return InverseDynamics(ts, found, columns, {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}, residual)
 

@@ -56,7 +56,7 @@ def modes(mechanism: Mechanism, state: State | None = None, t: ArrayLike = 0.0, 
     analysis = analyse(mechanism) if analysis is None else analysis
     free, t = degrees_of_freedom(analysis), number(t)
     state = equilibrium(mechanism, None, t, analysis=analysis).state if state is None else state
-    return _modes(mechanism.bare, analysis, free, t, jnp.ravel(state.q))
+    return _modes(mechanism.without_origin, analysis, free, t, jnp.ravel(state.q))
 
 
 @eqx.filter_jit
