@@ -11,7 +11,7 @@ from udkjax.equations import loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.closing import HALVINGS, STRIDE
 from udkjax.integrate.assembly import State, close
-from udkjax.integrate.undifferentiated import undifferentiated
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv import SVD
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -115,7 +115,7 @@ def omega2(at: Linearization) -> Float[Array, "f"]:
 
 @eqx.filter_jit
 def _equilibrium(curve: Curve, analysis: Analysis, t: Any, start: Any, free: int, stable: bool) -> Equilibrium:
-    q = sequential(_settle, *undifferentiated((curve, analysis, t, start)), free, stable)
+    q = sequential(_settle, *stop_gradients((curve, analysis, t, start)), free, stable)
     q = _resting(curve, analysis, t, q, free)
     at = linearize(curve.mechanism, analysis, free, t, q)
     left = _left(curve.mechanism, at, t, q)

@@ -12,8 +12,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.assembly import State, assemble
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.march import march, march_at_once, marches, psi_at_once
-from udkjax.integrate.undifferentiated import undifferentiated
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
@@ -200,12 +200,12 @@ def _solved(driven: Driven, s: Any, q: Any, values: Any, fast: bool = True) -> P
     curve = Curve.of(driven)
     points, first = no_points(len(values), len(q)), jnp.asarray(0)
     if fast and marches(driven.mechanism, driven.analysis):
-        found = march(*undifferentiated((driven.mechanism, driven.analysis, driven.unit, s, q, values)))
+        found = march(*stop_gradients((driven.mechanism, driven.analysis, driven.unit, s, q, values)))
         first, last = found.trusted, jnp.maximum(found.trusted - 1, 0)
         some = first > 0
         s, q = jnp.where(some, values[last], s), jnp.where(some, found.q[last], q)
         points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=jnp.zeros_like(points.status))
-    points = follow(*undifferentiated((curve, s, q, values)), points, first)
+    points = follow(*stop_gradients((curve, s, q, values)), points, first)
     there = points.status <= Reached.singular
     safe = jnp.where(there[:, None], points.q, jax.lax.stop_gradient(q))
     found = _with_derivatives(curve, values, safe, points.dq, points.ddq)
