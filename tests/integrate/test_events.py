@@ -362,3 +362,15 @@ def test_both_engines_find_the_same():
 def test_mistakes_are_named(events, message):
     with pytest.raises(ValueError, match=message):
         udk.simulate(PENDULUM, TS, events=events)
+
+
+def test_conditions_do_not_close_over_traced_numbers():
+    """Their derivatives would be lost."""
+
+    def end(height):
+        event = udk.Event(lambda t, at: at["ball"].y - height, udk.Stop())
+        return udk.simulate(BALL, TS, events=event).time
+
+    for function in (jax.grad(end), jax.jit(end)):
+        with pytest.raises(ValueError, match="closes over traced numbers"):
+            function(0.5)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -296,6 +297,13 @@ def _check(event: Event, mechanism: Mechanism) -> None:
     except KeyError as error:
         name = error.args[0]
         raise ValueError(f"{where}: no body named {quoted(str(name))}{suggestion(name, mechanism.body_names)}") from error
+    if not any(isinstance(x, Tracer) for x in jax.tree.leaves(event)):
+        known: Any = np.linspace(0.1, 0.9, mechanism.q0.size)
+        with jax.ensure_compile_time_eval():
+            found = event.condition(0.0, frames_of(mechanism.body_names, known, known))
+        if isinstance(found, Tracer):  # its derivatives by them would be lost
+            cure = "make it an equinox module that holds them and has a `__call__`"
+            raise ValueError(f"{where}: the condition closes over traced numbers; {cure}")
     if value.shape:
         raise ValueError(f"{where}: the condition must return one number, not an array of shape {value.shape}")
     if isinstance(action, Impact):

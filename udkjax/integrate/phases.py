@@ -157,7 +157,7 @@ def _with(mechanism: Mechanism, active: frozenset[str], extra: dict[str, Joint])
     drivers = {name: driver for name, driver in mechanism.drivers.items() if name in active}
     parts = (joints | added, drivers, mechanism.forces, mechanism.gravity, mechanism.name)
     is_known = not any(isinstance(x, Tracer) for x in jax.tree.leaves(list(added.values())))
-    if mechanism.is_known and is_known:
+    if mechanism.is_concrete and is_known:
         with jax.ensure_compile_time_eval():  # while something else is traced, what a joint takes from the guess is known, too
             return Mechanism(mechanism.bodies, *parts)
     origin = None
