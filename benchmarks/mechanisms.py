@@ -96,7 +96,7 @@ def positions(smoke: bool) -> list[dict[str, Any]]:
     def solved(g: Any) -> Any:
         changed = mech.with_parameters({JOINT: g})
         driven, q = drive(changed, INPUT), jnp.ravel(udk.assemble(changed).q)
-        return march(driven.mechanism, driven.analysis, driven.unit, values[0], q, values)
+        return march(driven.mechanism, driven.analysis, driven.unit, driven.value(q), q, values)
 
     batch = jax.jit(jax.vmap(solved))
     found = batch(grounds)
@@ -140,12 +140,13 @@ def rest(smoke: bool) -> list[dict[str, Any]]:
         return CRANK * end[1] / 2 + COUPLER * (end[1] + pin[1]) / 2 + ROCKER * pin[1] / 2
 
     def script() -> float:
-        return minimize_scalar(height, bounds=(-math.pi, math.pi), method="bounded", options={"xatol": 1e-12}).x
+        return minimize_scalar(height, bounds=(near - 1.0, near + 1.0), method="bounded", options={"xatol": 1e-12}).x
 
     def ours() -> Any:
         return udk.equilibrium(mech, stable=True).q
 
-    turned = (float(ours()[0, 2]) - script()) / 2
+    near = float(ours()[0, 2])
+    turned = (near - script()) / 2
     assert abs(math.sin(turned)) < 1e-6  # a minimum of a function is known to the root of rounding
     state = udk.equilibrium(mech, stable=True).state
     runs = {

@@ -11,8 +11,8 @@ import sys
 import time
 
 import numpy as np
-from pylinkage.solver import simulate
-from pylinkage.solver.types import JOINT_CRANK, JOINT_REVOLUTE, JOINT_STATIC
+from pylinkage.solver import simulate  # pyright: ignore[reportMissingImports]
+from pylinkage.solver.types import JOINT_CRANK, JOINT_REVOLUTE, JOINT_STATIC  # pyright: ignore[reportMissingImports]
 
 crank, coupler, rocker, ground, start, steps = map(float, sys.argv[1:])
 count = int(steps)

@@ -204,6 +204,7 @@ def test_transmission_angle_and_mechanical_advantage():
         udk.transmission_angle(mech, found, "A")
 
 
+@pytest.mark.slow
 def test_the_workspace_of_two_links_is_a_ring():
     mech = udk.library.double_pendulum()
     one, two = mech.body_names

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import udkjax as udk
 
@@ -77,6 +78,7 @@ def test_a_four_bar_with_a_diagonal_spring_against_its_reduction():
     np.testing.assert_allclose(udk.modes(mech, rest.state).omega2, [omega2], rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_equilibria_from_many_starts():
     """Both assembly branches of the four-bar, each with its equilibria: the reduction finds those of the first."""
     mech = spring_four_bar()

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.dense_rows import DenseRows
@@ -41,13 +41,13 @@ def marches(mechanism: Mechanism, analysis: Analysis) -> bool:
     return True
 
 
-def march(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Float[Array, "T"]) -> March:
+def march(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Float[ArrayLike, "T"]) -> March:
     """Follow the positions over the values, from the closed position q at the value s. Without derivatives.
 
     The mechanism's driver has the value for its time; `unit` is what values are measured by.
     """
     inputs = _inputs(mechanism, analysis, unit, s, q, values, jnp)
-    return _march(native_p.bind(*inputs, kind=_kind(mechanism, analysis), times=APPROACH + len(values)), jnp)
+    return _march(native_p.bind(*inputs, kind=_kind(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
 
 
 def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Any) -> March:
