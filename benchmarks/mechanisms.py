@@ -51,7 +51,7 @@ def by_fsolve(values: np.ndarray) -> np.ndarray:
     q = linkage().q0
     x, found = np.array([float(q[1, 2]), float(q[2, 2])]), []
     for s in values:
-        x = fsolve(loop, x, (s,), xtol=1e-13)
+        x = fsolve(loop, x, (s,), xtol=1e-12)
         found.append(x[1])
     return np.array(found)
 
@@ -140,7 +140,7 @@ def rest(smoke: bool) -> list[dict[str, Any]]:
         return CRANK * end[1] / 2 + COUPLER * (end[1] + pin[1]) / 2 + ROCKER * pin[1] / 2
 
     def script() -> float:
-        return minimize_scalar(height, bounds=(near - 1.0, near + 1.0), method="bounded", options={"xatol": 1e-12}).x
+        return minimize_scalar(height, bounds=(near - 0.05, near + 0.07), method="bounded", options={"xatol": 1e-12}).x
 
     def ours() -> Any:
         return udk.equilibrium(mech, stable=True).q
