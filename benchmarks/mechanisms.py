@@ -77,6 +77,8 @@ def by_pylinkage(values: np.ndarray) -> float | None:
 def timed(run: Callable[[], Any], least: float = 0.05) -> Callable[[], float]:
     """How long a call takes (CPU s), the mean of as many as take so long; JAX is waited for."""
 
+    jax.block_until_ready(run())  # compiled
+
     def seconds() -> float:
         count, start = 0, time.process_time()
         while not count or time.process_time() - start < least:
