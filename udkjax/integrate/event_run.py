@@ -80,12 +80,25 @@ def _(primals, tangents):
     if jax.tree.unflatten(numbers.tree, moving)[1].ts:
         raise NotImplementedError("a run with events has no derivatives by its output times")
 
+    xs = [_differentiated_once(x) for x in xs]
+
     def replayed(*some: Array) -> tuple[Array, ...]:
         hybrid, start = numbers.combined(replaced(xs, moving, some))
         return replay(hybrid, start, stop_gradients(found))
 
     change = jax.jvp(replayed, select(xs, moving), select(tangents[1], moving))[1]
     return found, Trace(*change, *(None for _ in found[len(change) :]))
+
+
+@jax.custom_jvp
+def _differentiated_once(x: Array) -> Array:
+    """A number that the first derivatives depend on: they are right at fixed event times, and so have no derivatives."""
+    return x
+
+
+@_differentiated_once.defjvp
+def _(primals, tangents):
+    raise NotImplementedError("a run with events has first derivatives only: take differences of these")
 
 
 # --- derivatives
