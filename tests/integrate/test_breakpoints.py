@@ -124,7 +124,14 @@ def test_members_of_a_batch_have_breakpoints_of_their_own(single):
         assert_allclose(found[k], single((knots[k], switches[k]), 1e-8), rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("choices", [{"solver": diffrax.Tsit5()}, {"solver": udk.Adams()}, {"solver": diffrax.Kvaerno5()}])
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"solver": diffrax.Tsit5()},
+        pytest.param({"solver": udk.Adams()}, marks=pytest.mark.slow),
+        pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow),
+    ],
+)
 def test_other_solvers(choices):
     """Of this engine, and of diffrax."""
     ts = TS[::20]
@@ -144,6 +151,7 @@ def by_differences():
     return ts, (ahead - behind) / (2 * h)
 
 
+@pytest.mark.slow
 def test_derivatives_along_breakpoints(by_differences):
     """Forward, and reverse by a recorded run; a spline's first knot is left out, before which it is another line."""
     ts, expected = by_differences

@@ -125,10 +125,10 @@ def assemble(x):
 @pytest.mark.parametrize("second", [None, *(pytest.param(f, marks=pytest.mark.slow, id=n) for n, f in SECOND.items())])
 def test_derivatives_of_assembly(second):
     x = jnp.array([np.deg2rad(-50.0) + 0.05, 2.0])
-    slope = jax.jit(jax.jacfwd(assembled))
+    slope = jax.jit(jax.jacfwd(assemble))
     if second is None:
-        expected = differences(jax.jit(assembled), x, 1e-3)
+        expected = differences(jax.jit(assemble), x, 1e-3)
         for mode in (jax.jacfwd, jax.grad, jax.jacrev):
-            assert_allclose(jax.jit(mode(assembled))(x), expected, rtol=1e-7, atol=1e-9)
+            assert_allclose(jax.jit(mode(assemble))(x), expected, rtol=1e-7, atol=1e-9)
         return
-    assert_allclose(jax.jit(second(assembled))(x), differences(slope, x, 1e-3), rtol=1e-5, atol=1e-7)
+    assert_allclose(jax.jit(second(assemble))(x), differences(slope, x, 1e-3), rtol=1e-5, atol=1e-7)

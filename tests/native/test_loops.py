@@ -271,7 +271,7 @@ def changed(mechanism, scale):
     return jax.tree.unflatten(tree, [x * (1.0 + scale * (f - 1.0)) for x, f in zip(leaves, factors, strict=True)])
 
 
-@pytest.mark.parametrize(("name", "assembled"), [("loaded", True), ("scissor lift", False)])
+@pytest.mark.parametrize(("name", "assembled"), [pytest.param("loaded", True, marks=pytest.mark.slow), ("scissor lift", False)])
 def test_derivatives_of_runs_are_those_of_code_that_is_written_out(name, assembled, monkeypatch):
     """And of closing what they start with, forward and reverse."""
     mechanism = SCENES[name]()

@@ -97,7 +97,8 @@ def served(monkeypatch, request):
 )
 def test_the_library(name):
     mechanism = getattr(udk.library, name)()
-    solution = agrees(mechanism, np.linspace(0.0, 0.6, 7), atol=2e-7 * max(1.0, float(jnp.abs(mechanism.q0).max())))
+    end = min(0.6, 4 * float(udk.analyse(mechanism).time))  # Andrews' mechanism is a hundred times as fast as the others
+    solution = agrees(mechanism, np.linspace(0.0, end, 7), atol=2e-7 * max(1.0, float(jnp.abs(mechanism.q0).max())))
     assert np.max(np.abs(udk.violation(mechanism, solution))) < 1e-9
 
 

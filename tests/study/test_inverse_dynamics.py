@@ -65,6 +65,7 @@ def test_efforts_are_what_the_drivers_reactions_say():
     ts = np.linspace(0.0, 0.4, 3)
     found = udk.inverse_dynamics(mech, ts)
     moved = found.motion
+    assert moved is not None
     for k, t in enumerate(ts):
         _, lam = udk.accelerations(mech, t, moved.q[k], moved.v[k], multipliers=True)
         assert abs(float(found.efforts["motor"][k] + lam[-1])) < 1e-10

@@ -1,6 +1,5 @@
 """Progress means the same in every function: a line after two seconds, at once, never, or a callable's own."""
 
-import os
 import threading
 import time
 from itertools import pairwise
@@ -8,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from udkjax.study import progress as module
-from udkjax.study.progress import Line, Progress, reporting
+from udkjax.study.progress import Progress, reporting
 
 
 def work(progress, steps=4, pause=0.0):
@@ -86,14 +85,3 @@ def test_what_is_left_and_the_text():
 def test_other_values_are_refused():
     with pytest.raises(TypeError, match='progress must be None, "auto", True, False or a function'):
         work("loud")
-
-
-def test_what_was_longer_is_covered_and_nothing_goes_on_in_the_next_line(monkeypatch, streams, notebook):
-    monkeypatch.setattr(module.shutil, "get_terminal_size", lambda: os.terminal_size((10, 24)))
-    terminal = streams(True)
-    for stream in (terminal, notebook):
-        line = Line(stream)
-        line.say("123456789012")
-        line.say("abc", last=True)
-    assert terminal.text == "\r123456789\rabc      \n"
-    assert notebook.text == "\r123456789012\rabc         \n"

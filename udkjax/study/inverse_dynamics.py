@@ -69,7 +69,7 @@ class Effort(ForceElement):
 
 def inverse_dynamics(
     mechanism: Mechanism,
-    ts: Float[ArrayLike, "T"],
+    ts: Float[ArrayLike, "T"] | Sequence[float],
     motion: Any = None,
     drivers: Sequence[str | Coordinate] | None = None,
     weights: Mapping[str, ArrayLike] | None = None,

@@ -1,6 +1,6 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -81,7 +81,7 @@ class Travel(eqx.Module):
 def kinematics(
     mechanism: Mechanism,
     driver: Drive,
-    values: Float[ArrayLike, "T"],
+    values: Float[ArrayLike, "T"] | Sequence[float],
     state: State | None = None,
     rate: Float[ArrayLike, "*T"] = 1.0,
     acceleration: Float[ArrayLike, "*T"] = 0.0,
