@@ -204,7 +204,7 @@ STARTS = {"closed": [1.0, 1.0, 0.2, np.deg2rad(-50), 0.0], "rough": [1.15, 1.3, 
 
 
 @pytest.fixture(scope="module")
-def assemble(linkage):
+def assembled(linkage):
     def outcome(p):
         state = udk.assemble(tied(linkage, p))
         return jnp.concatenate([state.q.ravel(), state.v.ravel()])

@@ -11,6 +11,7 @@ from udkjax.native.module import Module
 from udkjax.native.power import power
 from udkjax.native.singular import is_clear, step_around, time_to_singularity
 from udkjax.native.steps import (
+    CAUTIOUS,
     DONE,
     EXPECTED,
     GAP,
@@ -99,7 +100,7 @@ def write_decide(t: Module):
     first = s.tried < 0.0
     if t.plan.breaks:
         h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
-        h = where(begun & (tried > 0.0), s.h * SAFETY, h)
+        h = where(begun & (tried > 0.0), s.h * CAUTIOUS, h)
         s.where(begun, rate=inf, distance0=inf, distance1=inf)
         s.where(judged, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
         s.where(accept & (s.lands > 0.5), steps=-1.0)
