@@ -304,6 +304,7 @@ def test_gradients_of_a_bouncing_ball():
     assert np.abs(jax.jacfwd(run)(x) - jax.jacfwd(exact)(x)).max() < 1e-10
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_refused():
     end = lambda e: udk.simulate(BALL, TS[:3], events=floor(e, at_rest="stop"), max_events=1).q[-1, 0, 1]  # noqa: E731
     with pytest.raises(NotImplementedError, match="first derivatives only"):
