@@ -208,7 +208,7 @@ def test_what_json_cannot_hold_is_written_as_what_it_can():
         (MissingExtraError("optax is not installed: pip install 'udkjax[identify]'"), 2, "pip install 'udkjax[identify]'"),
         (KeyboardInterrupt(), 130, "udkjax: stopped"),
         (BrokenPipeError(), 1, ""),
-        (PermissionError(13, "Permission denied", "/root/x"), 1, "Permission denied: '/root/x'"),
+        (PermissionError(13, "Permission denied", "/elsewhere/x"), 1, "Permission denied: '/elsewhere/x'"),
         (udk.SceneError(["body.a.mass: must be > 0"]), 2, "udkjax: body.a.mass: must be > 0"),
         (ClusterError("no worker is left"), 1, "udkjax: no worker is left"),
     ],
