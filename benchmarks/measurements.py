@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import udkjax as udk
-from udkjax.study.identify.channels import channel_of, measure
+from udkjax.study.channel_values import measure
+from udkjax.study.channels import channel_of
 from udkjax.study.identify.parameters import Unknowns, apply_values, unknowns_of
 
 LINKS = ("link1", "link2", "link3")

@@ -156,6 +156,11 @@ def test_a_run_by_default_imports_no_other_solvers():
     assert python(DEFAULT, UDKJAX_CACHE=os.environ["UDKJAX_CACHE"]) == "{'jax'}"
 
 
+def test_asking_for_identify_loads_no_optimizer():
+    loaded = "print({'optimistix', 'optax', 'lineax', 'scipy.optimize', 'scipy.stats', 'pandas', 'xarray'} & set(sys.modules))"
+    assert python(f"import sys, udkjax; udkjax.identify; {loaded}") == "set()"
+
+
 OPTIONAL = ("anywidget", "dask", "distributed", "h5netcdf", "h5py", "matplotlib", "optax", "pandas", "tyro", "xarray")
 CORE = f"""
 import sys

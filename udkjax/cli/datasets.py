@@ -6,8 +6,6 @@ from typing import Any
 
 from udkjax.cli.common import refuse
 
-COORDINATES = ("x", "y", "angle")
-
 
 def check_target(out: Path | None) -> None:
     """Refuse a file that has no folder."""
@@ -22,11 +20,15 @@ def write(
     coordinates: Mapping[str, Any],
     settings: Mapping[str, Any],
 ) -> None:
-    """Write variables, each its dimensions, values and unit, to a file if there is to be one, with the scene and versions."""
+    """Write variables, each its dimensions, values and unit, to a file if there is to be one, with the scene and versions.
+
+    The coordinates of bodies are labelled where a variable lies along them.
+    """
     if out is None:
         return
     from udkjax.extras import OptionalImport
     from udkjax.integrate.solution import versions
+    from udkjax.scene.bodies import COORDINATES
 
     with OptionalImport():
         import h5netcdf  # noqa: F401  # the engine
@@ -36,4 +38,5 @@ def write(
     data = {name: (tuple(dims), np.asarray(values), {"units": unit}) for name, (dims, values, unit) in variables.items()}
     attributes = {"scene": scene, **{f"setting_{k}": v for k, v in settings.items() if v is not None}}
     attributes |= {f"version_{k}": v for k, v in versions().items()}
-    xarray.Dataset(data, dict(coordinates), attributes).to_netcdf(out, engine="h5netcdf")
+    labels = {"coordinate": list(COORDINATES)} if any("coordinate" in dims for dims, _, _ in variables.values()) else {}
+    xarray.Dataset(data, {**coordinates, **labels}, attributes).to_netcdf(out, engine="h5netcdf")

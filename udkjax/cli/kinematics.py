@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from udkjax.cli.common import Json, Scene, fail, load, refuse, show
-from udkjax.cli.datasets import COORDINATES, check_target, write
+from udkjax.cli.datasets import check_target, write
 from udkjax.extras import OptionalImport
 
 with OptionalImport():
@@ -84,7 +84,7 @@ def kinematics(
         "a": (dims, found.a, "m/s2, m/s2, rad/s2"),
         "status": (("value",), found.status, "0 closed, 1 singular, 2 beyond limit, 3 lost, 4 open"),
     }
-    coordinates = {"value": np.asarray(found.values), "body": list(found.bodies), "coordinate": list(COORDINATES)}
+    coordinates = {"value": np.asarray(found.values), "body": list(found.bodies)}
     write(out, text, variables, coordinates, {"driver": driver, "rate": rate})
     show(results, table(f"{mech.name or 'mechanism'}, driven by {driver}", lines), json)
     if reached < count:

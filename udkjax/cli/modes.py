@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from udkjax.cli.common import Json, Scene, fail, load, show
-from udkjax.cli.datasets import COORDINATES, check_target, write
+from udkjax.cli.datasets import check_target, write
 
 
 def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None = None, json: Json = False) -> None:
@@ -48,7 +48,7 @@ def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None
         "shape": (("mode", "body", "coordinate"), found.shapes, "m, m, rad, of modal mass 1 kg"),
         "q": (("body", "coordinate"), found.q, "m, m, rad"),
     }
-    write(out, text, variables, {"body": list(mech.body_names), "coordinate": list(COORDINATES)}, {"t": t})
+    write(out, text, variables, {"body": list(mech.body_names)}, {"t": t})
     show(results, table(f"{mech.name or 'mechanism'}, about its position of rest", lines), json)
     if not rest.balanced:
         fail("it does not rest: no equilibrium was found near the initial guess")

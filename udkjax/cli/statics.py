@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from udkjax.cli.common import Json, Scene, fail, load, refuse, show
-from udkjax.cli.datasets import COORDINATES, check_target, write
+from udkjax.cli.datasets import check_target, write
 
 
 def statics(
@@ -56,7 +56,7 @@ def statics(
             "omega2": (("equilibrium", "mode"), np.stack([np.asarray(e.omega2) for e in found]), "1/s2"),
             "multiplier": (("equilibrium", "row"), np.stack([np.asarray(e.multipliers) for e in found]), "N, N m"),
         }
-        write(out, text, variables, {"body": list(mech.body_names), "coordinate": list(COORDINATES)}, {"t": t, "starts": starts})
+        write(out, text, variables, {"body": list(mech.body_names)}, {"t": t, "starts": starts})
     show(results, table(f"{mech.name or 'mechanism'}, at rest", lines), json)
     if not found:
         fail("no position of rest was found near the initial guess; try --stable, or --starts 64")

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from udkjax.extras import OptionalImport
 from udkjax.html import html_table
+from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -126,11 +127,10 @@ class Solution(eqx.Module):
         with OptionalImport():
             import xarray
 
-        coordinates = ("x", "y", "angle")
         dims = ("time", "body", "coordinate")
         data = xarray.Dataset(
             {"q": (dims, np.asarray(self.q)), "v": (dims, np.asarray(self.v))},
-            coords={"time": np.asarray(self.ts), "body": list(self.bodies), "coordinate": list(coordinates)},
+            coords={"time": np.asarray(self.ts), "body": list(self.bodies), "coordinate": list(COORDINATES)},
         )
         data["time"].attrs = {"units": "s"}
         data["q"].attrs = {"long_name": "coordinates: centre of mass and angle", "units": "m, m, rad"}

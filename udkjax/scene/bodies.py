@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from udkjax.scene.fields import POSITIVE, number
 
 GROUND = "ground"
+COORDINATES = ("x", "y", "angle")  # of a body, in the order in which q and v hold them
 
 
 class Body(eqx.Module):

@@ -22,7 +22,7 @@ from udkjax.scene.drivers import Driver, Motion, Polynomial
 from udkjax.scene.fields import Numbers, names, number, optional
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
-from udkjax.study.identify.channels import channel_of
+from udkjax.study.channels import channel_of
 
 DRIVEN = ("angle", "x", "y", "distance")
 STILL = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # the ground

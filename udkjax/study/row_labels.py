@@ -1,5 +1,6 @@
 """What rows of constraints, coordinates and directions are called in texts."""
 
+from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
 
 _ROWS = {"Revolute": ("x", "y"), "Weld": ("x", "y", "angle"), "Prismatic": ("across", "angle")}
@@ -15,7 +16,7 @@ def row_label(mechanism: Mechanism, constraint: str, row: int) -> str:
 
 def column_labels(mechanism: Mechanism) -> list[str]:
     """Name the coordinates: x, y and angle of each body."""
-    return [f"{coordinate} {body}" for body in mechanism.body_names for coordinate in ("x", "y", "angle")]
+    return [f"{coordinate} {body}" for body in mechanism.body_names for coordinate in COORDINATES]
 
 
 def plural(count: int, noun: str) -> str:

@@ -1,5 +1,10 @@
-"""Units of parameters and of the settings of a run."""
+"""Units: of parameters and of the settings of a run, and those in which data may be written."""
 
+import math
+import re
+from typing import NamedTuple
+
+from udkjax.scene.checks import quoted
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.parameters import holder_of, parameters_of, split
 
@@ -63,3 +68,94 @@ def units_of(mechanism: Mechanism, name: str) -> str:
     if field in _FOLLOWS:
         return "rad" if getattr(mechanism.drivers.get(found.owner), "coordinate", "") == "angle" else "m"
     return _OF_TYPE.get((type(element).__name__, field), _FIELDS.get(field, ""))
+
+
+# --- units of data
+
+
+class _Unit(NamedTuple):
+    size: float  # in SI units
+    dimension: tuple[int, ...]  # powers of length, mass, time, angle
+
+    def times(self, other: "_Unit", power: int) -> "_Unit":
+        dimension = tuple(a + power * b for a, b in zip(self.dimension, other.dimension, strict=True))
+        return _Unit(self.size * other.size**power, dimension)
+
+
+_NONE, _LENGTH, _MASS, _TIME, _ANGLE = (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
+_RATE, _FORCE, _TORQUE, _ACCELERATION = (0, 0, -1, 1), (1, 1, -2, 0), (2, 1, -2, 0), (1, 0, -2, 0)
+_SIZES = {
+    _NONE: {"1": 1.0},
+    _LENGTH: {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048},
+    _MASS: {"kg": 1.0, "g": 1e-3, "t": 1e3, "lb": 0.45359237},
+    _TIME: {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0},
+    _ANGLE: {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "rev": 2 * math.pi},
+    _RATE: {"rpm": 2 * math.pi / 60},
+    _FORCE: {"N": 1.0, "mN": 1e-3, "kN": 1e3, "MN": 1e6, "lbf": 4.4482216152605},
+    _TORQUE: {"Nm": 1.0, "mNm": 1e-3, "kNm": 1e3, "Nmm": 1e-3, "Ncm": 1e-2},
+}
+_UNITS = {name: _Unit(size, dimension) for dimension, sizes in _SIZES.items() for name, size in sizes.items()}
+_GRAVITY = _Unit(9.80665, _ACCELERATION)  # what "g" is to an accelerometer; else it is a gram
+_SPELLINGS = {
+    "°": "deg",
+    "²": "2",
+    "³": "3",
+    "µ": "u",  # the micro sign
+    "μ": "u",  # the Greek letter
+    "·": " ",
+    "**": "^",
+    "*": " ",
+}
+_WORDS = {
+    **dict.fromkeys(("degree", "degrees"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("second", "seconds", "sec"), "s"),
+    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+}
+_USUAL = (
+    "m, mm, cm",
+    "rad, deg, rev",
+    "s, ms",
+    "m/s, mm/s",
+    "rad/s, deg/s, rpm",
+    "m/s2, mm/s2, g",
+    "rad/s2, deg/s2",
+    "N, kN",
+    "N m, N mm, kN m",
+    "kg, g",
+)
+
+
+def conversion_factor(units: str, wanted: str) -> float:
+    """Return the factor that converts numbers in `units` into `wanted`, which are SI units.
+
+    Args:
+        units: products written with a space, powers as m/s2 or m/s^2. "g" is a gram, and where
+            an acceleration is wanted 9.80665 m/s2.
+        wanted: the units of a channel.
+
+    Raises:
+        ValueError: `units` are unknown, or of another dimension.
+    """
+    if units.split() == wanted.split():
+        return 1.0
+    goal = _read(wanted)
+    given = _GRAVITY if units.strip() == "g" and goal.dimension == _ACCELERATION else _read(units)
+    if given.dimension != goal.dimension:
+        usual = next((some for some in _USUAL if _read(some.partition(",")[0]).dimension == goal.dimension), wanted)
+        raise ValueError(f"{quoted(units)} does not fit; it is measured in {usual}")
+    return given.size / goal.size
+
+
+def _read(text: str) -> _Unit:
+    """Read a product of powers of units; a slash divides by the one that follows."""
+    plain = text
+    for spelling, usual in _SPELLINGS.items():
+        plain = plain.replace(spelling, usual)
+    found = _UNITS["1"]
+    for slash, name, power in re.findall(r"(/?)\s*([^\W\d]+|1)\^?(-?\d+)?|\S", plain):
+        name = _WORDS.get(name, name)
+        if name not in _UNITS:
+            raise ValueError(f"{quoted(text)} is no unit known here: they are made of {', '.join(_UNITS)}")
+        found = found.times(_UNITS[name], int(power or 1) * (-1 if slash else 1))
+    return found

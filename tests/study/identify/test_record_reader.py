@@ -9,11 +9,11 @@ import xarray
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.identify.channels import Quantity
+from udkjax.study.channels import Quantity
 from udkjax.study.identify.messages import IdentificationError
 from udkjax.study.identify.record_reader import records_of
 from udkjax.study.identify.records import Record, Start
-from udkjax.study.identify.unit_conversion import conversion_factor
+from udkjax.study.units import conversion_factor
 
 DEG = math.pi / 180
 

@@ -1,7 +1,6 @@
 """Identification: parameters of mechanisms, found from measured motion.
 
-records, tables, record_reader, unit_conversion    measurements, whatever they come as
-channels                                           what can be measured of a motion
+records, tables, record_reader                     measurements, whatever they come as
 parameters, initial_states                         what is to be found
 prediction, problem, shooting                      what would be measured, and how far it is from what was
 build_problem, loop_consistency                    whether all of these fit together
@@ -11,7 +10,7 @@ gradient_check, numerical_differences              whether derivatives are right
 identification, estimate, experiment_design        what users call, and what they get
 """
 
-from udkjax.study.identify.channels import Quantity as Quantity
+from udkjax.study.channels import Quantity as Quantity
 from udkjax.study.identify.estimate import Estimate as Estimate
 from udkjax.study.identify.experiment_design import Candidate as Candidate
 from udkjax.study.identify.experiment_design import Design as Design

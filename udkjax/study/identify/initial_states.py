@@ -8,13 +8,14 @@ from jaxtyping import Float, Int
 
 from udkjax.equations.redundancy import rows_of
 from udkjax.integrate.assembly import State, assemble
+from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import SceneError, quoted
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.channels import RATES, UNITS
 from udkjax.study.identify.messages import IdentificationError
 from udkjax.study.identify.parameters import Unknowns, apply_values
 from udkjax.study.identify.records import Record, Start
 
-COORDINATES, RATES = (("x", "m"), ("y", "m"), ("angle", "rad")), (("vx", "m/s"), ("vy", "m/s"), ("omega", "rad/s"))
 READABLE = 1e-3  # of the largest: how much of a free motion the coordinates that are taken as its unknowns must show at least
 
 
@@ -95,8 +96,8 @@ def unknowns_of_state(mechanism: Mechanism, unknowns: Unknowns, record: Record, 
         ("velocity", RATES, np.stack([nothing, basis])),
     ):
         if record.start.estimate in (what, "both"):
-            names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3][0]}" for k in chosen]
-            units += [fields[k % 3][1] for k in chosen]
+            names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3]}" for k in chosen]
+            units += [UNITS[fields[k % 3]] for k in chosen]
             parts.append(part)
     return InitialStateUnknowns(tuple(names), tuple(units), np.concatenate(parts, axis=2))
 

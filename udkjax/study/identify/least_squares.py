@@ -7,19 +7,21 @@ same sums of squares, gradients and steps.
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.study.identify.directions import INVISIBLE
 from udkjax.study.identify.parameters import FAR
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Residuals
+
+if TYPE_CHECKING:  # imported where a fit begins: it takes a second
+    import optimistix
 
 # Gauss-Newton steps, the largest change of a dimensionless unknown, at which a fit has settled: on the way; where the integration
 # is loose too; where costs have to be exact to the square of it; and at the end, where smaller steps change nothing that shows.
@@ -65,7 +67,7 @@ def minimize_squares(
     steps: int = STEPS,
     settled: float = EXACT_STEP,
     undamped: bool = False,
-    method: optimistix.AbstractLeastSquaresSolver | None = None,
+    method: "optimistix.AbstractLeastSquaresSolver | None" = None,
     loss: Loss = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> Fit:
@@ -165,8 +167,10 @@ def _linear(y: Array, known: tuple[Array, Array]) -> tuple[Array, None]:
 
 
 @lru_cache(maxsize=32)
-def _compiled_step(method: optimistix.AbstractLeastSquaresSolver | None, K: int, sets: int) -> tuple[PyTree, Callable]:
+def _compiled_step(method: "optimistix.AbstractLeastSquaresSolver | None", K: int, sets: int) -> tuple[PyTree, Callable]:
     """Return the first state of a method, of arrays alone, and its compiled step, of `sets` fits at once."""
+    import optimistix
+
     solver = method
     if solver is None:
         search = optimistix.ClassicalTrustRegion(high_cutoff=GOOD_DECREASE, high_constant=DAMPING_FACTOR)

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias, Union, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
-import scipy.optimize
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.extras import OptionalImport
@@ -18,15 +16,16 @@ from udkjax.study.identify.messages import IdentificationError
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Residuals
 
-if TYPE_CHECKING:  # needed only for fits by its optimizers
+if TYPE_CHECKING:  # imported where a fit begins: it takes a second
     import optax
+    import optimistix
 
 GRADIENT_STEPS = 2000  # at most, of an optimizer that knows no curvature
 FAILED_COST = 100.0  # times the first cost: what is taken for the cost where nothing can be computed
 HUBER = 1.345  # standard deviations: of noise that is Gaussian after all, estimates lose a twentieth of their precision
 
 UserLoss: TypeAlias = Callable[[Array], Array]
-Optimizer: TypeAlias = Union[optimistix.AbstractLeastSquaresSolver, "optax.GradientTransformation", None]
+Optimizer: TypeAlias = Union["optimistix.AbstractLeastSquaresSolver", "optax.GradientTransformation", None]
 
 
 class GradientMethod(NamedTuple):
@@ -36,7 +35,7 @@ class GradientMethod(NamedTuple):
     loss: UserLoss | None = None
 
 
-Method: TypeAlias = optimistix.AbstractLeastSquaresSolver | GradientMethod | None
+Method: TypeAlias = Union["optimistix.AbstractLeastSquaresSolver", GradientMethod, None]
 
 
 def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> Method:
@@ -49,7 +48,7 @@ def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> Method:
     if hasattr(optimizer, "init") and hasattr(optimizer, "update"):
         return GradientMethod(cast("optax.GradientTransformation", optimizer), own_loss)
     if own_loss is None:
-        return cast(optimistix.AbstractLeastSquaresSolver | None, optimizer)
+        return cast("optimistix.AbstractLeastSquaresSolver | None", optimizer)
     if optimizer is not None:
         raise IdentificationError(["optimizer: a loss of your own is no sum of squares; give an optimizer of optax, or none"])
     return GradientMethod(None, own_loss)
@@ -147,6 +146,8 @@ def minimize_by_gradient(
 
 
 def _walk_by_scipy(walk: "_LossAlongWalk", first: np.ndarray, steps: int) -> None:
+    import scipy.optimize
+
     def after_step(_) -> None:
         if walk.after_step():
             raise StopIteration

@@ -22,7 +22,8 @@ from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Solution
 from udkjax.integrate.solvers import forward_mode
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.identify.channels import Channel, Quantity, measure
+from udkjax.study.channel_values import measure
+from udkjax.study.channels import Channel, Quantity
 from udkjax.study.identify.parameters import Target, apply_values
 from udkjax.study.machine import CHUNKED, MEMBERS, cores
 

@@ -20,7 +20,7 @@ from udkjax.integrate.solution import Result
 from udkjax.scene.checks import quoted
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.parameters import parameters_of, split
-from udkjax.study.identify.channels import Channel, Quantity, channel_of
+from udkjax.study.channels import Channel, Quantity, channel_of
 from udkjax.study.identify.initial_states import initial_state_unknowns
 from udkjax.study.identify.messages import IdentificationError
 from udkjax.study.identify.parameters import Unknowns

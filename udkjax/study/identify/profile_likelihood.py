@@ -13,8 +13,8 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float
+from scipy.special import chdtri, fdtri
 
 from udkjax.study.identify.least_squares import FINE_STEP, LeastSquares, Loss, minimize_squares
 from udkjax.study.identify.parameters import FAR, Unknowns
@@ -200,8 +200,7 @@ def trace_profile(
 
 def quantile(level: float, degrees_of_freedom: float | None) -> float:
     """Return psi^2 at the ends of the interval: of chi^2 with one degree of freedom; of F, where the noise was estimated."""
-    law = scipy.stats.chi2(1) if degrees_of_freedom is None else scipy.stats.f(1, degrees_of_freedom)
-    return float(law.ppf(level))
+    return float(chdtri(1, 1.0 - level) if degrees_of_freedom is None else fdtri(1, degrees_of_freedom, level))
 
 
 def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, bound: float, rise: float, steps: int) -> _Side:

@@ -12,7 +12,7 @@ import numpy as np
 from udkjax.extras import OptionalImport
 from udkjax.scene.checks import quoted, shown, suggestion
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.identify.channels import Channel, Quantity, channel_of
+from udkjax.study.channels import Channel, Quantity, channel_of
 from udkjax.study.identify.messages import IdentificationError
 from udkjax.study.identify.records import Key, Noise, Record, key_of
 from udkjax.study.identify.tables import (
@@ -26,7 +26,7 @@ from udkjax.study.identify.tables import (
     table_of_columns,
     table_of_frame,
 )
-from udkjax.study.identify.unit_conversion import conversion_factor
+from udkjax.study.units import conversion_factor
 
 if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tables
     import pandas

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from udkjax.deprecation import renamed_arguments
 from udkjax.integrate.assembly import State
 from udkjax.scene.checks import quoted
-from udkjax.study.identify.channels import Quantity
+from udkjax.study.channels import Quantity
 from udkjax.study.identify.messages import IdentificationError
 
 Estimated = Literal["nothing", "position", "velocity", "both"]
@@ -45,7 +45,7 @@ class Record:
     Args:
         times: increasing (T,), s.
         values: arrays (T,) by channel, not a number where nothing was measured. Channels are named as in
-            `udkjax.study.identify.channels` ("body.crank.angle"), or `Quantity`s of the user's own.
+            `udkjax.study.channels` ("body.crank.angle"), or `Quantity`s of the user's own.
         noise: standard deviation of all channels, or of each by channel, a number or (T,). Where it is not given, it is estimated
             from the residuals of the fit.
         initial_state: the `State` or `Start` at t0; by default the scene's own.

@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import qmc
 
 from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, SOME_STEPS, STEPS, Fit, History, Loss
 from udkjax.study.identify.optimizer import Method, minimize
@@ -177,6 +176,8 @@ def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int
 
     Unknowns of initial states, which come after the parameters, are moved by a little.
     """
+    from scipy.stats import qmc  # here: it takes a second
+
     P = len(u.names)
     unit = qmc.Sobol(len(z), rng=seed).random(1 << max(0, int(np.ceil(np.log2(count)))))[:count]
     x0 = u.values(z[None, :P])[0]

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import quoted, shown, suggestion
+from udkjax.study.channels import RATES
 
 if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tables
     import pandas
@@ -20,7 +22,7 @@ if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tab
 TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings, and what follows that of a channel
 _DELIMITERS = (";", "\t", ",")
 # Coordinates of what `Solution.to_xarray` writes, as channels of bodies.
-_STATES = {"q": {"x": "x", "y": "y", "angle": "angle"}, "v": {"x": "vx", "y": "vy", "angle": "omega"}}
+_STATES = {"q": dict(zip(COORDINATES, COORDINATES, strict=True)), "v": dict(zip(COORDINATES, RATES, strict=True))}
 
 
 class Column(NamedTuple):

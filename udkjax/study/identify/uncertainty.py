@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float, Int
+from scipy.special import chdtr, chdtrc
 
 from udkjax.study.identify.directions import INVISIBLE, Direction, UnknownValues, describe, null_space, simplest_basis
 from udkjax.study.identify.messages import listed
@@ -216,12 +216,12 @@ def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
     """Say so where residuals are not as large as the noise that was given."""
     ratio = np.sqrt(chi2 / freedom)
     numbers = f"chi^2 = {chi2:.4g} with {freedom} degrees of freedom"
-    if scipy.stats.chi2.sf(chi2, freedom) < IMPROBABLE:
+    if chdtrc(freedom, chi2) < IMPROBABLE:
         yield (
             f"residuals are {ratio:.3g} times as large as the noise given ({numbers}): the model leaves something out, or the "
             "noise is larger; standard errors are those of the noise given"
         )
-    elif scipy.stats.chi2.cdf(chi2, freedom) < IMPROBABLE:
+    elif chdtr(freedom, chi2) < IMPROBABLE:
         yield (
             f"residuals are only {ratio:.3g} times as large as the noise given ({numbers}): the noise is smaller, or its samples "
             "are not independent; standard errors are those of the noise given"
@@ -296,4 +296,4 @@ def whiteness_of(
     if not z:
         return Whiteness(lag1, np.nan, 0, np.nan, len(e))
     Q = float(np.sum(np.square(z)))
-    return Whiteness(lag1, Q, len(z), float(scipy.stats.chi2.sf(Q, len(z))), len(e))
+    return Whiteness(lag1, Q, len(z), float(chdtrc(len(z), Q)), len(e))

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
+from udkjax.scene.bodies import COORDINATES
 from udkjax.study.sweep.axes import Column, Dimension
 from udkjax.study.sweep.chunk import program, variables_of
 from udkjax.study.sweep.cutting import lane_steps
@@ -16,7 +17,6 @@ from udkjax.study.sweep.plan import Plan, Variable
 
 FORMAT = "udkjax sweep 1"
 NOT_COMPUTED = -1  # the result of a member that is not among what is finished
-COORDINATES = ("x", "y", "angle")
 
 
 def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> Any:

@@ -12,7 +12,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.identify.channels import Quantity, channel_of, channels_of, measure
+from udkjax.study.channel_values import measure
+from udkjax.study.channels import Quantity, channel_of, channels_of
 
 compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # each runs a few times only
 OMEGA, STEP = 4.0, 1e-3
