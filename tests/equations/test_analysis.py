@@ -66,6 +66,29 @@ def test_a_traced_mechanism_has_the_analysis_of_the_known_one_that_it_was_made_f
     assert seen[1].redundant_rows is None and seen[1].rank is None and seen[1].row_names == seen[0].row_names
 
 
+def test_a_mechanism_made_while_something_is_traced():
+    """Its plain numbers stay known; of traced masses and loads the redundant rows are known, of traced geometry they are not."""
+    seen = []
+
+    def rail(mass, arm):
+        """A block on a rail that two equal slots and a stop for its angle hold."""
+        slots = {name: udk.Slot(["ground", "block"], [[0.0, 0.0], [x * arm, 0.0]], 0.0) for name, x in (("one", -1), ("two", 1))}
+        joints = {**slots, "angle": udk.Angle(["ground", "block"])}
+        return udk.Mechanism({"block": udk.Body(mass, 0.1)}, joints, gravity=[mass, 0])
+
+    @jax.jit
+    def trace(x):
+        made = [udk.library.parallelogram(), rail(1.0, 0.5), rail(x, 0.5), rail(1.0, x)]
+        seen.extend((mechanism.is_concrete, udk.analyse(mechanism).redundant_rows) for mechanism in made)
+        return x
+
+    trace(1.5)
+    assert [known for known, _ in seen] == [True, True, False, False]
+    rows = udk.analyse(rail(1.0, 0.5)).redundant_rows
+    assert len(rows) == 1
+    assert [found for _, found in seen] == [udk.analyse(udk.library.parallelogram()).redundant_rows, rows, rows, None]
+
+
 @pytest.mark.parametrize("first", ["udkjax", "udkjax.equations", "udkjax.scene"])
 def test_nothing_depends_on_the_order_of_imports(first):
     code = f"""

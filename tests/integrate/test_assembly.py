@@ -233,6 +233,20 @@ def test_derivatives_of_the_assembled_state(assembled, start):
     assert_allclose(assembled["reverse"](p), assembled["weights"] @ forward, atol=1e-11)
 
 
+def test_derivatives_with_respect_to_the_guess_alone():
+    """No number of the scene moves. Without redundant rows: those that contradict each other cost a part in a million."""
+    mech = udk.library.double_pendulum()
+    direction, weights = np.random.default_rng(3).standard_normal((2, 2, 3))
+
+    def outcome(size):
+        return udk.assemble(mech, state=udk.State(mech.q0 + size * direction, mech.v0)).q
+
+    value, slope = jax.jit(outcome), jax.jit(jax.jacfwd(outcome))(0.05)
+    assert_allclose(slope, (value(0.05 + 1e-5) - value(0.05 - 1e-5)) / 2e-5, atol=1e-8)
+    assert np.abs(slope).max() > 0.01
+    assert_allclose(jax.jit(jax.grad(lambda size: (weights * outcome(size)).sum()))(0.05), (weights * slope).sum(), atol=1e-12)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("start", STARTS)
 def test_second_derivatives_of_the_assembled_state(assembled, start):

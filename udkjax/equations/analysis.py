@@ -18,6 +18,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.equations.loop_programs import loop_programs
@@ -75,15 +76,17 @@ def analyse(mechanism: Mechanism) -> Analysis:
 
     Which rows are redundant depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of
     the known one that it was made from by `with_parameters`: rows that are left out are watched, and a run whose numbers made one
-    of them independent says so. One whose numbers are all traced, as an argument of a function under `jit`, has no origin: its
-    redundant rows stay unknown, and `Auto` then takes singular values throughout, by diffrax: right, and a hundred times slower.
-    Analyse before the trace, and hand it on: `simulate(mechanism, ts, analysis=analysis)`.
+    of them independent says so. Masses and loads decide nothing about rows: they may be traced. One whose geometry is traced and
+    that was made anew has no origin: its redundant rows stay unknown, and `Auto` then takes singular values throughout, by
+    diffrax: right, and a hundred times slower. Analyse before the trace, and hand it on: `simulate(mechanism, ts,
+    analysis=analysis)`.
     """
     if not mechanism.is_concrete:
         if mechanism.origin is not None:
             return analyse(mechanism.origin.mechanism)
         mechanism = mechanism.without_origin
-        return Analysis(traced_scales(mechanism), 3 * len(mechanism.body_names), _row_names(mechanism), None)
+        count, names = 3 * len(mechanism.body_names), _row_names(mechanism)
+        return Analysis(traced_scales(mechanism), count, names, _rows_of_known_geometry(mechanism))
     mechanism = mechanism.without_origin
     kind = structure(mechanism)
     return _analyses.get((kind, _bytes_of(mechanism)), lambda: _analyse(mechanism, kind))
@@ -116,9 +119,21 @@ def _analyse(mechanism: Mechanism, kind: Any) -> Analysis:
     with jax.ensure_compile_time_eval():  # while something else is traced, too
         scales = known_scales(mechanism)
         # Masses and loads decide nothing about rows: mechanisms that differ in them alone share what was found.
-        geometry = list(mechanism.constraints.values()), mechanism.q0
-        rows = _redundant.get((kind, _bytes_of(geometry)), lambda: redundant_rows(mechanism))
+        rows = _redundant.get((kind, _bytes_of(_geometry(mechanism))), lambda: redundant_rows(mechanism))
         return Analysis(scales, 3 * len(mechanism.body_names), _row_names(mechanism), rows)
+
+
+def _rows_of_known_geometry(mechanism: Mechanism) -> tuple[int, ...] | None:
+    """The redundant rows of a mechanism whose masses or loads are traced; None where its geometry is, too."""
+    with jax.ensure_compile_time_eval():
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(_geometry(mechanism))):
+            return None
+        known = jax.tree.map(lambda x: np.ones(np.shape(x)) if isinstance(x, Tracer) else x, mechanism)
+        return _analyse(known, structure(mechanism)).redundant_rows
+
+
+def _geometry(mechanism: Mechanism) -> Any:
+    return list(mechanism.constraints.values()), [(body.position, body.angle) for body in mechanism.bodies.values()]
 
 
 def _row_names(mechanism: Mechanism) -> tuple[tuple[str, int], ...]:

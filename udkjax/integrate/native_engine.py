@@ -214,7 +214,7 @@ def jvp(problem: Any, moving: Any, change: Any) -> tuple[IntegratorOutput, tuple
     if isinstance(kind.code, LoopPrograms):
         along = dconstants if any(kind.moving or ()) else jnp.zeros(0)
     else:
-        along = _vector([jnp.zeros(0), *(dc for dc, m in zip(dconstants, kind.moving or (), strict=True) if m)], jnp)
+        along = _vector([dc for dc, m in zip(dconstants, kind.moving or (), strict=True) if m], jnp)
     n = len(problem.q)
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     *found, dys, dend = native_p.bind(
@@ -298,7 +298,7 @@ def _inputs(problem: Any, code: Any = None, xp: Any = jnp) -> list[Any]:
 
 
 def _vector(parts: Sequence[Any], xp: Any) -> Any:
-    return xp.concatenate([xp.ravel(xp.asarray(x, float)) for x in parts])
+    return xp.concatenate([xp.zeros(0), *(xp.ravel(xp.asarray(x, float)) for x in parts)])
 
 
 def _raw(found: Sequence[Any]) -> IntegratorOutput:

@@ -1,5 +1,6 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
 
 MAX_STEPS = 100_000
 MAX_EVENTS = 64
+GEOMETRY_TRACED = (
+    "the geometry of the mechanism is traced: its redundant rows are not known, and the run takes singular values, by diffrax, a "
+    "hundred times slower. Make the mechanism of plain numbers and change them by with_parameters, or pass analysis=analyse(...)"
+)
 # Of the rows' scales. Projection leaves rounding errors, unless the rows that it does not see drift. Without it drift is what one
 # looks at, up to where a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
 # 2e-3 open.
@@ -127,7 +132,11 @@ def simulate(
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
     bare: Any = mechanism
     if isinstance(mechanism, Mechanism):
-        analysis, bare = analyse(mechanism) if analysis is None else analysis, mechanism.without_origin
+        if analysis is None:
+            analysis = analyse(mechanism)
+            if analysis.redundant_rows is None and not mechanism.is_concrete and type(method) is Auto and engine == "auto":
+                warnings.warn(GEOMETRY_TRACED, stacklevel=2)
+        bare = mechanism.without_origin
         if state is None and closure is None:
             closure = close(mechanism, start, analysis=analysis)
 

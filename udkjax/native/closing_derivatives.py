@@ -12,6 +12,9 @@ and transposed, from a cotangent w of x,
 The coordinates change by -s M^(-1/2) x; s, where it limits the step, is a function of it, too. Behind the last step there is one
 more correction, which changes nothing but the derivative: it returns it to the constraint manifold. dA, dr and d M^(-1/2) are
 straight-line programs of the constants, q and v.
+
+While loops are open, redundant rows contradict each other: singular values below the rank tolerance are not quite zero. How their
+vectors turn is left out, which costs as much of the derivative as their product with the violation: a part in a million at worst.
 """
 
 from collections.abc import Callable, Iterator

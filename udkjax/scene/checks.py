@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -142,7 +143,8 @@ def typed(path: str, choices: Mapping[str, type], table: Mapping[str, Any]) -> t
 
 def _number(path: str, dims: Sequence[str], value: Any, metadata: Mapping[str, Any], sizes: dict[str, int]) -> Iterator[str]:
     """Iterate over what is wrong with a number: not one, wrong shape, not finite, out of its range (unknown while traced)."""
-    array = value if isinstance(value, Tracer) else _array(value)
+    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(value))
+    array = jnp.asarray(value) if traced else _array(value)
     fixed = all(dim.isdigit() for dim in dims)
     if array is None or array.ndim != len(dims) or (fixed and array.shape != tuple(map(int, dims))):
         expected = f"{' x '.join(dims)} numbers" if fixed else "numbers"

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 Numbers = ArrayLike | Sequence[Any]  # a number, an array, or nested lists of numbers
@@ -20,6 +21,11 @@ def number(value: Numbers) -> Float[Array, "..."]:
     dtype = jnp.result_type(float)
     if all(isinstance(x, float | int | np.number | np.ndarray) for x in jax.tree.leaves(value)):
         value = np.asarray(value, dtype)  # JAX would compile a program to convert it
+        found = jnp.asarray(value)
+        if not isinstance(found, Tracer):
+            return found
+        with jax.ensure_compile_time_eval():  # what is known stays known while something else is traced
+            return jnp.asarray(value)
     return jnp.asarray(value, dtype=dtype)
 
 

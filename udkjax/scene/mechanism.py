@@ -1,6 +1,7 @@
 """A mechanism: the pytree of everything that exists in a scene, checked, with named access to every number."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -213,7 +214,10 @@ def _checked(given: Mapping[str, list], gravity: Any, name: str) -> dict[str, li
 def _resolved(constraint: Any, bodies: Mapping[str, Body]) -> Any:
     if type(constraint).resolved is Constraint.resolved:  # most joints: spares the sines and cosines of every body
         return constraint
-    return constraint.resolved(*(_FIXED if name == GROUND else bodies[name].frame() for name in constraint.attached))
+    placed = [(bodies[name].position, bodies[name].angle) for name in constraint.attached if name != GROUND]
+    known = not any(isinstance(x, Tracer) for x in jax.tree.leaves((constraint, placed)))
+    with jax.ensure_compile_time_eval() if known else nullcontext():  # known stays known while something else is traced
+        return constraint.resolved(*(_FIXED if name == GROUND else bodies[name].frame() for name in constraint.attached))
 
 
 def numbered(elements: Sequence[Any], names: Sequence[str | None] = ()) -> list[str]:

@@ -11,7 +11,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.forces import Spring, Torque
 from udkjax.scene.joints import Revolute
-from udkjax.scene.library.poses import moving
+from udkjax.scene.library.poses import known_at_once, moving
 from udkjax.scene.mechanism import Mechanism
 
 # Masses (kg) and inertias (kg m^2) of K1 to K7, then lengths (m), as the sources name them.
@@ -34,6 +34,7 @@ START: Mapping[str, float] = MappingProxyType(  # rad
 )
 
 
+@known_at_once
 def andrews_squeezer(
     torque: ArrayLike = 0.033, stiffness: ArrayLike = 4530.0, spring_length: ArrayLike = 0.07785, gravity: Numbers = (0.0, 0.0)
 ) -> Mechanism:

@@ -12,7 +12,7 @@ from udkjax.scene.drivers import Driver, Sine
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Revolute
-from udkjax.scene.library.poses import apex, bar, down, moving, uniform_rod
+from udkjax.scene.library.poses import apex, bar, down, known_at_once, moving, uniform_rod
 from udkjax.scene.mechanism import Mechanism
 
 # Points of a body in units of its length, from its first pin on, the x axis towards its last one.
@@ -23,6 +23,7 @@ BUCKET = {"centre": (0.45, 0.20), "bucket": (0.0, 0.0), "link": (-0.13, 0.28)}
 BASE = (0.13, -0.09)  # of the boom's cylinder on the ground, from the boom's foot, in units of the boom's length
 
 
+@known_at_once
 def excavator(
     angles: Sequence[ArrayLike] = (0.6, -1.1, -2.2),
     angular_velocities: Sequence[ArrayLike] = (-0.2, 0.3, 0.6),

@@ -11,10 +11,11 @@ from udkjax.scene.drivers import Driver, Polynomial
 from udkjax.scene.fields import number
 from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Prismatic, Revolute, Slot
-from udkjax.scene.library.poses import ORIGINS, apex, bar, down, moving, uniform_rod
+from udkjax.scene.library.poses import ORIGINS, apex, bar, down, known_at_once, moving, uniform_rod
 from udkjax.scene.mechanism import Mechanism
 
 
+@known_at_once
 def parallelogram(
     angle: ArrayLike = -np.pi / 4,
     angular_velocity: ArrayLike = 0.0,
@@ -49,6 +50,7 @@ def parallelogram(
     )
 
 
+@known_at_once
 def n_four_bar(
     n: int = 2, angle: ArrayLike = np.pi / 2, angular_velocity: ArrayLike = -1.0, gravity: ArrayLike = 9.81
 ) -> Mechanism:
@@ -72,6 +74,7 @@ def n_four_bar(
     return Mechanism(bodies, joints, gravity=down(gravity), name=f"{n}-four-bar")
 
 
+@known_at_once
 def four_bar(
     angle: ArrayLike = np.pi / 3,
     angular_velocity: ArrayLike = 0.0,
@@ -104,6 +107,7 @@ def four_bar(
     )
 
 
+@known_at_once
 def slider_crank(
     angle: ArrayLike = 0.0,
     angular_velocity: ArrayLike = 4.0,
@@ -145,6 +149,7 @@ def slider_crank(
     )
 
 
+@known_at_once
 def elliptic_trammel(
     angle: ArrayLike = np.pi / 4,
     angular_velocity: ArrayLike = 0.0,

@@ -9,10 +9,11 @@ from jaxtyping import ArrayLike
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import number
 from udkjax.scene.joints import Gear, Joint, Prismatic, Revolute, Slot
-from udkjax.scene.library.poses import ORIGINS, apex, bar, down, moving, uniform_disc, uniform_rod
+from udkjax.scene.library.poses import ORIGINS, apex, bar, down, known_at_once, moving, uniform_disc, uniform_rod
 from udkjax.scene.mechanism import Mechanism
 
 
+@known_at_once
 def scissor_lift(
     stages: int = 2,
     angle: ArrayLike = np.pi / 6,
@@ -55,6 +56,7 @@ def scissor_lift(
     return Mechanism(bodies, joints, gravity=down(gravity), name="scissor lift")
 
 
+@known_at_once
 def peaucellier(
     angle: ArrayLike = np.pi / 6,
     angular_velocity: ArrayLike = 0.0,
@@ -103,6 +105,7 @@ def peaucellier(
     return Mechanism(bodies, joints, gravity=jnp.stack([number(gravity), number(0.0)]), name="Peaucellier-Lipkin linkage")
 
 
+@known_at_once
 def planetary_gear(
     planets: int = 3,
     angular_velocity: ArrayLike = 1.0,

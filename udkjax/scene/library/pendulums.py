@@ -10,10 +10,11 @@ from udkjax.scene.bodies import GROUND, Body
 from udkjax.scene.drivers import Driver, Sine
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.joints import Distance, Revolute
-from udkjax.scene.library.poses import ORIGINS, down, hanging, moving, uniform_rod
+from udkjax.scene.library.poses import ORIGINS, down, hanging, known_at_once, moving, uniform_rod
 from udkjax.scene.mechanism import Mechanism
 
 
+@known_at_once
 def simple_pendulum(
     position: Numbers = (-1.0, 0.0),
     velocity: Numbers = (0.0, 0.0),
@@ -28,6 +29,7 @@ def simple_pendulum(
     return Mechanism(bodies, {"rod": Distance((GROUND, "bob"), ORIGINS)}, gravity=down(gravity), name="simple pendulum")
 
 
+@known_at_once
 def compound_pendulum(
     angle: ArrayLike = np.pi / 3,
     angular_velocity: ArrayLike = 0.0,
@@ -48,6 +50,7 @@ def compound_pendulum(
     )
 
 
+@known_at_once
 def double_pendulum(
     angles: Sequence[ArrayLike] = (np.pi / 2, np.pi / 2),
     angular_velocities: Sequence[ArrayLike] = (0.0, 0.0),
@@ -74,6 +77,7 @@ def double_pendulum(
     )
 
 
+@known_at_once
 def driven_pendulum(
     amplitude: ArrayLike = 0.8,
     frequency: ArrayLike = 3.0,
@@ -96,6 +100,7 @@ def driven_pendulum(
     )
 
 
+@known_at_once
 def chain(
     n: int = 10,
     angle: ArrayLike = np.pi / 2,

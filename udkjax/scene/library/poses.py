@@ -5,17 +5,35 @@ the velocity is the pose's derivative times the rate of s.
 """
 
 from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import ParamSpec
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.scene.bodies import Body
 from udkjax.scene.fields import Numbers, number
+from udkjax.scene.mechanism import Mechanism
 
 ORIGINS = ((0.0, 0.0), (0.0, 0.0))
+P = ParamSpec("P")
 FEW = 32  # bodies whose motion is compiled as a whole
+
+
+def known_at_once(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
+    """Make a mechanism whose arguments are known of known numbers, also while something else is traced."""
+
+    @wraps(build)
+    def made(*arguments: P.args, **named: P.kwargs) -> Mechanism:
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((arguments, named))):
+            return build(*arguments, **named)
+        with jax.ensure_compile_time_eval():
+            return build(*arguments, **named)
+
+    return made
 
 
 def moving(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: Numbers, rate: Numbers) -> dict[str, Body]:
