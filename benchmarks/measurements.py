@@ -15,7 +15,8 @@ import numpy as np
 import udkjax as udk
 from udkjax.study.channel_values import measure
 from udkjax.study.channels import channel_of
-from udkjax.study.identify.parameters import Unknowns, apply_values, unknowns_of
+from udkjax.study.identify.parameters import unknowns_of
+from udkjax.study.identify.unknowns import Unknowns, apply_values
 
 LINKS = ("link1", "link2", "link3")
 CYLINDERS = ("boom cylinder", "stick cylinder", "bucket cylinder")

@@ -4,7 +4,8 @@ from udkjax.equations.analysis import analyse
 from udkjax.integrate import Solution
 from udkjax.scene import Mechanism
 from udkjax.study.accuracy import Accuracy
-from udkjax.study.row_labels import plural, row_label
+from udkjax.study.row_labels import row_label
+from udkjax.study.wording import plural
 
 
 def check_summary(mech: Mechanism, check) -> str:

@@ -8,11 +8,11 @@ import numpy as np
 from udkjax.integrate import Result
 from udkjax.show.summary import table
 from udkjax.show.sweep_figures import RESULT, scalars
-from udkjax.study.row_labels import plural
 from udkjax.study.sweep.chunk import bytes_per_member, variables_of
 from udkjax.study.sweep.dry_run import Estimate
 from udkjax.study.sweep.plan import Plan
 from udkjax.study.sweep.sweep_progress import duration
+from udkjax.study.wording import plural
 
 
 def estimate_summary(plan: Plan, estimate: Estimate) -> str:

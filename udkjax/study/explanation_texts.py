@@ -7,7 +7,8 @@ import numpy as np
 
 from udkjax.equations.determinacy import unique_direction
 from udkjax.scene.joints import Revolute
-from udkjax.study.row_labels import plural, row_label
+from udkjax.study.row_labels import row_label
+from udkjax.study.wording import plural
 
 WIDE = 18  # columns of a matrix that fit beside each other
 TINY = 1e-12  # relative to the largest of an array: printed as 0

@@ -17,8 +17,3 @@ def row_label(mechanism: Mechanism, constraint: str, row: int) -> str:
 def column_labels(mechanism: Mechanism) -> list[str]:
     """Name the coordinates: x, y and angle of each body."""
     return [f"{coordinate} {body}" for body in mechanism.body_names for coordinate in COORDINATES]
-
-
-def plural(count: int, noun: str) -> str:
-    """Say how many there are."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"

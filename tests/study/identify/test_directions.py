@@ -3,7 +3,7 @@
 import numpy as np
 
 from udkjax.study.identify.directions import connected, echelon, null_space, row_space
-from udkjax.study.identify.messages import listed, ratio
+from udkjax.study.wording import listed, ratio
 
 
 def test_spaces_of_rows():

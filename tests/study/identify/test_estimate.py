@@ -9,6 +9,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.study.identify.estimate import Estimate, rounded
+from udkjax.study.identify.least_squares import squares
 from udkjax.study.identify.records import Record, labels
 
 
@@ -86,7 +87,7 @@ def estimate() -> Estimate:
         tol=(1e-9, 1e-9),
         z=np.zeros(5),
         problem=problem,
-        loss=None,
+        loss=squares,
     )
     vars(found)["mechanism"] = SimpleNamespace(name="<linkage>")
     return found

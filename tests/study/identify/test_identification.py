@@ -9,7 +9,8 @@ from udkjax.study.identify import prediction
 from udkjax.study.identify.identification import identify
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.search import horizons, sample_guesses
+from udkjax.study.identify.search import horizons
+from udkjax.study.identify.unknowns import sample_guesses
 
 TRUE = {"body.rod.inertia": 0.375, "force.spring.damping": 0.2}
 

@@ -9,11 +9,10 @@ import pytest
 
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
 from udkjax.study.identify.identification import identify
-from udkjax.study.identify.messages import IdentificationError
-from udkjax.study.identify.optimizer import GradientMethod, minimize, minimize_by_gradient
+from udkjax.study.identify.optimizer import GradientMethod, Minimizer, minimize_by_gradient
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.records import Record
+from udkjax.study.identify.records import IdentificationError, Record
 
 TOL, NOISE = (1e-9, 1e-9), 1e-3
 
@@ -32,7 +31,7 @@ def noisy(measured):
 def test_lbfgs_ends_where_least_squares_do(noisy):
     problem = problem_of(noisy)
     fit = minimize_by_gradient(GradientMethod(optax.lbfgs()), problem, np.zeros((1, 2)), TOL, steps=100)
-    squares = minimize(problem, np.zeros((1, 2)), TOL)
+    squares = Minimizer().minimize(problem, np.zeros((1, 2)), TOL)
     assert fit.settled[0] and len(fit.history) < 40
     assert np.abs(fit.z - squares.z).max() < 1e-5
     assert fit.cost[0] == pytest.approx(squares.cost[0], rel=1e-8)
@@ -49,7 +48,7 @@ OTHERS = {
 def test_other_optimizers_end_there_too(noisy, optimizer, settled, within):
     problem = problem_of(noisy)
     fit = minimize_by_gradient(GradientMethod(optimizer), problem, np.zeros((1, 2)), TOL, steps=600, settled=settled)
-    squares = minimize(problem, np.zeros((1, 2)), TOL)
+    squares = Minimizer().minimize(problem, np.zeros((1, 2)), TOL)
     assert fit.settled[0] and np.abs(fit.z - squares.z).max() < within
     costs = [cost for cost, _ in fit.history]
     assert costs == sorted(costs, reverse=True) and costs[-1] == fit.cost[0]
@@ -62,7 +61,7 @@ def test_a_loss_of_the_users_own(noisy):
     problem = problem_of(noisy)
     method = GradientMethod(None, lambda r: jnp.sum(jnp.sqrt(1.0 + r**2)))
     fit = minimize_by_gradient(method, problem, np.zeros((1, 2)), TOL, steps=200)
-    squares = minimize(problem, np.zeros((1, 2)), TOL)
+    squares = Minimizer().minimize(problem, np.zeros((1, 2)), TOL)
     truth = problem.unknowns.z_of(np.array([0.375, 0.2]))
     assert fit.settled[0] and np.abs(fit.z[0] - truth).max() < 0.02
     assert np.abs(squares.z[0] - truth).max() > 3.0 * np.abs(fit.z[0] - truth).max()

@@ -6,7 +6,8 @@ import pytest
 
 import udkjax as udk
 from udkjax.scene.reshaping import length_of
-from udkjax.study.identify.parameters import apply_values, unknowns_of
+from udkjax.study.identify.parameters import unknowns_of
+from udkjax.study.identify.unknowns import apply_values
 
 
 @pytest.fixture(scope="module")

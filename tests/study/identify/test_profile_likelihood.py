@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 from udkjax.study.identify.estimate import profiles_dataset
+from udkjax.study.identify.least_squares import squares
 from udkjax.study.identify.problem import Residuals
 from udkjax.study.identify.profile_likelihood import WithFixedParameter, profile_likelihood, trace_profile
 
@@ -160,7 +161,7 @@ def fitted(problem, noise=()):
     errors = np.sqrt(np.diag(np.linalg.inv(problem.J.T @ problem.J)))[:2] * SCALE[: len(z)] * s
     known: Any = SimpleNamespace(standard_errors=errors, noise=np.array(noise), degrees_of_freedom=37)
     values = dict(zip(problem.unknowns.names, problem.unknowns.values(z[:2]), strict=True))
-    return known, values, partial(profile_likelihood, problem, problem.unknowns, z, (1e-9, 1e-9), None, known)
+    return known, values, partial(profile_likelihood, problem, problem.unknowns, z, (1e-9, 1e-9), squares, known)
 
 
 def test_one_unknown_is_fixed():

@@ -10,9 +10,8 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.study.channels import Quantity
-from udkjax.study.identify.messages import IdentificationError
 from udkjax.study.identify.record_reader import records_of
-from udkjax.study.identify.records import Record, Start
+from udkjax.study.identify.records import IdentificationError, Record, Start
 from udkjax.study.units import conversion_factor
 
 DEG = math.pi / 180

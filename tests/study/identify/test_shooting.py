@@ -8,7 +8,7 @@ import pytest
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
 from udkjax.study.identify.identification import identify
-from udkjax.study.identify.optimizer import minimize
+from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import Record
@@ -36,8 +36,8 @@ def test_each_number_is_in_one_piece(problem, pieces):
     assert parts == pieces.pieces and len(parts) == 5
     assert parts[0].first == 0 and parts[-1].end == len(TS) - 1
     assert all(one.end == two.first for one, two in pairwise(parts))
-    assert np.array_equal(pieces.times[pieces.piece, pieces.time], TS)
-    assert np.array_equal(pieces.times[1:, 0], pieces.times[:-1, -1]) and (np.diff(pieces.times) > 0).all()
+    assert np.array_equal(pieces.runs.ts[pieces.run, pieces.time], TS)
+    assert np.array_equal(pieces.runs.ts[1:, 0], pieces.runs.ts[:-1, -1]) and (np.diff(pieces.runs.ts) > 0).all()
     assert pieces.K == 2 + 4 * 2 == len(pieces.all_names) == len(pieces.all_units)
 
 
@@ -60,10 +60,10 @@ def test_a_first_guess_follows_what_was_measured(pieces):
 
 
 def test_the_fit_is_that_of_the_whole_record(problem):
-    pieces, fit = fit_pieces(problem, np.zeros(problem.K), TOL, samples=6)
+    pieces, fit = fit_pieces(problem, np.zeros(problem.K), TOL, Minimizer(), samples=6)
     assert fit.settled[0] and explains(pieces, fit, TOL)
     assert pieces.gaps(fit.z, TOL)[0] < 1e-7
-    whole = minimize(problem, fit.z[:, :2], TOL, undamped=True)
+    whole = Minimizer().minimize(problem, fit.z[:, :2], TOL, undamped=True)
     assert np.abs(fit.z[0, :2] - whole.z[0]).max() < 1e-5
     assert np.all(np.abs(problem.unknowns.values(fit.z[0, :2]) / [0.375, 0.2] - 1.0) < 0.02)
     # Errors of the integration, 1e-9, count in defects, which weigh 1e7.
@@ -72,7 +72,7 @@ def test_the_fit_is_that_of_the_whole_record(problem):
 
 @pytest.mark.slow
 def test_whole_records_end_the_fit_where_they_can(problem):
-    found = search(problem, np.zeros((1, problem.K)), TOL, strategy="pieces")
+    found = search(problem, np.zeros((1, problem.K)), TOL, Minimizer(), strategy="pieces")
     assert found.ways == ("records in pieces",) and found.problem is problem and found.fit.settled[0]
     assert found.fit.z.shape == (1, 2)
 
@@ -96,7 +96,7 @@ def test_chaos():
         first = truth.with_parameters({names[0]: factors[0], names[2]: values[2] * factors[2]})
         first = udk.with_length(first, "upper", factors[1])
         whole = Problem(first, unknowns_of(first, names), [record])
-        along = fit_growing_parts(whole, np.zeros((1, 3)), TOL, lambda text: None)
+        along = fit_growing_parts(whole, np.zeros((1, 3)), TOL, Minimizer())
         assert along.cost[0] > 1e3 * q.size  # half of it would be noise
         estimate = identify(first, record, names, progress=False)
         assert estimate.ways[-1] == "records in pieces" and isinstance(estimate.problem, MultipleShooting)

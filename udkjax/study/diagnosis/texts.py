@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.study.row_labels import plural, row_label
+from udkjax.study.row_labels import row_label
+from udkjax.study.wording import plural
 
 WIDTH = 14
 MOST = 8  # fixes of one set that are printed

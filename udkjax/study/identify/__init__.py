@@ -18,8 +18,8 @@ from udkjax.study.identify.experiment_design import design_experiment as design_
 from udkjax.study.identify.gradient_check import GradientCheck as GradientCheck
 from udkjax.study.identify.gradient_check import check_gradients as check_gradients
 from udkjax.study.identify.identification import identify as identify
-from udkjax.study.identify.messages import IdentificationError as IdentificationError
 from udkjax.study.identify.parameters import Parameter as Parameter
 from udkjax.study.identify.parameters import length as length
+from udkjax.study.identify.records import IdentificationError as IdentificationError
 from udkjax.study.identify.records import Record as Record
 from udkjax.study.identify.records import Start as Start

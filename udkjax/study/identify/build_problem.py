@@ -2,8 +2,8 @@
 
 import dataclasses
 import inspect
-from collections.abc import Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, get_args
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, get_args
 
 import jax
 import numpy as np
@@ -15,16 +15,13 @@ from udkjax.integrate.solution import Result
 from udkjax.scene.checks import SceneError, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.loop_consistency import loop_problems
-from udkjax.study.identify.messages import IdentificationError, collect
-from udkjax.study.identify.parameters import Asked, Unknowns, apply_values, unknowns_of
+from udkjax.study.identify.parameters import Asked, unknowns_of
 from udkjax.study.identify.prediction import LOOSE, TIGHT
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.record_reader import records_of
-from udkjax.study.identify.records import Estimated, Noise, Record, Start
-from udkjax.study.identify.search import Strategy, sample_guesses
-
-if TYPE_CHECKING:
-    from udkjax.study.identify.record_reader import Data
+from udkjax.study.identify.record_reader import Data, records_of
+from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start
+from udkjax.study.identify.search import Strategy
+from udkjax.study.identify.unknowns import Unknowns, apply_values, sample_guesses
 
 NEARBY_GUESSES = 64  # that are tried where the first cannot be closed
 MOST_STORED = 256  # structures of mechanisms whose parameters keep all loops closed
@@ -34,7 +31,7 @@ DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "prog
 
 def build_problem(
     mechanism: Mechanism,
-    data: "Data",
+    data: Data,
     parameters: Asked,
     settings: Mapping[str, Any],
     noise: Noise = None,
@@ -50,12 +47,25 @@ def build_problem(
         IdentificationError: with every mistake in them.
         AssemblyError: the mechanism cannot be closed with the first guess, nor with any near it.
     """
-    unknowns, records = collect(
+    unknowns, records = _collect(
         lambda: _check(settings, strategy),
         lambda: unknowns_of(mechanism, parameters),
         lambda: _with_initial_state(records_of(mechanism, data, noise, ignore), initial_state),
     )[1:]
     return _closable_problem(mechanism, unknowns, records, settings, seed, tol)
+
+
+def _collect(*steps: Callable[[], Any]) -> list[Any]:
+    """Return the results of some steps; if any of them raises `IdentificationError`, raise one with the mistakes of all."""
+    found, problems = [], []
+    for step in steps:
+        try:
+            found.append(step())
+        except IdentificationError as error:
+            problems += error.problems
+    if problems:
+        raise IdentificationError(problems)
+    return found
 
 
 def _with_initial_state(records: Sequence[Record], given: Start | Estimated | None) -> Sequence[Record]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.study.identify.messages import listed
+from udkjax.study.wording import listed
 
 # Of the largest singular value of a Jacobian: directions below it do not show in what was measured. A change that leaves the
 # equations of motion as they are has 1e-16, whatever the tolerance; derivatives integrated at 1e-7 have errors of 1e-8.

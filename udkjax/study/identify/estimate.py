@@ -21,13 +21,13 @@ from udkjax.scene.checks import quoted, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
 from udkjax.study.identify.least_squares import Loss
-from udkjax.study.identify.messages import IdentificationError, aligned, counted, listed
-from udkjax.study.identify.parameters import apply_values
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikelihood, estimated_noise, profile_likelihood, quantile
-from udkjax.study.identify.records import labels
+from udkjax.study.identify.records import IdentificationError, labels
 from udkjax.study.identify.uncertainty import Uncertainty, Whiteness
+from udkjax.study.identify.unknowns import apply_values
+from udkjax.study.wording import aligned, listed, plural
 
 if TYPE_CHECKING:
     import xarray
@@ -118,7 +118,8 @@ class Estimate:
         members = problem.members(self.z[None])
         for k, record in enumerate(problem.records):
             own = self.mechanism.with_parameters(record.conditions) if record.conditions else self.mechanism
-            found.append(assemble(own, record.t0, problem.predictor.guess(members, k), throw=False))
+            guess = problem.predictor.guess(members, problem.beginnings[k])
+            found.append(assemble(own, record.t0, guess, throw=False))
         return tuple(found)
 
     @property
@@ -196,14 +197,14 @@ class Estimate:
 
     def _head(self) -> str:
         problem, title = self.problem, self.mechanism.name or "mechanism"
-        numbers, records = counted(len(problem.index), "number"), counted(len(problem.records), "record")
-        return f"{title}: {counted(len(self.names), 'parameter')} from {numbers} in {records}"
+        numbers, records = plural(len(problem.index), "number"), plural(len(problem.records), "record")
+        return f"{title}: {plural(len(self.names), 'parameter')} from {numbers} in {records}"
 
     def _facts(self) -> dict[str, str]:
         problem, known = self.problem, self.uncertainty
         ended = "settled" if self.converged else "not settled"
         agreed = f", {self.agreeing} of {self.guesses} first guesses led here" if self.guesses > 1 else ""
-        facts = {"fit": f"{ended} after {counted(self.evaluations, 'evaluation')} in {self.seconds:.1f} s{agreed}"}
+        facts = {"fit": f"{ended} after {plural(self.evaluations, 'evaluation')} in {self.seconds:.1f} s{agreed}"}
         if problem.noise_given.any():
             facts["chi^2"] = f"{known.chi2:.4g} with {known.degrees_of_freedom} degrees of freedom"
         if not problem.noise_given.all():

@@ -22,11 +22,10 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.build_problem import build_problem
 from udkjax.study.identify.directions import INVISIBLE, PART
 from udkjax.study.identify.estimate import Estimate
-from udkjax.study.identify.messages import IdentificationError
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import MEDIUM, Tolerances
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.records import Key, Noise, Record, Start
+from udkjax.study.identify.records import IdentificationError, Key, Noise, Record, Start
 
 Criterion = Literal["D", "A", "E"]
 

@@ -13,7 +13,7 @@ out whose h J d is more than all that a channel shows, if it moves at all.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,15 +23,14 @@ from udkjax.integrate.solution import CAUSES, Result
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify import prediction
 from udkjax.study.identify.build_problem import build_problem
-from udkjax.study.identify.messages import IdentificationError, aligned, listed
 from udkjax.study.identify.numerical_differences import DIFFERENCE_STEPS, Differences, differences, sizes
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import TIGHT, Tolerances
 from udkjax.study.identify.problem import Problem, Residuals
+from udkjax.study.identify.record_reader import Data
+from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.records import labels as record_labels
-
-if TYPE_CHECKING:
-    from udkjax.study.identify.record_reader import Data
+from udkjax.study.wording import aligned, listed
 
 AGREEMENT = 3.0  # floors: a floor is a sum of sizes, each of which was measured once
 USEFUL = 0.1  # of the derivative's size: where the floor is higher, agreement says little
@@ -148,7 +147,7 @@ class GradientCheck:
 
 def check_gradients(
     mechanism: Mechanism,
-    data: "Data",
+    data: Data,
     parameters: Asked,
     *,
     tol: float = TIGHT,
@@ -245,7 +244,7 @@ def _predict(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> 
     """Return what channels show, in their units; no numbers where a run does not come to its end."""
     rows = len(problem.index)
     # As many at a time as are computed one by one: lanes would have to be compiled.
-    together = max(1, (prediction.LANES_FROM - 1) // len(getattr(problem, "pieces", problem.records)))
+    together = max(1, (prediction.LANES_FROM - 1) // len(problem.columns))
     parts = [problem.evaluate(z[k : k + together], tol) for k in range(0, len(z), together)]
     r, code = np.concatenate([part.r for part in parts]), np.concatenate([part.code for part in parts])
     seen = r[:, :rows] * problem.sigma + problem.y[problem.present]

@@ -2,8 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,19 +14,16 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.build_problem import build_problem
 from udkjax.study.identify.directions import UnknownValues
 from udkjax.study.identify.estimate import Estimate
-from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History, Loss
-from udkjax.study.identify.messages import IdentificationError
-from udkjax.study.identify.optimizer import Method, Optimizer, UserLoss, choose_method, minimize, named_loss
+from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History, Loss, squares
+from udkjax.study.identify.optimizer import Minimizer, Optimizer, UserLoss, choose_method, named_loss
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import LOOSE, TIGHT, Tolerances
 from udkjax.study.identify.problem import Problem
-from udkjax.study.identify.records import Estimated, Noise, Start
-from udkjax.study.identify.search import N_STARTS, Report, SearchResult, Strategy, search
+from udkjax.study.identify.record_reader import Data
+from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
+from udkjax.study.identify.search import N_STARTS, SearchResult, Strategy, search
 from udkjax.study.identify.uncertainty import Whiteness, estimate_uncertainty, whiteness_of
 from udkjax.study.progress import ProgressOption, reporting
-
-if TYPE_CHECKING:
-    from udkjax.study.identify.record_reader import Data
 
 REWEIGHTED = 2  # fits, each with the noise that the one before left
 NOISE_FLOOR = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike
@@ -35,18 +31,10 @@ SAME_WEIGHTS = 1.05  # ratio of weights, compared with each other, that moves no
 ROUNDING = 1e-8  # of what a channel shows: smaller residuals are errors of the integration, which need not be noise
 
 
-class Choices(TypedDict):
-    """How all fits of an identification are made."""
-
-    method: Method
-    loss: Loss
-    report: Report
-
-
 @renamed_arguments(start="initial_state", starts="n_starts")
 def identify(
     mechanism: Mechanism,
-    data: "Data",
+    data: Data,
     parameters: Asked,
     *,
     noise: Noise = None,
@@ -102,14 +90,13 @@ def identify(
         n_starts, guesses = 0, n_starts
     problem = build_problem(mechanism, data, parameters, settings, noise, ignore, seed, strategy, initial_state, tol)
     first = _first_guesses(problem, n_starts, guesses)
-    residual_loss = None if callable(loss) else named_loss(loss, len(problem.index))
+    residual_loss = squares if callable(loss) else named_loss(loss, len(problem.index))
     method = choose_method(optimizer, loss)
     with reporting(progress, None, "identify") as report:
-        say: Report = lambda text: report(report.state.done + 1, text)  # noqa: E731
-        choices = Choices(method=method, loss=residual_loss, report=say)
-        found = search(problem, first, (tol, tol), 0 if guesses is not None else n_starts, seed, strategy=strategy, **choices)
+        minimizer = Minimizer(method, residual_loss, lambda text: report(report.state.done + 1, text))
+        found = search(problem, first, (tol, tol), minimizer, 0 if guesses is not None else n_starts, seed, strategy)
         _require_finite(problem, found)
-        fit, history = _refit(found, (tol, tol), choices)
+        fit, history = _refit(found, (tol, tol), minimizer)
     return _estimate_of(fit, found, history, (tol, tol), residual_loss, time.perf_counter() - start)
 
 
@@ -142,27 +129,26 @@ def _require_finite(problem: Problem, found: SearchResult) -> None:
 # --- the end of a fit
 
 
-def _refit(found: SearchResult, tol: Tolerances, choices: Choices) -> tuple[Fit, History]:
+def _refit(found: SearchResult, tol: Tolerances, minimizer: Minimizer) -> tuple[Fit, History]:
     """Fit to the end, each channel weighted by the noise that it has turned out to have."""
     problem = found.problem
-    end = partial(_polish, problem, tol=tol, choices=choices)
-    fit = end(found.fit.z)
+    fit = _polish(problem, found.fit.z, tol, minimizer)
     history = [*found.history, *fit.history]
     unknown = np.unique(problem.index[~problem.noise_given, 2])
     for _ in range(REWEIGHTED if len(unknown) + problem.noise_given.any() > 1 else 0):
-        if not reweigh(problem, fit.z, tol, choices["loss"], NOISE_FLOOR):
+        if not reweigh(problem, fit.z, tol, minimizer.loss, NOISE_FLOOR):
             break
-        fit = end(fit.z)
+        fit = _polish(problem, fit.z, tol, minimizer)
         history += fit.history
     return fit, history
 
 
-def _polish(problem: Problem, z: np.ndarray, tol: Tolerances, choices: Choices) -> Fit:
+def _polish(problem: Problem, z: np.ndarray, tol: Tolerances, minimizer: Minimizer) -> Fit:
     """Fit from beside a minimum; with damped steps where other weights have moved it far along what hardly shows."""
-    near = minimize(problem, z, tol, steps=FEW_STEPS, undamped=True, **choices)
+    near = minimizer.minimize(problem, z, tol, steps=FEW_STEPS, undamped=True)
     if near.settled[0] or near.history[-1][1] <= LOOSE_STEP:
         return near
-    fit = minimize(problem, near.z, tol, **choices)
+    fit = minimizer.minimize(problem, near.z, tol)
     return fit._replace(history=near.history + fit.history)
 
 
@@ -173,8 +159,7 @@ def reweigh(problem: Problem, z: Float[np.ndarray, "1 K"], tol: Tolerances, loss
         Whether residuals weigh otherwise now, compared with each other.
     """
     before = problem.sigma.copy()
-    found = problem.evaluate(z, tol)
-    found = found if loss is None else loss(found)
+    found = loss(problem.evaluate(z, tol))
     rows = len(problem.index)
     left = found.r[0, :rows] * problem.sigma
     for c in range(len(problem.channels)):
@@ -185,7 +170,7 @@ def reweigh(problem: Problem, z: Float[np.ndarray, "1 K"], tol: Tolerances, loss
             size = np.sqrt(left[own] @ left[own] / max(freedom, 1.0))
             problem.sigma[own] = max(size, max(least, np.finfo(float).tiny ** 0.25) * problem.channel_scale[c])
     ratio = problem.sigma / before
-    return bool(ratio.max() > SAME_WEIGHTS * ratio.min()) or loss is not None or bool(len(problem.priors))
+    return bool(ratio.max() > SAME_WEIGHTS * ratio.min()) or loss is not squares or bool(len(problem.priors))
 
 
 def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerances, loss: Loss, seconds: float) -> Estimate:
@@ -194,7 +179,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
     unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z[0]
     x = unknowns.values(z[:P])
     plain = problem.evaluate(fit.z, tol)
-    weighted = plain if loss is None else loss(plain)
+    weighted = loss(plain)
     groups = problem.noise_groups()
     values = UnknownValues(
         problem.all_names,

@@ -1,20 +1,19 @@
 """The unknowns of a fit that are initial states of records: coordinates and rates that parametrize the closed states."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from udkjax.equations.redundancy import rows_of
+from udkjax.equations.dense_rows import KinematicRows
 from udkjax.integrate.assembly import State, assemble
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import SceneError, quoted
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import RATES, UNITS
-from udkjax.study.identify.messages import IdentificationError
-from udkjax.study.identify.parameters import Unknowns, apply_values
-from udkjax.study.identify.records import Record, Start
+from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
+from udkjax.study.identify.unknowns import Unknowns, apply_values
 
 READABLE = 1e-3  # of the largest: how much of a free motion the coordinates that are taken as its unknowns must show at least
 
@@ -39,22 +38,24 @@ def initial_state_unknowns(
         start = record.start
         if start.estimate == "nothing":
             of_record.append(None)
-            continue
-        if start.name and start.name in tied:
+        elif start.name and start.name in tied:
             first, own = tied[start.name]
             if first.estimate != start.estimate or (first.state is not start.state and not _same(first.state, start.state)):
                 problems.append(
                     f"{record.place}start {quoted(start.name)} is another one in an earlier record: give one Start to both"
                 )
             of_record.append(own)
-            continue
-        label = start.name or record.name or (f"record {k + 1}" if len(records) > 1 else "start")
-        own = at, unknowns_of_state(mechanism, unknowns, record, label)
-        found.append(own[1])
-        of_record.append(own)
-        at += len(own[1].names)
-        if start.name:
-            tied[start.name] = start, own
+        else:
+            label = start.name or record.name or (f"record {k + 1}" if len(records) > 1 else "start")
+            try:
+                mech = apply_values(with_conditions(mechanism, record), unknowns.targets, unknowns.guess)
+                state = state_unknowns(mech, record.t0, start.state, start.estimate, label)
+            except SceneError as problem:
+                raise IdentificationError([f"{record.place}{problem}"]) from None
+            tied[start.name] = start, (at, state)
+            of_record.append((at, state))
+            found.append(state)
+            at += len(state.names)
     if problems:
         raise IdentificationError(problems)
     S = max((len(state.names) for state in found), default=0)
@@ -71,34 +72,37 @@ def _same(one: State | None, two: State | None) -> bool:
     return one is not None and two is not None and np.array_equal(one.q, two.q) and np.array_equal(one.v, two.v)
 
 
-def unknowns_of_state(mechanism: Mechanism, unknowns: Unknowns, record: Record, label: str) -> InitialStateUnknowns:
-    """Choose coordinates that parametrize the closed states beside the guess: angles where they do."""
-    mech = mechanism.with_parameters(record.conditions) if record.conditions else mechanism
-    try:
-        mech = apply_values(mech, unknowns.targets, unknowns.guess)
-        state = assemble(mech, record.t0, record.start.state)
-    except SceneError as problem:
-        raise IdentificationError([f"{record.place}{problem}"]) from None
-    rows = rows_of(mech)
-    q = np.asarray(state.q, float).ravel()
+def with_conditions(mechanism: Mechanism, record: Record) -> Mechanism:
+    """Return the mechanism as it was in a record."""
+    return mechanism.with_parameters(record.conditions) if record.conditions else mechanism
+
+
+def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Estimated, label: str) -> InitialStateUnknowns:
+    """Choose coordinates that parametrize the closed states beside a guess: angles where they do.
+
+    Args:
+        mech: with its parameters.
+        t0: the time of the state (s).
+        guess: the state that is closed; None: the scene's own.
+        estimate: what of it is unknown.
+        label: what names of the unknowns begin with.
+    """
+    rows, q = KinematicRows(mech), np.asarray(assemble(mech, t0, guess).q, float).ravel()
     free = np.eye(len(q))
     if rows.count:
-        position: Any = rows.close(record.t0, q)
+        position = rows.close(t0, q)
+        assert position is not None, "what has been assembled is closed"
         free = rows.metric[:, None] * position.vt[position.rank :].T
     chosen = _independent_rows(free)
     basis = free @ np.linalg.inv(free[chosen])
     names: list[str] = []
     units: list[str] = []
-    parts = []
-    nothing = np.zeros_like(basis)
-    for what, fields, part in (
-        ("position", COORDINATES, np.stack([basis, nothing])),
-        ("velocity", RATES, np.stack([nothing, basis])),
-    ):
-        if record.start.estimate in (what, "both"):
+    parts, nothing = [], np.zeros_like(basis)
+    for what, fields, part in (("position", COORDINATES, (basis, nothing)), ("velocity", RATES, (nothing, basis))):
+        if estimate in (what, "both"):
             names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3]}" for k in chosen]
             units += [UNITS[fields[k % 3]] for k in chosen]
-            parts.append(part)
+            parts.append(np.stack(part))
     return InitialStateUnknowns(tuple(names), tuple(units), np.concatenate(parts, axis=2))
 
 

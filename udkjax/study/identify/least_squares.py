@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.study.identify.directions import INVISIBLE
-from udkjax.study.identify.parameters import FAR
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Residuals
+from udkjax.study.identify.unknowns import FAR
 
 if TYPE_CHECKING:  # imported where a fit begins: it takes a second
     import optimistix
@@ -40,7 +40,8 @@ SHORT_STEP = 0.3  # of an unknown: where the first Gauss-Newton step is no longe
 GOOD_DECREASE, DAMPING_FACTOR = 0.75, 10.0  # part of the decrease promised from which on the damping falls, and by how much
 MOST_REFUSED = 8  # steps one after another, before a fit is given up
 
-Loss: TypeAlias = Callable[[Residuals], Residuals] | None  # residuals whose squares are minimized, of plain ones
+Loss: TypeAlias = Callable[[Residuals], Residuals]  # residuals whose squares are minimized, of plain ones
+Report: TypeAlias = Callable[[str], None]  # is called with a text after each step
 History: TypeAlias = list[tuple[float, float]]  # cost, and largest change of an unknown by the next step: after each step
 
 
@@ -48,6 +49,11 @@ class LeastSquares(Protocol):
     """What is minimized: residuals and their Jacobian at B sets of K unknowns."""
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals: ...
+
+
+def squares(found: Residuals) -> Residuals:
+    """Return plain residuals: the loss of least squares."""
+    return found
 
 
 class Fit(NamedTuple):
@@ -68,8 +74,8 @@ def minimize_squares(
     settled: float = EXACT_STEP,
     undamped: bool = False,
     method: "optimistix.AbstractLeastSquaresSolver | None" = None,
-    loss: Loss = None,
-    report: Callable[[str], None] = lambda text: None,
+    loss: Loss = squares,
+    report: Report = lambda text: None,
 ) -> Fit:
     """Minimize r.r / 2 by Levenberg-Marquardt, or another `method`, from several first guesses.
 
@@ -82,7 +88,7 @@ def minimize_squares(
         settled: a fit has settled where its Gauss-Newton step is below this (dimensionless).
         undamped: whether the guesses are at a minimum, up to the tolerance of the integration.
         method: a least-squares solver of optimistix; by default Levenberg-Marquardt.
-        loss: transforms residuals and Jacobian into those whose squares are minimized; by default none.
+        loss: transforms residuals and Jacobian into those whose squares are minimized.
         report: is called with a text after each step.
     """
     sets, K = z.shape
@@ -98,8 +104,7 @@ def minimize_squares(
         asked = active[np.abs(trial[active]).max(1, initial=0.0) < FAR]
         costs, triangles = np.full(sets, np.inf), np.zeros((sets, K + 1, K + 1))
         if len(asked):
-            found = problem.evaluate(trial[asked], tol, horizon)
-            found = found if loss is None else loss(found)
+            found = loss(problem.evaluate(trial[asked], tol, horizon))
             for k, r, J, ok in zip(asked, found.r, found.J, found.ok, strict=True):
                 if ok:
                     costs[k], triangles[k] = 0.5 * r @ r, _triangular_factor(r, J)

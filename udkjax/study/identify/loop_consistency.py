@@ -26,7 +26,7 @@ from udkjax.scene.checks import quoted
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.directions import COEFFICIENT, connected, echelon, null_space, row_space
-from udkjax.study.identify.messages import listed, ratio
+from udkjax.study.wording import listed, ratio
 
 # Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions
 # that are closed to 1e-11 leave 5e-12 of it; a parameter that opens a loop leaves a tenth or more.

@@ -1,6 +1,7 @@
 """Methods and losses of a fit: least squares, plain or robust, and losses of the user's own by optimizers of scipy or optax."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, Union, cast
 
@@ -11,10 +12,21 @@ from jaxtyping import Array, Float, PyTree
 
 from udkjax.extras import OptionalImport
 from udkjax.study.identify.directions import INVISIBLE
-from udkjax.study.identify.least_squares import EXACT_STEP, FINE_STEP, STEPS, Fit, History, LeastSquares, Loss, minimize_squares
-from udkjax.study.identify.messages import IdentificationError
+from udkjax.study.identify.least_squares import (
+    EXACT_STEP,
+    FINE_STEP,
+    STEPS,
+    Fit,
+    History,
+    LeastSquares,
+    Loss,
+    Report,
+    minimize_squares,
+    squares,
+)
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Residuals
+from udkjax.study.identify.records import IdentificationError
 
 if TYPE_CHECKING:  # imported where a fit begins: it takes a second
     import optax
@@ -54,31 +66,49 @@ def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> Method:
     return GradientMethod(None, own_loss)
 
 
-def minimize(
-    problem: LeastSquares,
-    z: Float[np.ndarray, "B K"],
-    tol: Tolerances,
-    horizon: float | None = None,
-    steps: int = STEPS,
-    settled: float = EXACT_STEP,
-    undamped: bool = False,
-    method: Method = None,
-    loss: Loss = None,
-    report: Callable[[str], None] = lambda text: None,
-) -> Fit:
-    """Minimize from several first guesses by a method: see `minimize_squares`, whose arguments these are."""
-    if isinstance(method, GradientMethod):
-        return minimize_by_gradient(method, problem, z, tol, horizon, settled=settled, transform=loss, report=report)
-    return minimize_squares(problem, z, tol, horizon, steps, settled, undamped, method, loss, report)
+@dataclass(frozen=True)
+class Minimizer:
+    """How all fits of an identification are made.
+
+    Attributes:
+        method: a least-squares solver of optimistix, or an optimizer by gradients; None: Levenberg-Marquardt.
+        loss: transforms residuals and Jacobian into those whose squares are minimized.
+        report: is called with a text after each step.
+    """
+
+    method: Method = None
+    loss: Loss = squares
+    report: Report = lambda text: None
+
+    def minimize(
+        self,
+        problem: LeastSquares,
+        z: Float[np.ndarray, "B K"],
+        tol: Tolerances,
+        horizon: float | None = None,
+        steps: int = STEPS,
+        settled: float = EXACT_STEP,
+        undamped: bool = False,
+    ) -> Fit:
+        """Minimize from several first guesses: see `minimize_squares`, whose arguments these are."""
+        if isinstance(self.method, GradientMethod):
+            return minimize_by_gradient(
+                self.method, problem, z, tol, horizon, settled=settled, transform=self.loss, report=self.report
+            )
+        return minimize_squares(problem, z, tol, horizon, steps, settled, undamped, self.method, self.loss, self.report)
+
+    def labelled(self, what: str) -> "Minimizer":
+        """Return the same one, with reports that begin with what is fitted."""
+        return replace(self, report=lambda text: self.report(f"{what}: {text}"))
 
 
 # --- losses
 
 
 def named_loss(name: str, residuals: int) -> Loss:
-    """Return the loss of a name, for the first `residuals` of a problem: priors are not outliers. None: squares."""
+    """Return the loss of a name, for the first `residuals` of a problem: priors are not outliers."""
     if name == "least_squares":
-        return None
+        return squares
     if name == "huber":
         return partial(huber, residuals=residuals)
     raise IdentificationError([f"loss must be 'least_squares' or 'huber', is {name!r}"])
@@ -121,15 +151,24 @@ def minimize_by_gradient(
     horizon: float | None = None,
     steps: int = GRADIENT_STEPS,
     settled: float = FINE_STEP,
-    transform: Loss = None,
-    report: Callable[[str], None] = lambda text: None,
+    transform: Loss = squares,
+    report: Report = lambda text: None,
 ) -> Fit:
     """Minimize a loss rho(r) by an optimizer that knows its gradient J^T d rho / dr, from guesses one after another.
 
     A fit has settled where (J^T J)^-1 J^T d rho / dr is small, but no smaller than first-order methods come. Derivatives are
     taken forward here too: in reverse mode a gradient costs a fifth of it with 20 unknowns, but takes 20 to 40 s to compile.
 
-    Args: see `minimize`; `transform` is its `loss`.
+    Args:
+        method: the optimizer and the loss.
+        problem: whose residuals they are of.
+        z: B first guesses.
+        tol: tolerances of the integration.
+        horizon: the part of each record that is fitted; None: all of it.
+        steps: how many at most.
+        settled: a fit has settled where its Gauss-Newton step is below this (dimensionless).
+        transform: residuals that the loss is of, of plain ones.
+        report: is called with a text after each step.
     """
     settled = max(settled, FINE_STEP)
     walks = [_LossAlongWalk(problem, tol, horizon, method.loss or _half_square, transform, settled, report) for _ in z]
@@ -190,7 +229,7 @@ class _LossAlongWalk:
         rho: UserLoss,
         transform: Loss,
         settled: float,
-        report: Callable[[str], None],
+        report: Report,
     ):
         self.problem, self.tol, self.horizon, self.transform = problem, tol, horizon, transform
         self.settled, self.report = settled, report
@@ -225,8 +264,7 @@ class _LossAlongWalk:
 
     @jax.disable_jit(False)
     def _computed(self, z: tuple[float, ...]) -> _LossPoint:
-        found = self.problem.evaluate(np.array([z]), self.tol, self.horizon)
-        found = found if self.transform is None else self.transform(found)
+        found = self.transform(self.problem.evaluate(np.array([z]), self.tol, self.horizon))
         if not found.ok[0]:
             return _LossPoint(self.worst, np.zeros(len(z)), np.inf)
         value, slope = self.value_and_slope(jnp.asarray(found.r[0]))

@@ -24,7 +24,7 @@ from udkjax.integrate.solvers import forward_mode
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure
 from udkjax.study.channels import Channel, Quantity
-from udkjax.study.identify.parameters import Target, apply_values
+from udkjax.study.identify.unknowns import Target, apply_values
 from udkjax.study.machine import CHUNKED, MEMBERS, cores
 
 # Tolerances of the integration, relative and absolute: of final estimates (parameters are known to that much where there is no

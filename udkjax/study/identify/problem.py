@@ -7,7 +7,7 @@ With y what is measured, yhat(z) what the mechanism with the unknowns z would sh
 followed by (x - mean) / sigma of each prior. Every number y that is there is one residual; the order is record, time, channel.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -20,12 +20,11 @@ from udkjax.integrate.solution import Result
 from udkjax.scene.checks import quoted
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.parameters import parameters_of, split
-from udkjax.study.channels import Channel, Quantity, channel_of
+from udkjax.study.channels import Quantity, channel_of
 from udkjax.study.identify.initial_states import initial_state_unknowns
-from udkjax.study.identify.messages import IdentificationError
-from udkjax.study.identify.parameters import Unknowns
-from udkjax.study.identify.prediction import Members, Predictor, Tolerances
-from udkjax.study.identify.records import Key, Record
+from udkjax.study.identify.prediction import Members, Prediction, Predictor, Tolerances
+from udkjax.study.identify.records import IdentificationError, Key, Record
+from udkjax.study.identify.unknowns import Unknowns
 
 PADDING = 1e-9  # of the length of a record: the distance of the times that pad it; so short a step costs nothing
 STILL = 1e-12  # of the largest number in a channel: with a smaller deviation the channel does not move
@@ -45,16 +44,28 @@ class Residuals(NamedTuple):
         return (self.code == Result.successful) & np.isfinite(self.r).all(1) & np.isfinite(self.J).all((1, 2))
 
 
+class Runs(NamedTuple):
+    """The N runs that show what was measured, each a record or a piece of one: what `Members` holds of them."""
+
+    ts: Float[np.ndarray, "N T"]
+    q: Float[np.ndarray, "N bodies 3"] | None
+    v: Float[np.ndarray, "N bodies 3"] | None
+    bases: Float[np.ndarray, "N 2 n S"]
+    conditions: Mapping[str, np.ndarray]
+
+
 class Problem:
     """What is to be minimized, as a function of the unknowns z (K,): P of parameters, then those of initial states.
 
     Attributes:
+        ts: times (records, times) of the records, from their beginning on (s).
         y: measured values (records, times, channels), not a number where nothing was measured.
         present: where there is a value; `index` (R, 3) is the record, time and channel of each of these R residuals.
         sigma: standard deviations (R,) that residuals are divided by; `noise_given` (R,) says which of them were given.
         channel_scale: the size of what each channel shows (C,).
-        columns: where in z the unknowns of the initial state of each record are (records, S), -1 where it has none; `bases`
-            (records, 2, n, S) are the changes of q and v (n,) by each of them.
+        runs: what is simulated; `run` and `time` (R,) are the run and the place in its times that each residual is of.
+        columns: where in z the unknowns of the initial state of each run are (N, S), -1 where it has none.
+        beginnings: the run that each record begins with (records,).
         priors: which parameters have a prior; their residuals follow the R.
         predictor: computes what the channels show, and counts evaluations.
     """
@@ -66,46 +77,40 @@ class Problem:
         self, mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any] | None = None
     ):
         self.mechanism, self.unknowns, self.records = mechanism, unknowns, tuple(records)
-        self.channels = _channels(mechanism, self.records)
+        keys = list(dict.fromkeys(key for record in self.records for key in record.values))
+        self.channels = tuple(key if isinstance(key, Quantity) else channel_of(mechanism, key) for key in keys)
         self.channel_names = tuple(channel.name for channel in self.channels)
-        self.initial_states, self.columns, self.bases = initial_state_unknowns(mechanism, unknowns, self.records)
-        self.K = len(unknowns.names) + sum(len(state.names) for state in self.initial_states)
-        self._tabulate()
-        self._conditions = _conditions(mechanism, self.records)
+        self.initial_states, self.columns, bases = initial_state_unknowns(mechanism, unknowns, self.records)
+        self.all_names = (*unknowns.names, *(name for state in self.initial_states for name in state.names))
+        self.all_units = (*unknowns.units, *(unit for state in self.initial_states for unit in state.units))
+        self.K = len(self.all_names)
+        self._tabulate(keys)
+        self.run, self.time, _ = self.index.T
+        self.runs = Runs(self.ts, *_guessed_states(mechanism, self.records), bases, _conditions(mechanism, self.records))
+        self.beginnings = np.arange(len(self.records))
         self.priors = np.flatnonzero(np.isfinite(unknowns.sigma))
         self.extra_rows = len(self.priors)
-        self.predictor = Predictor(
-            mechanism, unknowns.targets, self.channels, {"analysis": analyse(mechanism), **(settings or {})}
-        )
+        self.settings = {"analysis": analyse(mechanism), **(settings or {})}
+        self.predictor = Predictor(mechanism, unknowns.targets, self.channels, self.settings)
 
-    @property
-    def all_names(self) -> tuple[str, ...]:
-        """Names of all K unknowns."""
-        return (*self.unknowns.names, *(name for state in self.initial_states for name in state.names))
-
-    @property
-    def all_units(self) -> tuple[str, ...]:
-        """Units of all K unknowns."""
-        return (*self.unknowns.units, *(unit for state in self.initial_states for unit in state.units))
-
-    def _tabulate(self) -> None:
+    def _tabulate(self, keys: Sequence[Key]) -> None:
         """Arrange all records in tables of one length; shorter ones are padded with times at which nothing was measured."""
         tables = [_with_start(record) for record in self.records]
         length = max(2, *(len(ts) for ts, _ in tables))
         self.ts = np.stack([_padded(ts, length) for ts, _ in tables])
-        shape = len(self.records), length, len(self.channels)
+        shape = len(self.records), length, len(keys)
         self.y, sigma = np.full(shape, np.nan), np.full(shape, np.nan)
         for r, (record, (ts, first)) in enumerate(zip(self.records, tables, strict=True)):
-            for text, values in record.values.items():
-                c = self.channel_names.index(_channel(self.mechanism, text).name)
-                self.y[r, first : len(ts), c] = values
-                noise = record.noise[text]
-                sigma[r, first : len(ts), c] = np.nan if noise is None else noise
+            for key, values in record.values.items():
+                place = r, slice(first, len(ts)), keys.index(key)
+                self.y[place] = values
+                if (noise := record.noise[key]) is not None:
+                    sigma[place] = noise
         self.present = np.isfinite(self.y)
         self.noise_given = np.isfinite(sigma)[self.present]
         self.channel_scale = np.array([_size_of(self.y[:, :, c]) for c in range(shape[2])])
         self.sigma = np.where(np.isfinite(sigma), sigma, self.channel_scale)[self.present]
-        self.index = np.argwhere(self.present)  # (R, 3): record, time, channel of each residual
+        self.index = np.argwhere(self.present)
 
     def series(self) -> list[np.ndarray]:
         """Return which residuals belong to one channel of one record, in the order of time: for each that has some."""
@@ -125,25 +130,23 @@ class Problem:
         full[self.present] = rows
         found = []
         for k, record in enumerate(self.records):
-            first = 0 if record.t0 == record.times[0] else 1
-            part = full[k, first : first + len(record.times)]
+            ts, first = _with_start(record)
+            part = full[k, first : len(ts)]
             found.append({name: part[:, c] for c, name in enumerate(self.channel_names) if np.isfinite(part[:, c]).any()})
         return tuple(found)
 
     def members(self, z: Float[np.ndarray, "B K"], horizon: float | None = None) -> Members:
-        """Return the members of B sets of unknowns: all records of the first, then of the next."""
-        sets, P, records = len(z), len(self.unknowns.names), len(self.records)
-        x = np.repeat(self.unknowns.values(z[:, :P]), records, axis=0)
-        shift = np.where(self.columns < 0, 0.0, z[:, self.columns])
-        ts = self.ts if horizon is None else np.stack([_until(ts, horizon) for ts in self.ts])
-        states = [record.start.state for record in self.records]
-        q = v = None
-        if any(state is not None for state in states):
-            own = State(self.mechanism.q0, self.mechanism.v0)
-            q, v = (np.stack([np.asarray(getattr(own if state is None else state, part)) for state in states]) for part in "qv")
-        same = ts, q, v, self.bases, self._conditions
-        tiled = jax.tree.map(lambda leaf: np.tile(leaf, (sets, *[1] * (np.ndim(leaf) - 1))), same)
-        return Members(x, shift.reshape(sets * records, self.columns.shape[1]), *tiled)
+        """Return the members of B sets of unknowns: all runs of the first, then of the next."""
+        sets, (N, S) = len(z), self.columns.shape
+        x = np.repeat(self.unknowns.values(z[:, : len(self.unknowns.names)]), N, axis=0)
+        shift = np.where(self.columns < 0, 0.0, z[:, self.columns]).reshape(sets * N, S)
+        runs = np.tile(np.arange(N), sets)
+        found = self.members_of(runs, x, shift)
+        return found if horizon is None else found._replace(ts=np.stack([_until(ts, horizon) for ts in self.runs.ts])[runs])
+
+    def members_of(self, runs: Int[np.ndarray, "M"], x: Float[np.ndarray, "M P"], shift: Float[np.ndarray, "M S"]) -> Members:
+        """Return the members of some runs, with these parameters and unknowns of their initial states."""
+        return Members(x, shift, *jax.tree.map(lambda leaf: leaf[runs], self.runs))
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
         """Compute residuals and their Jacobian.
@@ -153,37 +156,37 @@ class Problem:
             tol: tolerances of the integration.
             horizon: the part of each record (0 to 1) that counts; residuals beyond it are zero. None: all of it.
         """
-        sets, records = len(z), len(self.records)
         found = self.predictor(self.members(z, horizon), tol)
-        y = found.y.reshape(sets, records, *found.y.shape[1:])
-        dy = found.dy.reshape(sets, records, *found.dy.shape[1:])
-        r = (y[:, self.present] - self.y[self.present]) / self.sigma
-        record = self.index[:, 0]
-        J = self.by_unknowns(dy[:, self.present] / self.sigma[:, None], record, z)
+        found = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), found)
+        at = self.run, self.time, self.index[:, 2]
+        r = (found.y[:, *at] - self.y[self.present]) / self.sigma
+        J = self.by_unknowns(found.dy[:, *at] / self.sigma[:, None], self.run, z)
         if horizon is not None:
-            beyond = self.ts[tuple(self.index[:, :2].T)] > _end(self.ts[record], horizon)
+            record, time, _ = self.index.T
+            beyond = self.ts[record, time] > _end(self.ts[record], horizon)
             r[:, beyond], J[:, beyond] = 0.0, 0.0
-        code = found.code.reshape(sets, records).max(1)
-        return Residuals(*self.with_priors(z, r, J), code)
+        for more_r, more_J in self.further_rows(found, z):
+            r, J = np.concatenate([r, more_r], axis=1), np.concatenate([J, more_J], axis=1)
+        return Residuals(r, J, found.code.max(1))
 
-    def by_unknowns(self, by: np.ndarray, owner: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Return derivatives by x and by the state of each row's owner, (B, R, P + S), as derivatives by z, (B, R, K)."""
+    def further_rows(self, found: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Iterate over residuals, with Jacobians, that follow those of what was measured: of priors, (x - mean) / sigma."""
+        which, u = self.priors, self.unknowns
+        if not len(which):
+            return
+        z = z[:, : len(u.names)]
+        J = np.zeros((len(z), len(which), self.K))
+        J[:, np.arange(len(which)), which] = u.dx_dz(z)[:, which] / u.sigma[which]
+        yield (u.values(z)[:, which] - u.mean[which]) / u.sigma[which], J
+
+    def by_unknowns(self, by: np.ndarray, run: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Return derivatives by x and by the state of each row's run, (B, R, P + S), as derivatives by z, (B, R, K)."""
         P = len(self.unknowns.names)
         J = np.zeros((*by.shape[:2], self.K + 1))  # the last column takes the derivatives by what is no unknown
-        columns = self.columns[owner] % (self.K + 1)
+        columns = self.columns[run] % (self.K + 1)
         np.put_along_axis(J, np.broadcast_to(columns, (len(z), *columns.shape)), by[..., P:], 2)
         J[..., :P] = by[..., :P] * self.unknowns.dx_dz(z[:, :P])[:, None]
         return J[..., : self.K]
-
-    def with_priors(self, z: np.ndarray, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Append the residuals and the Jacobian of the priors, (x - mean) / sigma."""
-        which, P, u = self.priors, len(self.unknowns.names), self.unknowns
-        if not len(which):
-            return r, J
-        x, dx_dz = u.values(z[:, :P])[:, which], u.dx_dz(z[:, :P])[:, which]
-        more = np.zeros((len(z), len(which), J.shape[2]))
-        more[:, np.arange(len(which)), which] = dx_dz / u.sigma[which]
-        return np.concatenate([r, (x - u.mean[which]) / u.sigma[which]], 1), np.concatenate([J, more], 1)
 
 
 def _size_of(values: np.ndarray) -> float:
@@ -214,29 +217,14 @@ def _until(ts: np.ndarray, horizon: float) -> np.ndarray:
     return _padded(ts[: last + 1], len(ts))
 
 
-def _channels(mechanism: Mechanism, records: Sequence[Record]) -> tuple[Channel | Quantity, ...]:
-    found: dict[str, Channel | Quantity] = {}
-    problems = []
-    for record in records:
-        own: dict[str, Key] = {}
-        for text in record.values:
-            try:
-                channel = _channel(mechanism, text)
-            except ValueError as problem:
-                problems.append(f"{record.place}{problem}")
-                continue
-            name = channel.name
-            if name in own:
-                problems.append(f"{record.place}{quoted(str(text))} and {quoted(str(own[name]))} are the same channel")
-            own[name] = text
-            found.setdefault(name, channel)
-    if problems:
-        raise IdentificationError(problems)
-    return tuple(found.values())
-
-
-def _channel(mechanism: Mechanism, given: Key) -> Channel | Quantity:
-    return given if isinstance(given, Quantity) else channel_of(mechanism, given)
+def _guessed_states(mechanism: Mechanism, records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+    """Return q and v (records, bodies, 3) from which initial states are closed; None where all are the scene's own."""
+    states = [record.start.state for record in records]
+    if all(state is None for state in states):
+        return None, None
+    own = State(mechanism.q0, mechanism.v0)
+    q, v = (np.stack([np.asarray(getattr(state or own, part)) for state in states]) for part in "qv")
+    return q, v
 
 
 def _conditions(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np.ndarray]:

@@ -17,10 +17,10 @@ from jaxtyping import Float
 from scipy.special import chdtri, fdtri
 
 from udkjax.study.identify.least_squares import FINE_STEP, LeastSquares, Loss, minimize_squares
-from udkjax.study.identify.parameters import FAR, Unknowns
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Residuals
 from udkjax.study.identify.uncertainty import Uncertainty
+from udkjax.study.identify.unknowns import FAR, Unknowns
 
 CONFIDENCE = 0.95
 STEPS_TO_END = 4.0  # from the estimate to the end of the interval, where the curve is a straight line
@@ -129,7 +129,7 @@ def profile_likelihood(
 
 def cost_of(found: Residuals, loss: Loss) -> float:
     """Return r.r / 2 of the first set of unknowns."""
-    r = (found if loss is None else loss(found)).r[0]
+    r = loss(found).r[0]
     return float(0.5 * r @ r)
 
 

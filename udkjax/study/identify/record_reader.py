@@ -13,8 +13,7 @@ from udkjax.extras import OptionalImport
 from udkjax.scene.checks import quoted, shown, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Channel, Quantity, channel_of
-from udkjax.study.identify.messages import IdentificationError
-from udkjax.study.identify.records import Key, Noise, Record, key_of
+from udkjax.study.identify.records import IdentificationError, Key, Noise, Record, key_of
 from udkjax.study.identify.tables import (
     NOISE,
     RECORD,
@@ -32,14 +31,14 @@ if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tab
     import pandas
     import xarray
 
-    OneTable: TypeAlias = Record | Mapping[Any, Any] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]
-    Data: TypeAlias = OneTable | Sequence[OneTable]
+OneTable: TypeAlias = "Record | Mapping[Any, Any] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]"
+Data: TypeAlias = "OneTable | Sequence[OneTable]"
 MOST_SHOWN = 3  # mistakes of one kind in a column; the others are counted
 ByChannel: TypeAlias = dict[Key, np.ndarray]
 
 
 def records_of(
-    mechanism: Mechanism, data: "Data", noise: Noise = None, ignore: Sequence[str] = (), quantities: Sequence[Quantity] = ()
+    mechanism: Mechanism, data: Data, noise: Noise = None, ignore: Sequence[str] = (), quantities: Sequence[Quantity] = ()
 ) -> tuple[Record, ...]:
     """Read data into records, in SI units, their channels named as `channel_of` names them.
 
@@ -230,7 +229,7 @@ class _DataReader:
         self.mechanism, self.ignore, self.quantities = mechanism, ignore, quantities
         self.problems: list[str] = []
 
-    def read(self, data: "Data", source: str) -> Iterator[Record]:
+    def read(self, data: Data, source: str) -> Iterator[Record]:
         """Iterate over the records in anything that holds some."""
         if isinstance(data, Record):
             yield data
@@ -241,7 +240,7 @@ class _DataReader:
             for table in self.tables(data, source):
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
-    def tables(self, data: "Data", source: str) -> Iterator[Table]:
+    def tables(self, data: Data, source: str) -> Iterator[Table]:
         """Iterate over the tables of one file or object."""
         bodies = self.mechanism.body_names
         if isinstance(data, str | os.PathLike):

@@ -10,13 +10,18 @@ from numpy.typing import ArrayLike
 
 from udkjax.deprecation import renamed_arguments
 from udkjax.integrate.assembly import State
-from udkjax.scene.checks import quoted
+from udkjax.scene.checks import Mistakes, quoted
 from udkjax.study.channels import Quantity
-from udkjax.study.identify.messages import IdentificationError
 
 Estimated = Literal["nothing", "position", "velocity", "both"]
 Key: TypeAlias = str | Quantity  # channels go by their names, a user's own by itself
 Noise: TypeAlias = Mapping[Any, ArrayLike | None] | float | None  # standard deviations by channel, or of all channels
+
+
+class IdentificationError(Mistakes):
+    """Data, parameters or settings do not fit the mechanism, or each other. `problems` lists every mistake, with its place."""
+
+    of = "identification"
 
 
 @dataclass(frozen=True, eq=False)

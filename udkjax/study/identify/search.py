@@ -6,21 +6,19 @@ record, each time from where it was; and where that fails too, from other guesse
 of chaotic motion: see `shooting`.
 """
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, SOME_STEPS, STEPS, Fit, History, Loss
-from udkjax.study.identify.optimizer import Method, minimize
-from udkjax.study.identify.parameters import Unknowns
+from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, SOME_STEPS, STEPS, Fit, History
+from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import LOOSE, MEDIUM, Tolerances
 from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem
 from udkjax.study.identify.shooting import PieceFailed, fit_pieces
+from udkjax.study.identify.unknowns import sample_guesses
 
 N_STARTS = 15  # guesses besides the first, where it does not lead to a fit
-GUESS_RADIUS = 0.5  # of a value: how far they are from the first
 MOST_PIECEWISE = 4  # guesses from which the records are fitted in pieces
 PART_GROWTH = 2.0  # from one part of the records that is fitted to the next
 CHAOTIC_GROWTH = 100.0  # of derivatives, from the first halves of records to the second: t^2 makes 4 of it
@@ -30,7 +28,6 @@ WHITE_CORRELATION = 4.0  # standard deviations of the correlation of neighbours,
 SAME_MINIMUM = 1e-4  # of an unknown: fits this near are at one minimum
 
 Strategy = Literal["auto", "pieces"]
-Report: TypeAlias = Callable[[str], None]
 
 
 class SearchResult(NamedTuple):
@@ -48,12 +45,10 @@ def search(
     problem: Problem,
     z: Float[np.ndarray, "B K"],
     tol: Tolerances,
+    minimizer: Minimizer,
     more: int = N_STARTS,
     seed: int = 0,
-    report: Report = lambda text: None,
     strategy: Strategy = "auto",
-    method: Method = None,
-    loss: Loss = None,
 ) -> SearchResult:
     """Find the unknowns that explain the records best.
 
@@ -63,31 +58,29 @@ def search(
         problem: whose records are fitted.
         z: first guesses.
         tol: tolerances of the integration at the end; on the way it is looser.
+        minimizer: how each fit is made.
         more: how many guesses beside the first may be tried where the given ones do not lead to a fit.
         seed: of these guesses.
-        report: is called with a text after each step.
         strategy: "pieces" cuts the records into pieces at once.
-        method, loss: see `minimize_squares`.
     """
-    choices = {"method": method, "loss": loss}
     loose = max(tol[0], LOOSE), max(tol[1], LOOSE)
     if strategy == "pieces":
-        along = fit_growing_parts(problem, z, loose, report, **choices)
-        if found := fit_in_pieces(problem, np.concatenate([along.z, z]), tol, report, **choices):
+        along = fit_growing_parts(problem, z, loose, minimizer)
+        if found := fit_in_pieces(problem, np.concatenate([along.z, z]), tol, minimizer):
             return found._replace(history=along.history + found.history)
-    ways, history, tried = ["whole records"], [], [z]
-    fit = minimize(problem, z, loose, None, SOME_STEPS, LOOSE_STEP, report=_prefixed(report, "whole records"), **choices)
-    history += fit.history
+    ways, tried = ["whole records"], [z]
+    fit = minimizer.labelled("whole records").minimize(problem, z, loose, None, SOME_STEPS, LOOSE_STEP)
+    history = list(fit.history)
     if not explains(problem, fit, loose):
         ways.append("growing records")
-        other = fit_growing_parts(problem, z, loose, report, **choices)
+        other = fit_growing_parts(problem, z, loose, minimizer)
         history += other.history
         tried = [other.z, z]
         fit = _better_of_each(fit, other)
     if more and not explains(problem, fit, loose):
         ways.append(f"{more} more first guesses")
         guesses = sample_guesses(problem.unknowns, z[0], more, seed)
-        other = fit_growing_parts(problem, guesses, loose, report, **choices)
+        other = fit_growing_parts(problem, guesses, loose, minimizer)
         history += other.history
         z = np.concatenate([z, guesses])
         tried.append(other.z)
@@ -98,15 +91,13 @@ def search(
     only = Fit(fit.z[best : best + 1], fit.cost[best : best + 1], fit.settled[best : best + 1], fit.history)
     lost = 2 * agreeing < len(z) or is_chaotic(problem, only.z, loose)  # else the mechanism does not move like that
     if more and lost and not explains(problem, only, loose):
-        found = fit_in_pieces(problem, np.concatenate(tried), tol, report, **choices)
+        found = fit_in_pieces(problem, np.concatenate(tried), tol, minimizer)
         if found:
             return found._replace(guesses=len(z), ways=(*ways, *found.ways), history=history + found.history)
     return SearchResult(only, agreeing, len(z), tuple(ways), history, problem)
 
 
-def fit_in_pieces(
-    problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, report: Report, method: Method = None, loss: Loss = None
-) -> SearchResult | None:
+def fit_in_pieces(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, minimizer: Minimizer) -> SearchResult | None:
     """Fit the records in pieces, from the most promising guesses until one explains them; None: none does.
 
     Where the motion is not so chaotic that whole records are beyond the errors of their integration, the fit is of these.
@@ -114,17 +105,15 @@ def fit_in_pieces(
     loose = max(tol[0], MEDIUM), max(tol[1], MEDIUM)
     for k, guess in enumerate(rank_guesses(problem, z, loose)[:MOST_PIECEWISE]):
         try:
-            pieces, fit = fit_pieces(problem, guess, loose, report=report, method=method, loss=loss)
+            pieces, fit = fit_pieces(problem, guess, loose, minimizer)
         except PieceFailed:
             continue
         if explains(pieces, fit, loose):
-            history = fit.history
-            found = SearchResult(fit, 1, k + 1, ("records in pieces",), history, pieces)
-            say = _prefixed(report, "whole records")
+            found = SearchResult(fit, 1, k + 1, ("records in pieces",), fit.history, pieces)
             along = fit.z[:, : problem.K]
-            whole = minimize(problem, along, tol, None, SOME_STEPS, LOOSE_STEP, True, method, loss, say)
+            whole = minimizer.labelled("whole records").minimize(problem, along, tol, None, SOME_STEPS, LOOSE_STEP, True)
             if explains(problem, whole, tol):
-                return found._replace(fit=whole, history=history + whole.history, problem=problem)
+                return found._replace(fit=whole, history=fit.history + whole.history, problem=problem)
             return found
     return None
 
@@ -145,18 +134,15 @@ def rank_guesses(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances)
     return z[np.argsort(np.nan_to_num(np.sum(logs, axis=0), nan=np.inf), kind="stable")]
 
 
-def fit_growing_parts(
-    problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, report: Report, method: Method = None, loss: Loss = None
-) -> Fit:
+def fit_growing_parts(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, minimizer: Minimizer) -> Fit:
     """Fit more and more of the records, each time from where the fits of the part before have ended."""
-    parts = horizons(problem)
     history: History = []
-    for part in parts[:-1]:
-        say = _prefixed(report, f"{part:.0%} of the records")
-        fit = minimize(problem, z, tol, part, FEW_STEPS, COARSE_STEP, False, method, loss, say)
+    for part in horizons(problem)[:-1]:
+        one = minimizer.labelled(f"{part:.0%} of the records")
+        fit = one.minimize(problem, z, tol, part, FEW_STEPS, COARSE_STEP)
         z = np.where(np.isfinite(fit.cost)[:, None], fit.z, z)
         history += fit.history
-    fit = minimize(problem, z, tol, None, STEPS, LOOSE_STEP, False, method, loss, _prefixed(report, "whole records"))
+    fit = minimizer.labelled("whole records").minimize(problem, z, tol, None, STEPS, LOOSE_STEP)
     return fit._replace(history=history + fit.history)
 
 
@@ -169,24 +155,6 @@ def horizons(problem: Problem) -> list[float]:
     first = max(float(passed[enough]), 1e-6)
     count = max(0, int(np.ceil(np.log(1.0 / first) / np.log(PART_GROWTH))))
     return [PART_GROWTH ** (k - count) for k in range(count)] + [1.0]
-
-
-def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int) -> Float[np.ndarray, "B K"]:
-    """Sample guesses beside a first one: each parameter within a half of its value, or anywhere between its bounds.
-
-    Unknowns of initial states, which come after the parameters, are moved by a little.
-    """
-    from scipy.stats import qmc  # here: it takes a second
-
-    P = len(u.names)
-    unit = qmc.Sobol(len(z), rng=seed).random(1 << max(0, int(np.ceil(np.log2(count)))))[:count]
-    x0 = u.values(z[None, :P])[0]
-    bounded = np.array([kind == "bounded" for kind in u.kinds])
-    size = np.where([kind == "positive" for kind in u.kinds], x0, u.scale)
-    low, high = np.where(bounded, u.low, x0 - GUESS_RADIUS * size), np.where(bounded, u.high, x0 + GUESS_RADIUS * size)
-    inside = 0.02 + 0.96 * unit[:, :P]  # bounds themselves are infinitely far
-    starts = z[P:] + 0.1 * (unit[:, P:] - 0.5)
-    return np.concatenate([u.z_of(low + (high - low) * inside), starts], axis=1)
 
 
 def explains(problem: Problem, fit: Fit, tol: Tolerances) -> bool:
@@ -223,7 +191,3 @@ def _concatenated(one: Fit, two: Fit) -> Fit:
     """Return fits from some guesses, then those from others."""
     z, cost, settled = (np.concatenate(pair) for pair in zip(one[:3], two[:3], strict=True))
     return Fit(z, cost, settled, one.history)
-
-
-def _prefixed(report: Report, what: str) -> Report:
-    return lambda text: report(f"{what}: {text}")

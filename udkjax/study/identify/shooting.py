@@ -12,9 +12,7 @@ H. G. Bock, Recent advances in parameter identification techniques for ODE, 1983
 J. Kurths, Nonlinear dynamical system identification from uncertain and indirect measurements, 2004.
 """
 
-import copy
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -22,12 +20,12 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.integrate.assembly import State
-from udkjax.study.identify.initial_states import unknowns_of_state
-from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, FINE_STEP, SOME_STEPS, STEPS, Fit, Loss, minimize_squares
-from udkjax.study.identify.optimizer import Method, minimize
-from udkjax.study.identify.prediction import Members, Prediction, Predictor, Tolerances
-from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals
-from udkjax.study.identify.records import Record, Start
+from udkjax.study.identify.initial_states import InitialStateUnknowns, state_unknowns, with_conditions
+from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, FINE_STEP, SOME_STEPS, STEPS, Fit, minimize_squares
+from udkjax.study.identify.optimizer import Minimizer
+from udkjax.study.identify.prediction import Prediction, Predictor, Tolerances
+from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals, Runs
+from udkjax.study.identify.unknowns import apply_values
 
 MOST_PIECES = 60  # of all records: the algebra is that of dense matrices
 CONTINUED = 1e-2  # of the largest singular value: what a piece shows less of its initial state stays as the piece before leads to
@@ -52,72 +50,55 @@ class MultipleShooting(Problem):
     Attributes:
         whole: the problem that is cut.
         weight: w of the defects, over how far coordinates move in a piece.
-        pieces: N parts of records; `following` are those that another leads to.
+        pieces: N parts of records, which are the runs; `following` are those that another leads to.
         guess: the first guess (K,): pieces along the records.
+        scale: how far coordinates move in a piece (S,).
     """
 
     def __init__(self, whole: Problem, z: Float[np.ndarray, "K"], tol: Tolerances, samples: float = RESIDUALS_PER_UNKNOWN):
         """Cut the records, and find initial states of all pieces along them with the unknowns z of the whole problem."""
-        vars(self).update(vars(whole))
+        super().__init__(whole.mechanism, whole.unknowns, whole.records, whole.settings)
+        self.predictor = Predictor(whole.mechanism, whole.unknowns.targets, whole.channels, whole.settings, ends=True)
         self.whole, self.weight = whole, WEIGHTS[0]
-        free = unknowns_of_state(whole.mechanism, whole.unknowns, _with_free_state(whole.records[0]), "start")
+        first = whole.records[0]
+        free = self._unknowns_at(0, whole.unknowns.guess, first.t0, first.start.state)
         n, self.S = free.basis.shape[1:]
         self.pieces = cut_records(whole, max(samples * self.S, len(whole.index) / MOST_PIECES))
-        self.times, self.piece, self.time = _piece_tables(whole, self.pieces)
-        self.predictor = Predictor(whole.mechanism, whole.unknowns.targets, whole.channels, whole.predictor.settings, ends=True)
-        N = len(self.pieces)
-        self.following = np.array([p for p, piece in enumerate(self.pieces) if piece.first], int)
+        times, self.run, self.time = _piece_tables(whole, self.pieces)
+        records, N = np.array([piece.record for piece in self.pieces]), len(self.pieces)
+        self.beginnings = np.array([p for p, piece in enumerate(self.pieces) if not piece.first])
+        self.following = np.setdiff1d(np.arange(N), self.beginnings)
         self.constrained = len(self.following) * self.S
         self.K, self.extra_rows = whole.K + self.constrained, whole.extra_rows + self.constrained
-        self.columns = np.full((N, self.S), -1)
+        self.all_names += tuple(f"piece {p + 1}: {name}" for p in self.following for name in free.names)
+        self.all_units += free.units * len(self.following)
+        self.columns, bases = np.full((N, self.S), -1), np.zeros((N, 2, n, self.S))
+        S = whole.columns.shape[1]
+        self.columns[self.beginnings, :S], bases[self.beginnings, ..., :S] = whole.columns, whole.runs.bases
         self.columns[self.following] = whole.K + np.arange(self.constrained).reshape(-1, self.S)
-        self.more_names = tuple(f"piece {p + 1}: {name}" for p in self.following for name in free.names)
-        self.more_units = free.units * len(self.following)
-        self.q, self.v = np.zeros((2, N, n // 3, 3))
-        self.bases, self.inverse = np.zeros((N, 2, n, self.S)), np.zeros((N, self.S, 2 * n))
-        members = whole.members(z[None])
-        self.conditions = jax.tree.map(lambda leaf: leaf[[piece.record for piece in self.pieces]], members.conditions)
-        for p, piece in enumerate(self.pieces):
-            if not piece.first:
-                self._begin_with_record(p, members)
+        q, v, conditions = jax.tree.map(lambda leaf: leaf[records], (whole.runs.q, whole.runs.v, whole.runs.conditions))
+        if q is None:
+            q, v = (np.tile(np.asarray(part), (N, 1, 1)) for part in (self.mechanism.q0, self.mechanism.v0))
+        self.runs = Runs(times, q, v, bases, conditions)
+        self.inverse = np.zeros((N, self.S, 2 * n))
         self.guess, self.scale = self._guess_along(z, tol)
 
-    @property
-    def all_names(self) -> tuple[str, ...]:
-        """Names of all K unknowns."""
-        return (*self.whole.all_names, *self.more_names)
-
-    @property
-    def all_units(self) -> tuple[str, ...]:
-        """Units of all K unknowns."""
-        return (*self.whole.all_units, *self.more_units)
-
-    def members(self, z: Float[np.ndarray, "B K"], horizon: float | None = None) -> Members:
-        """Return members of the whole problem: the records from their beginning on."""
-        return self.whole.members(z[:, : self.whole.K], horizon)
-
-    def members_of(self, pieces: np.ndarray, x: np.ndarray, shift: np.ndarray) -> Members:
-        """Return the members of some pieces, with parameters x (M, P) and shifts of their initial states (M, S)."""
-        conditions = jax.tree.map(lambda leaf: leaf[pieces], self.conditions)
-        return Members(x, shift, self.times[pieces], self.q[pieces], self.v[pieces], self.bases[pieces], conditions)
-
-    def _begin_with_record(self, p: int, members: Members) -> None:
-        """Let the first piece of a record begin as the record does."""
-        k, mech = self.pieces[p].record, self.mechanism
-        self.q[p], self.v[p] = (mech.q0, mech.v0) if members.q is None or members.v is None else (members.q[k], members.v[k])
-        S = self.whole.columns.shape[1]
-        self.columns[p, :S], self.bases[p, ..., :S] = self.whole.columns[k], self.whole.bases[k]
+    def _unknowns_at(self, record: int, x: np.ndarray, t: float, guess: State | None) -> InitialStateUnknowns:
+        """Return the unknowns of a state of a record with parameters x, at a time beside a guess."""
+        mech = apply_values(with_conditions(self.mechanism, self.records[record]), self.unknowns.targets, x)
+        return state_unknowns(mech, t, guess, "both", "start")
 
     def _begin_at(self, p: int, state: np.ndarray, x: np.ndarray) -> None:
         """Let a piece begin beside a closed state (2, n)."""
-        record = _with_free_state(self.records[self.pieces[p].record], State(*state.reshape(2, -1, 3)), self.times[p, 0])
-        basis = unknowns_of_state(self.mechanism, dataclasses.replace(self.unknowns, guess=x), record, "start").basis
-        self.bases[p], self.inverse[p] = basis, np.linalg.pinv(basis.reshape(-1, self.S))
-        self.q[p], self.v[p] = state.reshape(2, -1, 3)
+        q, v = state.reshape(2, -1, 3)
+        basis = self._unknowns_at(self.pieces[p].record, x, float(self.runs.ts[p, 0]), State(q, v)).basis
+        self.runs.bases[p], self.inverse[p] = basis, np.linalg.pinv(basis.reshape(-1, self.S))
+        assert self.runs.q is not None and self.runs.v is not None
+        self.runs.q[p], self.runs.v[p] = q, v
         for _ in range(2):  # what the values of parameters will move the guess by is taken off before
             found = self.predictor.guess(self.members_of(np.array([p]), x[None], np.zeros((1, self.S))), 0)
-            self.q[p] += state[0].reshape(-1, 3) - found.q
-            self.v[p] += state[1].reshape(-1, 3) - found.v
+            self.runs.q[p] += q - found.q
+            self.runs.v[p] += v - found.v
 
     def _guess_along(self, z: np.ndarray, tol: Tolerances) -> tuple[np.ndarray, np.ndarray]:
         """Find initial states of the pieces one after another, and how far the coordinates move in a piece (S,).
@@ -129,8 +110,7 @@ class MultipleShooting(Problem):
         found, moved = np.concatenate([z, np.zeros(self.K - len(z))]), []
         ends = np.zeros((2, 2, 0))
         for p, piece in enumerate(self.pieces):
-            state = _InitialStateOfPiece(self, p, x)
-            columns = self.columns[p]
+            state, columns = _InitialStateOfPiece(self, p, x), self.columns[p]
             if piece.first:
                 self._begin_at(p, ends[1], x)  # the piece before is of the same record
                 fit = minimize_squares(state, np.zeros((1, self.S)), tol, None, FEW_STEPS, COARSE_STEP)
@@ -143,29 +123,20 @@ class MultipleShooting(Problem):
         size = np.sqrt(np.mean(np.square(moved), axis=0)) if moved else np.ones(self.S)
         return found, np.maximum(size, LEAST_MOTION * size.max(initial=0.0))
 
-    def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
-        """Compute residuals and Jacobian: of all records, of priors, and of continuity, (F_p - s_{p+1}) / scale * weight."""
-        sets, P, N = len(z), len(self.unknowns.names), len(self.pieces)
-        x = np.repeat(self.unknowns.values(z[:, :P]), N, axis=0)
-        shift = np.where(self.columns < 0, 0.0, z[:, self.columns])
-        found = self.predictor(self.members_of(np.tile(np.arange(N), sets), x, shift.reshape(sets * N, self.S)), tol)
-        parts = map(np.asarray, (found.y, found.dy, found.ends, found.d_ends))
-        y, dy, ends, d_ends = (part.reshape(sets, N, *part.shape[1:]) for part in parts)
-        at = self.piece, self.time, self.index[:, 2]
-        rows = (y[:, *at] - self.y[self.present]) / self.sigma
-        by = dy[:, *at] / self.sigma[:, None]
-        before, weight = self.following - 1, self._defect_weight / self.scale
-        gap = (ends[:, before, 1] - ends[:, self.following, 0]).reshape(sets, len(self.following), -1)
-        defects = np.einsum("psn,bpn->bps", self.inverse[self.following], gap) * weight
-        J_defects = 0.0
-        for sign, pieces, which in ((1.0, before, 1), (-1.0, self.following, 0)):
-            flat = d_ends[:, pieces, which].reshape(sets, len(self.following), -1, P + self.S)
-            by_both = sign * weight[:, None] * np.einsum("psn,bpnk->bpsk", self.inverse[self.following], flat)
-            J_defects = J_defects + self.by_unknowns(by_both.reshape(sets, -1, P + self.S), np.repeat(pieces, self.S), z)
-        J = self.by_unknowns(by, self.piece, z)
-        r, J = self.with_priors(z, rows, J)
-        code = found.code.reshape(sets, N).max(1)
-        return Residuals(np.concatenate([r, defects.reshape(sets, -1)], 1), np.concatenate([J, J_defects], 1), code)
+    def further_rows(self, found: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Iterate over the residuals of priors, and those of continuity, (F_p - s_{p+1}) / scale * weight."""
+        yield from super().further_rows(found, z)
+        sets, before, following = len(z), self.following - 1, self.following
+        ends, d_ends, inverse = np.asarray(found.ends), np.asarray(found.d_ends), self.inverse[following]
+        weight = self._defect_weight / self.scale
+        gap = (ends[:, before, 1] - ends[:, following, 0]).reshape(sets, len(following), -1)
+        defects = np.einsum("psn,bpn->bps", inverse, gap) * weight
+        J = 0.0
+        for sign, pieces, which in ((1.0, before, 1), (-1.0, following, 0)):
+            flat = d_ends[:, pieces, which].reshape(sets, len(following), -1, d_ends.shape[-1])
+            by_both = sign * weight[:, None] * np.einsum("psn,bpnk->bpsk", inverse, flat)
+            J = J + self.by_unknowns(by_both.reshape(sets, -1, d_ends.shape[-1]), np.repeat(pieces, self.S), z)
+        yield defects.reshape(sets, -1), np.asarray(J)
 
     @property
     def _defect_weight(self) -> float:
@@ -188,7 +159,7 @@ class _InitialStateOfPiece:
     def __init__(self, shooting: MultipleShooting, p: int, x: np.ndarray):
         self.shooting, self.p, self.x = shooting, p, x
         self.damping: float | None = None
-        self.rows = np.flatnonzero(shooting.piece == p)
+        self.rows = np.flatnonzero(shooting.run == p)
 
     def predict(self, shift: Float[np.ndarray, "B S"], tol: Tolerances) -> Prediction:
         """Predict the piece."""
@@ -212,10 +183,8 @@ def fit_pieces(
     problem: Problem,
     z: Float[np.ndarray, "K"],
     tol: Tolerances,
+    minimizer: Minimizer,
     samples: float = RESIDUALS_PER_UNKNOWN,
-    report: Callable[[str], None] = lambda text: None,
-    method: Method = None,
-    loss: Loss = None,
 ) -> tuple[MultipleShooting, Fit]:
     """Fit the records in pieces, from unknowns z of the problem.
 
@@ -223,8 +192,8 @@ def fit_pieces(
         problem: the whole problem.
         z: first guess (K,).
         tol: tolerances of the integration.
+        minimizer: how each fit is made.
         samples: residuals of a piece at least, per unknown of its initial state.
-        report, method, loss: see `minimize_squares`.
 
     Returns:
         The problem in pieces, and the fit of its unknowns.
@@ -236,11 +205,11 @@ def fit_pieces(
     fit, history = Fit(shooting.guess[None], np.full(1, np.inf), np.zeros(1, bool), []), []
     for weight in WEIGHTS:
         shooting.weight = weight
-        say = lambda text, w=weight: report(f"pieces held together by {w:.0e}: {text}")  # noqa: E731
+        one = minimizer.labelled(f"pieces held together by {weight:.0e}")
         steps, settled = (STEPS, FINE_STEP) if weight == WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
         # From one weight to the next the Gauss-Newton step is right, but for a few: these take damped ones.
         for undamped in (False,) if weight == WEIGHTS[0] else (True, False):
-            fit = minimize(shooting, fit.z, tol, None, steps, settled, undamped, method, loss, say)
+            fit = one.minimize(shooting, fit.z, tol, None, steps, settled, undamped)
             history += fit.history
             if fit.settled[0]:
                 break
@@ -278,11 +247,3 @@ def _piece_tables(problem: Problem, pieces: Sequence[Piece]) -> tuple[np.ndarray
         own_rows = (record == piece.record) & (time >= piece.first) & (time <= piece.end)  # the next takes back what is its own
         which[own_rows], at[own_rows] = p, np.where(time[own_rows] == piece.end, length - 1, time[own_rows] - piece.first)
     return np.stack(ts), which, at
-
-
-def _with_free_state(record: Record, state: State | None = None, t0: float | None = None) -> Record:
-    """Return a record whose whole initial state is to be estimated, from a state at another time."""
-    record = copy.copy(record)
-    record.start = Start(record.start.state if state is None else state, "both")
-    record.t0 = record.t0 if t0 is None else t0
-    return record

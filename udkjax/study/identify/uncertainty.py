@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from scipy.special import chdtr, chdtrc
 
 from udkjax.study.identify.directions import INVISIBLE, Direction, UnknownValues, describe, null_space, simplest_basis
-from udkjax.study.identify.messages import listed
+from udkjax.study.wording import listed
 
 POOR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
 CORRELATED = 0.98  # of two parameters: their difference is known ten times worse than their sum

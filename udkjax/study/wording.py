@@ -1,0 +1,30 @@
+"""How counts, lists and tables are worded in texts for people."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+MOST_LISTED = 8  # names in one sentence
+
+
+def plural(count: int, noun: str) -> str:
+    """Say how many there are."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as they stand in a sentence: "a, b and c"."""
+    if len(names) > MOST_LISTED:
+        return f"{', '.join(names[:MOST_LISTED])} and {len(names) - MOST_LISTED} more"
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def ratio(values: Sequence[float] | np.ndarray) -> str:
+    """Return numbers relative to the first, such as "1 : 2 : 0.5"."""
+    return " : ".join(f"{v / values[0]:.4g}" for v in values)
+
+
+def aligned(cells: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table, its columns below each other."""
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return ["  " + "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip() for row in cells]
