@@ -7,6 +7,7 @@ import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
 from udkjax.study.identify import prediction
 from udkjax.study.identify.identification import identify
+from udkjax.study.identify.initial_states import state_unknowns
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.search import horizons
@@ -291,3 +292,31 @@ def test_progress_is_that_of_every_other_function(measured, capsys):
     assert "identify: 00:0" in capsys.readouterr().err
     identify(pendulum(0.5, 0.15), data, NAMES, progress=False)
     assert capsys.readouterr() == ("", "")
+
+
+# --- initial states
+
+
+@pytest.mark.parametrize("metre", [1e-6, 1.0, 1e3])
+def test_initial_states_are_found_whatever_the_size(metre):
+    """A slider on a spring that begins a hundredth of its way farther out, and moving: the fit is the same at every size."""
+    k, m, x0, v0 = 30.0, 2.0, 0.31 * metre, 0.5 * metre
+    slider = udk.Body(mass=m, inertia=0.1 * metre**2, position=(1.3 * metre, 0.0))
+    rail = udk.Prismatic(("ground", "slider"), points=np.zeros((2, 2)), axis=0.0)
+    spring = udk.Spring(("ground", "slider"), points=np.zeros((2, 2)), stiffness=0.8 * k, length=metre)
+    first = udk.Mechanism({"slider": slider}, {"rail": rail}, forces={"spring": spring}, gravity=(0.0, 0.0))
+    ts, w = np.linspace(0.0, 2.0, 30), np.sqrt(k / m)
+    data = {"time": ts, "body.slider.x": metre + x0 * np.cos(w * ts) + v0 / w * np.sin(w * ts)}
+    estimate = found(first, data, ["force.spring.stiffness"], initial_state="both", noise=1e-3 * metre)
+    changes = [change / metre for change, _ in estimate.initial_state_values.values()]
+    assert estimate.success and len(estimate.history) < 12
+    assert [estimate.values[0], *changes] == pytest.approx([k, 0.01, 0.5], rel=1e-6)
+
+
+def test_the_states_of_large_scenes_have_coordinates_too():
+    chain = udk.library.chain(21)  # more elements than the analysis takes by dense matrices
+    unknowns = state_unknowns(chain, 0.0, None, "both", "start")
+    assert unknowns.names[::21] == ("start: body.link0.angle", "start: body.link0.omega") and len(unknowns.names) == 42
+    J = np.asarray(udk.equations.psi_q(chain, 0.0, chain.q0))
+    assert np.abs(J @ unknowns.basis[0, :, :21]).max() < 1e-12 * np.abs(J).max() * np.abs(unknowns.basis).max()
+    assert np.linalg.matrix_rank(unknowns.basis[0, :, :21]) == 21

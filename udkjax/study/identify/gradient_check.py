@@ -21,9 +21,9 @@ from jaxtyping import Bool, Float, Int
 from udkjax.deprecation import renamed_attributes
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.differences import DIFFERENCE_STEPS, Differences, differences, sizes
 from udkjax.study.identify import prediction
 from udkjax.study.identify.build_problem import build_problem
-from udkjax.study.identify.numerical_differences import DIFFERENCE_STEPS, Differences, differences, sizes
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import TIGHT, Tolerances
 from udkjax.study.identify.problem import Problem, Residuals

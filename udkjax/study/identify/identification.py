@@ -177,15 +177,15 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
     """Return the estimate of a fit."""
     problem = found.problem
     unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z[0]
-    x = unknowns.values(z[:P])
+    x, states = unknowns.values(z[:P]), problem.state_sizes * z[P:]
     plain = problem.evaluate(fit.z, tol)
     weighted = loss(plain)
     groups = problem.noise_groups()
     values = UnknownValues(
         problem.all_names,
         problem.all_units,
-        np.concatenate([x, z[P:]]),
-        np.concatenate([unknowns.dx_dz(z[:P]), np.ones(problem.K - P)]),
+        np.concatenate([x, states]),
+        np.concatenate([unknowns.dx_dz(z[:P]), problem.state_sizes]),
         (*unknowns.kinds, *["free"] * (problem.K - P)),
     )
     uncertainty, of_all = (
@@ -209,7 +209,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
         uncertainty=uncertainty,
         at_bounds=unknowns.at_bounds(x),
         initial_state_values={
-            name: (float(z[P + k]), float(of_all.standard_errors[P + k]))
+            name: (float(states[k]), float(of_all.standard_errors[P + k]))
             for k, name in enumerate(name for state in problem.initial_states for name in state.names)
         },
         predicted=problem.by_record(problem.y[problem.present] - left),

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udkjax.equations.dense_rows import KinematicRows
+from udkjax.equations.scales import known_scales
 from udkjax.integrate.assembly import State, assemble
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import SceneError, quoted
@@ -19,10 +20,14 @@ READABLE = 1e-3  # of the largest: how much of a free motion the coordinates tha
 
 
 class InitialStateUnknowns(NamedTuple):
-    """The unknowns of one initial state, which tied records share: how each of the S changes q and v (n,) of its guess."""
+    """The S unknowns of one initial state, which tied records share. They are dimensionless, over the scales of the scene.
+
+    `sizes` (S,) are changes of the named coordinates and rates by one of each, in `units`; `basis` those of all q and v (n,).
+    """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
+    sizes: Float[np.ndarray, "S"]
     basis: Float[np.ndarray, "2 n S"]
 
 
@@ -93,17 +98,21 @@ def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Es
         position = rows.close(t0, q)
         assert position is not None, "what has been assembled is closed"
         free = rows.metric[:, None] * position.vt[position.rank :].T
-    chosen = _independent_rows(free)
-    basis = free @ np.linalg.inv(free[chosen])
+    chosen, scales = _independent_rows(free), known_scales(mech)
+    size = np.where(np.array(chosen) % 3 == 2, 1.0, float(scales.length))  # angles are in rad
+    rate = float(scales.rate) or 1.0  # of what rests without any load, in 1/s
+    basis = free @ np.linalg.inv(free[chosen]) * size
     names: list[str] = []
     units: list[str] = []
-    parts, nothing = [], np.zeros_like(basis)
-    for what, fields, part in (("position", COORDINATES, (basis, nothing)), ("velocity", RATES, (nothing, basis))):
+    sizes, parts, nothing = [], [], np.zeros_like(basis)
+    kinds = ("position", COORDINATES, 1.0, (basis, nothing)), ("velocity", RATES, rate, (nothing, rate * basis))
+    for what, fields, factor, part in kinds:
         if estimate in (what, "both"):
+            sizes.append(factor * size)
             names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3]}" for k in chosen]
             units += [UNITS[fields[k % 3]] for k in chosen]
             parts.append(np.stack(part))
-    return InitialStateUnknowns(tuple(names), tuple(units), np.concatenate(parts, axis=2))
+    return InitialStateUnknowns(tuple(names), tuple(units), np.concatenate(sizes), np.concatenate(parts, axis=2))
 
 
 def _independent_rows(free: np.ndarray) -> list[int]:

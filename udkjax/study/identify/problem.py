@@ -64,6 +64,7 @@ class Problem:
         sigma: standard deviations (R,) that residuals are divided by; `noise_given` (R,) says which of them were given.
         channel_scale: the size of what each channel shows (C,).
         runs: what is simulated; `run` and `time` (R,) are the run and the place in its times that each residual is of.
+        state_sizes: changes of the unknowns of initial states, in their units, by one of each z (K - P,).
         columns: where in z the unknowns of the initial state of each run are (N, S), -1 where it has none.
         beginnings: the run that each record begins with (records,).
         priors: which parameters have a prior; their residuals follow the R.
@@ -83,6 +84,7 @@ class Problem:
         self.initial_states, self.columns, bases = initial_state_unknowns(mechanism, unknowns, self.records)
         self.all_names = (*unknowns.names, *(name for state in self.initial_states for name in state.names))
         self.all_units = (*unknowns.units, *(unit for state in self.initial_states for unit in state.units))
+        self.state_sizes = np.concatenate([np.zeros(0), *(state.sizes for state in self.initial_states)])
         self.K = len(self.all_names)
         self._tabulate(keys)
         self.run, self.time, _ = self.index.T

@@ -45,7 +45,7 @@ class Piece(NamedTuple):
 class MultipleShooting(Problem):
     """A problem in pieces. Its first residuals are those of the whole problem, in the same order; defects follow.
 
-    The unknowns z are those of the whole problem, then those of the initial states of pieces, in m, rad and s.
+    The unknowns z are those of the whole problem, then those of the initial states of pieces.
 
     Attributes:
         whole: the problem that is cut.
@@ -72,6 +72,7 @@ class MultipleShooting(Problem):
         self.K, self.extra_rows = whole.K + self.constrained, whole.extra_rows + self.constrained
         self.all_names += tuple(f"piece {p + 1}: {name}" for p in self.following for name in free.names)
         self.all_units += free.units * len(self.following)
+        self.state_sizes = np.concatenate([self.state_sizes, *[free.sizes] * len(self.following)])
         self.columns, bases = np.full((N, self.S), -1), np.zeros((N, 2, n, self.S))
         S = whole.columns.shape[1]
         self.columns[self.beginnings, :S], bases[self.beginnings, ..., :S] = whole.columns, whole.runs.bases

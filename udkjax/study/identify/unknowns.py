@@ -23,7 +23,7 @@ AT_BOUND = 1e-3  # of the distance between the bounds: a value as near to one of
 FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
 GUESS_RADIUS = 0.5  # of a value: how far other guesses are from the first
 BOUND_MARGIN = 0.02  # of the distance between the bounds: no guess is nearer, since bounds themselves are infinitely far
-STATE_RADIUS = 0.05  # m, rad, m/s, rad/s: how far guesses of initial states are from the first
+STATE_RADIUS = 0.05  # of the scene's length, time and one radian: how far guesses of initial states are from the first
 
 
 class Target(NamedTuple):

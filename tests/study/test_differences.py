@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from udkjax.study.identify.numerical_differences import DIFFERENCE_STEPS, differences, sizes
+from udkjax.study.differences import DIFFERENCE_STEPS, differences, sizes
 
 TS = np.linspace(0.5, 3.0, 40)
 SERIES = [np.arange(25), np.arange(25, 40)]
