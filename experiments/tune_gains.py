@@ -33,11 +33,11 @@ from experiments.common import described, panels, tracked
 from experiments.gains import exponent
 from experiments.parts.linkage import parallelogram
 from experiments.parts.tuning import (
+    ABSOLUTE_RANK_TOL,
     DEGREES,
     ENDS,
     GUESSES,
     OPEN,
-    RANK_TOL,
     REFERENCE,
     SCENES,
     SEED,
@@ -69,7 +69,15 @@ def study(smoke: bool) -> xarray.Dataset:
             compat="equals",
         ),
         parallelogram(),
-        {"start": DEGREES, "open": OPEN, "span": SPAN, "ends": ENDS, "guesses": GUESSES, "settled": SETTLED, "rank_tol": RANK_TOL}
+        {
+            "start": DEGREES,
+            "open": OPEN,
+            "span": SPAN,
+            "ends": ENDS,
+            "guesses": GUESSES,
+            "settled": SETTLED,
+            "rank_tol": ABSOLUTE_RANK_TOL,
+        }
         | {"solver": "Dopri8", "method": "SVD", "four-bar": "udk.library.four_bar()"},
         SEED,
     )

@@ -30,7 +30,7 @@ OPEN, SEED = 1e-2, 1
 MOST = 256  # steps of the longest run by equal steps
 LANES = len(GUESSES)
 SETTLED = 1e-3  # of the logarithm of a gain: drift is flat there
-RANK_TOL = 1e-4  # in the units of D
+ABSOLUTE_RANK_TOL = 1e-4  # in the units of D
 
 
 class Scene(NamedTuple):
@@ -51,7 +51,7 @@ def scene(name: str) -> Scene:
     """Build a scene and compile its two programs."""
     mechanism = parallelogram() if name == SCENES[0] else udk.library.four_bar()
     state = start(DEGREES) if name == SCENES[0] else udk.State(mechanism.q0, mechanism.v0)
-    method = udk.SVD.absolute(RANK_TOL)
+    method = udk.SVD.absolute(ABSOLUTE_RANK_TOL)
     stepped = drift_of_steps(mechanism, method, MOST)
 
     def equal(z, state, steps):

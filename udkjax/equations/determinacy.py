@@ -20,10 +20,11 @@ from udkjax.equations.constraints import State
 from udkjax.equations.scales import Scales
 from udkjax.scene.mechanism import Mechanism
 
-# Relative to the largest singular value. At a singular configuration a residual of rounding, 1e-16, is a displacement of its
+# Relative to the largest singular value: the rank on which depends what statics leaves open (`scales.RANK_TOL`, of motion, has to
+# let runs cross singular configurations, and is larger). At a singular configuration a residual of rounding, 1e-16, is a displacement of its
 # root, 1e-8, and so is the singular value that should vanish there: a hundred times that.
-RANK_TOL = 1e-6
-# The length of a row of N, whose columns are orthonormal: rounding leaves 1e-15 / RANK_TOL at most.
+STATIC_RANK_TOL = 1e-6
+# The length of a row of N, whose columns are orthonormal: rounding leaves 1e-15 / STATIC_RANK_TOL at most.
 UNIQUE_TOL = 1e-6
 
 
@@ -55,7 +56,7 @@ def singular_values(mechanism: Mechanism, t: ArrayLike, q: State, analysis: Anal
 
 
 def left_null_space(
-    mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None, rank_tol: ArrayLike = RANK_TOL
+    mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None, rank_tol: ArrayLike = STATIC_RANK_TOL
 ) -> LeftNullSpace:
     """Return N, J^T N = 0, its columns orthonormal; singular values up to `rank_tol` times the largest count as zero."""
     J = scaled_jacobian(mechanism, t, q, analysis)
@@ -68,7 +69,7 @@ def left_null_space(
 
 
 def uniqueness(
-    mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None, rank_tol: ArrayLike = RANK_TOL
+    mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None, rank_tol: ArrayLike = STATIC_RANK_TOL
 ) -> Uniqueness:
     """Tell for each row of Psi whether its multiplier is unique: whether its row of N is zero.
 

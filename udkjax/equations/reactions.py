@@ -24,7 +24,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse
 from udkjax.equations.constraints import psi_q
-from udkjax.equations.determinacy import RANK_TOL, UNIQUE_TOL, left_null_space
+from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
@@ -79,7 +79,7 @@ def reactions(
 
 
 def unique_reactions(
-    mechanism: Mechanism, solution: Any, frame: Axes = "ground", about: About = "centre", rank_tol: ArrayLike = RANK_TOL
+    mechanism: Mechanism, solution: Any, frame: Axes = "ground", about: About = "centre", rank_tol: ArrayLike = STATIC_RANK_TOL
 ) -> dict[str, dict[str, Bool[Array, "T 3"]]]:
     """Tell which components of `reactions` equilibrium alone decides, whatever their split.
 
@@ -190,7 +190,7 @@ def split_by_compliance(
     if not len(soft):
         return multipliers
     D = uk.D(mechanism, t, q, w)
-    P = jnp.eye(len(soft)) - D @ SVD(rank_tol=RANK_TOL)(D)
+    P = jnp.eye(len(soft)) - D @ SVD(rank_tol=STATIC_RANK_TOL)(D)
     K = soft * w**2
     K, mu = K / jnp.maximum(jnp.max(jax.lax.stop_gradient(K)), jnp.finfo(float).tiny), multipliers / w
     z = SVD(rank_tol=STIFFEST)(P @ (K[:, None] * P)) @ (P @ (K * mu))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.equations import Analysis, analyse, energy, reactions, singular_values, unique_reactions, violation
-from udkjax.equations.determinacy import RANK_TOL
+from udkjax.equations.determinacy import STATIC_RANK_TOL
 from udkjax.scene import GROUND, Mechanism
 
 ROUNDING = 1e-17  # below any violation (m, rad) or singular value but zero; drawn in place of zero, which has no logarithm
@@ -58,10 +58,10 @@ def singular_values_over_time(mechanism: Mechanism, solution: Any) -> Float[np.n
 
 
 def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
-    """Return how many singular values are above `RANK_TOL` of the largest, in each row; not a number where these are none."""
+    """Return how many singular values are above `STATIC_RANK_TOL` of the largest, in each row; not a number where these are none."""
     if values.shape[1] == 0:
         return np.zeros(len(values))
-    count = (values > RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
+    count = (values > STATIC_RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
     return np.where(np.isfinite(values[:, 0]), count, np.nan)
 
 

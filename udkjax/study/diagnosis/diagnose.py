@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.determinacy import RANK_TOL, UNIQUE_TOL, unique_direction
+from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, unique_direction
 from udkjax.integrate.assembly import State, close, require_closed
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
@@ -25,7 +25,7 @@ def diagnose(
     state: State | None = None,
     solution: Any = None,
     t: float = 0.0,
-    rank_tol: float = RANK_TOL,
+    rank_tol: float = STATIC_RANK_TOL,
     time_tol: float | None = None,
     fixes: bool = True,
     walk: bool = True,
