@@ -20,9 +20,9 @@ from udkjax.equations.constraints import State
 from udkjax.equations.scales import Scales
 from udkjax.scene.mechanism import Mechanism
 
-# Relative to the largest singular value: the rank on which depends what statics leaves open (`scales.RANK_TOL`, of motion, has to
-# let runs cross singular configurations, and is larger). At a singular configuration a residual of rounding, 1e-16, is a displacement of its
-# root, 1e-8, and so is the singular value that should vanish there: a hundred times that.
+# Relative to the largest singular value: the rank that decides what statics leaves open. `scales.RANK_TOL`, of motion, has to let
+# runs cross singular configurations, and is larger. At one, a residual of rounding, 1e-16, is a displacement of its root, 1e-8,
+# and so is the singular value that should vanish there: a hundred times that.
 STATIC_RANK_TOL = 1e-6
 # The length of a row of N, whose columns are orthonormal: rounding leaves 1e-15 / STATIC_RANK_TOL at most.
 UNIQUE_TOL = 1e-6

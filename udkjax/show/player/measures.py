@@ -58,7 +58,7 @@ def singular_values_over_time(mechanism: Mechanism, solution: Any) -> Float[np.n
 
 
 def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
-    """Return how many singular values are above `STATIC_RANK_TOL` of the largest, in each row; not a number where these are none."""
+    """Return how many singular values are above `STATIC_RANK_TOL` of the largest, in each row; nan where there are none."""
     if values.shape[1] == 0:
         return np.zeros(len(values))
     count = (values > STATIC_RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
