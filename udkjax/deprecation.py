@@ -70,3 +70,18 @@ def renamed_attributes(owner: str, **renamed: str) -> Callable[[Any, str], Any]:
         return getattr(self, renamed[name])
 
     return get
+
+
+def renamed_methods(**renamed: str) -> Any:
+    """Return a class's `__init_subclass__` under which subclasses may still define a method or property by its old name.
+
+    `__init_subclass__ = renamed_methods(resolved="complete")`
+    """
+
+    def init_subclass(cls: type) -> None:
+        for old, new in renamed.items():
+            if old in vars(cls) and new not in vars(cls):
+                warnings.warn(f"{cls.__name__}.{old} is now {cls.__name__}.{new}", DeprecationWarning, stacklevel=4)
+                setattr(cls, new, vars(cls)[old])
+
+    return classmethod(init_subclass)

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import udkjax as udk
-from udkjax.scene.splines import natural
+from udkjax.scene.splines import natural_spline
 
 TS = np.linspace(0.0, 2.0, 401)
 KNOTS, VALUES = np.array([0.0, 0.37, 0.71, 1.13, 1.6]), np.array([0.0, 0.12, -0.1, 0.15, 0.05])
@@ -56,7 +56,7 @@ def kicked(x):
 
 def start(knots):
     """The rod at rest above a carriage that moves as the spline does."""
-    x, rate = jax.jvp(lambda t: natural(t, knots, jnp.asarray(VALUES)), (0.0,), (1.0,))
+    x, rate = jax.jvp(lambda t: natural_spline(t, knots, jnp.asarray(VALUES)), (0.0,), (1.0,))
     q = [[x, 0.0, 0.0], [x + ARM * np.cos(ANGLE), ARM * np.sin(ANGLE), ANGLE]]
     return udk.State(jnp.array(q), jnp.array([[rate, 0.0, 0.0], [rate, 0.0, 0.0]]))
 

@@ -5,13 +5,14 @@ import pytest
 
 import udkjax.scene as udk
 from udkjax.scene import GROUND, Frame
+from udkjax.scene.bodies import GROUND_FRAME_AT_REST
 
 
 def frames(mechanism, q, v=None):
     """The frames of all bodies, by name."""
-    found = {GROUND: Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)}
+    found = {GROUND: GROUND_FRAME_AT_REST}
     for k, name in enumerate(mechanism.body_names):
-        (x, y, angle), speed = q[k], (None, None, None) if v is None else v[k]
+        (x, y, angle), speed = q[k], () if v is None else v[k]
         found[name] = Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), *speed)
     return found
 

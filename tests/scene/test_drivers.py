@@ -20,7 +20,7 @@ def test_coordinates(points):
     expected: dict[Any, Any] = {"angle": 1.5, "x": local[0], "y": local[1], "distance": np.linalg.norm(d)}
     for coordinate, value in expected.items():
         driver = udk.Driver(["one", "two"], coordinate, udk.Polynomial([0.0, 0.5]), points)
-        assert_allclose(driver.residual(3.0, ONE, TWO), [value - 1.5], rtol=1e-14)
+        assert_allclose(np.array(driver.residual(3.0, ONE, TWO)), [value - 1.5], rtol=1e-14)
 
 
 def test_points_default_to_the_origins():

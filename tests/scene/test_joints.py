@@ -65,7 +65,7 @@ def test_wheels_in_mesh_have_one_velocity_at_the_pitch_point(internal):
     def frame(angle):
         return udk.Frame(0.0, 0.0, angle, jnp.cos(angle), jnp.sin(angle))
 
-    gradient = jax.jacfwd(lambda angles: gear._rolled(frame(angles[0]), frame(angles[1])))(jnp.zeros(2))
+    gradient = jax.jacfwd(lambda angles: gear._rolling_distance(frame(angles[0]), frame(angles[1])))(jnp.zeros(2))
     omega = jnp.array([1.0, -gradient[0] / gradient[1]])  # what the row allows
     # Wheel 1 at the origin, wheel 2 on the x axis: the pitch point is at x = 0.3, centre 2 at 0.3 + 0.1, or at 0.3 - 0.1.
     arm = 0.1 if internal else -0.1
@@ -97,14 +97,16 @@ def test_natural_spline_goes_on_straight():
     exact = CubicSpline(knots, values, bc_type="natural")
 
     def spline(x):
-        return splines.natural(x, jnp.asarray(knots), jnp.asarray(values))
+        return splines.natural_spline(x, jnp.asarray(knots), jnp.asarray(values))
 
     x = jnp.linspace(0.0, 3.0, 61)
     for order in range(3):
         assert_allclose(jax.vmap(_derivative(spline, order))(x), exact(x, order), atol=1e-12)
     assert_allclose(spline(5.0), values[-1] + 2.0 * exact(3.0, 1), rtol=1e-13)
     assert_allclose(spline(-1.0), values[0] - 1.0 * exact(0.0, 1), rtol=1e-13)
-    assert_allclose(splines.natural(0.25, jnp.array([0.0, 1.0]), jnp.array([1.0, 3.0])), 1.5, rtol=1e-15)  # two knots: a line
+    assert_allclose(
+        splines.natural_spline(0.25, jnp.array([0.0, 1.0]), jnp.array([1.0, 3.0])), 1.5, rtol=1e-15
+    )  # two knots: a line
 
 
 def test_cam_depends_smoothly_on_its_profile(everything, at):
@@ -123,3 +125,23 @@ def _derivative(function, order):
     for _ in range(order):
         function = jax.grad(function)
     return function
+
+
+def test_a_joint_that_overrides_old_names_works_and_says_the_new_ones():
+    with pytest.warns(DeprecationWarning) as warned:
+
+        class Old(udk.Joint):
+            @property
+            def frame_names(self):
+                return (*self.bodies, udk.GROUND)
+
+            def complete(self, *frames):
+                return "completed"
+
+            def residual(self, t, *frames):
+                return [0.0]
+
+    assert {str(w.message) for w in warned} == {"Old.attached is now Old.frame_names", "Old.resolved is now Old.complete"}
+    old = Old(("a", "b"))
+    assert old.frame_names == ("a", "b", udk.GROUND)
+    assert old.complete() == "completed"

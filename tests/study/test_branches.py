@@ -3,7 +3,7 @@
 import numpy as np
 
 import udkjax as udk
-from udkjax.scene.library.poses import bar
+from udkjax.scene.library.posed_bodies import bar_pose
 
 
 def linkage(pins, bars):
@@ -11,7 +11,7 @@ def linkage(pins, bars):
     ground = [name for name in pins if name.isupper()]
     bodies, joints, seen = {}, {}, {}
     for name, ends in bars.items():
-        position, angle = bar(*(np.asarray(pins[e], float) for e in ends[:2]))
+        position, angle = bar_pose(*(np.asarray(pins[e], float) for e in ends[:2]))
         bodies[name] = udk.Body(1.0, 0.1, position, angle)
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         for e in ends:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from udkjax.scene import Mechanism
-from udkjax.scene.checks import quoted, suggestion
+from udkjax.scene.checks import quote, suggestion
 from udkjax.study.identify import IdentificationError, Parameter, Record, Start
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.record_reader import records_of
@@ -62,7 +62,7 @@ class IdentifyOptions:
         given = [text for group in groups for text in group]
         if self.names:
             self.problems += [
-                f"--profile {quoted(text)}: is not among --parameters{suggestion(text, self.names)}"
+                f"--profile {quote(text)}: is not among --parameters{suggestion(text, self.names)}"
                 for text in given
                 if _plain(text) not in known
             ]
@@ -75,9 +75,9 @@ class IdentifyOptions:
             channel, _, number = text.rpartition("=")
             sigma = _numbers(number, 1)
             if sigma is None or not sigma[0] > 0:
-                self.problems.append(f"--noise {quoted(text)}: must be NUMBER or CHANNEL=NUMBER, in SI units, and positive")
+                self.problems.append(f"--noise {quote(text)}: must be NUMBER or CHANNEL=NUMBER, in SI units, and positive")
             elif channel.strip() in by_channel or (not channel and everywhere is not None):
-                self.problems.append(f"--noise {quoted(text)}: is there twice")
+                self.problems.append(f"--noise {quote(text)}: is there twice")
             elif channel:
                 by_channel[channel.strip()] = sigma[0]
             else:
@@ -86,7 +86,7 @@ class IdentifyOptions:
 
     def _add(self, given: dict[str, dict[str, Any]], option: str, text: str) -> None:
         """Note what is given of a parameter, which may be called by any of the names that are tied in it."""
-        place = f"--{option} {quoted(text)}"
+        place = f"--{option} {quote(text)}"
         name, _, numbers = text.rpartition("=")
         of = {_plain(part): whole for whole in given for part in (whole, *whole.split("="))}.get(_plain(name))
         values = _numbers(numbers, 1 if option == "guess" else 2)
@@ -95,9 +95,9 @@ class IdentifyOptions:
             self.problems.append(f"{place}: must be {form}, in SI units")
         elif of is None:
             near = suggestion(name.strip(), [part.strip() for whole in given for part in (whole, *whole.split("="))])
-            self.problems.append(f"{place}: {quoted(name.strip())} is not among --parameters{near}")
+            self.problems.append(f"{place}: {quote(name.strip())} is not among --parameters{near}")
         elif option in given[of]:
-            self.problems.append(f"{place}: is there twice for {quoted(of)}")
+            self.problems.append(f"{place}: is there twice for {quote(of)}")
         elif option == "bounds" and not values[0] < values[1]:
             self.problems.append(f"{place}: the lower bound must be below the upper one")
         else:

@@ -12,7 +12,7 @@ from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
-from udkjax.scene.fields import number, optional
+from udkjax.scene.fields import number, optional_number
 
 
 class ConstrainedSystem(eqx.Module):
@@ -28,7 +28,7 @@ class ConstrainedSystem(eqx.Module):
     force: Callable[[Any, Any, Any], Any]
     constraint: Callable[[Any, Any], Any] | None = None
     velocity_constraint: Callable[[Any, Any, Any], Any] | None = None
-    breakpoints: Float[Array, "k"] | None = eqx.field(converter=optional, default=None)
+    breakpoints: Float[Array, "k"] | None = eqx.field(converter=optional_number, default=None)
 
 
 class GeneralEquations(AbstractSystem):

@@ -29,7 +29,7 @@ from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.bodies import GROUND, Frame, Point, between
-from udkjax.scene.checks import quoted, suggestion
+from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.drivers import Driver
 from udkjax.scene.joints import Constraint, Distance, Prismatic, Rack, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
@@ -168,12 +168,12 @@ def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, ArrayLike])
         counts[name] = counts.get(name, 0) + 1
     for name, given in compliances.items():
         if name not in known:
-            raise ValueError(f"compliances: no joint named {quoted(name)}{suggestion(name, known)}")
+            raise ValueError(f"compliances: no joint named {quote(name)}{suggestion(name, known)}")
         shape, alike = np.shape(given), isinstance(known[name], Revolute) or counts[name] == 1
         if shape != (counts[name],) and not (shape == () and alike):
-            raise ValueError(f"compliances: {quoted(name)} takes {counts[name]} numbers, one for each of its rows, not {given!r}")
+            raise ValueError(f"compliances: {quote(name)} takes {counts[name]} numbers, one for each of its rows, not {given!r}")
         if not isinstance(given, Tracer) and not np.all(np.asarray(given) >= 0):
-            raise ValueError(f"compliances: those of {quoted(name)} must not be negative, as {given!r}")
+            raise ValueError(f"compliances: those of {quote(name)} must not be negative, as {given!r}")
     rows = [jnp.broadcast_to(jnp.asarray(compliances.get(name, 0.0), float), (count,)) for name, count in counts.items()]
     return jnp.concatenate(rows) if rows else jnp.zeros(0)
 

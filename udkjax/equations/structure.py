@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.scene.bodies import GROUND, Frame
-from udkjax.scene.mechanism import Mechanism, attached
+from udkjax.scene.mechanism import Mechanism, attached_bodies
 
 # Bodies, constraints and force elements beyond which the programs are loops over elements of the same structure. Straight-line
 # programs evaluate faster, up to several times this size, but take the longer to trace and compile, the larger the scene is
@@ -95,7 +95,7 @@ def element_kinds(mechanism: Mechanism, elements: Sequence[Any], labels: Sequenc
     body_index, joints = {name: k for k, name in enumerate(mechanism.body_names)}, mechanism.joints
     found: dict[Any, list[tuple[int, list[int]]]] = {}
     for i, element in enumerate(elements):
-        frames = attached(element, joints)  # a method of a large module takes a look at all of its leaves
+        frames = attached_bodies(element, joints)  # a method of a large module takes a look at all of its leaves
         key = element_structure(element, frames), labels[i] if labels else None
         found.setdefault(key, []).append((i, [body_index[name] for name in frames if name in body_index]))
     result = []

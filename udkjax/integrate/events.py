@@ -20,8 +20,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from udkjax.scene.bodies import GROUND, Frame, Point, between
-from udkjax.scene.checks import quoted, suggestion
-from udkjax.scene.fields import number, optional
+from udkjax.scene.checks import quote, suggestion
+from udkjax.scene.fields import number, optional_number
 from udkjax.scene.joints import Joint, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 
@@ -111,8 +111,8 @@ class JointLimit(eqx.Module):
     """
 
     joint: str = eqx.field(static=True)
-    lower: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
-    upper: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
+    lower: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)
+    upper: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)
     restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
     at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
     name: str = eqx.field(static=True, default="")
@@ -120,9 +120,9 @@ class JointLimit(eqx.Module):
     def expand(self, mechanism: Mechanism) -> list[Event]:
         """One event for each limit."""
         name, found = self.name or self.joint, []
-        coordinate = joint_coordinate(mechanism, self.joint, f"limit {quoted(name)}")
+        coordinate = joint_coordinate(mechanism, self.joint, f"limit {quote(name)}")
         if self.lower is None and self.upper is None:
-            raise ValueError(f"limit {quoted(name)}: give `lower` or `upper`, or both")
+            raise ValueError(f"limit {quote(name)}: give `lower` or `upper`, or both")
         for side, limit, sign in (("lower", self.lower, 1.0), ("upper", self.upper, -1.0)):
             if limit is not None:
                 action = Impact(self.restitution, self.at_rest)
@@ -150,11 +150,11 @@ class Contact(eqx.Module):
         """The event."""
         name = self.name or f"{self.body} on {self.on}"
         for body in (self.body, self.on):
-            _require(body, [*mechanism.body_names, GROUND], f"contact {quoted(name)}", "body")
+            _require(body, [*mechanism.body_names, GROUND], f"contact {quote(name)}", "body")
         if self.body == self.on:
-            raise ValueError(f"contact {quoted(name)}: {quoted(self.body)} cannot touch itself")
+            raise ValueError(f"contact {quote(name)}: {quote(self.body)} cannot touch itself")
         if not isinstance(self.normal, Tracer) and not np.any(np.asarray(self.normal)):
-            raise ValueError(f"contact {quoted(name)}: the normal must not be zero")
+            raise ValueError(f"contact {quote(name)}: the normal must not be zero")
         gap = _Gap((self.body, self.on), self.point, self.through, self.normal)
         return [Event(gap, Impact(self.restitution, self.at_rest), -1, name)]
 
@@ -240,7 +240,7 @@ def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoord
     if isinstance(found, Prismatic | Slot):
         return JointCoordinate(found.bodies, found.points, found.axis)
     kinds = "a revolute or prismatic joint, or a slot"
-    raise ValueError(f"{where}: {quoted(joint)} is a {type(found).__name__}, and must be {kinds}")
+    raise ValueError(f"{where}: {quote(joint)} is a {type(found).__name__}, and must be {kinds}")
 
 
 def expanded(events: Sequence[Any], mechanism: Mechanism) -> tuple[Event, ...]:
@@ -252,7 +252,7 @@ def expanded(events: Sequence[Any], mechanism: Mechanism) -> tuple[Event, ...]:
         for one in event.expand(mechanism):
             name = one.name or f"event{k + 1}"
             if any(name == other.name for other in found):
-                raise ValueError(f"event {quoted(name)}: two events have this name; give one of them another (`name=`)")
+                raise ValueError(f"event {quote(name)}: two events have this name; give one of them another (`name=`)")
             found.append(_named(one, name))
     for event in found:
         _check(event, mechanism)
@@ -285,7 +285,7 @@ def _named(event: Event, name: str) -> Event:
 
 
 def _check(event: Event, mechanism: Mechanism) -> None:
-    where, action = f"event {quoted(event.name)}", event.action
+    where, action = f"event {quote(event.name)}", event.action
     if not isinstance(action, Action):
         raise ValueError(f"{where}: the action must be Stop(), Log(), Impact(...), ..., is a {type(action).__name__}")
     if event.direction not in (-1, 0, 1):
@@ -296,7 +296,7 @@ def _check(event: Event, mechanism: Mechanism) -> None:
         value = jnp.asarray(event.condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())))
     except KeyError as error:
         name = error.args[0]
-        raise ValueError(f"{where}: no body named {quoted(str(name))}{suggestion(name, mechanism.body_names)}") from error
+        raise ValueError(f"{where}: no body named {quote(str(name))}{suggestion(name, mechanism.body_names)}") from error
     if not any(isinstance(x, Tracer) for x in jax.tree.leaves(event)):
         known: Any = np.linspace(0.1, 0.9, mechanism.q0.size)
         with jax.ensure_compile_time_eval():
@@ -318,11 +318,11 @@ def _check(event: Event, mechanism: Mechanism) -> None:
         joint_coordinate(mechanism, action.joint, where)
     elif isinstance(action, Attach):
         if action.name in mechanism.constraints:
-            raise ValueError(f"{where}: {quoted(action.name)} is in the scene already; attach the joint under another name")
+            raise ValueError(f"{where}: {quote(action.name)} is in the scene already; attach the joint under another name")
         for body in action.joint.bodies:
             _require(body, [*mechanism.body_names, GROUND], where, "body")
 
 
 def _require(name: str, known: Sequence[str], where: str, what: str) -> None:
     if name not in known:
-        raise ValueError(f"{where}: no {what} named {quoted(name)}{suggestion(name, known)}")
+        raise ValueError(f"{where}: no {what} named {quote(name)}{suggestion(name, known)}")

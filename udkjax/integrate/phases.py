@@ -16,9 +16,9 @@ from jaxtyping import Array
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.events import FIXED, Attach, Event, Impact, JointCoordinate, Lock, Release, frames_of, joint_coordinate
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import quoted, suggestion
-from udkjax.scene.fields import number, optional
-from udkjax.scene.joints import Angle, Joint, filled
+from udkjax.scene.checks import quote, suggestion
+from udkjax.scene.fields import number, optional_number
+from udkjax.scene.joints import Angle, Joint, fill
 from udkjax.scene.mechanism import Mechanism, Origin
 
 MOST_PHASES = 32  # each is compiled
@@ -58,7 +58,7 @@ class Phases(eqx.Module):
     def resolved(self, k: int, q: Array) -> Joint:
         """What the k-th of them is when it is added at q."""
         joint, frames = self.added[k], frames_of(self.mechanisms[0].body_names, q)
-        return jax.tree.map(number, joint.resolved(*(frames[name] for name in joint.attached)))
+        return jax.tree.map(number, joint.complete(*(frames[name] for name in joint.frame_names)))
 
 
 def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis) -> Phases:
@@ -69,7 +69,7 @@ def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis)
     for event in events:
         if isinstance(event.action, Release) and event.action.name not in known:
             near = suggestion(event.action.name, known)
-            raise ValueError(f"event {quoted(event.name)}: no joint or driver named {quoted(event.action.name)}{near}")
+            raise ValueError(f"event {quote(event.name)}: no joint or driver named {quote(event.action.name)}{near}")
     first: frozenset[str] = frozenset(mechanism.constraints)
     found, steps = [first], []
     for active in found:  # which grows while it is followed
@@ -107,13 +107,13 @@ def _additions(mechanism: Mechanism, events: Sequence[Event]) -> tuple[list[Join
             joints.append(event.action.joint)
             by.append((k, event.action.name))
         elif isinstance(event.action, Lock):
-            coordinate = joint_coordinate(mechanism, event.action.joint, f"event {quoted(event.name)}")
+            coordinate = joint_coordinate(mechanism, event.action.joint, f"event {quote(event.name)}")
             bodies, points, axis = coordinate.bodies, coordinate.points, coordinate.axis
             joints.append(Angle(bodies) if points is None or axis is None else Displacement(bodies, points, axis))
             by.append((k, f"{event.action.joint}.lock"))
     for k, name in by:
         if [other for _, other in by].count(name) > 1:
-            raise ValueError(f"event {quoted(events[k].name)}: two events add {quoted(name)}; give one of them another name")
+            raise ValueError(f"event {quote(events[k].name)}: two events add {quote(name)}; give one of them another name")
     return joints, by
 
 
@@ -187,13 +187,13 @@ class Displacement(Joint):
 
     points: Any = eqx.field(converter=number)
     axis: Any = eqx.field(converter=number)
-    position: Any = eqx.field(converter=optional, default=None)
+    position: Any = eqx.field(converter=optional_number, default=None)
 
     def residual(self, t, *frames):
         return [self._along(*frames) - self.position]
 
-    def resolved(self, *frames):
-        return filled(self, "position", self._along(*frames))
+    def complete(self, *frames):
+        return fill(self, "position", self._along(*frames))
 
     def _along(self, one, two):
         return JointCoordinate(self.bodies, self.points, self.axis).of(one, two)

@@ -4,11 +4,11 @@ from udkjax.scene import library
 from udkjax.scene.bodies import GROUND, Body, Frame, Point, between
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Driver, Motion, Polynomial, Sine, Spline
-from udkjax.scene.files import dumps, load, loads, save
 from udkjax.scene.forces import Force, ForceElement, Friction, Spring, Torque, TorsionSpring
 from udkjax.scene.joints import Angle, Cam, Constraint, Distance, Gear, Joint, Prismatic, Profile, Rack, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.reshaping import with_angle, with_length
+from udkjax.scene.toml_files import dumps, load, loads, save
 
 __all__ = [
     "GROUND",

@@ -1,15 +1,17 @@
 """A rigid body, and the frame through which joints and forces see it."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.scene.fields import POSITIVE, number
+from udkjax.scene.fields import POSITIVE, Number, number
 
 GROUND = "ground"
 COORDINATES = ("x", "y", "angle")  # of a body, in the order in which q and v hold them
+Vector = Float[Array, "2"] | Sequence[Number]  # two components
 
 
 class Body(eqx.Module):
@@ -33,55 +35,59 @@ class Body(eqx.Module):
 class Point(NamedTuple):
     """A point, a vector or a velocity in ground coordinates."""
 
-    x: Any
-    y: Any
+    x: Number
+    y: Number
 
-    def dot(self, other: "Point") -> Any:
+    def dot(self, other: "Point") -> Number:
         """Return the scalar product with another vector."""
         return self.x * other.x + self.y * other.y
 
-    def norm(self) -> Any:
+    def norm(self) -> Array:
         """Return the vector's length; at the zero vector, where it has a kink, the derivative is taken as zero."""
         square = self.dot(self)
-        moved = square > 0
-        return jnp.where(moved, jnp.sqrt(jnp.where(moved, square, 1.0)), 0.0)
+        nonzero = square > 0
+        return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, square, 1.0)), 0.0)
 
 
 class Frame(NamedTuple):
-    """Where a body is and how it moves, as scalars: what joints and force elements are written with.
+    """Position and velocity of a body, as scalars: the arguments with which joints and force elements are written.
 
-    Joints see `vx`, `vy` and `omega` as None: ideal joints hold positions. The ground is the frame with all zeros.
+    Joints see `vx`, `vy` and `omega` as None: ideal joints hold positions. The ground is `GROUND_FRAME`.
     """
 
-    x: Any  # m
-    y: Any  # m
-    angle: Any  # rad
-    cos: Any
-    sin: Any
-    vx: Any = None  # m/s
-    vy: Any = None  # m/s
-    omega: Any = None  # rad/s
+    x: Number  # m
+    y: Number  # m
+    angle: Number  # rad
+    cos: Number
+    sin: Number
+    vx: Number = None  # pyright: ignore[reportAssignmentType]  # m/s
+    vy: Number = None  # pyright: ignore[reportAssignmentType]  # m/s
+    omega: Number = None  # pyright: ignore[reportAssignmentType]  # rad/s
 
-    def vector(self, local) -> Point:
+    def vector(self, local: Vector) -> Point:
         """Turn a vector of the body's own frame into ground coordinates."""
         return Point(self.cos * local[0] - self.sin * local[1], self.sin * local[0] + self.cos * local[1])
 
-    def point(self, local) -> Point:
+    def point(self, local: Vector) -> Point:
         """Return where a point of the body's own frame is, in ground coordinates (m)."""
         arm = self.vector(local)
         return Point(self.x + arm.x, self.y + arm.y)
 
-    def velocity(self, local) -> Point:
+    def velocity(self, local: Vector) -> Point:
         """Return the velocity of a point of the body's own frame, in ground coordinates (m/s)."""
         arm = self.vector(local)
         return Point(self.vx - self.omega * arm.y, self.vy + self.omega * arm.x)
 
-    def local(self, vector) -> Point:
+    def local(self, vector: Vector) -> Point:
         """Turn a vector in ground coordinates into the body's own frame: the inverse of `vector`."""
         return Point(self.cos * vector[0] + self.sin * vector[1], self.cos * vector[1] - self.sin * vector[0])
 
 
-def between(points, one: Frame, two: Frame) -> Point:
+GROUND_FRAME = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # as joints see the ground
+GROUND_FRAME_AT_REST = Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # as force elements see it, with its velocities
+
+
+def between(points: Float[Array, "2 2"] | Sequence[Vector], one: Frame, two: Frame) -> Point:
     """Return the vector from `points[0]` of body 1 to `points[1]` of body 2, in ground coordinates (m)."""
     p, q = one.point(points[0]), two.point(points[1])
     return Point(q.x - p.x, q.y - p.y)

@@ -1,4 +1,4 @@
-"""What can be wrong with a scene, found all at once, for files and for Python alike."""
+"""Checks of a scene, which find all of its mistakes at once, in files and in Python alike."""
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -11,19 +11,22 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.scene.bodies import GROUND
+from udkjax.scene.fields import FieldMetadata, Table
 from udkjax.scene.joints import Revolute
-from udkjax.scene.schema import PLAIN, TYPES, in_files, keys, table_of
+from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
+
+KnownNames = Mapping[str, Mapping[str, type | None]]  # the classes of elements, by kind (body, revolute) and by name
 
 
 class Mistakes(ValueError):
-    """Everything that is wrong with something: `problems` lists every mistake, `source` says where it stands, if anywhere."""
+    """All mistakes in a thing: `problems` lists them, `source` is the file that they stand in, or empty."""
 
-    of = ""  # what it is that is wrong
+    subject = ""  # the thing that has the mistakes, as the message calls it
 
     def __init__(self, problems: Sequence[str], source: str = ""):
         self.problems, self.source = list(problems), source
         head = f"{source}: " if source else ""
-        count = f"{len(self.problems)} mistakes in the {self.of}:\n  "
+        count = f"{len(self.problems)} mistakes in the {self.subject}:\n  "
         super().__init__(head + (self.problems[0] if len(self.problems) == 1 else count + "\n  ".join(self.problems)))
 
     def __reduce__(self):
@@ -33,29 +36,29 @@ class Mistakes(ValueError):
 class SceneError(Mistakes):
     """A scene cannot be what it says. `problems` lists every mistake, each with the path of the offending entry."""
 
-    of = "scene"
+    subject = "scene"
 
 
-class Entry(NamedTuple):
+class SceneEntry(NamedTuple):
     """One element to check: its section, its place there, its name, its class (None if unknown) and its table."""
 
     section: str
     index: int
-    name: Any
+    name: object
     cls: type | None
-    table: Mapping[str, Any]
-    problem: str = ""  # why the class is not known
+    table: Table
+    problem: str = ""  # the reason why the class is not known
 
     @property
     def where(self) -> str:
         """The path of the entry, as in error messages."""
         place = f"{self.section}[{self.index}]"
-        return f"{self.section} {quoted(self.name)} ({place})" if isinstance(self.name, str) and self.name else place
+        return f"{self.section} {quote(self.name)} ({place})" if isinstance(self.name, str) and self.name else place
 
 
-def problems_of(entries: Sequence[Entry], gravity: Any) -> list[str]:
+def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
     """Return every mistake of a scene, in the order of its entries."""
-    found = list(_number("gravity", ["2"], gravity, {}, {}))
+    found = list(_check_number("gravity", ["2"], gravity, {}, {}))
     bodies = [entry for entry in entries if entry.section == "body"]
     if not bodies:
         found.append("body: a mechanism needs at least one body")
@@ -63,11 +66,11 @@ def problems_of(entries: Sequence[Entry], gravity: Any) -> list[str]:
         "body": {GROUND: None, **{e.name: e.cls for e in bodies if isinstance(e.name, str)}},
         "revolute": {e.name: e.cls for e in entries if e.section == "joint" and isinstance(e.name, str)},
     }
-    owner: dict[tuple[str, str], Entry] = {}
+    owner: dict[tuple[str, str], SceneEntry] = {}
     for entry in entries:
         space = "joint" if entry.section == "driver" else entry.section
         if not isinstance(entry.name, str) or not entry.name:
-            given = "missing" if entry.name is None else f"must be a non-empty string, is {shown(entry.name)}"
+            given = "missing" if entry.name is None else f"must be a non-empty string, is {abbreviate(entry.name)}"
             found.append(f"{entry.where}.name: {given}")
         elif entry.section == "body" and entry.name == GROUND:
             found.append(f'{entry.where}.name: "{GROUND}" is the fixed frame; choose another name')
@@ -75,13 +78,13 @@ def problems_of(entries: Sequence[Entry], gravity: Any) -> list[str]:
             found.append(f"{entry.where}.name: taken by {first.section}[{first.index}]; names must be unique")
         if entry.cls is None:
             found.append(entry.problem)
-            found.extend(_references(f"{entry.where}.bodies", "body", entry.table.get("bodies"), known))
+            found.extend(_check_references(f"{entry.where}.bodies", "body", entry.table.get("bodies"), known))
         else:
             found.extend(check_table(entry.where, entry.cls, entry.table, known))
     return found
 
 
-def check_table(where: str, cls: type, table: Mapping[str, Any], known: Mapping[str, Mapping[str, type | None]]) -> Iterator[str]:
+def check_table(where: str, cls: type, table: Table, known: KnownNames) -> Iterator[str]:
     """Iterate over the mistakes of one table, read as an element of class `cls`."""
     expected, sizes = keys(cls), {}
     for name in table:
@@ -89,94 +92,94 @@ def check_table(where: str, cls: type, table: Mapping[str, Any], known: Mapping[
             yield f"{where}.{name}: unknown key{suggestion(name, expected)}"
     for name, key in expected.items():
         if name in table:
-            yield from _value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes)
-            yield from _references(f"{where}.{name}", key.metadata.get("names"), table[name], known)
+            yield from _check_value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes)
+            yield from _check_references(f"{where}.{name}", key.metadata.get("names"), table[name], known)
         elif key.required:
             yield f"{where}.{name}: missing"
     if "bodies" in expected:
-        yield from _bodies_differ(where, cls, table)
+        yield from _check_bodies(where, cls, table)
 
 
-def _value(path: str, annotation: Any, value: Any, metadata: Mapping[str, Any], sizes: dict[str, int]) -> Iterator[str]:
-    """Iterate over what is wrong with one value. `sizes` holds the lengths that the named dimensions of a table have so far."""
+def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
+    """Iterate over the mistakes of one value. `sizes` holds the lengths of a table's named dimensions so far."""
     if hasattr(annotation, "dim_str"):
-        yield from _number(path, annotation.dim_str.split(), value, metadata, sizes)
+        yield from _check_number(path, annotation.dim_str.split(), value, metadata, sizes)
     elif get_origin(annotation) is Literal:
         if value not in get_args(annotation):
-            choices = ", ".join(quoted(choice) for choice in get_args(annotation))
-            yield f"{path}: must be one of {choices}, is {shown(value)}{suggestion(value, get_args(annotation))}"
+            choices = ", ".join(quote(choice) for choice in get_args(annotation))
+            yield f"{path}: must be one of {choices}, is {abbreviate(value)}{suggestion(value, get_args(annotation))}"
     elif annotation in (str, bool):
         if not isinstance(value, annotation):
-            yield f"{path}: must be {'a string' if annotation is str else 'true or false'}, is {shown(value)}"
+            yield f"{path}: must be {'a string' if annotation is str else 'true or false'}, is {abbreviate(value)}"
     elif get_origin(annotation) is tuple and get_args(annotation)[0] is str:
         if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
-            yield f"{path}: must be a list of names, is {shown(value)}"
+            yield f"{path}: must be a list of names, is {abbreviate(value)}"
     elif isinstance(annotation, type) and issubclass(annotation, eqx.Module):
-        yield from _nested(path, annotation, value)
+        yield from _check_nested(path, annotation, value)
 
 
-def _nested(path: str, annotation: type, value: Any) -> Iterator[str]:
+def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
     """Iterate over the mistakes of a motion law or a profile: a module in Python, a table in a file."""
-    if isinstance(value, annotation):
+    if isinstance(value, annotation) and isinstance(value, eqx.Module):
         yield from check_table(path, type(value), table_of(value), {})
     elif not isinstance(value, dict):
-        yield f"{path}: must be a table, is {shown(value)}"
-    elif annotation in PLAIN.values():
+        yield f"{path}: must be a table, is {abbreviate(value)}"
+    elif annotation in CLASSES_WITHOUT_TYPE.values():
         yield from check_table(path, annotation, value, {})
     else:
-        cls, problem = typed(path, TYPES["motion"], value)
+        cls, problem = find_class(path, CLASSES_BY_TYPE["motion"], value)
         if cls is None:
             yield problem
         else:
             yield from check_table(path, cls, {name: v for name, v in value.items() if name != "type"}, {})
 
 
-def typed(path: str, choices: Mapping[str, type], table: Mapping[str, Any]) -> tuple[type | None, str]:
+def find_class(path: str, choices: Mapping[str, type], table: Table) -> tuple[type | None, str]:
     """Return the class that a table's `type` names, or None and what is wrong with it."""
     kind = table.get("type")
     if isinstance(kind, str) and kind in choices:
         return choices[kind], ""
     if kind is None:
         return None, f"{path}.type: missing; one of {', '.join(choices)}"
-    return None, f"{path}.type: no type {shown(kind)}{suggestion(kind, choices) or '; one of ' + ', '.join(choices)}"
+    return None, f"{path}.type: no type {abbreviate(kind)}{suggestion(kind, choices) or '; one of ' + ', '.join(choices)}"
 
 
-def _number(path: str, dims: Sequence[str], value: Any, metadata: Mapping[str, Any], sizes: dict[str, int]) -> Iterator[str]:
-    """Iterate over what is wrong with a number: not one, wrong shape, not finite, out of its range (unknown while traced)."""
+def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
+    """Iterate over the mistakes of a number: its type, its shape and, where it is not traced, its value."""
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(value))
-    array = jnp.asarray(value) if traced else _array(value)
+    array = jnp.asarray(value) if traced else _as_array(value)
     fixed = all(dim.isdigit() for dim in dims)
     if array is None or array.ndim != len(dims) or (fixed and array.shape != tuple(map(int, dims))):
         expected = f"{' x '.join(dims)} numbers" if fixed else "numbers"
-        yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, is {shown(value)}"
+        yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, is {abbreviate(value)}"
         return
     for dim, size in zip(dims, array.shape, strict=True):
         if not dim.isdigit() and sizes.setdefault(dim, size) != size:
-            yield f"{path}: must have {sizes[dim]} entries, as the list before it has, is {shown(value)}"
+            yield f"{path}: must have {sizes[dim]} entries, as the list before it has, is {abbreviate(value)}"
             return
     if array.ndim and len(array) < metadata.get("at_least", 0):
-        yield f"{path}: needs at least {metadata['at_least']} entries, is {shown(value)}"
+        yield f"{path}: needs at least {metadata.get('at_least')} entries, is {abbreviate(value)}"
     if not isinstance(array, np.ndarray):
         return
     wrong = ~np.isfinite(array)
-    yield from _entries(path, array, wrong, "must be finite")
+    yield from _check_entries(path, array, wrong, "must be finite")
     if array.size and not wrong.any():
         for requirement in metadata.get("require", ()):
-            yield from _entries(path, array, ~requirement.holds(array), requirement.text)
+            yield from _check_entries(path, array, ~requirement.holds(array), requirement.text)
 
 
-def _entries(path: str, array: np.ndarray, wrong: np.ndarray, text: str) -> Iterator[str]:
+def _check_entries(path: str, array: np.ndarray, wrong: np.ndarray, text: str) -> Iterator[str]:
     for index in map(tuple, np.argwhere(wrong)):
-        yield f"{path}{''.join(f'[{i}]' for i in index)}: {text}, is {shown(float(array[index]))}"
+        yield f"{path}{''.join(f'[{i}]' for i in index)}: {text}, is {abbreviate(float(array[index]))}"
 
 
-def _array(value: Any) -> np.ndarray | None:
-    """Return a number, or nested lists of numbers, as an array; None if it is not one. Truth values and text are not numbers."""
+def _as_array(value: object) -> np.ndarray | None:
+    """Return a number, or nested lists of numbers, as an array; None for anything else, booleans and text too."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         array = np.asarray(value)
         return array if array.dtype.kind in "iuf" else None
     if isinstance(value, list | tuple):
-        items = [_array(item) for item in value]
+        items = [_as_array(item) for item in value]
         ragged = any(item is None for item in items) or len({item.shape for item in items if item is not None}) > 1
         return None if ragged else np.array(items, dtype=float)
     if isinstance(value, int | float) and not isinstance(value, bool):
@@ -184,7 +187,7 @@ def _array(value: Any) -> np.ndarray | None:
     return None
 
 
-def _references(path: str, kind: str | None, value: Any, known: Mapping[str, Mapping[str, type | None]]) -> Iterator[str]:
+def _check_references(path: str, kind: str | None, value: object, known: KnownNames) -> Iterator[str]:
     """Iterate over the names in a value that name nothing."""
     if kind is None:
         return
@@ -196,55 +199,55 @@ def _references(path: str, kind: str | None, value: Any, known: Mapping[str, Map
             continue
         if name not in named:
             what = "body" if kind == "body" else "revolute joint"
-            yield f"{place}: no {what} named {quoted(name)}{suggestion(name, named)}"
+            yield f"{place}: no {what} named {quote(name)}{suggestion(name, named)}"
         elif kind == "revolute" and not issubclass(named[name] or Revolute, Revolute):
-            yield f"{place}: {quoted(name)} must be a revolute joint"
+            yield f"{place}: {quote(name)} must be a revolute joint"
         elif single and name == GROUND and path.endswith(".body"):
             yield f'{place}: "{GROUND}" does not move; name a body'
 
 
-def _bodies_differ(where: str, cls: type, table: Mapping[str, Any]) -> Iterator[str]:
-    """Iterate over mistakes in who is connected: two bodies for every type of the format, none of them twice."""
+def _check_bodies(where: str, cls: type, table: Table) -> Iterator[str]:
+    """Iterate over the mistakes of an element's bodies: two for every type of the format, none of them twice."""
     bodies = table.get("bodies")
     if not isinstance(bodies, list | tuple):
         return
-    if in_files(cls) and len(bodies) != 2:
-        yield f"{where}.bodies: must name 2 bodies, is {shown(bodies)}"
+    if is_in_format(cls) and len(bodies) != 2:
+        yield f"{where}.bodies: must name 2 bodies, is {abbreviate(bodies)}"
     carrier = [table["carrier"]] if table.get("carrier", GROUND) != GROUND else []
     attached = [*bodies, *carrier]
     twice = {name: None for name in attached if isinstance(name, str) and attached.count(name) > 1}
-    yield from (f"{where}.{'carrier' if name in carrier else 'bodies'}: {quoted(name)} is connected to itself" for name in twice)
+    yield from (f"{where}.{'carrier' if name in carrier else 'bodies'}: {quote(name)} is connected to itself" for name in twice)
 
 
-def suggestion(name: Any, choices: Iterable[str]) -> str:
+def suggestion(name: object, choices: Iterable[str]) -> str:
     """Return '; did you mean "..."?' where one of the choices is close, else nothing."""
     if not isinstance(name, str):
         return ""
     lowered = {choice.lower(): choice for choice in choices}
     close = difflib.get_close_matches(name.lower(), lowered, n=1)
-    return f"; did you mean {quoted(lowered[close[0]])}?" if close else ""
+    return f"; did you mean {quote(lowered[close[0]])}?" if close else ""
 
 
-def quoted(name: str) -> str:
+def quote(name: str) -> str:
     """Return a name in double quotes."""
     return '"' + name.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
 
 
-def shown(value: Any) -> str:
-    """Return a value for a message, shortened, as a TOML file would show it where it can."""
+def abbreviate(value: object) -> str:
+    """Return a value as the text of a message: as in a TOML file, and not longer than 60 characters."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return quoted(value)
+        return quote(value)
     if isinstance(value, list | tuple):
-        text = f"[{', '.join(map(shown, value))}]"
+        text = f"[{', '.join(map(abbreviate, value))}]"
     else:
         text = f"shape {value.shape}" if isinstance(value, Tracer) else str(getattr(value, "tolist", lambda: value)())
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def not_hashable(element: eqx.Module) -> Iterator[str]:
-    """Iterate over what is wrong with the static fields of a user-written element."""
+def check_hashable(element: eqx.Module) -> Iterator[str]:
+    """Iterate over the mistakes of the static fields of a user-written element."""
     try:
         hash(jax.tree.structure(element))
     except TypeError as error:

@@ -2,16 +2,16 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import between
-from udkjax.scene.fields import KNOTS, SOME, number, optional
-from udkjax.scene.joints import Constraint, filled
-from udkjax.scene.splines import natural
+from udkjax.scene.fields import KNOTS, NOT_EMPTY, Number, number, number_or_guess
+from udkjax.scene.joints import Constraint, fill
+from udkjax.scene.splines import natural_spline
 
 
 class Motion(eqx.Module):
@@ -21,11 +21,11 @@ class Motion(eqx.Module):
     """
 
     @abstractmethod
-    def __call__(self, t: Any) -> Any:
+    def __call__(self, t: Number) -> Number:
         """Return the prescribed value at time t; it is differentiated twice."""
 
     @property
-    def breakpoints(self) -> Float[Array, "k"] | Sequence[Any]:
+    def breakpoints(self) -> Float[Array, "k"] | Sequence[Number]:
         """The times (s) where the law is not smooth: steps end there, and no interpolation reaches across. By default none."""
         return ()
 
@@ -33,7 +33,7 @@ class Motion(eqx.Module):
 class Polynomial(Motion):
     """c0 + c1 t + c2 t^2 + ..."""
 
-    coefficients: Float[Array, "n"] = eqx.field(converter=number, metadata=SOME)
+    coefficients: Float[Array, "n"] = eqx.field(converter=number, metadata=NOT_EMPTY)
 
     def __call__(self, t):
         value = self.coefficients[-1]
@@ -61,7 +61,7 @@ class Spline(Motion):
     values: Float[Array, "n"] = eqx.field(converter=number)
 
     def __call__(self, t):
-        return natural(t, self.times, self.values)
+        return natural_spline(t, self.times, self.values)
 
     @property
     def breakpoints(self):
@@ -77,7 +77,7 @@ class Driver(Constraint):
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
     motion: Motion
-    points: Float[Array, "2 2"] | None = eqx.field(converter=optional, default=None)
+    points: Float[Array, "2 2"] = eqx.field(converter=number_or_guess, default=None)
 
     def residual(self, t, *frames):
         one, two = frames
@@ -92,5 +92,5 @@ class Driver(Constraint):
     def breakpoints(self):
         return self.motion.breakpoints
 
-    def resolved(self, *frames):
-        return self if self.coordinate == "angle" else filled(self, "points", ((0.0, 0.0), (0.0, 0.0)))
+    def complete(self, *frames):
+        return self if self.coordinate == "angle" else fill(self, "points", ((0.0, 0.0), (0.0, 0.0)))

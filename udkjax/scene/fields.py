@@ -1,11 +1,11 @@
-"""How the classes of a scene declare their fields: converters at the door, and what a value must satisfy.
+"""How the classes of a scene declare their fields: converters, and the requirements that values must satisfy.
 
 A class of this folder is its own schema: its fields are the keys of the scene format, the annotation of a number states its
-shape, and the metadata below what else must hold. Files and Python are checked by the same declarations (`checks.py`).
+shape, and the metadata below state what else must hold. Files and Python are checked by the same declarations (`checks.py`).
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal, NamedTuple, TypeAlias, TypedDict
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-Numbers = ArrayLike | Sequence[Any]  # a number, an array, or nested lists of numbers
+Number: TypeAlias = Array | float  # one number, which may be traced
+Numbers: TypeAlias = ArrayLike | Sequence[object]  # a number, an array, or nested lists of numbers
+Table: TypeAlias = Mapping[str, object]  # {key: value} of one element, as in a scene file
 
 
 def number(value: Numbers) -> Float[Array, "..."]:
@@ -29,9 +31,14 @@ def number(value: Numbers) -> Float[Array, "..."]:
     return jnp.asarray(value, dtype=dtype)
 
 
-def optional(value: Numbers | None) -> Float[Array, "..."] | None:
+def optional_number(value: Numbers | None) -> Float[Array, "..."] | None:
     """Like `number`; None stays None: an absent number, for which nothing is computed."""
     return None if value is None else number(value)
+
+
+def number_or_guess(value: Numbers | None) -> Float[Array, "..."]:
+    """Like `number`; None stands for the value in the initial guess, which the mechanism fills in (`Constraint.complete`)."""
+    return None if value is None else number(value)  # pyright: ignore[reportReturnType]
 
 
 def names(value: Sequence[str] | str) -> tuple[str, ...]:
@@ -40,25 +47,27 @@ def names(value: Sequence[str] | str) -> tuple[str, ...]:
 
 
 @jax.tree_util.register_static
-class Choice:
-    """What a field of a user's class holds that is neither an array nor a number: a function, a name. Static by itself.
+class StaticValue:
+    """The value of a field of a user's class that is neither an array nor a number, such as a function or a name: a static leaf.
 
-    It is called, compared, looked up and asked for attributes as the `value` that it stands for.
+    Calls, comparisons and attributes are those of the `value` that it wraps.
     """
 
-    def __init__(self, value: Any):
+    def __init__(self, value: object):
         self.value = value
 
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
+    def __call__(self, *arguments: object, **named: object) -> object:
+        if not callable(self.value):
+            raise TypeError(f"{self.value!r} is not callable")
         return self.value(*arguments, **named)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         if name == "value":  # not yet set, while it is copied
             raise AttributeError(name)
         return getattr(self.value, name)
 
     def __eq__(self, other: object) -> bool:
-        other = other.value if isinstance(other, Choice) else other
+        other = other.value if isinstance(other, StaticValue) else other
         return self.value is other or bool(self.value == other)
 
     def __hash__(self) -> int:
@@ -75,16 +84,24 @@ class Requirement(NamedTuple):
     holds: Callable[[np.ndarray], np.ndarray]
 
 
+class FieldMetadata(TypedDict, total=False):
+    """What the value of a field must satisfy beyond its annotation."""
+
+    require: tuple[Requirement, ...]
+    at_least: int  # entries
+    names: Literal["body", "revolute"]  # the field holds names: of bodies, or of revolute joints
+
+
 _POSITIVE = Requirement("must be > 0", lambda v: v > 0)
 _NOT_NEGATIVE = Requirement("must be >= 0", lambda v: v >= 0)
 _INCREASING = Requirement("must be greater than the entry before", lambda v: np.diff(v, prepend=-np.inf) > 0)
 _ONE_TURN = Requirement("must be less than a turn after the first (the profile closes by itself)", lambda v: v - v[0] < 2 * np.pi)
 
-POSITIVE = {"require": (_POSITIVE,)}
-NOT_NEGATIVE = {"require": (_NOT_NEGATIVE,)}
-KNOTS = {"require": (_INCREASING,), "at_least": 2}
-TURN = {"require": (_INCREASING, _ONE_TURN), "at_least": 3}
-RADII = {"require": (_POSITIVE,), "at_least": 3}
-SOME = {"at_least": 1}
-BODY = {"names": "body"}  # the field names one or several bodies
-REVOLUTE = {"names": "revolute"}  # the field names a revolute joint
+POSITIVE: FieldMetadata = {"require": (_POSITIVE,)}
+NOT_NEGATIVE: FieldMetadata = {"require": (_NOT_NEGATIVE,)}
+KNOTS: FieldMetadata = {"require": (_INCREASING,), "at_least": 2}
+PROFILE_ANGLES: FieldMetadata = {"require": (_INCREASING, _ONE_TURN), "at_least": 3}
+PROFILE_RADII: FieldMetadata = {"require": (_POSITIVE,), "at_least": 3}
+NOT_EMPTY: FieldMetadata = {"at_least": 1}
+BODY: FieldMetadata = {"names": "body"}  # the field names one or several bodies
+REVOLUTE: FieldMetadata = {"names": "revolute"}  # the field names a revolute joint

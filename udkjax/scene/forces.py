@@ -1,16 +1,16 @@
-"""Force elements. One writes its potential energy, or the loads that it puts on its bodies, or both: they add up."""
+"""Force elements: springs, dampers, constant loads and friction, each by its potential energy, its loads, or the sum of both."""
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import Frame, Point, between
-from udkjax.scene.fields import BODY, NOT_NEGATIVE, POSITIVE, REVOLUTE, names, number, optional
+from udkjax.scene.fields import BODY, NOT_NEGATIVE, POSITIVE, REVOLUTE, Number, names, number, optional_number
 
-Load = tuple[Any, Any, Any]  # force x, force y (N), torque about the centre of mass (N m), in ground axes
+Load = tuple[Number, Number, Number]  # force x, force y (N), torque about the centre of mass (N m), in ground axes
 
 
 class ForceElement(eqx.Module):
@@ -21,21 +21,21 @@ class ForceElement(eqx.Module):
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
 
-    def potential(self, t: Any, *frames: Frame) -> Any:
+    def potential(self, t: Number, *frames: Frame) -> Number | None:
         """Return the potential energy V (J), or None; the load is -dV/dq."""
         return None
 
-    def loads(self, t: Any, *frames: Frame) -> Sequence[Load] | None:
+    def loads(self, t: Number, *frames: Frame) -> Sequence[Load] | None:
         """Return (force x, force y, torque about the centre of mass) for each attached body, in ground axes (N, N m), or None."""
         return None
 
     @property
-    def breakpoints(self) -> Float[Array, "k"] | Sequence[Any]:
+    def breakpoints(self) -> Float[Array, "k"] | Sequence[Number]:
         """The times (s) where the loads are not smooth: steps end there, and no interpolation reaches across. By default none."""
         return ()
 
-    def piece(self, t: Any, *frames: Frame) -> Any:
-        """Return which of their smooth pieces the loads are in, as a whole number, or None: they are smooth (the default).
+    def piece(self, t: Number, *frames: Frame) -> Number | None:
+        """Return the number of the smooth piece in which the loads are, or None where they are smooth everywhere (the default).
 
         Where pieces meet, loads are continuous. No interpolation reaches from one piece to another.
         """
@@ -51,7 +51,7 @@ class Spring(ForceElement):
     points: Float[Array, "2 2"] = eqx.field(converter=number)
     stiffness: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
     length: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
-    damping: Float[Array, ""] | None = eqx.field(converter=optional, default=None, metadata=NOT_NEGATIVE)
+    damping: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=NOT_NEGATIVE)
 
     def potential(self, t, *frames):
         return 0.5 * self.stiffness * (between(self.points, *frames).norm() - self.length) ** 2
@@ -64,7 +64,7 @@ class Spring(ForceElement):
         square, rate = d.dot(d), d.dot(Point(v2.x - v1.x, v2.y - v1.y))
         pull = self.damping * rate / jnp.where(square > 0, square, 1.0)
         force = Point(pull * d.x, pull * d.y)  # on point 1
-        return [_at(one, self.points[0], force), _at(two, self.points[1], Point(-force.x, -force.y))]
+        return [_load(one, self.points[0], force), _load(two, self.points[1], Point(-force.x, -force.y))]
 
 
 class TorsionSpring(ForceElement):
@@ -74,7 +74,7 @@ class TorsionSpring(ForceElement):
     """
 
     stiffness: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
-    damping: Float[Array, ""] | None = eqx.field(converter=optional, default=None, metadata=NOT_NEGATIVE)
+    damping: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=NOT_NEGATIVE)
     angle: Float[Array, ""] = eqx.field(converter=number, default=0.0)
 
     def potential(self, t, *frames):
@@ -103,7 +103,7 @@ class Force(ForceElement):
     def loads(self, t, *frames):
         (body,) = frames
         force = body.vector(self.vector) if self.frame == "body" else Point(self.vector[0], self.vector[1])
-        return [_at(body, self.point, force)]
+        return [_load(body, self.point, force)]
 
 
 class Torque(ForceElement):
@@ -132,12 +132,12 @@ class Friction(ForceElement):
         return _couple(-self.torque * jnp.tanh((two.omega - one.omega) / self.velocity))
 
 
-def _at(frame: Frame, point, force: Point) -> Load:
+def _load(frame: Frame, point: Float[Array, "2"], force: Point) -> Load:
     """Return a force at a point of a body as a load about its centre of mass."""
     arm = frame.vector(point)
     return force.x, force.y, arm.x * force.y - arm.y * force.x
 
 
-def _couple(torque) -> list[Load]:
+def _couple(torque: Number) -> list[Load]:
     """Return the loads of a torque on body 2 and its reaction on body 1."""
     return [(0.0, 0.0, -torque), (0.0, 0.0, torque)]

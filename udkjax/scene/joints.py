@@ -7,16 +7,17 @@ when a joint is made ("as in the initial guess") is filled in by the mechanism.
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any, Self
+from collections.abc import Mapping, Sequence
+from typing import Self, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.deprecation import renamed_attributes, renamed_methods
 from udkjax.scene.bodies import GROUND, Frame, Point, between
-from udkjax.scene.fields import BODY, POSITIVE, RADII, TURN, names, number, optional
-from udkjax.scene.splines import interval, periodic, wrapped
+from udkjax.scene.fields import BODY, POSITIVE, PROFILE_ANGLES, PROFILE_RADII, Number, Numbers, names, number, number_or_guess
+from udkjax.scene.splines import count_knots, periodic_spline, wrap
 
 
 class Constraint(eqx.Module):
@@ -24,30 +25,36 @@ class Constraint(eqx.Module):
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
 
+    __getattr__ = renamed_attributes("Constraint", attached="frame_names", resolved="complete")
+    __init_subclass__ = renamed_methods(attached="frame_names", resolved="complete")
+
     @abstractmethod
-    def residual(self, t: Any, *frames: Frame) -> Sequence[Any]:
+    def residual(self, t: Number, *frames: Frame) -> Sequence[Number]:
         """Return Psi, one scalar a row, from the time (s) and the frames of the attached bodies."""
 
     @property
-    def attached(self) -> tuple[str, ...]:
+    def frame_names(self) -> tuple[str, ...]:
         """The bodies whose frames `residual` gets, in that order."""
         return self.bodies
 
     @property
-    def breakpoints(self) -> Float[Array, "k"] | Sequence[Any]:
+    def breakpoints(self) -> Float[Array, "k"] | Sequence[Number]:
         """The times (s) where Psi is not smooth, though it and its rate are continuous. By default none."""
         return ()
 
-    def piece(self, t: Any, *frames: Frame) -> Any:
-        """Return which of its smooth pieces Psi is in, as a whole number, or None: it is smooth (the default).
+    def piece(self, t: Number, *frames: Frame) -> Number | None:
+        """Return the number of the smooth piece in which Psi is, or None where it is smooth everywhere (the default).
 
         Where pieces meet, Psi has continuous second derivatives. No interpolation reaches from one piece to another.
         """
         return None
 
-    def resolved(self, *frames: Frame) -> Self:
-        """Return the same with every number that the initial guess decides, given the attached bodies' frames there."""
+    def complete(self, *frames: Frame) -> Self:
+        """Return the constraint with the numbers that it leaves to the initial guess, from its bodies' frames there."""
         return self
+
+
+AnyConstraint = TypeVar("AnyConstraint", bound=Constraint)
 
 
 class Joint(Constraint):
@@ -74,14 +81,14 @@ class Prismatic(Joint):
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
     axis: Float[Array, ""] = eqx.field(converter=number)
-    angle: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
+    angle: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None)
 
     def residual(self, t, *frames):
         one, two = frames
-        return [_beside(self.axis, self.points, one, two), two.angle - one.angle - self.angle]
+        return [_lateral_distance(self.axis, self.points, one, two), two.angle - one.angle - self.angle]
 
-    def resolved(self, *frames):
-        return filled(self, "angle", frames[1].angle - frames[0].angle)
+    def complete(self, *frames):
+        return fill(self, "angle", frames[1].angle - frames[0].angle)
 
 
 class Slot(Joint):
@@ -91,22 +98,22 @@ class Slot(Joint):
     axis: Float[Array, ""] = eqx.field(converter=number)
 
     def residual(self, t, *frames):
-        return [_beside(self.axis, self.points, *frames)]
+        return [_lateral_distance(self.axis, self.points, *frames)]
 
 
 class Weld(Joint):
     """No relative motion. 3 rows: those of `Revolute`, and theta2 - theta1 - `angle` (rad; default: as in the initial guess)."""
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
-    angle: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
+    angle: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None)
 
     def residual(self, t, *frames):
         one, two = frames
         gap = between(self.points, one, two)
         return [gap.x, gap.y, two.angle - one.angle - self.angle]
 
-    def resolved(self, *frames):
-        return filled(self, "angle", frames[1].angle - frames[0].angle)
+    def complete(self, *frames):
+        return fill(self, "angle", frames[1].angle - frames[0].angle)
 
 
 class Distance(Joint):
@@ -116,28 +123,28 @@ class Distance(Joint):
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
-    length: Float[Array, ""] | None = eqx.field(converter=optional, default=None, metadata=POSITIVE)
+    length: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None, metadata=POSITIVE)
 
     def residual(self, t, *frames):
         one, two = frames
         d = between(self.points, one, two)
         return [0.5 * (d.dot(d) / self.length - self.length)]
 
-    def resolved(self, *frames):
-        return filled(self, "length", between(self.points, *frames).norm())
+    def complete(self, *frames):
+        return fill(self, "length", between(self.points, *frames).norm())
 
 
 class Angle(Joint):
     """The relative angle is fixed. 1 row: theta2 - theta1 - `angle` (rad; default: as in the initial guess)."""
 
-    angle: Float[Array, ""] | None = eqx.field(converter=optional, default=None)
+    angle: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None)
 
     def residual(self, t, *frames):
         one, two = frames
         return [two.angle - one.angle - self.angle]
 
-    def resolved(self, *frames):
-        return filled(self, "angle", frames[1].angle - frames[0].angle)
+    def complete(self, *frames):
+        return fill(self, "angle", frames[1].angle - frames[0].angle)
 
 
 class Gear(Joint):
@@ -150,19 +157,19 @@ class Gear(Joint):
     radii: Float[Array, "2"] = eqx.field(converter=number, metadata=POSITIVE)
     internal: bool = eqx.field(static=True, default=False)
     carrier: str = eqx.field(static=True, default=GROUND, metadata=BODY)
-    constant: Float[Array, ""] | None = eqx.field(init=False, default_factory=lambda: None)
+    constant: Float[Array, ""] = eqx.field(init=False, default_factory=lambda: None)
 
     @property
-    def attached(self):
+    def frame_names(self):
         return self.bodies if self.carrier == GROUND else (*self.bodies, self.carrier)
 
     def residual(self, t, *frames):
-        return [self._rolled(*frames) - self.constant]
+        return [self._rolling_distance(*frames) - self.constant]
 
-    def resolved(self, *frames):
-        return _with(self, "constant", self._rolled(*frames))
+    def complete(self, *frames):
+        return _replace(self, "constant", self._rolling_distance(*frames))
 
-    def _rolled(self, one, two, carrier=None):
+    def _rolling_distance(self, one: Frame, two: Frame, carrier: Frame | None = None) -> Number:
         first, second = (one.angle, two.angle) if carrier is None else (one.angle - carrier.angle, two.angle - carrier.angle)
         rolled = self.radii[1] * second
         return self.radii[0] * first - rolled if self.internal else self.radii[0] * first + rolled
@@ -177,15 +184,15 @@ class Rack(Joint):
 
     radius: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)
     axis: Float[Array, ""] = eqx.field(converter=number)
-    constant: Float[Array, ""] | None = eqx.field(init=False, default_factory=lambda: None)
+    constant: Float[Array, ""] = eqx.field(init=False, default_factory=lambda: None)
 
     def residual(self, t, *frames):
-        return [self._rolled(*frames) - self.constant]
+        return [self._rolling_distance(*frames) - self.constant]
 
-    def resolved(self, *frames):
-        return _with(self, "constant", self._rolled(*frames))
+    def complete(self, *frames):
+        return _replace(self, "constant", self._rolling_distance(*frames))
 
-    def _rolled(self, one, two):
+    def _rolling_distance(self, one: Frame, two: Frame) -> Number:
         along = one.vector((jnp.cos(self.axis), jnp.sin(self.axis)))
         return along.dot(Point(two.x - one.x, two.y - one.y)) + self.radius * (two.angle - one.angle)
 
@@ -193,19 +200,19 @@ class Rack(Joint):
 class Profile(eqx.Module):
     """A cam's outline: a closed curve, radius over polar angle, by a periodic cubic spline. The first point is not repeated."""
 
-    angle: Float[Array, "n"] = eqx.field(converter=number, metadata=TURN)  # rad, increasing, less than one turn
-    radius: Float[Array, "n"] = eqx.field(converter=number, metadata=RADII)  # m
+    angle: Float[Array, "n"] = eqx.field(converter=number, metadata=PROFILE_ANGLES)  # rad, increasing, less than one turn
+    radius: Float[Array, "n"] = eqx.field(converter=number, metadata=PROFILE_RADII)  # m
 
-    def __call__(self, angle: Any) -> Any:
+    def __call__(self, angle: Number) -> Array:
         """Return the radius (m) at a polar angle (rad)."""
-        return periodic(angle, self.angle, self.radius, 2 * jnp.pi)
+        return periodic_spline(angle, self.angle, self.radius, 2 * jnp.pi)
 
-    def piece(self, angle: Any) -> Any:
+    def piece(self, angle: Number) -> Array:
         """Return the number of the cubic at a polar angle (rad)."""
-        return interval(wrapped(angle, self.angle[0], 2 * jnp.pi), self.angle)
+        return count_knots(wrap(angle, self.angle[0], 2 * jnp.pi), self.angle)
 
 
-def _profile(value) -> Profile:
+def _profile(value: Profile | Mapping[str, Numbers]) -> Profile:
     return value if isinstance(value, Profile) else Profile(**value)
 
 
@@ -226,21 +233,21 @@ class Cam(Joint):
         d = self._arm(*frames)
         return self.profile.piece(jnp.arctan2(d.y, d.x))
 
-    def _arm(self, one, two):
+    def _arm(self, one: Frame, two: Frame) -> Point:
         """Return the vector from point 1 to point 2 in body 1's frame."""
         return one.local(between(self.points, one, two))
 
 
-def _beside(axis, points, one, two):
-    """Return how far point 2 is to the left of the line through point 1 along `axis` of body 1 (m)."""
+def _lateral_distance(axis: Number, points: Float[Array, "2 2"], one: Frame, two: Frame) -> Number:
+    """Return the distance of point 2 to the left of the line through point 1 along `axis` of body 1 (m)."""
     normal = one.vector((-jnp.sin(axis), jnp.cos(axis)))
     return normal.dot(between(points, one, two))
 
 
-def _with(constraint, name, value):
+def _replace(constraint: AnyConstraint, name: str, value: Numbers) -> AnyConstraint:
     return eqx.tree_at(lambda c: getattr(c, name), constraint, number(value), is_leaf=lambda leaf: leaf is None)
 
 
-def filled(constraint, name, value):
-    """Return the constraint with an absent number filled in."""
-    return constraint if getattr(constraint, name) is not None else _with(constraint, name, value)
+def fill(constraint: AnyConstraint, name: str, value: Numbers) -> AnyConstraint:
+    """Return the constraint with its number `name` set to `value` where it is absent (None)."""
+    return constraint if getattr(constraint, name) is not None else _replace(constraint, name, value)

@@ -13,18 +13,17 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.deprecation import renamed_attributes
-from udkjax.scene.bodies import GROUND, Body, Frame
-from udkjax.scene.checks import Entry, SceneError, not_hashable, problems_of
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body
+from udkjax.scene.checks import SceneEntry, SceneError, check_hashable, problems_of
 from udkjax.scene.description import mechanism_html
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Choice, Numbers, number
+from udkjax.scene.fields import Numbers, StaticValue, number
 from udkjax.scene.forces import ForceElement, Friction
-from udkjax.scene.joints import Constraint, Joint
-from udkjax.scene.parameters import parameters_of, replaced
+from udkjax.scene.joints import AnyConstraint, Constraint, Joint
+from udkjax.scene.number_fields import parameters_of, replace_numbers
 from udkjax.scene.schema import table_of, type_name
 
 Element = TypeVar("Element", bound=eqx.Module)
-_FIXED = Frame(0.0, 0.0, 0.0, 1.0, 0.0)
 
 
 class Origin:
@@ -82,55 +81,55 @@ class Mechanism(eqx.Module):
             "body": list(bodies.items()),
             "joint": list((joints or {}).items()),
             "driver": list((drivers or {}).items()),
-            "force": list(forces.items() if isinstance(forces, Mapping) else zip(numbered(forces), forces, strict=True)),
+            "force": list(forces.items() if isinstance(forces, Mapping) else zip(name_elements(forces), forces, strict=True)),
         }
-        found = _checked(given, gravity, name)
+        found = _check_elements(given, gravity, name)
         self.name, self.gravity = name, number(gravity)
-        self.body_names, self._bodies = _columns(found["body"])
+        self.body_names, self._bodies = _unzip(found["body"])
         known = dict(found["body"])
-        self.joint_names, self._joints = _columns([(key, _resolved(c, known)) for key, c in found["joint"]])
-        self.driver_names, self._drivers = _columns([(key, _resolved(c, known)) for key, c in found["driver"]])
-        self.force_names, self._forces = _columns(found["force"])
+        self.joint_names, self._joints = _unzip([(key, _complete(c, known)) for key, c in found["joint"]])
+        self.driver_names, self._drivers = _unzip([(key, _complete(c, known)) for key, c in found["driver"]])
+        self.force_names, self._forces = _unzip(found["force"])
         self.origin = origin if any(isinstance(leaf, Tracer) for leaf in self._numbers) else None
 
     @property
     def bodies(self) -> Mapping[str, Body]:
         """The bodies by name."""
-        return _named(self.body_names, self._bodies)
+        return _by_name(self.body_names, self._bodies)
 
     @property
     def joints(self) -> Mapping[str, Any]:
         """The joints by name, each with the attributes of its own class."""
-        return _named(self.joint_names, self._joints)
+        return _by_name(self.joint_names, self._joints)
 
     @property
     def drivers(self) -> Mapping[str, Driver]:
         """The drivers by name."""
-        return _named(self.driver_names, self._drivers)
+        return _by_name(self.driver_names, self._drivers)
 
     @property
     def forces(self) -> Mapping[str, Any]:
         """The force elements by name, each with the attributes of its own class."""
-        return _named(self.force_names, self._forces)
+        return _by_name(self.force_names, self._forces)
 
     @property
     def constraints(self) -> Mapping[str, Constraint]:
         """Joints, then drivers, by name: the order of the rows of Psi."""
-        return _named(self.joint_names + self.driver_names, self._joints + self._drivers)
+        return _by_name(self.joint_names + self.driver_names, self._joints + self._drivers)
 
     def frames_of(self, element: Constraint | ForceElement) -> tuple[str, ...]:
         """Return the names of the bodies whose frames an element gets, in that order."""
-        return attached(element, self.joints if isinstance(element, Friction) else {})
+        return attached_bodies(element, self.joints if isinstance(element, Friction) else {})
 
     @property
     def q0(self) -> Float[Array, "bodies 3"]:
         """The initial guess of the coordinates: x, y (m) and angle (rad) of each body."""
-        return _side_by_side([body.position for body in self._bodies], [body.angle for body in self._bodies])
+        return _coordinates([body.position for body in self._bodies], [body.angle for body in self._bodies])
 
     @property
     def v0(self) -> Float[Array, "bodies 3"]:
         """The initial guess of the velocities (m/s, rad/s)."""
-        return _side_by_side([body.velocity for body in self._bodies], [body.angular_velocity for body in self._bodies])
+        return _coordinates([body.velocity for body in self._bodies], [body.angular_velocity for body in self._bodies])
 
     @property
     def breakpoints(self) -> Float[Array, "k"] | None:
@@ -156,11 +155,11 @@ class Mechanism(eqx.Module):
     __getattr__ = renamed_attributes("Mechanism", bare="without_origin", is_known="is_concrete")
 
     @property
-    def _numbers(self) -> list[Any]:
+    def _numbers(self) -> list[Array]:
         return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
 
     def _repr_html_(self) -> str:
-        return mechanism_html(self)
+        return mechanism_html(self, self.frames_of)
 
     def parameters(self) -> dict[str, Array]:
         """Return every number of the scene under its name, such as `body.link1.mass`; absent ones (a damping) are left out."""
@@ -174,35 +173,35 @@ class Mechanism(eqx.Module):
         made from (`origin`), so that their analysis serves it. A number that was absent is then there. Numbers that a joint
         once took from the initial guess stay as they are; the constants of gears and racks follow the guess. Raises `SceneError`.
         """
-        new, gravity = replaced(self, values)
+        new, gravity = replace_numbers(self, values)
         traced = any(isinstance(value, Tracer) for value in jax.tree.leaves(dict(values)))
         origin = Origin(self) if traced and self.is_concrete else self.origin
         return Mechanism(new["body"], new["joint"], new["driver"], new["force"], gravity, self.name, origin)
 
 
-def attached(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:
+def attached_bodies(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:
     """Return the names of the bodies whose frames an element gets, in that order, where `joints` are those of its mechanism."""
     if isinstance(element, Friction):
-        return joints[element.joint].attached
-    return element.attached if isinstance(element, Constraint) else element.bodies
+        return joints[element.joint].frame_names
+    return element.frame_names if isinstance(element, Constraint) else element.bodies
 
 
-def _checked(given: Mapping[str, list], gravity: Any, name: str) -> dict[str, list[tuple[str, Any]]]:
+def _check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> dict[str, list[tuple[str, Any]]]:
     """Return all elements with plain numbers made arrays; raise `SceneError` where anything is wrong with any of them."""
     kinds = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}
     problems, entries, found = [], [], {section: [] for section in given}
     for section, items in given.items():
         for index, (key, element) in enumerate(items):
             if not isinstance(element, kinds[section]):
-                entry = Entry(section, index, key, None, {})
+                entry = SceneEntry(section, index, key, None, {})
                 problem = f"{entry.where}: must be of class {kinds[section].__name__}, is a {type(element).__name__}"
                 entries.append(entry._replace(problem=problem))
                 continue
             element = jax.tree.map(_as_number, element)
-            entries.append(entry := Entry(section, index, key, type(element), table_of(element)))
-            element = jax.tree.map(_as_choice, element)
-            problems.extend(f"{entry.where}{problem}" for problem in not_hashable(element))
-            if section == "force" and not _acts(type(element)):
+            entries.append(entry := SceneEntry(section, index, key, type(element), table_of(element)))
+            element = jax.tree.map(_as_static, element)
+            problems.extend(f"{entry.where}{problem}" for problem in check_hashable(element))
+            if section == "force" and not _has_load(type(element)):
                 problems.append(f"{entry.where}: {type(element).__name__} must have a method `potential` or `loads`")
             found[section].append((key, element))
     problems.extend(problems_of(entries, gravity))
@@ -211,16 +210,16 @@ def _checked(given: Mapping[str, list], gravity: Any, name: str) -> dict[str, li
     return found
 
 
-def _resolved(constraint: Any, bodies: Mapping[str, Body]) -> Any:
-    if type(constraint).resolved is Constraint.resolved:  # most joints: spares the sines and cosines of every body
+def _complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstraint:
+    if type(constraint).complete is Constraint.complete:  # most joints: spares the sines and cosines of every body
         return constraint
-    placed = [(bodies[name].position, bodies[name].angle) for name in constraint.attached if name != GROUND]
+    placed = [(bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND]
     known = not any(isinstance(x, Tracer) for x in jax.tree.leaves((constraint, placed)))
     with jax.ensure_compile_time_eval() if known else nullcontext():  # known stays known while something else is traced
-        return constraint.resolved(*(_FIXED if name == GROUND else bodies[name].frame() for name in constraint.attached))
+        return constraint.complete(*(GROUND_FRAME if name == GROUND else bodies[name].frame() for name in constraint.frame_names))
 
 
-def numbered(elements: Sequence[Any], names: Sequence[str | None] = ()) -> list[str]:
+def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:
     """Name each element that has no name TYPE1, TYPE2, ... by its place among those of its type (classes or their names)."""
     found, counts = [], {}
     for i, element in enumerate(elements):
@@ -230,30 +229,30 @@ def numbered(elements: Sequence[Any], names: Sequence[str | None] = ()) -> list[
     return found
 
 
-def _acts(cls: type) -> bool:
+def _has_load(cls: type) -> bool:
     return cls.potential is not ForceElement.potential or cls.loads is not ForceElement.loads
 
 
-def _as_number(leaf):
+def _as_number(leaf: object) -> object:
     """Convert the plain numbers of user-written elements, which would be static."""
     return number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
 
 
-def _as_choice(leaf):
-    """Make what is no number static by itself."""
-    return leaf if eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct) else Choice(leaf)
+def _as_static(leaf: object) -> object:
+    """Wrap a leaf that is not a number, so that it is static."""
+    return leaf if eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct) else StaticValue(leaf)
 
 
-def _side_by_side(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
+def _coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
     known = not any(isinstance(x, Tracer) for x in (*vectors, *numbers))  # by NumPy: jnp takes its time for each array
     if known:
         return number(np.column_stack([np.stack([np.asarray(x) for x in vectors]), [np.asarray(x) for x in numbers]]))
     return jnp.column_stack([jnp.stack(vectors), jnp.stack(numbers)])
 
 
-def _columns(items: Sequence[tuple[str, Element]]) -> tuple[tuple[str, ...], tuple[Element, ...]]:
+def _unzip(items: Sequence[tuple[str, Element]]) -> tuple[tuple[str, ...], tuple[Element, ...]]:
     return tuple(key for key, _ in items), tuple(element for _, element in items)
 
 
-def _named(names: tuple[str, ...], elements: tuple[Element, ...]) -> Mapping[str, Element]:
+def _by_name(names: tuple[str, ...], elements: tuple[Element, ...]) -> Mapping[str, Element]:
     return MappingProxyType(dict(zip(names, elements, strict=True)))

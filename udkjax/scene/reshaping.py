@@ -6,14 +6,13 @@ guess has it: along a tree of pins, which holds each body once, no pin opens. Th
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.scene.bodies import GROUND, Body, Frame
-from udkjax.scene.checks import SceneError, quoted, suggestion
-from udkjax.scene.fields import number
+from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Body, Frame
+from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.fields import Number, Numbers, number
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 
@@ -28,8 +27,8 @@ def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: Array
     proportion to the length and to its third power. Angles stay, and positions and velocities of the initial guess follow along
     the pins. Pure and differentiable; the length may be traced. Raises `SceneError`.
     """
-    names = _known(mechanism, bodies)
-    values: dict[str, Any] = {}
+    names = _check_names(mechanism, bodies)
+    values: dict[str, Numbers] = {}
     for body in names:
         points = dict(_attachments(mechanism, body))
         scale = number(length) / length_of(mechanism, body)
@@ -37,15 +36,15 @@ def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: Array
         if as_rod:
             element = mechanism.bodies[body]
             values |= {f"body.{body}.mass": scale * element.mass, f"body.{body}.inertia": scale**3 * element.inertia}
-    return _followed(mechanism, mechanism.with_parameters(values))
+    return _move_along_pins(mechanism, mechanism.with_parameters(values))
 
 
 def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
     """Return the largest distance (m) between two points where a body is attached. Raises `SceneError`."""
-    _known(mechanism, body)
+    _check_names(mechanism, body)
     points = [point for _, point in _attachments(mechanism, body)]
     if len(points) < 2:
-        raise SceneError([f"body {quoted(body)} has no length: it is attached at fewer than two points"], mechanism.name)
+        raise SceneError([f"body {quote(body)} has no length: it is attached at fewer than two points"], mechanism.name)
     stacked = jnp.stack(points)
     square = jnp.sum((stacked[:, None] - stacked[None]) ** 2, axis=-1)
     return jnp.sqrt(jnp.max(square))
@@ -59,17 +58,17 @@ def with_angle(
     Positions and velocities of the initial guess follow along the pins: a parallelogram stays closed where all links are given.
     Pure and differentiable; the angle may be traced. Raises `SceneError`.
     """
-    names = _known(mechanism, bodies)
-    values: dict[str, Any] = {f"body.{body}.angle": angle for body in names}
+    names = _check_names(mechanism, bodies)
+    values: dict[str, Numbers] = {f"body.{body}.angle": angle for body in names}
     if angular_velocity is not None:
         values |= {f"body.{body}.angular_velocity": angular_velocity for body in names}
-    return _followed(mechanism, mechanism.with_parameters(values))
+    return _move_along_pins(mechanism, mechanism.with_parameters(values))
 
 
-def _known(mechanism: Mechanism, bodies: Sequence[str] | str) -> tuple[str, ...]:
+def _check_names(mechanism: Mechanism, bodies: Sequence[str] | str) -> tuple[str, ...]:
     names = (bodies,) if isinstance(bodies, str) else tuple(bodies)
     known = mechanism.body_names
-    problems = [f"no body named {quoted(name)}{suggestion(name, known)}" for name in names if name not in known]
+    problems = [f"no body named {quote(name)}{suggestion(name, known)}" for name in names if name not in known]
     if problems:
         raise SceneError(problems, mechanism.name)
     return names
@@ -87,19 +86,19 @@ def _attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[A
                 yield f"{section}.{name}.point", element.point
 
 
-def _followed(before: Mechanism, after: Mechanism) -> Mechanism:
+def _move_along_pins(before: Mechanism, after: Mechanism) -> Mechanism:
     """Move bodies by as much as the pins that hold them have moved: a guess in which nothing has changed stays as it is."""
     bodies: dict[str, Body] = dict(after.bodies)
-    old = {GROUND: _still()} | {name: _moving(body) for name, body in before.bodies.items()}
-    new = {GROUND: _still()} | {name: _moving(body) for name, body in bodies.items()}
-    values: dict[str, Any] = {}
-    for joint, held, body in _tree(before):
+    old = {GROUND: GROUND_FRAME_AT_REST} | {name: _initial_frame(body) for name, body in before.bodies.items()}
+    new = {GROUND: GROUND_FRAME_AT_REST} | {name: _initial_frame(body) for name, body in bodies.items()}
+    values: dict[str, Numbers] = {}
+    for joint, holder, body in _spanning_tree(before):
         was, now = before.joints[joint], after.joints[joint]
         one, two = (0, 1) if was.bodies[1] == body else (1, 0)
         frame = new[body]
         # Of the holder and of the body itself, how the pin has moved; then the body makes up for the difference.
-        shift = _minus(_pin(new[held], now.points[one]), _pin(old[held], was.points[one]))
-        own = _minus(_pin(frame, now.points[two]), _pin(old[body], was.points[two]))
+        shift = _subtract(_pin_state(new[holder], now.points[one]), _pin_state(old[holder], was.points[one]))
+        own = _subtract(_pin_state(frame, now.points[two]), _pin_state(old[body], was.points[two]))
         x, y, vx, vy = (a - b for a, b in zip(shift, own, strict=True))
         frame = frame._replace(x=frame.x + x, y=frame.y + y, vx=frame.vx + vx, vy=frame.vy + vy)
         new[body] = frame
@@ -108,7 +107,7 @@ def _followed(before: Mechanism, after: Mechanism) -> Mechanism:
     return after.with_parameters(values) if values else after
 
 
-def _tree(mechanism: Mechanism) -> Iterator[tuple[str, str, str]]:
+def _spanning_tree(mechanism: Mechanism) -> Iterator[tuple[str, str, str]]:
     """Pins by which each body is reached: the joint, the body that holds it, and the body that it reaches.
 
     From the ground on; of bodies that no pin joins to it, from the first of them, which stays.
@@ -117,27 +116,24 @@ def _tree(mechanism: Mechanism) -> Iterator[tuple[str, str, str]]:
     seen: set[str] = set()
     for root in (GROUND, *mechanism.body_names):
         reached = [] if root in seen else [root]
-        for held in reached:  # grows while it is gone through: the nearest to the root first
-            seen.add(held)
+        for holder in reached:  # grows while it is gone through: the nearest to the root first
+            seen.add(holder)
             for joint, pair in pins.items():
-                body = pair[0] if pair[1] == held else pair[1]
-                if held in pair and body not in seen and body not in reached:
+                body = pair[0] if pair[1] == holder else pair[1]
+                if holder in pair and body not in seen and body not in reached:
                     reached.append(body)
-                    yield joint, held, body
+                    yield joint, holder, body
 
 
-def _still() -> Frame:
-    return Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
-
-
-def _moving(body: Body) -> Frame:
+def _initial_frame(body: Body) -> Frame:
     return body.frame()._replace(vx=body.velocity[0], vy=body.velocity[1], omega=body.angular_velocity)
 
 
-def _pin(frame: Frame, local: Any) -> tuple[Any, Any, Any, Any]:
-    """Where a point of a body is (m) and how it moves (m/s)."""
-    return *frame.point(local), *frame.velocity(local)
+def _pin_state(frame: Frame, local: Float[Array, "2"]) -> tuple[Number, Number, Number, Number]:
+    """Return the position (m) and the velocity (m/s) of a point of a body."""
+    (x, y), (vx, vy) = frame.point(local), frame.velocity(local)
+    return x, y, vx, vy
 
 
-def _minus(one: tuple, two: tuple) -> tuple:
+def _subtract(one: tuple, two: tuple) -> tuple:
     return tuple(a - b for a, b in zip(one, two, strict=True))

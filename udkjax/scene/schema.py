@@ -7,14 +7,15 @@ scenes are read, checked and written.
 import dataclasses
 import re
 import types
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, Union, get_args, get_origin
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Union, cast, get_args, get_origin
 
 import equinox as eqx
 import jax
 
 from udkjax.scene import drivers, forces, joints
 from udkjax.scene.bodies import Body
+from udkjax.scene.fields import FieldMetadata
 
 SECTIONS = ("body", "joint", "driver", "force")
 
@@ -24,33 +25,37 @@ def type_name(cls: type) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
 
-def _by_name(module, *names: str) -> dict[str, type]:
+def _by_name(module: types.ModuleType, *names: str) -> dict[str, type]:
     return {type_name(getattr(module, name)): getattr(module, name) for name in names}
 
 
-TYPES: dict[str, dict[str, type]] = {
+CLASSES_BY_TYPE: dict[str, dict[str, type]] = {
     "joint": _by_name(joints, "Revolute", "Prismatic", "Slot", "Weld", "Distance", "Angle", "Gear", "Rack", "Cam"),
     "force": _by_name(forces, "Spring", "TorsionSpring", "Force", "Torque", "Friction"),
     "motion": _by_name(drivers, "Polynomial", "Sine", "Spline"),
 }
-PLAIN: dict[str, type] = {"body": Body, "driver": drivers.Driver, "profile": joints.Profile}  # tables without a `type`
+CLASSES_WITHOUT_TYPE: dict[str, type] = {
+    "body": Body,
+    "driver": drivers.Driver,
+    "profile": joints.Profile,
+}  # tables without a `type`
 
 
-def in_files(cls: type) -> bool:
+def is_in_format(cls: type) -> bool:
     """Tell whether the scene format knows the class."""
-    return cls in PLAIN.values() or any(cls in known.values() for known in TYPES.values())
+    return cls in CLASSES_WITHOUT_TYPE.values() or any(cls in known.values() for known in CLASSES_BY_TYPE.values())
 
 
 class Key(NamedTuple):
     """One key of an element: a field of its class."""
 
-    annotation: Any  # without None
+    annotation: Any  # without None: a type, or a union of types
     required: bool
-    metadata: Mapping[str, Any]
+    metadata: FieldMetadata
 
 
 def keys(cls: type) -> dict[str, Key]:
-    """Return the keys of a class: its fields, in their order, but those that are worked out."""
+    """Return the keys of a class: the fields that its constructor takes, in their order."""
     found = {}
     for field in dataclasses.fields(cls):
         if field.init:
@@ -59,11 +64,11 @@ def keys(cls: type) -> dict[str, Key]:
                 some = [kind for kind in get_args(annotation) if kind is not type(None)]
                 annotation = some[0] if len(some) == 1 else annotation
             default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-            found[field.name] = Key(annotation, not default, field.metadata)
+            found[field.name] = Key(annotation, not default, cast(FieldMetadata, field.metadata))
     return found
 
 
-def table_of(element: eqx.Module) -> dict[str, Any]:
+def table_of(element: eqx.Module) -> dict[str, object]:
     """Return an element as a table; what is absent (None) is left out, and nested modules stay modules."""
     table = {name: getattr(element, name) for name in keys(type(element))}
     return {name: value for name, value in table.items() if value is not None}

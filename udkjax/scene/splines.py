@@ -11,24 +11,24 @@ Source: de Boor, A Practical Guide to Splines, chapter 4.
 All of it is arithmetic on numbers, choices between them, and loops of known length, so that it can be part of machine code.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.scene.fields import Number
 
-def natural(x: Any, knots: Float[Array, " n"], values: Float[Array, " n"]) -> Any:
+
+def natural_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " n"]) -> Array:
     """Evaluate the natural cubic spline (no curvature at the ends) at a scalar x; beyond the ends it is a straight line."""
     steps, slopes = jnp.diff(knots), jnp.diff(values) / jnp.diff(knots)
     inner = _tridiagonal(2 * (steps[:-1] + steps[1:]), steps[1:-1], 6 * jnp.diff(slopes)[:, None])[:, 0]
     within = jnp.clip(x, knots[0], knots[-1])
-    none = jnp.zeros(1, knots.dtype)
-    value, slope = _cubic(within, knots, values, jnp.concatenate([none, inner, none]))
+    end = jnp.zeros(1, knots.dtype)
+    value, slope = _cubic(within, knots, values, jnp.concatenate([end, inner, end]))
     return value + slope * (x - within)
 
 
-def periodic(x: Any, knots: Float[Array, " n"], values: Float[Array, " n"], period: Any) -> Any:
+def periodic_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " n"], period: Number) -> Array:
     """Evaluate the periodic cubic spline at a scalar x; the knot after the last is the first, one period on."""
     n = knots.size
     closed, around = jnp.append(knots, knots[0] + period), jnp.append(values, values[0])
@@ -43,21 +43,23 @@ def periodic(x: Any, knots: Float[Array, " n"], values: Float[Array, " n"], peri
         one, other = _tridiagonal(diagonal[:-1], steps[: n - 2], jnp.stack([right[:-1], corner], 1)).T
         last = (right[-1] - jnp.sum(corner * one)) / (diagonal[-1] - jnp.sum(corner * other))
         curvatures = jnp.append(one - last * other, last)
-    within = wrapped(x, knots[0], period)
+    within = wrap(x, knots[0], period)
     return _cubic(within, closed, around, jnp.append(curvatures, curvatures[0]))[0]
 
 
-def wrapped(x: Any, start: Any, period: Any) -> Any:
-    """X, less as many periods as bring it between start and start + period."""
+def wrap(x: Number, start: Number, period: Number) -> Array:
+    """Return x less as many periods as bring it between start and start + period."""
     return x - period * jnp.floor((x - start) / period)
 
 
-def interval(x: Any, knots: Float[Array, " n"]) -> Any:
-    """How many of the knots x has reached."""
+def count_knots(x: Number, knots: Float[Array, " n"]) -> Array:
+    """Count the knots up to x."""
     return jnp.sum(jnp.where(x >= knots, 1.0, 0.0))
 
 
-def _cubic(x, knots, values, curvatures):
+def _cubic(
+    x: Number, knots: Float[Array, " n"], values: Float[Array, " n"], curvatures: Float[Array, " n"]
+) -> tuple[Array, Array]:
     """Return the spline's value and slope at x within the knots."""
     reached = jnp.append(True, x >= knots[1:-1])
     inside = reached & jnp.append(x < knots[1:-1], True)
@@ -70,7 +72,7 @@ def _cubic(x, knots, values, curvatures):
     return value, slope
 
 
-def _tridiagonal(diagonal, beside, right):
+def _tridiagonal(diagonal: Float[Array, " n"], beside: Float[Array, " n-1"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Solve a symmetric system that is dominated by its diagonal (n,), with `beside` (n - 1,) next to it, for columns (n, k)."""
 
     def eliminate(before, row):

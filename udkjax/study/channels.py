@@ -19,7 +19,7 @@ from typing import Literal, Protocol
 from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import quoted, suggestion
+from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 
 Needs = Literal["states", "accelerations", "reactions"]
@@ -107,7 +107,7 @@ def _parse_body(mechanism: Mechanism, text: str) -> Channel:
     point, rest = _split_point(rest, _CENTRE)
     shown = _with_point(name, point) if point is not _CENTRE else name
     known = _POINT_UNITS if point is not _CENTRE else {**_POINT_UNITS, **_ANGLE_UNITS}
-    quantity = _check_quantity(f"body {quoted(shown)}", rest, known)
+    quantity = _check_quantity(f"body {quote(shown)}", rest, known)
     needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
     return Channel(f"body.{shown}.{quantity}", UNITS[quantity], needs, "body", "", (name,), (point,), quantity)
 
@@ -117,11 +117,11 @@ def _parse_joint(mechanism: Mechanism, text: str) -> Channel:
     bodies = mechanism.frames_of(mechanism.joints[name])
     for body in sorted(bodies, key=len, reverse=True):
         if rest.startswith(f".{body}."):
-            quantity = _check_quantity(f"joint {quoted(name)} on body {quoted(body)}", rest.removeprefix(f".{body}"), LOADS)
+            quantity = _check_quantity(f"joint {quote(name)} on body {quote(body)}", rest.removeprefix(f".{body}"), LOADS)
             return Channel(f"joint.{name}.{body}.{quantity}", UNITS[quantity], "reactions", "joint", name, (body,), (), quantity)
     pair = bodies[:2]
     known = {**(_ANGLE_UNITS if len(pair) == 2 else {}), **LOADS}
-    quantity = _check_quantity(f"joint {quoted(name)}", rest, known, [f"{b}.{q}" for b in bodies for q in LOADS])
+    quantity = _check_quantity(f"joint {quote(name)}", rest, known, [f"{b}.{q}" for b in bodies for q in LOADS])
     units, label = UNITS[quantity], f"joint.{name}.{quantity}"
     if quantity in LOADS:
         return Channel(label, units, "reactions", "joint", name, pair[-1:], (), quantity)
@@ -131,7 +131,7 @@ def _parse_joint(mechanism: Mechanism, text: str) -> Channel:
 
 def _parse_driver(mechanism: Mechanism, text: str) -> Channel:
     name, rest = _split_owner("driver", mechanism.driver_names, text)
-    quantity = _check_quantity(f"driver {quoted(name)}", rest, {"load": ""})
+    quantity = _check_quantity(f"driver {quote(name)}", rest, {"load": ""})
     driver = mechanism.drivers[name]
     units = "N m" if driver.coordinate == "angle" else "N"
     return Channel(f"driver.{name}.{quantity}", units, "reactions", "driver", name, driver.bodies[1:], (), quantity)
@@ -141,11 +141,11 @@ def _parse_distance(mechanism: Mechanism, text: str) -> Channel:
     one, rest = _split_owner("body", (*mechanism.body_names, GROUND), text)
     point, rest = _split_point(rest)
     if not rest.startswith("."):
-        raise ValueError(f"must be distance.BODY(px, py).BODY2(px, py); after the first point comes {quoted(rest)}")
+        raise ValueError(f"must be distance.BODY(px, py).BODY2(px, py); after the first point comes {quote(rest)}")
     two, rest = _split_owner("body", (*mechanism.body_names, GROUND), rest[1:])
     other, rest = _split_point(rest)
     if rest:
-        raise ValueError(f"must be distance.BODY(px, py).BODY2(px, py); after the second point comes {quoted(rest)}")
+        raise ValueError(f"must be distance.BODY(px, py).BODY2(px, py); after the second point comes {quote(rest)}")
     name = f"distance.{_with_point(one, point)}.{_with_point(two, other)}"
     return Channel(name, "m", "states", "distance", "", (one, two), (point, other), "distance")
 
@@ -167,8 +167,8 @@ def _split_owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
     given = re.split(r"\(|\.[^.]*$", text)[0]
     if given == GROUND:
         raise ValueError(f'"{GROUND}" does not move; name a body')
-    known = f"; there are {', '.join(map(quoted, names))}" if names else "; the mechanism has none"
-    raise ValueError(f"no {kind} named {quoted(given)}{suggestion(given, names) or known}")
+    known = f"; there are {', '.join(map(quote, names))}" if names else "; the mechanism has none"
+    raise ValueError(f"no {kind} named {quote(given)}{suggestion(given, names) or known}")
 
 
 def _split_point(text: str, default: Point | None = None) -> tuple[Point, str]:
@@ -183,7 +183,7 @@ def _split_point(text: str, default: Point | None = None) -> tuple[Point, str]:
     except ValueError:
         x = y = float("nan")
     if not closed or not abs(x) + abs(y) < float("inf"):
-        raise ValueError(f"a point is (px, py), two numbers (m) in the body's own frame, not {quoted('(' + inside + closed)}")
+        raise ValueError(f"a point is (px, py), two numbers (m) in the body's own frame, not {quote('(' + inside + closed)}")
     return (x, y), rest
 
 
@@ -192,7 +192,7 @@ def _check_quantity(owner: str, text: str, known: Iterable[str], more: Iterable[
     if text.startswith(".") and name in known:
         return name
     near = suggestion(name, [*known, *more]) or f"; it has {', '.join([*known, *more])}"
-    raise ValueError(f"{owner} has no {quoted(name)}{near}" if name else f"{owner}: name one of {', '.join([*known, *more])}")
+    raise ValueError(f"{owner} has no {quote(name)}{near}" if name else f"{owner}: name one of {', '.join([*known, *more])}")
 
 
 def _with_point(name: str, point: Point) -> str:

@@ -9,7 +9,7 @@ from udkjax.equations import Augmented, Baumgarte, CoordinatePartitioning, NullS
 from udkjax.integrate import Projection
 from udkjax.integrate.solvers import solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Varga
-from udkjax.scene.checks import quoted, shown, suggestion
+from udkjax.scene.checks import abbreviate, quote, suggestion
 
 Table = dict[str, Callable[..., Any]]
 
@@ -51,10 +51,10 @@ def choice(setting: str, given: Any) -> Any:
     table = given if isinstance(given, dict) else {"type": given}
     name, numbers = table.get("type"), {key: value for key, value in table.items() if key != "type"}
     if not isinstance(name, str) or name not in known:
-        raise ValueError(f"no {setting} {shown(name)}{suggestion(name, known) or '; one of ' + ', '.join(known)}")
+        raise ValueError(f"no {setting} {abbreviate(name)}{suggestion(name, known) or '; one of ' + ', '.join(known)}")
     make = known[name]
     expected = [] if setting == "solver" else list(inspect.signature(make).parameters)
     for key in numbers:
         if key not in expected:
-            raise ValueError(f"{quoted(name)} has no {quoted(key)}{suggestion(key, expected)}")
+            raise ValueError(f"{quote(name)} has no {quote(key)}{suggestion(key, expected)}")
     return make(**numbers)

@@ -17,9 +17,9 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
 from udkjax.scene.bodies import GROUND, Frame
-from udkjax.scene.checks import SceneError, quoted, suggestion
+from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.drivers import Driver, Motion, Polynomial
-from udkjax.scene.fields import Numbers, names, number, optional
+from udkjax.scene.fields import Numbers, names, number, optional_number
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.study.channels import channel_of
@@ -36,7 +36,7 @@ class Coordinate(eqx.Module):
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True, default="angle")
-    points: Float[Array, "2 2"] | None = eqx.field(converter=optional, default=None)
+    points: Float[Array, "2 2"] | None = eqx.field(converter=optional_number, default=None)
 
 
 Drive = str | Coordinate | None  # a driver's name, the name of a coordinate, a coordinate; or all drivers along time
@@ -122,7 +122,7 @@ def _frame(q: Any) -> Frame:
 
 def measured(element: Any, *frames: Frame) -> Any:
     """Return the value (rad, m) of a coordinate, of anything that has `bodies`, `coordinate` and `points`, from its frames."""
-    return Driver(element.bodies, element.coordinate, _constant(0.0), element.points).resolved().residual(0.0, *frames)[0]
+    return Driver(element.bodies, element.coordinate, _constant(0.0), element.points).complete().residual(0.0, *frames)[0]
 
 
 def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
@@ -138,11 +138,11 @@ def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
     try:
         channel = channel_of(mechanism, text)
     except ValueError as problem:
-        drivers = ", ".join(map(quoted, mechanism.driver_names)) or "none"
+        drivers = ", ".join(map(quote, mechanism.driver_names)) or "none"
         cure = suggestion(text, mechanism.driver_names) or f"; drivers: {drivers}; coordinates: body.NAME.angle, joint.NAME.angle"
-        raise SceneError([f"{quoted(text)} is neither a driver nor a coordinate: {problem}{cure}"], mechanism.name) from None
+        raise SceneError([f"{quote(text)} is neither a driver nor a coordinate: {problem}{cure}"], mechanism.name) from None
     if channel.quantity not in DRIVEN:
-        raise SceneError([f"{quoted(text)} cannot be driven: name an angle, x, y or a distance"], mechanism.name)
+        raise SceneError([f"{quote(text)} cannot be driven: name an angle, x, y or a distance"], mechanism.name)
     kind: Any = channel.quantity
     with jax.ensure_compile_time_eval():
         if len(channel.bodies) == 2:

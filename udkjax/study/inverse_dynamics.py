@@ -22,9 +22,9 @@ from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD
-from udkjax.scene.checks import SceneError, quoted
+from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.drivers import Motion, Spline
-from udkjax.scene.fields import number, optional
+from udkjax.scene.fields import number, optional_number
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.drive import Coordinate, element_of, measured, unused, value_of, without_drivers
@@ -57,7 +57,7 @@ class Effort(ForceElement):
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
     law: Motion
-    points: Float[Array, "2 2"] | None = eqx.field(converter=optional, default=None)
+    points: Float[Array, "2 2"] | None = eqx.field(converter=optional_number, default=None)
 
     def potential(self, t, *frames):
         return -self.law(t) * measured(self, *frames)
@@ -102,7 +102,7 @@ def inverse_dynamics(
     named = {d if isinstance(d, str) else f"{d.coordinate} of {' and '.join(d.bodies)}": d for d in chosen}
     unknown = [name for name in weights or {} if name not in named]
     if unknown:
-        raise SceneError([f"weights: {quoted(name)} is not among the drivers" for name in unknown], mechanism.name)
+        raise SceneError([f"weights: {quote(name)} is not among the drivers" for name in unknown], mechanism.name)
     w = jnp.stack([number((weights or {}).get(name, 1.0)) for name in named])
     values = tuple(element_of(mechanism, d) for d in named.values())
     joints = without_drivers(mechanism)

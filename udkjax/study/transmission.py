@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.integrate.assembly import State
 from udkjax.scene.bodies import Frame
-from udkjax.scene.checks import SceneError, quoted
+from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
@@ -40,12 +40,12 @@ def transmission_angle(mechanism: Mechanism, motion: Any, joint: str) -> Float[A
     """
     pins = {name: pin for name, pin in mechanism.joints.items() if isinstance(pin, Revolute)}
     if joint not in pins:
-        raise SceneError([f"{quoted(joint)} is not a revolute joint; there are {', '.join(map(quoted, pins))}"], mechanism.name)
+        raise SceneError([f"{quote(joint)} is not a revolute joint; there are {', '.join(map(quote, pins))}"], mechanism.name)
     arms = []
     for body, here in zip(pins[joint].bodies, pins[joint].points, strict=True):
         others = [pin.points[pin.bodies.index(body)] for name, pin in pins.items() if name != joint and body in pin.bodies]
         if len(others) != 1 or body not in mechanism.body_names:
-            problem = f"{quoted(body)} at {quoted(joint)} has {len(others)} pins besides, not one"
+            problem = f"{quote(body)} at {quote(joint)} has {len(others)} pins besides, not one"
             raise SceneError([f"{problem}: a transmission angle is that between two links of two pins each"], mechanism.name)
         angle = motion.q[..., mechanism.body_names.index(body), 2]
         frame = Frame(0.0, 0.0, angle, jnp.cos(angle), jnp.sin(angle))

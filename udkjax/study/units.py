@@ -4,9 +4,9 @@ import math
 import re
 from typing import NamedTuple
 
-from udkjax.scene.checks import quoted
+from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.parameters import holder_of, parameters_of, split
+from udkjax.scene.number_fields import owner_of, parameters_of, split_index
 
 # The settings of a run that are numbers: one program serves all their values.
 NUMBERS = {
@@ -58,12 +58,12 @@ def units_of(mechanism: Mechanism, name: str) -> str:
     if name in NUMBERS:
         return NUMBERS[name]
     known = parameters_of(mechanism)
-    found = known.get(split(name, known)[0])
+    found = known.get(split_index(name, known)[0])
     if found is None:
         return ""
     if not found.path:
         return _FIELDS[name.partition("[")[0]]
-    element = holder_of(mechanism, found)
+    element = owner_of(mechanism, found)
     field = found.path[-1]
     if field in _FOLLOWS:
         return "rad" if getattr(mechanism.drivers.get(found.owner), "coordinate", "") == "angle" else "m"
@@ -143,7 +143,7 @@ def conversion_factor(units: str, wanted: str) -> float:
     given = _GRAVITY if units.strip() == "g" and goal.dimension == _ACCELERATION else _read(units)
     if given.dimension != goal.dimension:
         usual = next((some for some in _USUAL if _read(some.partition(",")[0]).dimension == goal.dimension), wanted)
-        raise ValueError(f"{quoted(units)} does not fit; it is measured in {usual}")
+        raise ValueError(f"{quote(units)} does not fit; it is measured in {usual}")
     return given.size / goal.size
 
 
@@ -156,6 +156,6 @@ def _read(text: str) -> _Unit:
     for slash, name, power in re.findall(r"(/?)\s*([^\W\d]+|1)\^?(-?\d+)?|\S", plain):
         name = _WORDS.get(name, name)
         if name not in _UNITS:
-            raise ValueError(f"{quoted(text)} is no unit known here: they are made of {', '.join(_UNITS)}")
+            raise ValueError(f"{quote(text)} is no unit known here: they are made of {', '.join(_UNITS)}")
         found = found.times(_UNITS[name], int(power or 1) * (-1 if slash else 1))
     return found

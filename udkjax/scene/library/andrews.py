@@ -11,7 +11,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.forces import Spring, Torque
 from udkjax.scene.joints import Revolute
-from udkjax.scene.library.poses import known_at_once, moving
+from udkjax.scene.library.posed_bodies import bodies_on_pose, known_at_once
 from udkjax.scene.mechanism import Mechanism
 
 # Masses (kg) and inertias (kg m^2) of K1 to K7, then lengths (m), as the sources name them.
@@ -80,5 +80,5 @@ def andrews_squeezer(
         "spring": Spring((GROUND, "K3"), [C, (SD - SB, SA - SC)], stiffness, spring_length),
     }
     angles = np.array(list(START.values()))
-    bodies = moving([f"K{i}" for i in range(1, 8)], list(zip(MASSES, INERTIAS, strict=True)), pose, angles, np.zeros(7))
+    bodies = bodies_on_pose([f"K{i}" for i in range(1, 8)], list(zip(MASSES, INERTIAS, strict=True)), pose, angles, np.zeros(7))
     return Mechanism(bodies, joints, forces=forces, gravity=number(gravity), name="Andrews' squeezing mechanism")

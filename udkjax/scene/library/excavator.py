@@ -12,7 +12,7 @@ from udkjax.scene.drivers import Driver, Sine
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Revolute
-from udkjax.scene.library.poses import apex, bar, down, known_at_once, moving, uniform_rod
+from udkjax.scene.library.posed_bodies import apex, bar_pose, bodies_on_pose, gravity_vector, known_at_once, uniform_rod
 from udkjax.scene.mechanism import Mechanism
 
 # Points of a body in units of its length, from its first pin on, the x axis towards its last one.
@@ -63,7 +63,7 @@ def excavator(
         shovel = _held(on_bucket["bucket"], _spot(fore, on_stick["bucket"]), s[2])
         start, end = _spot(fore, on_stick["rocker"]), _spot(shovel, on_bucket["link"])
         knee = apex(start, end, rocker, link)
-        return [arm, fore, bar(start, knee), bar(knee, end), shovel]
+        return [arm, fore, bar_pose(start, knee), bar_pose(knee, end), shovel]
 
     def extents(s):
         frames = {GROUND: _frame(number([0.0, 0.0]), 0.0)} | {n: _frame(*p) for n, p in zip(names, pose(s), strict=True)}
@@ -90,7 +90,7 @@ def excavator(
     }
     physics = [uniform_rod(mass, k) for mass, k in zip(masses, (boom, stick, rocker, link, bucket), strict=True)]
     return Mechanism(
-        moving(names, physics, pose, start, 0.0 * start if driven else angular_velocities),
+        bodies_on_pose(names, physics, pose, start, 0.0 * start if driven else angular_velocities),
         {
             "foot": Revolute((GROUND, "boom"), [(0.0, 0.0), on_boom["foot"]]),
             "tip": Revolute(("boom", "stick"), [on_boom["tip"], on_stick["tip"]]),
@@ -101,7 +101,7 @@ def excavator(
         },
         drivers if driven else {},
         {} if driven else springs,
-        gravity=down(gravity),
+        gravity=gravity_vector(gravity),
         name="excavator",
     )
 

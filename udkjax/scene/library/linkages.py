@@ -11,7 +11,7 @@ from udkjax.scene.drivers import Driver, Polynomial
 from udkjax.scene.fields import number
 from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Prismatic, Revolute, Slot
-from udkjax.scene.library.poses import ORIGINS, apex, bar, down, known_at_once, moving, uniform_rod
+from udkjax.scene.library.posed_bodies import ORIGINS, apex, bar_pose, bodies_on_pose, gravity_vector, known_at_once, uniform_rod
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -42,10 +42,10 @@ def parallelogram(
     physics = [(mass, inertia)] * 3 + [(coupler_mass, coupler_inertia)]
     half = 0.5 * length
     return Mechanism(
-        moving((*links, "coupler"), physics, pose, angle, angular_velocity),
+        bodies_on_pose((*links, "coupler"), physics, pose, angle, angular_velocity),
         {f"A{i + 1}": Revolute((GROUND, link), [(float(i), 0.0), (-half, 0.0)]) for i, link in enumerate(links)}
         | {f"B{i + 1}": Revolute(("coupler", link), [(i - 1.0, 0.0), (half, 0.0)]) for i, link in enumerate(links)},
-        gravity=down(gravity),
+        gravity=gravity_vector(gravity),
         name="five-bar parallelogram",
     )
 
@@ -70,8 +70,8 @@ def n_four_bar(
     for i in range(n):
         joints[f"B{i}"] = Revolute((f"link{i}", f"coupler{i}"), [(0.5, 0.0), (-0.5, 0.0)])
         joints[f"C{i}"] = Revolute((f"link{i + 1}", f"coupler{i}"), [(0.5, 0.0), (0.5, 0.0)])
-    bodies = moving(names, [uniform_rod(1.0, 1.0)] * len(names), pose, angle, angular_velocity)
-    return Mechanism(bodies, joints, gravity=down(gravity), name=f"{n}-four-bar")
+    bodies = bodies_on_pose(names, [uniform_rod(1.0, 1.0)] * len(names), pose, angle, angular_velocity)
+    return Mechanism(bodies, joints, gravity=gravity_vector(gravity), name=f"{n}-four-bar")
 
 
 @known_at_once
@@ -92,17 +92,19 @@ def four_bar(
     def pose(s):
         start, end = a * jnp.array([jnp.cos(s), jnp.sin(s)]), jnp.stack([number(ground), number(0.0)])
         pin = apex(start, end, b, c)
-        return [bar(number([0.0, 0.0]), start), bar(start, pin), bar(end, pin)]
+        return [bar_pose(number([0.0, 0.0]), start), bar_pose(start, pin), bar_pose(end, pin)]
 
     return Mechanism(
-        moving(("crank", "coupler", "rocker"), [uniform_rod(density * k, k) for k in (a, b, c)], pose, angle, angular_velocity),
+        bodies_on_pose(
+            ("crank", "coupler", "rocker"), [uniform_rod(density * k, k) for k in (a, b, c)], pose, angle, angular_velocity
+        ),
         {
             "A": Revolute((GROUND, "crank"), [(0.0, 0.0), (-a / 2, 0.0)]),
             "B": Revolute(("crank", "coupler"), [(a / 2, 0.0), (-b / 2, 0.0)]),
             "C": Revolute(("coupler", "rocker"), [(b / 2, 0.0), (c / 2, 0.0)]),
             "D": Revolute((GROUND, "rocker"), [(ground, 0.0), (-c / 2, 0.0)]),
         },
-        gravity=down(gravity),
+        gravity=gravity_vector(gravity),
         name="four-bar",
     )
 
@@ -135,7 +137,7 @@ def slider_crank(
     motor = Driver((GROUND, "crank"), "angle", Polynomial([angle, angular_velocity]))
     a, b = 0.5 * number(crank), 0.5 * number(rod)
     return Mechanism(
-        moving(("crank", "rod", "slider"), physics, pose, angle, angular_velocity),
+        bodies_on_pose(("crank", "rod", "slider"), physics, pose, angle, angular_velocity),
         {
             "O": Revolute((GROUND, "crank"), [(0.0, 0.0), (-a, 0.0)]),
             "P": Revolute(("crank", "rod"), [(a, 0.0), (-b, 0.0)]),
@@ -144,7 +146,7 @@ def slider_crank(
         },
         {"motor": motor} if driven else {},
         {} if spring is None else {"spring": Spring((GROUND, "slider"), ORIGINS, *spring)},
-        gravity=down(gravity),
+        gravity=gravity_vector(gravity),
         name="slider-crank",
     )
 
@@ -167,11 +169,11 @@ def elliptic_trammel(
         return [(half * jnp.array([jnp.cos(s), jnp.sin(s)]), -s)]
 
     return Mechanism(
-        moving(("rod",), [uniform_rod(mass, length)], pose, angle, angular_velocity),
+        bodies_on_pose(("rod",), [uniform_rod(mass, length)], pose, angle, angular_velocity),
         {
             "A": Slot((GROUND, "rod"), [(0.0, 0.0), (-half, 0.0)], axis=np.pi / 2),
             "B": Slot((GROUND, "rod"), [(0.0, 0.0), (half, 0.0)], axis=0.0),
         },
-        gravity=down(gravity),
+        gravity=gravity_vector(gravity),
         name="elliptic trammel",
     )

@@ -9,7 +9,16 @@ from jaxtyping import ArrayLike
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import number
 from udkjax.scene.joints import Gear, Joint, Prismatic, Revolute, Slot
-from udkjax.scene.library.poses import ORIGINS, apex, bar, down, known_at_once, moving, uniform_disc, uniform_rod
+from udkjax.scene.library.posed_bodies import (
+    ORIGINS,
+    apex,
+    bar_pose,
+    bodies_on_pose,
+    gravity_vector,
+    known_at_once,
+    uniform_disc,
+    uniform_rod,
+)
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -52,8 +61,8 @@ def scissor_lift(
     joints["sliding head"] = Slot(("platform", f"rising{stages - 1}"), [left, right], axis=0.0)
     joints["guide"] = Prismatic((GROUND, "platform"), [(0.0, 0.0), left], axis=np.pi / 2, angle=0.0)
     physics = [uniform_rod(mass, length)] * len(names) + [uniform_rod(platform_mass, length)]
-    bodies = moving((*names, "platform"), physics, pose, angle, angular_velocity)
-    return Mechanism(bodies, joints, gravity=down(gravity), name="scissor lift")
+    bodies = bodies_on_pose((*names, "platform"), physics, pose, angle, angular_velocity)
+    return Mechanism(bodies, joints, gravity=gravity_vector(gravity), name="scissor lift")
 
 
 @known_at_once
@@ -80,7 +89,7 @@ def peaucellier(
         c = q + r * jnp.array([jnp.cos(s), jnp.sin(s)])
         upper, lower = apex(o, c, a, b), apex(c, o, b, a)
         d = upper + lower - c
-        return [bar(*ends) for ends in ((q, c), (o, upper), (o, lower), (c, upper), (c, lower), (upper, d), (lower, d))]
+        return [bar_pose(*ends) for ends in ((q, c), (o, upper), (o, lower), (c, upper), (c, lower), (upper, d), (lower, d))]
 
     names = ("crank", "armA", "armB", "CA", "CB", "AD", "BD")
     lengths = (r, a, a, b, b, b, b)
@@ -101,7 +110,7 @@ def peaucellier(
         "B2": pin("armB", 1, "BD", 0),
         "D": pin("AD", 1, "BD", 1),
     }
-    bodies = moving(names, [uniform_rod(density * k, k) for k in lengths], pose, angle, angular_velocity)
+    bodies = bodies_on_pose(names, [uniform_rod(density * k, k) for k in lengths], pose, angle, angular_velocity)
     return Mechanism(bodies, joints, gravity=jnp.stack([number(gravity), number(0.0)]), name="Peaucellier-Lipkin linkage")
 
 
@@ -141,4 +150,9 @@ def planetary_gear(
         joints[f"ring mesh{i + 1}"] = Gear((GROUND, name), jnp.stack([ring, p]), internal=True, carrier="carrier")
     physics = [uniform_disc(masses[0], r), *[uniform_disc(masses[1], p)] * planets, uniform_disc(masses[2], reach)]
     names = ("sun", *(f"planet{i + 1}" for i in range(planets)), "carrier")
-    return Mechanism(moving(names, physics, pose, 0.0, angular_velocity), joints, gravity=down(gravity), name="planetary gear")
+    return Mechanism(
+        bodies_on_pose(names, physics, pose, 0.0, angular_velocity),
+        joints,
+        gravity=gravity_vector(gravity),
+        name="planetary gear",
+    )

@@ -10,7 +10,14 @@ from udkjax.scene.bodies import GROUND, Body
 from udkjax.scene.drivers import Driver, Sine
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.joints import Distance, Revolute
-from udkjax.scene.library.poses import ORIGINS, down, hanging, known_at_once, moving, uniform_rod
+from udkjax.scene.library.posed_bodies import (
+    ORIGINS,
+    bodies_on_pose,
+    gravity_vector,
+    hanging_rod_pose,
+    known_at_once,
+    uniform_rod,
+)
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -26,7 +33,7 @@ def simple_pendulum(
     A body needs an inertia: 1 kg m^2, which nothing feels, since the rod holds the bob at its centre.
     """
     bodies = {"bob": Body(mass, 1.0, position, velocity=velocity)}
-    return Mechanism(bodies, {"rod": Distance((GROUND, "bob"), ORIGINS)}, gravity=down(gravity), name="simple pendulum")
+    return Mechanism(bodies, {"rod": Distance((GROUND, "bob"), ORIGINS)}, gravity=gravity_vector(gravity), name="simple pendulum")
 
 
 @known_at_once
@@ -40,12 +47,12 @@ def compound_pendulum(
     """Return a uniform rod pinned at one end; `angle` is measured from hanging straight down."""
 
     def pose(s):
-        return [hanging(number([0.0, 0.0]), length, s)]
+        return [hanging_rod_pose(number([0.0, 0.0]), length, s)]
 
     return Mechanism(
-        moving(("rod",), [uniform_rod(mass, length)], pose, angle, angular_velocity),
+        bodies_on_pose(("rod",), [uniform_rod(mass, length)], pose, angle, angular_velocity),
         {"pin": Revolute((GROUND, "rod"), [(0.0, 0.0), (-0.5 * number(length), 0.0)])},
-        gravity=down(gravity),
+        gravity=gravity_vector(gravity),
         name="compound pendulum",
     )
 
@@ -63,16 +70,16 @@ def double_pendulum(
 
     def pose(s):
         tip = 2 * a * jnp.array([jnp.sin(s[0]), -jnp.cos(s[0])])
-        return [hanging(number([0.0, 0.0]), 2 * a, s[0]), hanging(tip, 2 * b, s[1])]
+        return [hanging_rod_pose(number([0.0, 0.0]), 2 * a, s[0]), hanging_rod_pose(tip, 2 * b, s[1])]
 
     physics = [uniform_rod(mass, length) for mass, length in zip(masses, lengths, strict=True)]
     return Mechanism(
-        moving(("upper", "lower"), physics, pose, angles, angular_velocities),
+        bodies_on_pose(("upper", "lower"), physics, pose, angles, angular_velocities),
         {
             "shoulder": Revolute((GROUND, "upper"), [(0.0, 0.0), (-a, 0.0)]),
             "elbow": Revolute(("upper", "lower"), [(a, 0.0), (-b, 0.0)]),
         },
-        gravity=down(gravity),
+        gravity=gravity_vector(gravity),
         name="double pendulum",
     )
 
@@ -92,10 +99,10 @@ def driven_pendulum(
         return [(half * jnp.array([jnp.cos(s), jnp.sin(s)]), s)]
 
     return Mechanism(
-        moving(("rod",), [uniform_rod(mass, length)], pose, 0.0, amplitude * number(frequency)),
+        bodies_on_pose(("rod",), [uniform_rod(mass, length)], pose, 0.0, amplitude * number(frequency)),
         {"pin": Revolute((GROUND, "rod"), [(0.0, 0.0), (-half, 0.0)])},
         {"motor": Driver((GROUND, "rod"), "angle", Sine(amplitude, frequency))},
-        gravity=down(gravity),
+        gravity=gravity_vector(gravity),
         name="driven pendulum",
     )
 
@@ -123,8 +130,8 @@ def chain(
     ends = [((0.0, 0.0), (-half, 0.0))] + [((half, 0.0), (-half, 0.0))] * (n - 1)
     attached = zip([GROUND, *names[:-1]], names, strict=True)
     return Mechanism(
-        moving(names, [uniform_rod(number(mass) / n, 2 * half)] * n, pose, angle, angular_velocity),
+        bodies_on_pose(names, [uniform_rod(number(mass) / n, 2 * half)] * n, pose, angle, angular_velocity),
         {f"pin{i}": Revolute(bodies, end) for i, (bodies, end) in enumerate(zip(attached, ends, strict=True))},
-        gravity=down(gravity),
+        gravity=gravity_vector(gravity),
         name=f"chain of {n} links",
     )

@@ -167,7 +167,7 @@ class _Drawing:
                 self._rack(joint)
             case Cam():
                 angle = np.linspace(0.0, 2 * np.pi, PROFILE_POINTS, endpoint=False)
-                radius = np.asarray(jax.vmap(joint.profile)(angle))
+                radius = np.asarray(jax.vmap(joint.profile)(jax.numpy.asarray(angle)))
                 rim = np.asarray(joint.points)[0] + radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
                 self.wheels.append({"kind": "outline", "body": self.number[joint.bodies[0]], "points": rim.tolist()})
                 self.elements.append({"kind": "roller", **self._at(joint.bodies[1], joint.points[1])})

@@ -17,7 +17,7 @@ from udkjax.extras import OptionalImport
 from udkjax.html import html_table
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.solution import scene_text, versions
-from udkjax.scene.checks import quoted, suggestion
+from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
 from udkjax.study.identify.least_squares import Loss
@@ -151,7 +151,7 @@ class Estimate:
             IdentificationError: no such parameter was identified.
         """
         if name not in self.names:
-            raise IdentificationError([f"{quoted(name)} was not identified{suggestion(name, self.names)}"])
+            raise IdentificationError([f"{quote(name)} was not identified{suggestion(name, self.names)}"])
         return profile_likelihood(self.problem, self.problem.unknowns, self.z, self.tol, self.loss, self.uncertainty, name, level)
 
     def check_gradients(self) -> GradientCheck:

@@ -10,7 +10,7 @@ from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.scales import known_scales
 from udkjax.integrate.assembly import State, assemble
 from udkjax.scene.bodies import COORDINATES
-from udkjax.scene.checks import SceneError, quoted
+from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import RATES, UNITS
 from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
@@ -47,7 +47,7 @@ def initial_state_unknowns(
             first, own = tied[start.name]
             if first.estimate != start.estimate or (first.state is not start.state and not _same(first.state, start.state)):
                 problems.append(
-                    f"{record.place}start {quoted(start.name)} is another one in an earlier record: give one Start to both"
+                    f"{record.place}start {quote(start.name)} is another one in an earlier record: give one Start to both"
                 )
             of_record.append(own)
         else:

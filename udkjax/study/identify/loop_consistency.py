@@ -22,7 +22,7 @@ from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.redundancy import ORDINARY, chosen_rows, positions_of, rows_of
 from udkjax.equations.sparse_rows import SparseRows
-from udkjax.scene.checks import quoted
+from udkjax.scene.checks import quote
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.directions import COEFFICIENT, connected, echelon, null_space, row_space
@@ -223,7 +223,7 @@ class RedundantLoops:
         involved = np.abs(circuits).max((0, 2)) > COEFFICIENT
         constraints = list(dict.fromkeys(name for name, there in zip(self._names, involved, strict=True) if there))
         what = "constraints" if set(constraints) & set(self._drivers) else "joints"
-        return f"{what} {listed([quoted(name) for name in constraints])} close a loop"
+        return f"{what} {listed([quote(name) for name in constraints])} close a loop"
 
 
 def _dense(matrix: np.ndarray | csr_array) -> np.ndarray:

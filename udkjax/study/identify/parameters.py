@@ -8,10 +8,10 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from udkjax.deprecation import renamed_arguments
-from udkjax.scene.checks import SceneError, quoted, suggestion
+from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.parameters import holder_of, parameters_of, split
+from udkjax.scene.number_fields import owner_of, parameters_of, split_index
 from udkjax.scene.reshaping import length_of
 from udkjax.scene.schema import keys
 from udkjax.study.identify.records import IdentificationError
@@ -80,13 +80,13 @@ def unknowns_of(mechanism: Mechanism, given: Asked) -> Unknowns:
     if not items:
         problems.append("parameters: there is none to identify; name some, such as body.link1.mass")
     names = [unknown.name for unknown in found]
-    problems += [f"{quoted(n)}: is there {names.count(n)} times" for n in dict.fromkeys(names) if names.count(n) > 1]
+    problems += [f"{quote(n)}: is there {names.count(n)} times" for n in dict.fromkeys(names) if names.count(n) > 1]
     owner: dict[str, str] = {}  # of each number of the scene, the parameter that contains it
     for unknown in found:
         for number in unknown.target.names:
             other = owner.setdefault(number, unknown.name)
             if other != unknown.name:
-                problems.append(f"{quoted(unknown.name)}: {number} is a part of {quoted(other)} already; tie them, or take one")
+                problems.append(f"{quote(unknown.name)}: {number} is a part of {quote(other)} already; tie them, or take one")
     if problems:
         raise IdentificationError(problems)
     return Unknowns.of(found)
@@ -98,7 +98,7 @@ def _entries(mechanism: Mechanism, item: OneAsked, problems: list[str]) -> list[
     try:
         parts = _parts(mechanism, p)
     except (SceneError, ValueError) as problem:
-        problems.append(str(problem) if not p.name else f"{quoted(p.name)}: {problem}")
+        problems.append(str(problem) if not p.name else f"{quote(p.name)}: {problem}")
         return []
     found = []
     for part in parts:
@@ -108,7 +108,7 @@ def _entries(mechanism: Mechanism, item: OneAsked, problems: list[str]) -> list[
         try:
             found.append(_unknown(mechanism, p, name, part))
         except (TypeError, ValueError) as problem:
-            problems.append(f"{quoted(name)}: {problem}")
+            problems.append(f"{quote(name)}: {problem}")
     return found
 
 
@@ -162,11 +162,12 @@ def _is_positive(mechanism: Mechanism, target: Target, guess: float) -> bool:
 
 def _must_be_positive(mechanism: Mechanism, name: str) -> bool:
     known = parameters_of(mechanism)
-    found = known[split(name, known)[0]]
+    found = known[split_index(name, known)[0]]
     if not found.path:
         return False
-    metadata = keys(type(holder_of(mechanism, found)))[found.path[-1]].metadata
-    return any(rule in metadata.get("require", ()) for rule in POSITIVE["require"] + NOT_NEGATIVE["require"])
+    metadata = keys(type(owner_of(mechanism, found)))[found.path[-1]].metadata
+    bounds = (*POSITIVE.get("require", ()), *NOT_NEGATIVE.get("require", ()))
+    return any(rule in metadata.get("require", ()) for rule in bounds)
 
 
 # --- what a parameter refers to
@@ -188,11 +189,11 @@ def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
     names = tuple(of)
     problems = []
     for name in names:
-        owner, _ = split(name, known)
+        owner, _ = split_index(name, known)
         if owner not in known:
-            problems.append(f"no parameter {quoted(name)}{suggestion(name, known)}")
+            problems.append(f"no parameter {quote(name)}{suggestion(name, known)}")
         elif known[owner].value is None:
-            problems.append(f"{quoted(name)} is absent from the scene: set it there first")
+            problems.append(f"{quote(name)} is absent from the scene: set it there first")
     if problems or not names:
         raise ValueError("; ".join(problems) or "names nothing")
     values = [np.asarray(value_of(mechanism, name)) for name in names]
@@ -220,7 +221,7 @@ def _read(mechanism: Mechanism, text: str, scaled: bool) -> tuple[Length | tuple
     if all(bodies):
         return Length(tuple(body for group in bodies for body in group)), False
     if any(bodies):
-        raise ValueError(f"{quoted(text)}: a length cannot be tied to another kind of number")
+        raise ValueError(f"{quote(text)}: a length cannot be tied to another kind of number")
     return tuple(parts), scaled
 
 

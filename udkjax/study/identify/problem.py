@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.assembly import State
 from udkjax.integrate.solution import Result
-from udkjax.scene.checks import quoted
+from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.parameters import parameters_of, split
+from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.study.channels import Quantity, channel_of
 from udkjax.study.identify.initial_states import initial_state_unknowns
 from udkjax.study.identify.prediction import Members, Prediction, Predictor, Tolerances
@@ -234,9 +234,9 @@ def _conditions(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np
     known, problems = parameters_of(mechanism), []
     found: dict[str, np.ndarray] = {}
     for name in dict.fromkeys(name for record in records for name in record.conditions):
-        owner, index = split(name, known)
+        owner, index = split_index(name, known)
         if owner not in known or known[owner].value is None:
-            problems.append(f"conditions: no parameter {quoted(name)}")
+            problems.append(f"conditions: no parameter {quote(name)}")
             continue
         usual = np.asarray(known[owner].value)[index]
         try:
@@ -244,7 +244,7 @@ def _conditions(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np
                 [np.broadcast_to(np.asarray(r.conditions.get(name, usual), float), usual.shape) for r in records]
             )
         except ValueError:
-            problems.append(f"conditions: {quoted(name)} must be of shape {usual.shape} in each record")
+            problems.append(f"conditions: {quote(name)} must be of shape {usual.shape} in each record")
     if problems:
         raise IdentificationError(problems)
     return found

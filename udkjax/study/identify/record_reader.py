@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 import numpy as np
 
 from udkjax.extras import OptionalImport
-from udkjax.scene.checks import quoted, shown, suggestion
+from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Channel, Quantity, channel_of
 from udkjax.study.identify.records import IdentificationError, Key, Noise, Record, key_of
@@ -69,7 +69,7 @@ def records_of(
     if isinstance(given, Mapping):
         measured = {channel for record in found for channel in record.values}
         reader.problems += [
-            f"noise: {quoted(str(channel))} is measured in no record" for channel in given if channel not in measured
+            f"noise: {quote(str(channel))} is measured in no record" for channel in given if channel not in measured
         ]
     records = [reader.with_noise(record, given) for record in found]
     if reader.problems:
@@ -104,7 +104,7 @@ class _TableReader:
         if time is None:
             if self.table.columns:
                 near = suggestion(TIME[0], self.columns)
-                self.problems.append(f"{self.table.source}: there is no column {quoted(TIME[0])}{near}")
+                self.problems.append(f"{self.table.source}: there is no column {quote(TIME[0])}{near}")
             return
         times = self.numbers(time, self.columns[time], "s")
         numbers = len(self.problems) == before
@@ -124,7 +124,7 @@ class _TableReader:
             of = heading.removesuffix(NOISE)
             if of != heading:
                 if of not in (*headings, *self.ignore):
-                    self.add(heading, f"there is no column {quoted(of)}")
+                    self.add(heading, f"there is no column {quote(of)}")
                 continue
             try:
                 channel = self.channel(heading)
@@ -132,7 +132,7 @@ class _TableReader:
                 self.add(heading, f"{error} (what is not to be read must be listed in `ignore`)")
                 continue
             if channel.name in found:
-                self.add(heading, f"is the same channel as {quoted(found[channel.name].heading)}")
+                self.add(heading, f"is the same channel as {quote(found[channel.name].heading)}")
             values, noise = self.columns[heading], self.columns.get(heading + NOISE)
             if noise is not None and noise.units is None:
                 noise = noise._replace(units=values.units)
@@ -155,7 +155,7 @@ class _TableReader:
             return np.full(count, np.nan)
         found = np.asarray(cells, float) if kind in "iuf" else np.array([_number(cell) for cell in cells], float)
         wrong = np.flatnonzero(np.isinf(found))
-        self.add_each(heading, wrong, lambda k: f"must be a number, is {shown(cells[k])}")
+        self.add_each(heading, wrong, lambda k: f"must be a number, is {abbreviate(cells[k])}")
         return scale * found
 
     def rows_by_record(self) -> list[tuple[str, np.ndarray]]:
@@ -192,12 +192,12 @@ class _TableReader:
 
     def add(self, heading: str, problem: str) -> None:
         """Note a mistake of a column."""
-        self.problems.append(f"{self.table.source}, column {quoted(heading)}: {problem}")
+        self.problems.append(f"{self.table.source}, column {quote(heading)}: {problem}")
 
     def add_each(self, heading: str, rows: Sequence[int] | np.ndarray, problem: Callable[[int], str]) -> None:
         """Note the same mistake in some rows: the first few, and how many more."""
         for k in rows[:MOST_SHOWN]:
-            self.problems.append(f"{self.table.source}, {self.table.rows[k]}, column {quoted(heading)}: {problem(k)}")
+            self.problems.append(f"{self.table.source}, {self.table.rows[k]}, column {quote(heading)}: {problem(k)}")
         if len(rows) > MOST_SHOWN:
             self.add(heading, f"and so in {len(rows) - MOST_SHOWN} more rows")
 
@@ -285,16 +285,16 @@ class _DataReader:
             try:
                 key = key_of(self.channel(text))
             except ValueError as error:
-                self.problems.append(f"{place}, {quoted(str(text))}: {error}")
+                self.problems.append(f"{place}, {quote(str(text))}: {error}")
                 continue
             if key in found:
-                self.problems.append(f"{place}, {quoted(str(text))}: {quoted(str(key))} is there twice")
+                self.problems.append(f"{place}, {quote(str(text))}: {quote(str(key))} is there twice")
             found[key] = value
         return found
 
     def with_usual_names(self, record: Record) -> Record:
         """Return the record with the usual names of its channels."""
-        place = f"record {quoted(record.name)}" if record.name else "record"
+        place = f"record {quote(record.name)}" if record.name else "record"
         values = self.by_channel(record.values, place)
         if list(values) == list(record.values) or len(values) != len(record.values):
             return record

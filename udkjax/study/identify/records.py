@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from udkjax.deprecation import renamed_arguments
 from udkjax.integrate.assembly import State
-from udkjax.scene.checks import Mistakes, quoted
+from udkjax.scene.checks import Mistakes, quote
 from udkjax.study.channels import Quantity
 
 Estimated = Literal["nothing", "position", "velocity", "both"]
@@ -21,7 +21,7 @@ Noise: TypeAlias = Mapping[Any, ArrayLike | None] | float | None  # standard dev
 class IdentificationError(Mistakes):
     """Data, parameters or settings do not fit the mechanism, or each other. `problems` lists every mistake, with its place."""
 
-    of = "identification"
+    subject = "identification"
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +88,10 @@ class Record:
             problems.append("nothing was measured: there is no channel")
         for channel, value in self.values.items():
             if not np.isfinite(value).any() and value.size:
-                problems.append(f"{quoted(str(channel))}: holds no number; leave the channel out")
+                problems.append(f"{quote(str(channel))}: holds no number; leave the channel out")
             elif np.isinf(value).any():
                 problems.append(
-                    f"{quoted(str(channel))}: entry {int(np.flatnonzero(np.isinf(value))[0])} is infinite; a gap is nan"
+                    f"{quote(str(channel))}: entry {int(np.flatnonzero(np.isinf(value))[0])} is infinite; a gap is nan"
                 )
         if problems:
             raise IdentificationError([self.place + problem for problem in problems])
@@ -99,7 +99,7 @@ class Record:
     @property
     def place(self) -> str:
         """What messages about it begin with."""
-        return f"record {quoted(self.name)}: " if self.name else ""
+        return f"record {quote(self.name)}: " if self.name else ""
 
     def with_start(self, start: Start) -> "Record":
         """Return the same record with another start."""
@@ -124,16 +124,16 @@ class Record:
         found: dict[Key, np.ndarray | None] = dict.fromkeys(self.values)
         for channel, sigma in by_channel.items():
             if channel not in self.values:
-                problems.append(f"noise: {quoted(str(channel))} is not among the channels")
+                problems.append(f"noise: {quote(str(channel))} is not among the channels")
             elif sigma is not None:
                 sigma = np.asarray(sigma, float)
                 sigma = sigma if sigma.ndim else np.full(self.times.shape, sigma)
                 shapes = self.times.shape, sigma.shape
                 used = sigma[np.isfinite(self.values[channel])] if sigma.shape == self.times.shape else sigma
                 if sigma.shape != self.times.shape:
-                    problems.append(f"noise of {quoted(str(channel))}: must be a number or of shape {shapes[0]}, is {shapes[1]}")
+                    problems.append(f"noise of {quote(str(channel))}: must be a number or of shape {shapes[0]}, is {shapes[1]}")
                 elif not (np.isfinite(used).all() and (used > 0).all()):
-                    problems.append(f"noise of {quoted(str(channel))}: a standard deviation must be a finite number > 0")
+                    problems.append(f"noise of {quote(str(channel))}: a standard deviation must be a finite number > 0")
                 found[channel] = sigma
         return found
 
@@ -153,9 +153,9 @@ def _numbers(name: str, given: ArrayLike | Sequence[float], shape: tuple[int, ..
     try:
         found = np.asarray(given, float)
     except (TypeError, ValueError):
-        problems.append(f"{quoted(name)}: must be numbers, is {given!r:.40}")
+        problems.append(f"{quote(name)}: must be numbers, is {given!r:.40}")
         return np.zeros(shape or 0)
     if shape is not None and found.shape != shape:
-        problems.append(f"{quoted(name)}: must have a value for each of the {shape[0]} times, is of shape {found.shape}")
+        problems.append(f"{quote(name)}: must have a value for each of the {shape[0]} times, is of shape {found.shape}")
         return np.zeros(shape)
     return found

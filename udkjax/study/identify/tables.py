@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from udkjax.scene.bodies import COORDINATES
-from udkjax.scene.checks import quoted, shown, suggestion
+from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.study.channels import RATES
 
 if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tables
@@ -104,7 +104,7 @@ def table_of_columns(
     for text, values in given:
         heading, units = _heading(text)
         if heading in columns or not heading:
-            what = f"there are two columns {quoted(heading)}" if heading else "a column has no heading"
+            what = f"there are two columns {quote(heading)}" if heading else "a column has no heading"
             problems.append(f"{source}: {what}")
         else:
             columns[heading] = Column(np.asarray(values) if hasattr(values, "dtype") else values, units)
@@ -147,7 +147,7 @@ def read_dataset(
 def _read_record(data: "xarray.Dataset", bodies: Sequence[str], source: str, problems: list[str], name: str) -> Table:
     time = next((t for t in TIME if t in data.variables and data[t].ndim == 1), None)
     if time is None:
-        problems.append(f"{source}: there is no coordinate {quoted(TIME[0])}")
+        problems.append(f"{source}: there is no coordinate {quote(TIME[0])}")
         return Table(source, {}, [], name)
     dims, count = data[time].dims, data[time].size
     columns = {time: Column(data[time].values, data[time].attrs.get("units"))}
@@ -157,7 +157,9 @@ def _read_record(data: "xarray.Dataset", bodies: Sequence[str], source: str, pro
         elif variable.dims in ((), dims):
             columns[str(key)] = Column(np.broadcast_to(variable.values, count), variable.attrs.get("units"))
         else:
-            problems.append(f"{source}, {quoted(str(key))}: must be along {quoted(time)}, is along {shown(list(variable.dims))}")
+            problems.append(
+                f"{source}, {quote(str(key))}: must be along {quote(time)}, is along {abbreviate(list(variable.dims))}"
+            )
     return Table(source, columns, [f"entry {k}" for k in range(count)], name)
 
 
@@ -168,7 +170,7 @@ def _state_columns(
     found = {}
     for i, body in enumerate(map(str, values["body"].values)):
         if body not in bodies:
-            problems.append(f"{source}, {quoted(key)}: no body named {quoted(body)}{suggestion(body, bodies)}")
+            problems.append(f"{source}, {quote(key)}: no body named {quote(body)}{suggestion(body, bodies)}")
             continue
         for k, coordinate in enumerate(map(str, values["coordinate"].values)):
             found[f"body.{body}.{_STATES[key].get(coordinate, coordinate)}"] = Column(values.values[:, i, k], None)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.parameters import parameters_of, split
+from udkjax.scene.number_fields import parameters_of, split_index
 
 Transform = Literal["positive", "bounded", "free"]
 Setter: TypeAlias = Callable[[Mechanism, Numbers], Mechanism]  # (mechanism, value) -> mechanism
@@ -142,7 +142,7 @@ def apply_values(mechanism: Mechanism, targets: Sequence[Target], x: Float[Array
 def value_of(mechanism: Mechanism, name: str) -> Array:
     """Return a parameter of a mechanism, or one entry of it."""
     known = parameters_of(mechanism)
-    owner, index = split(name, known)
+    owner, index = split_index(name, known)
     return jnp.asarray(known[owner].value)[index]
 
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from udkjax.integrate.solution import Solution, scene_text, versions
-from udkjax.scene.checks import shown
+from udkjax.scene.checks import abbreviate
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import Column
 from udkjax.study.sweep.measures import Measure
@@ -118,9 +118,9 @@ def _between(before: Any, now: Any, path: str) -> Iterator[str]:
         for key in {**before, **now}:
             place = f"{path}.{key}" if path else key
             if key not in now:
-                yield f"{place}: was {shown(before[key])}, is no longer there"
+                yield f"{place}: was {abbreviate(before[key])}, is no longer there"
             elif key not in before:
-                yield f"{place}: was not there, is {shown(now[key])}"
+                yield f"{place}: was not there, is {abbreviate(now[key])}"
             else:
                 yield from _between(before[key], now[key], place)
     elif isinstance(before, list) and isinstance(now, list):
@@ -128,12 +128,12 @@ def _between(before: Any, now: Any, path: str) -> Iterator[str]:
     elif isinstance(before, str) and isinstance(now, str) and "\n" in before + now:
         yield from _texts(before, now, path)
     elif not _same(before, now):
-        yield f"{path}: was {shown(before)}, is {shown(now)}"
+        yield f"{path}: was {abbreviate(before)}, is {abbreviate(now)}"
 
 
 def _lists(before: list, now: list, path: str) -> Iterator[str]:
     if len(before) != len(now):
-        yield f"{path}: was {shown(before)} ({len(before)} entries), is {shown(now)} ({len(now)} entries)"
+        yield f"{path}: was {abbreviate(before)} ({len(before)} entries), is {abbreviate(now)} ({len(now)} entries)"
         return
     found = [line for k, pair in enumerate(zip(before, now, strict=True)) for line in _between(*pair, f"{path}[{k}]")]
     yield from found[:MOST_LINES]

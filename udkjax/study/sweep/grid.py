@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from udkjax.extras import OptionalImport
-from udkjax.scene.checks import quoted, shown, suggestion
+from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.study.choices import CHOICES
 from udkjax.study.quantities import Angle, Length, Scaled
 from udkjax.study.sweep.axes import Axis, LatinHypercube, Random, Sobol, Zipped
@@ -78,7 +78,7 @@ class _GridReader(Reader):
         with OptionalImport():
             import xarray
         if not isinstance(given, str):
-            return self.wrong("reference", f"must be the name of a file that udkjax simulate wrote, is {shown(given)}")
+            return self.wrong("reference", f"must be the name of a file that udkjax simulate wrote, is {abbreviate(given)}")
         try:
             with xarray.open_dataset(self.folder / given, engine="h5netcdf") as data:
                 return data["q"].transpose("time", "body", "coordinate").values
@@ -93,7 +93,7 @@ class _GridReader(Reader):
                     self.wrong(key, "ts is given: leave one of them out")
             ts = self.numbers("ts", given["ts"])
             if ts is not None and (ts.ndim != 1 or len(ts) < 2 or not np.all(np.diff(ts) > 0)):
-                self.wrong("ts", f"must be at least two times (s), each later than the one before, is {shown(given['ts'])}")
+                self.wrong("ts", f"must be at least two times (s), each later than the one before, is {abbreviate(given['ts'])}")
             return ts
         if "t1" not in given:
             return self.wrong("t1", "missing; write t1 = 10.0 (s), or ts = [...]")
@@ -130,7 +130,7 @@ class _GridReader(Reader):
 
     def values(self, place: str, name: str, given: Any) -> Any:
         if not isinstance(given, list) or not given:
-            return self.wrong(place, f"must be a list of values, or a table of from, to and num, is {shown(given)}")
+            return self.wrong(place, f"must be a list of values, or a table of from, to and num, is {abbreviate(given)}")
         if name not in CHOICES:
             return self.numbers(place, given)
         return [self.choice(f"{place}[{k}]", name, value) for k, value in enumerate(given)]
@@ -146,7 +146,7 @@ class _GridReader(Reader):
         num = self.whole(f"{place}.num", given.get("num", 2), 1)
         scale = given.get("scale", "linear")
         if scale not in SCALES:
-            return self.wrong(f"{place}.scale", f"must be one of {', '.join(map(quoted, SCALES))}, is {shown(scale)}")
+            return self.wrong(f"{place}.scale", f"must be one of {', '.join(map(quote, SCALES))}, is {abbreviate(scale)}")
         if low is None or high is None or num is None:
             return None
         if scale == "log" and min(low, high) <= 0:
@@ -162,7 +162,7 @@ class _GridReader(Reader):
         if not self.drawn:
             return self.wrong(f"{place}.distribution", "needs a [design] that draws from it")
         if name not in known:
-            return self.wrong(f"{place}.distribution", f"scipy.stats has no {shown(name)}{suggestion(name, known)}")
+            return self.wrong(f"{place}.distribution", f"scipy.stats has no {abbreviate(name)}{suggestion(name, known)}")
         try:
             return getattr(stats, name)(**numbers)
         except TypeError as error:
@@ -175,7 +175,7 @@ class _GridReader(Reader):
         if isinstance(given, list):
             return self.names(place, given)
         if not isinstance(given, dict) or not given:
-            return self.wrong(place, f"must be a name, a list of names or a table, is {shown(given)}")
+            return self.wrong(place, f"must be a name, a list of names or a table, is {abbreviate(given)}")
         if "length" in given:
             self.known(place, given, ("length", "as_rod"))
             return Length(self.names(f"{place}.length", given["length"]), given.get("as_rod", False) is True)
@@ -202,6 +202,6 @@ class _GridReader(Reader):
         kind = given.get("type")
         members, seed = self.whole("design.members", given.get("members"), 1), self.whole("design.seed", given.get("seed", 0), 0)
         if kind not in DESIGNS:
-            there = f"must be one of {', '.join(map(quoted, DESIGNS))}"
-            return self.wrong("design.type", f"{there}, is {shown(kind)}{suggestion(kind, DESIGNS)}")
+            there = f"must be one of {', '.join(map(quote, DESIGNS))}"
+            return self.wrong("design.type", f"{there}, is {abbreviate(kind)}{suggestion(kind, DESIGNS)}")
         return None if members is None or seed is None else DESIGNS[kind](members, seed)

@@ -10,9 +10,9 @@ import numpy as np
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import State
 from udkjax.pinv import Auto
-from udkjax.scene.checks import SceneError, quoted, shown, suggestion
+from udkjax.scene.checks import SceneError, abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.parameters import parameters_of, split
+from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.study.sweep.axes import CHOICES, Axis, Column, Design, Dimension, Zipped, labels_of, spread
 from udkjax.study.units import NUMBERS, units_of
 
@@ -54,7 +54,7 @@ def laid_out(mechanism: Mechanism, axes: Mapping[str, Any], design: Design | Non
             problems.append(f"{name}: axes that advance together have as many values each, but these have {sizes}")
         if name in TAKEN or (name == MEMBER and unit):
             problems.append(
-                f"axis {quoted(name)}: the dataset has a dimension or variable of this name; choose another, with of=..."
+                f"axis {quote(name)}: the dataset has a dimension or variable of this name; choose another, with of=..."
             )
         if columns:
             found.append(Dimension(name, len(columns[0].values), columns))
@@ -81,18 +81,18 @@ def _column(mechanism: Mechanism, name: str, given: Any, unit: np.ndarray | None
         problems += _unknown(mechanism, name, of)
     values = axis.values if unit is None else spread(axis.values, unit)
     if values is None:
-        problems.append(f"axis {quoted(name)}: with a design its values are a range (low, high), or a frozen distribution")
+        problems.append(f"axis {quote(name)}: with a design its values are a range (low, high), or a frozen distribution")
     elif hasattr(values, "ppf"):
-        problems.append(f"axis {quoted(name)}: a distribution needs a design to draw from it, such as design=Sobol(1024)")
+        problems.append(f"axis {quote(name)}: a distribution needs a design to draw from it, such as design=Sobol(1024)")
     elif not hasattr(values, "__len__") or len(values) == 0:
-        problems.append(f"axis {quoted(name)}: needs at least one value, is {shown(values)}")
+        problems.append(f"axis {quote(name)}: needs at least one value, is {abbreviate(values)}")
     if len(problems) > before:
         return None
     if not callable(of) and any(target in CHOICES for target in of):
         return _choices(name, of, values, problems)
     numbers = _numbers(values)
     if numbers is None or not np.all(np.isfinite(numbers)):
-        problems.append(f"axis {quoted(name)}: must be finite numbers, one entry a value, is {shown(values)}")
+        problems.append(f"axis {quote(name)}: must be finite numbers, one entry a value, is {abbreviate(values)}")
         return None
     if not callable(of):
         problems += _misfits(mechanism, name, of, numbers)
@@ -102,15 +102,13 @@ def _column(mechanism: Mechanism, name: str, given: Any, unit: np.ndarray | None
 
 def _choices(name: str, of: tuple[str, ...], values: Any, problems: list[str]) -> Column | None:
     if len(of) != 1:
-        problems.append(
-            f"axis {quoted(name)}: choices cannot be tied, but it is of {', '.join(map(quoted, of))}; zip them instead"
-        )
+        problems.append(f"axis {quote(name)}: choices cannot be tied, but it is of {', '.join(map(quote, of))}; zip them instead")
         return None
     values = _states(values) if of == ("state",) and isinstance(values, State) else tuple(values)
     if of == ("state",) and not all(isinstance(value, State) for value in values):
-        problems.append(f"axis {quoted(name)}: must be States, as `assemble` returns them")
+        problems.append(f"axis {quote(name)}: must be States, as `assemble` returns them")
     if of == ("mechanism",) and not all(isinstance(value, Mechanism) for value in values):
-        problems.append(f"axis {quoted(name)}: must be Mechanisms")
+        problems.append(f"axis {quote(name)}: must be Mechanisms")
     return Column(name, values, of, "", labels_of(of[0], values))
 
 
@@ -129,16 +127,16 @@ def _numbers(values: Any) -> np.ndarray | None:
 def _unknown(mechanism: Mechanism, name: str, of: Sequence[str]) -> Iterator[str]:
     known = parameters_of(mechanism)
     for target in of:
-        if target not in NUMBERS and target not in CHOICES and split(target, known)[0] not in known:
+        if target not in NUMBERS and target not in CHOICES and split_index(target, known)[0] not in known:
             near = suggestion(target, (*known, *NUMBERS, *CHOICES)) or _ending(target, known)
-            yield f"axis {quoted(name)}: {quoted(target)} is no parameter of the mechanism, nor a setting{near}"
+            yield f"axis {quote(name)}: {quote(target)} is no parameter of the mechanism, nor a setting{near}"
 
 
 def _ending(target: str, known: Mapping[str, Any]) -> str:
     """What ends as the name does: `mass` may stand for many."""
     last = {full.rpartition(".")[2]: full for full in known}
     close = difflib.get_close_matches(target, last, n=1)
-    return f"; did you mean {quoted(last[close[0]])}?" if close else ""
+    return f"; did you mean {quote(last[close[0]])}?" if close else ""
 
 
 def _misfits(mechanism: Mechanism, name: str, of: Sequence[str], numbers: np.ndarray) -> Iterator[str]:
@@ -149,13 +147,13 @@ def _misfits(mechanism: Mechanism, name: str, of: Sequence[str], numbers: np.nda
             try:
                 mechanism.with_parameters(dict.fromkeys(parameters, value))
             except SceneError as error:
-                yield from (f"axis {quoted(name)}: {problem}" for problem in error.problems)
+                yield from (f"axis {quote(name)}: {problem}" for problem in error.problems)
                 return
     for target in of:
         if target in NUMBERS and numbers.ndim != 1:
-            yield f"axis {quoted(name)}: {target} is a number, so its values are a list of numbers, not of shape {numbers.shape}"
+            yield f"axis {quote(name)}: {target} is a number, so its values are a list of numbers, not of shape {numbers.shape}"
         elif target in NUMBERS and np.min(numbers) < 0:
-            yield f"axis {quoted(name)}: {target} must not be negative, is {np.min(numbers):g}"
+            yield f"axis {quote(name)}: {target} must not be negative, is {np.min(numbers):g}"
 
 
 def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
@@ -164,11 +162,11 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
     for dimension in dimensions:
         for column in dimension.columns:
             if column.name in names or (column.name != dimension.name and column.name in {d.name for d in dimensions}):
-                yield f"axis {quoted(column.name)} is there twice"
+                yield f"axis {quote(column.name)} is there twice"
             names[column.name] = None
             for target in () if callable(column.of) else column.of:
                 if target in owner:
-                    yield f"axes {quoted(owner[target])} and {quoted(column.name)} both set {quoted(target)}"
+                    yield f"axes {quote(owner[target])} and {quote(column.name)} both set {quote(target)}"
                 owner[target] = column.name
 
 
@@ -181,7 +179,7 @@ def check_settings(dimensions: Sequence[Dimension], settings: Mapping[str, Any])
     def all_are(setting: str, kind: Any, wanted: str, cure: str) -> Iterator[str]:
         choices = targets[setting].values if setting in targets else (settings.get(setting),)
         if wanted in targets and not all(isinstance(choice, kind) for choice in choices):
-            yield f"axis {quoted(targets[wanted].name)}: {wanted} is a number of {cure}, which not all members have"
+            yield f"axis {quote(targets[wanted].name)}: {wanted} is a number of {cure}, which not all members have"
 
     for gain in ("alpha", "beta"):
         problems += all_are("stabilization", Baumgarte, gain, "stabilization=Baumgarte()")
@@ -196,12 +194,12 @@ def check_tangents(mechanism: Mechanism, dimensions: Sequence[Dimension], names:
     for name in names:
         if name in columns:
             if columns[name].chosen or columns[name].values.ndim > 1:
-                problems.append(f"derivatives: axis {quoted(name)} is not one of plain numbers")
+                problems.append(f"derivatives: axis {quote(name)} is not one of plain numbers")
             continue
-        owner, index = split(name, known)
+        owner, index = split_index(name, known)
         if owner not in known:
             near = suggestion(name, (*known, *columns))
-            problems.append(f"derivatives: {quoted(name)} is no parameter of the mechanism, nor an axis{near}")
+            problems.append(f"derivatives: {quote(name)} is no parameter of the mechanism, nor an axis{near}")
         elif known[owner].value is None or np.ndim(jax.eval_shape(lambda v, i=index: v[i], known[owner].value)):
-            problems.append(f"derivatives: {quoted(name)} is not one number; name an entry, such as {quoted(name + '[0]')}")
+            problems.append(f"derivatives: {quote(name)} is not one number; name an entry, such as {quote(name + '[0]')}")
     return problems

@@ -14,7 +14,7 @@ from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto
-from udkjax.scene.checks import quoted, suggestion
+from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 
 NOT_REACHED = -1  # the rank at output times that a run has not reached
@@ -95,13 +95,13 @@ def _measure(key: str, given: Any, reference: Any, ts: np.ndarray) -> Measure:
     if isinstance(given, str):
         if given not in BY_NAME:
             near = suggestion(given, BY_NAME) or f"; known are {', '.join(BY_NAME)}"
-            raise ValueError(f"measure {quoted(given)}: there is none of this name{near}")
+            raise ValueError(f"measure {quote(given)}: there is none of this name{near}")
         along, compute, labels = BY_NAME[given]
         if given == "error":
             reference = _reference(reference, ts)
         return Measure(given, along, compute, labels, reference if given == "error" else None, "" if key == given else key)
     if not callable(given):
-        raise ValueError(f"measure {quoted(key or str(given))}: must be a name or a function of (mechanism, solution)")
+        raise ValueError(f"measure {quote(key or str(given))}: must be a name or a function of (mechanism, solution)")
     name = key or getattr(given, "__name__", "measure").strip("<>")
     return Measure(name, True, _Own(given, name), {})
 

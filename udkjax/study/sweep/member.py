@@ -22,7 +22,7 @@ from udkjax.integrate.tableau import is_explicit
 from udkjax.pinv import Auto, Elimination
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.parameters import parameters_of, split
+from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.study.sweep.plan import Group, Plan, stacked
 from udkjax.study.units import NUMBERS
 
@@ -155,7 +155,7 @@ def _with(choice: Any, name: str, value: Array) -> Any:
 def at(mechanism: Mechanism, name: str) -> Array:
     """A parameter, or one entry of one, by its name."""
     known = parameters_of(mechanism)
-    owner, index = split(name, known)
+    owner, index = split_index(name, known)
     value = known[owner].value
     assert value is not None
     return value[index]

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.scene.checks import Mistakes, quoted, shown, suggestion
+from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion
 from udkjax.study.choices import choice
 
 
 class GridError(Mistakes):
     """A file cannot be the grid of a sweep. `problems` lists every mistake, each with the path of the offending entry."""
 
-    of = "grid"
+    subject = "grid"
 
 
 class Reader:
@@ -45,7 +45,7 @@ class Reader:
         """Read a table."""
         if isinstance(given, dict):
             return given
-        self.wrong(place, f"must be a table, is {shown(given)}")
+        self.wrong(place, f"must be a table, is {abbreviate(given)}")
         return {}
 
     def names(self, place: str, given: Any) -> tuple[str, ...]:
@@ -53,21 +53,21 @@ class Reader:
         names = [given] if isinstance(given, str) else given
         if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
             return tuple(names)
-        self.wrong(place, f"must be a list of names, is {shown(given)}")
+        self.wrong(place, f"must be a list of names, is {abbreviate(given)}")
         return ()
 
     def number(self, place: str, given: Any) -> float | None:
         """Read a finite number."""
         if isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given):
             return float(given)
-        self.wrong(place, f"must be a finite number, is {shown(given)}")
+        self.wrong(place, f"must be a finite number, is {abbreviate(given)}")
         return None
 
     def whole(self, place: str, given: Any, least: int) -> int | None:
         """Read a whole number."""
         if isinstance(given, int) and not isinstance(given, bool) and given >= least:
             return given
-        self.wrong(place, "missing" if given is None else f"must be a whole number from {least} on, is {shown(given)}")
+        self.wrong(place, "missing" if given is None else f"must be a whole number from {least} on, is {abbreviate(given)}")
         return None
 
     def numbers(self, place: str, given: Any) -> np.ndarray | None:
@@ -78,10 +78,10 @@ class Reader:
             values = np.array(None)
         if values.dtype.kind in "iuf" and values.ndim and np.isfinite(values).all():
             return values.astype(float)
-        self.wrong(place, f"must be a list of finite numbers, is {shown(given)}")
+        self.wrong(place, f"must be a list of finite numbers, is {abbreviate(given)}")
         return None
 
 
 def key_of(name: str) -> str:
     """A key as a TOML file shows it."""
-    return name if name.replace("_", "").replace("-", "").isalnum() else quoted(name)
+    return name if name.replace("_", "").replace("-", "").isalnum() else quote(name)

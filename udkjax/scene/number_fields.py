@@ -1,21 +1,37 @@
 """Every number of a mechanism under one name: the path in a scene file, with the element's name in place of its index."""
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 from jaxtyping import Array
 
-from udkjax.scene.checks import SceneError, quoted, shown, suggestion
-from udkjax.scene.fields import number
+from udkjax.scene.checks import SceneError, abbreviate, quote, suggestion
+from udkjax.scene.fields import Numbers, number
 from udkjax.scene.schema import numbers_in
 
 _SECTIONS = {"body": "bodies", "joint": "joints", "driver": "drivers", "force": "forces"}
 
 
-class Parameter(NamedTuple):
-    """Where a number is, and what it is."""
+class Sections(Protocol):
+    """The parts of a mechanism that hold numbers: its elements by section and name, and gravity."""
+
+    name: str
+    gravity: Array
+
+    @property
+    def bodies(self) -> Mapping[str, eqx.Module]: ...
+    @property
+    def joints(self) -> Mapping[str, eqx.Module]: ...
+    @property
+    def drivers(self) -> Mapping[str, eqx.Module]: ...
+    @property
+    def forces(self) -> Mapping[str, eqx.Module]: ...
+
+
+class NumberField(NamedTuple):
+    """The place of a number in a mechanism, its value and its shape."""
 
     section: str
     owner: str
@@ -24,35 +40,35 @@ class Parameter(NamedTuple):
     shape: tuple[int, ...] | None  # None: absent, any shape
 
 
-def parameters_of(mechanism: Any) -> dict[str, Parameter]:
+def parameters_of(mechanism: Sections) -> dict[str, NumberField]:
     """Return every number of a mechanism by name, absent ones too."""
-    found = {"gravity": Parameter("", "", (), mechanism.gravity, mechanism.gravity.shape)}
+    found = {"gravity": NumberField("", "", (), mechanism.gravity, mechanism.gravity.shape)}
     for section, plural in _SECTIONS.items():
         for owner, element in getattr(mechanism, plural).items():
             for path, value, shape in numbers_in(element):
-                found[".".join((section, owner, *path))] = Parameter(section, owner, path, value, shape)
+                found[".".join((section, owner, *path))] = NumberField(section, owner, path, value, shape)
     return found
 
 
-def holder_of(mechanism: Any, parameter: Parameter) -> Any:
-    """The element, or the motion law or profile in it, whose field the parameter is."""
+def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
+    """Return the element that holds a number, or the motion law or profile within the element."""
     element = getattr(mechanism, _SECTIONS[parameter.section])[parameter.owner]
     return _at(element, parameter.path[:-1])
 
 
-def replaced(mechanism: Any, values: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], Any]:
+def replace_numbers(mechanism: Sections, values: Mapping[str, Numbers]) -> tuple[dict[str, dict[str, Any]], Array]:
     """Return the elements of a mechanism by section and name, and gravity, with the values in; raise `SceneError`."""
     known, problems = parameters_of(mechanism), []
     groups, gravity = {section: dict(getattr(mechanism, plural)) for section, plural in _SECTIONS.items()}, mechanism.gravity
     # Whole arrays before their entries, whatever the order of the keys: jit sorts them.
     for given in sorted(values, key=lambda name: name not in known and name.count("[")):
-        name, index = split(given, known)
+        name, index = split_index(given, known)
         if name not in known:
-            problems.append(f"no parameter {quoted(given)}{suggestion(given, known)}")
+            problems.append(f"no parameter {quote(given)}{suggestion(given, known)}")
             continue
         section, owner, path, _, shape = known[name]
         old = _at(groups[section][owner], path) if path else gravity
-        new, problem = _fitting(given, values[given], name, index, shape, old)
+        new, problem = _fit(given, values[given], name, index, shape, old)
         if new is None:
             problems.append(problem)
         elif path:
@@ -64,14 +80,16 @@ def replaced(mechanism: Any, values: Mapping[str, Any]) -> tuple[dict[str, dict[
     return groups, gravity
 
 
-def _fitting(given: str, value: Any, name: str, index: tuple[int, ...], shape: tuple[int, ...] | None, old: Array | None):
+def _fit(
+    given: str, value: Numbers, name: str, index: tuple[int, ...], shape: tuple[int, ...] | None, old: Array | None
+) -> tuple[Array | None, str]:
     """Return the parameter's new value, or None and why the value does not fit."""
     try:
         new = None if isinstance(value, bool) else number(value)
     except (TypeError, ValueError):
         new = None
     if new is None:
-        return None, f"{given}: must be a number or an array, is {shown(value)}"
+        return None, f"{given}: must be a number or an array, is {abbreviate(value)}"
     if old is None and index:
         return None, f"{given}: {name} is absent; set it as a whole"
     if shape is not None and (len(index) > len(shape) or any(i >= n for i, n in zip(index, shape, strict=False))):
@@ -81,17 +99,17 @@ def _fitting(given: str, value: Any, name: str, index: tuple[int, ...], shape: t
     return (new if old is None or not index else old.at[index].set(new)), ""
 
 
-def split(given: str, known: Mapping[str, Any]) -> tuple[str, tuple[int, ...]]:
+def split_index(given: str, known: Collection[str]) -> tuple[str, tuple[int, ...]]:
     """Split `joint.A.points[1][0]` into the parameter and the index of one of its entries."""
     match = None if given in known else re.fullmatch(r"(.*?)((?:\[\d+\])+)", given)
     return (given, ()) if match is None else (match[1], tuple(int(i) for i in re.findall(r"\d+", match[2])))
 
 
-def _at(element: Any, path: Sequence[str]) -> Any:
+def _at(element: eqx.Module, path: Sequence[str]) -> Any:
     for name in path:
         element = getattr(element, name)
     return element
 
 
-def _set(element: Any, path: Sequence[str], value: Array) -> Any:
+def _set(element: eqx.Module, path: Sequence[str], value: Array) -> eqx.Module:
     return eqx.tree_at(lambda e: _at(e, path), element, value, is_leaf=lambda leaf: leaf is None)

@@ -20,7 +20,7 @@ from udkjax.scene.mechanism import Mechanism
 
 ORIGINS = ((0.0, 0.0), (0.0, 0.0))
 P = ParamSpec("P")
-FEW = 32  # bodies whose motion is compiled as a whole
+COMPILED_BODIES = 32  # bodies whose motion is compiled as a whole
 
 
 def known_at_once(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
@@ -36,14 +36,14 @@ def known_at_once(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
     return made
 
 
-def moving(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: Numbers, rate: Numbers) -> dict[str, Body]:
+def bodies_on_pose(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: Numbers, rate: Numbers) -> dict[str, Body]:
     """Make the bodies of the (mass, inertia)s, at the [(position, angle), ...] of pose(s), moving as s does at its rate."""
 
     def motion(s, rate):
         return jax.jvp(pose, (s,), (rate,))
 
     # By itself each operation is a program to compile, of which large mechanisms need no more than small ones.
-    places, rates = (jax.jit(motion) if len(names) <= FEW else motion)(number(s), number(rate))
+    places, rates = (jax.jit(motion) if len(names) <= COMPILED_BODIES else motion)(number(s), number(rate))
     bodies = zip(names, physics, places, rates, strict=True)
     return {name: Body(mass, inertia, *place, *speed) for name, (mass, inertia), place, speed in bodies}
 
@@ -58,13 +58,13 @@ def uniform_disc(mass: ArrayLike, radius: ArrayLike) -> tuple:
     return number(mass), number(mass * radius**2 / 2)
 
 
-def bar(start, end):
+def bar_pose(start, end):
     """Return position and angle of a bar between two points."""
     along = end - start
     return 0.5 * (start + end), jnp.arctan2(along[1], along[0])
 
 
-def hanging(pivot, length, angle):
+def hanging_rod_pose(pivot, length, angle):
     """Return position and angle of a rod that hangs from a point, at an angle from straight down."""
     return pivot + 0.5 * length * jnp.array([jnp.sin(angle), -jnp.cos(angle)]), angle - np.pi / 2
 
@@ -78,6 +78,6 @@ def apex(start, end, a, b):
     return start + x * along + y * jnp.stack([-along[1], along[0]])
 
 
-def down(gravity: ArrayLike) -> Float[Array, "2"]:
+def gravity_vector(gravity: ArrayLike) -> Float[Array, "2"]:
     """Return the acceleration of gravity along -y."""
     return number([0.0, 0.0 - gravity])

@@ -3,7 +3,7 @@
 import os
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,10 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from udkjax.scene.checks import Entry, SceneError, problems_of, shown, suggestion, typed
-from udkjax.scene.mechanism import Mechanism, numbered
-from udkjax.scene.schema import PLAIN, SECTIONS, TYPES, in_files, keys, table_of, type_name
+from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, find_class, problems_of, suggestion
+from udkjax.scene.fields import Table
+from udkjax.scene.mechanism import Mechanism, name_elements
+from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, is_in_format, keys, table_of, type_name
 
 FORMAT = 1
 
@@ -52,11 +53,11 @@ def dumps(mechanism: Mechanism) -> str:
         raise SceneError(["its numbers are traced: write it outside of jit, vmap and grad"], mechanism.name)
     groups = {"body": mechanism.bodies, "joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
     entries = [
-        Entry(section, index, name, type(element), table_of(element))
+        SceneEntry(section, index, name, type(element), table_of(element))
         for section, elements in groups.items()
         for index, (name, element) in enumerate(elements.items())
     ]
-    problems = [problem for entry in entries for problem in _foreign(entry.where, entry.cls or object, entry.table)]
+    problems = [problem for entry in entries for problem in _check_classes(entry.where, entry.cls or object, entry.table)]
     problems.extend(problems_of(entries, mechanism.gravity))
     if problems:
         raise SceneError(problems, mechanism.name)
@@ -72,79 +73,81 @@ def _read(text: str, source: str) -> Mechanism:
         scene = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SceneError([f"not valid TOML: {error}"], source) from None
-    entries, problems = [], list(_head(scene))
+    entries, problems = [], list(_check_head(scene))
     for section in SECTIONS:
-        entries.extend(_section(section, scene.get(section, []), problems))
+        entries.extend(_read_section(section, scene.get(section, []), problems))
     gravity = scene.get("gravity", [0.0, -9.81])
     problems.extend(problems_of(entries, gravity))
     if problems:
         raise SceneError(problems, source)
     made: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
     for entry in entries:
-        made[entry.section][entry.name] = _make(entry.cls, entry.table)
+        made[entry.section][entry.name] = _build(entry.cls, entry.table)
     return Mechanism(made["body"], made["joint"], made["driver"], made["force"], gravity, scene.get("name", ""))
 
 
-def _head(scene: Mapping[str, Any]) -> Iterator[str]:
+def _check_head(scene: Table) -> Iterator[str]:
     """Iterate over the mistakes at the top of a file."""
     version = scene.get("format")
     if version is None:
         yield f"format: missing; write format = {FORMAT}"
     elif version is True or version != FORMAT:
-        yield f"format: this version of udkjax reads format {FORMAT}, not {shown(version)}"
+        yield f"format: this version of udkjax reads format {FORMAT}, not {abbreviate(version)}"
     if not isinstance(scene.get("name", ""), str):
-        yield f"name: must be a string, is {shown(scene['name'])}"
+        yield f"name: must be a string, is {abbreviate(scene['name'])}"
     expected = ("format", "name", "gravity", *SECTIONS)
     yield from (f"{key}: unknown key{suggestion(key, expected)}" for key in scene if key not in expected)
 
 
-def _section(section: str, tables: Any, problems: list[str]) -> Iterator[Entry]:
+def _read_section(section: str, tables: object, problems: list[str]) -> Iterator[SceneEntry]:
     """Iterate over the entries of one section, their names and types read; adds to `problems` if it is not a section at all."""
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         problems.append(f"{section}: must be a list of tables; write [[{section}]] above each")
         return
-    names: Sequence[Any] = [table.get("name") for table in tables]
+    names: Sequence[object] = [table.get("name") for table in tables]
     if section == "force":
-        names = numbered([str(table.get("type")) for table in tables], names)
+        names = name_elements([str(table.get("type")) for table in tables], names)
     for index, (name, table) in enumerate(zip(names, tables, strict=True)):
-        entry = Entry(section, index, name, PLAIN.get(section), {key: value for key, value in table.items() if key != "name"})
-        if section in TYPES:
-            cls, problem = typed(entry.where, TYPES[section], table)
+        entry = SceneEntry(
+            section, index, name, CLASSES_WITHOUT_TYPE.get(section), {key: value for key, value in table.items() if key != "name"}
+        )
+        if section in CLASSES_BY_TYPE:
+            cls, problem = find_class(entry.where, CLASSES_BY_TYPE[section], table)
             table = {key: value for key, value in entry.table.items() if key != "type"}
             entry = entry._replace(cls=cls, problem=problem, table=table)
         yield entry
 
 
-def _make(annotation: Any, value: Any) -> Any:
+def _build(annotation: Any, value: object) -> Any:
     """Make an element, and the modules within it, of a table that has been checked."""
     if not isinstance(value, dict):
         return value
     cls = annotation
     if "type" in value:
-        cls = TYPES["motion"][value["type"]]
+        cls = CLASSES_BY_TYPE["motion"][value["type"]]
     expected = keys(cls)
-    return cls(**{name: _make(expected[name].annotation, item) for name, item in value.items() if name != "type"})
+    return cls(**{name: _build(expected[name].annotation, item) for name, item in value.items() if name != "type"})
 
 
-def _foreign(where: str, cls: type, table: Mapping[str, Any]) -> Iterator[str]:
+def _check_classes(where: str, cls: type, table: Table) -> Iterator[str]:
     """Iterate over the classes in an element that a file cannot name."""
-    if not in_files(cls):
+    if not is_in_format(cls):
         yield f"{where}: a scene file has no type for the class {cls.__name__}; keep this scene in Python"
     for name, value in table.items():
         if isinstance(value, eqx.Module):
-            yield from _foreign(f"{where}.{name}", type(value), table_of(value))
+            yield from _check_classes(f"{where}.{name}", type(value), table_of(value))
 
 
 def _type_of(cls: type) -> dict[str, str]:
-    return {} if cls in PLAIN.values() else {"type": type_name(cls)}
+    return {} if cls in CLASSES_WITHOUT_TYPE.values() else {"type": type_name(cls)}
 
 
 # tomli-w writes each number of a list on a line of its own: 174 lines for the paper's linkage, where these are 75.
-def _lines(table: Mapping[str, Any]) -> list[str]:
+def _lines(table: Table) -> list[str]:
     return [f"{key} = {_toml(value)}" for key, value in table.items()]
 
 
-def _toml(value: Any) -> str:
+def _toml(value: object) -> str:
     """Return a value as TOML; a float's shortest text that reads back as the same float."""
     if isinstance(value, bool):
         return "true" if value else "false"
