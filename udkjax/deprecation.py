@@ -81,7 +81,7 @@ def renamed_methods(**renamed: str) -> Any:
     def init_subclass(cls: type) -> None:
         for old, new in renamed.items():
             if old in vars(cls) and new not in vars(cls):
-                warnings.warn(f"{cls.__name__}.{old} is now {cls.__name__}.{new}", DeprecationWarning, stacklevel=4)
+                warnings.warn(f"{cls.__name__}.{old} is now {cls.__name__}.{new}", DeprecationWarning, stacklevel=5)
                 setattr(cls, new, vars(cls)[old])
 
     return classmethod(init_subclass)

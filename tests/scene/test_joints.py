@@ -132,10 +132,10 @@ def test_a_joint_that_overrides_old_names_works_and_says_the_new_ones():
 
         class Old(udk.Joint):
             @property
-            def frame_names(self):
+            def attached(self):
                 return (*self.bodies, udk.GROUND)
 
-            def complete(self, *frames):
+            def resolved(self, *frames):
                 return "completed"
 
             def residual(self, t, *frames):
