@@ -4,22 +4,22 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.expressions.loop_program import ADD, LEAST, Clear, Loop, LoopProgram, Slot
+from udkjax.expressions.loop_program import ADD, MINIMUM, Address, KernelLoop, LoopProgram, Reset
 
 
 def run(program: LoopProgram, arrays: dict[str, np.ndarray]) -> None:
     """Run a program on some arrays, in place."""
     for part in program.parts:
-        if isinstance(part, Clear):
+        if isinstance(part, Reset):
             arrays[part.array][part.start : part.start + part.count] = part.value
             continue
         kernel = part.kernel
         for row in part.table:
 
-            def at(slot: Slot, row: Any = row, part: Loop = part) -> tuple[np.ndarray, int]:
+            def at(slot: Address, row: Any = row, part: KernelLoop = part) -> tuple[np.ndarray, int]:
                 return arrays[part.array(slot.array)], slot.offset + (0 if slot.base is None else int(row[slot.base]))
 
-            def read(slot: Slot) -> float:
+            def read(slot: Address) -> float:
                 array, place = at(slot)
                 return float(array[place])
 
@@ -29,5 +29,5 @@ def run(program: LoopProgram, arrays: dict[str, np.ndarray]) -> None:
             ]
             for value, slot in zip(kernel.program(values), kernel.outputs, strict=True):
                 array, place = at(slot)
-                how = {ADD: np.add, LEAST: np.fmin}.get(slot.how, lambda old, new: new)
+                how = {ADD: np.add, MINIMUM: np.fmin}.get(slot.update, lambda old, new: new)
                 array[place] = how(array[place], float(value))

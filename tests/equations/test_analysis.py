@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import closing, dense_rows, redundancy, scales, sparse_rows
+from udkjax.equations import dense_rows, redundancy, scales, sparse_rows
 
 
 def test_a_duplicated_joint_is_named():
@@ -103,7 +103,7 @@ print(udk.analyse(mechanism).redundant_rows, udk.accelerations(mechanism, 0.0, m
     assert_allclose(float(found[1]), -3.5 * 9.81 * np.cos(-np.pi / 4) / 3.05, rtol=1e-12)
 
 
-MODULES = closing, dense_rows, redundancy, scales, sparse_rows
+MODULES = position_closure, dense_rows, redundancy, scales, sparse_rows
 DENSE = ["CLOSED", "ROUNDING", "STRIDE", "DEPENDENT", "CLEAR", "NEGLIGIBLE", "WANDER", "RANK_TOL", "ORDINARY_MASS_RATIO"]
 SPARSE = ["NO_PIVOT", "CLEAR", "NEGLIGIBLE"]
 
@@ -120,7 +120,7 @@ def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, name
     assert homes
     for module in homes:
         monkeypatch.setattr(module, name, factor * getattr(module, name))
-    choose = redundancy.rows_of
+    choose = redundancy.kinematic_rows
     monkeypatch.setattr(redundancy, "rows_of", lambda mechanism: choose(mechanism, large))
     for kind, mechanism in scenes.items():
         rows = redundancy.redundant_rows(mechanism)

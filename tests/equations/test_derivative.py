@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax import GROUND
 from udkjax.equations.implicit_derivative import acceleration_derivative, projection_derivative
-from udkjax.equations.scalar_programs import elimination_programs
+from udkjax.equations.scene_programs import elimination_programs
 from udkjax.equations.structure import leaves_as_scalars
 from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.pinv.rank_policy import RankPolicy

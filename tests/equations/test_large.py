@@ -48,13 +48,13 @@ REDUNDANT = {
 @pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in REDUNDANT])
 def test_sparse_analysis_finds_as_many_rows_as_singular_values_which_do_as_well(name, monkeypatch):
     """At every position that the other has seen, what stays is as far from dependent as what the other leaves."""
-    mech, choose = REDUNDANT[name](), redundancy.rows_of
+    mech, choose = REDUNDANT[name](), redundancy.kinematic_rows
     q, found = np.asarray(mech.q0).ravel(), []
     for size in (False, True):
         monkeypatch.setattr(redundancy, "rows_of", lambda mech, size=size: choose(mech, size))
         found.append(redundancy.redundant_rows(mech))
     dense = choose(mech, False)
-    null_spaces = [p.null_space for p in redundancy.positions_of(dense, q) if p.smallest > redundancy.ORDINARY]
+    null_spaces = [p.null_space for p in redundancy.sample_positions(dense, q) if p.smallest > redundancy.ORDINARY]
     assert len(found[0]) == len(found[1]) == null_spaces[0].shape[1]
     one, other = (min(np.linalg.svd(N[list(rows)])[1][-1] for N in null_spaces) for rows in found)
     assert one > 0.05 and other > 0.2 * one

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.equations import constraints, loads, prepare
-from udkjax.equations.scalar_programs import elimination_programs, scene_programs
+from udkjax.equations.scene_programs import elimination_programs, scene_programs
 from udkjax.equations.structure import leaves_as_scalars
 from udkjax.pinv.rank_policy import RankPolicy
 
@@ -164,7 +164,7 @@ def terms(mech, states):
 
     programs = scene_programs(mech)
     constants = programs.prologue([*map(float, leaves_as_scalars(jax.tree.leaves(mech.without_origin))), 1e-8, 1e-8])
-    (m, n), slots = programs.pattern.shape, programs.pattern.slots
+    (m, n), slots = programs.pattern.shape, programs.pattern.value_count
 
     def at(t, q, v):
         run = lambda program: np.array(program([*constants, t, *q.tolist(), *v.tolist()]), float)  # noqa: E731
@@ -283,7 +283,9 @@ def test_energy_changes_by_the_power_of_loads_and_drivers(machine):
 
     growth = jax.jvp(energy, (t, q, v), (1.0, v, a.ravel()))[1]
     psi_t = jax.jacfwd(constraints.psi, 1)(machine, t, q)
-    power = v @ loads.stated_loads(machine, t, q, v) + multipliers @ psi_t + jax.grad(loads.potential_energy, 1)(machine, t, q, v)
+    power = (
+        v @ loads.element_loads(machine, t, q, v) + multipliers @ psi_t + jax.grad(loads.potential_energy, 1)(machine, t, q, v)
+    )
     assert abs(multipliers @ psi_t) > 1.0  # the motor works
     assert_allclose(growth, power, rtol=1e-11)
 

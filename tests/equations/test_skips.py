@@ -9,7 +9,7 @@ import pytest
 import udkjax as udk
 from udkjax.equations.analysis import analyse
 from udkjax.equations.implicit_derivative import acceleration_derivative, projection_derivative
-from udkjax.equations.scalar_programs import elimination_programs
+from udkjax.equations.scene_programs import elimination_programs
 from udkjax.pinv.rank_policy import RankPolicy
 
 GROUND = "ground"

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.scalar_programs import elimination_programs
+from udkjax.equations.scene_programs import elimination_programs
 from udkjax.equations.structure import is_large, leaves_as_scalars
 from udkjax.pinv.rank_policy import RankPolicy
 
@@ -84,13 +84,13 @@ def test_the_power_balance(moved):
     @jax.jit
     def balance(q, v):
         A = constraints.psi_q(mech, T0, q)
-        v = v - uk.plus(SVD, A) @ constraints.psi_dot(mech, T0, q, v)
+        v = v - uk.pseudoinverse(SVD, A) @ constraints.psi_dot(mech, T0, q, v)
         a, multipliers = (f(mech, T0, q, v, SVD) for f in (uk.accelerations, uk.multipliers))
         energy = lambda t, q, v: loads.kinetic_energy(mech, v) + loads.potential_energy(mech, t, q, v)  # noqa: E731
         rate = jax.jvp(energy, (T0, q, v), (jnp.ones(()), v, a))[1]
         psi_t = jax.jvp(lambda t: constraints.psi(mech, t, q), (T0,), (jnp.ones(()),))[1]
         V_t = jax.grad(lambda t: loads.potential_energy(mech, t, q, v))(T0)
-        terms = [v @ loads.stated_loads(mech, T0, q, v), multipliers @ psi_t, V_t]
+        terms = [v @ loads.element_loads(mech, T0, q, v), multipliers @ psi_t, V_t]
         return (
             rate,
             sum(terms),
@@ -186,7 +186,7 @@ def test_programs_are_the_textbook(moved, policy):
     leaves = jax.tree.leaves(mech.without_origin)
     constants = programs.prologue([*map(float, leaves_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14])
     run = lambda program: named(program, constants, T0, q, v)  # noqa: E731
-    (m, n), slots = programs.pattern.shape, programs.pattern.slots
+    (m, n), slots = programs.pattern.shape, programs.pattern.value_count
     values, b, free, root = np.split(run(programs.equation_terms), [slots, slots + m, slots + m + n])
     psi_q = programs.pattern.dense(values, np) / root
     psi, psi_dot, (T, V) = run(programs.psi), run(programs.psi_dot), run(programs.energy)

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.expressions import Graph, Program, trace
+from udkjax.expressions import Graph, ScalarProgram, trace
 
 
 class Emitted(NamedTuple):
-    program: Program
+    program: ScalarProgram
     shapes: list[tuple[int, ...]]
 
     def __call__(self, *arguments: Any) -> tuple[Any, ...]:
@@ -44,7 +44,7 @@ def emit_function(function: Callable, *examples: Any) -> Emitted:
             array[place] = graph.input((k, place), "argument", example.dtype)
         inputs.append(array)
     outputs = trace(lambda *a: jax.tree.leaves(function(*a)), *examples)(graph, *inputs)
-    program = Program(graph, [s for a in inputs for s in a.flat], [s for o in outputs for s in o.flat])
+    program = ScalarProgram(graph, [s for a in inputs for s in a.flat], [s for o in outputs for s in o.flat])
     return Emitted(program, [o.shape for o in outputs])
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from udkjax.expressions import Differential, Graph, Program, cotangents, tangents, trace
+from udkjax.expressions import Differential, Graph, ScalarProgram, cotangents, tangents, trace
 from udkjax.expressions.differential import common_factors
 
 X, Y = np.array([0.3, -0.7, 1.1]), np.array([0.5, 0.9, -0.4])
@@ -39,11 +39,11 @@ def test_forward_and_reverse_are_those_of_jax(function):
     inputs, at, random = [*x, *y], np.concatenate([X, Y]), np.random.default_rng(0)
     dots, weights = random.standard_normal(6), random.standard_normal(len(outputs))
     seeds = [graph.constant(d) for d in dots]
-    found = Program(graph, inputs, tangents(graph, outputs, dict(zip(inputs, seeds, strict=True))))([float(a) for a in at])
+    found = ScalarProgram(graph, inputs, tangents(graph, outputs, dict(zip(inputs, seeds, strict=True))))([float(a) for a in at])
     np.testing.assert_allclose(found, jax.jvp(flat, (jnp.asarray(at),), (jnp.asarray(dots),))[1], rtol=1e-12, atol=1e-13)
     back = cotangents(graph, outputs, [graph.constant(w) for w in weights], inputs)
     expected = jax.vjp(flat, jnp.asarray(at))[1](jnp.asarray(weights))[0]
-    np.testing.assert_allclose(Program(graph, inputs, back)([float(a) for a in at]), expected, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(ScalarProgram(graph, inputs, back)([float(a) for a in at]), expected, rtol=1e-12, atol=1e-13)
 
 
 def traced(function, graph, *scalars):
@@ -57,7 +57,7 @@ def test_what_has_no_seed_does_not_move(graph, xyz):
     f, g = traced(lambda x, y, z: jnp.sin(y) * x + jnp.cos(z), graph, x, y, z), y * z
     df, dg = tangents(graph, [f, g], {x: dx})
     assert dg.is_zero
-    assert Program(graph, [x, y, z, dx], [df]).count() == {"sincos": 1, "mul": 1}
+    assert ScalarProgram(graph, [x, y, z, dx], [df]).count() == {"sincos": 1, "mul": 1}
     assert tangents(graph, [f, g], {})[0].is_zero
 
 
@@ -72,7 +72,7 @@ def test_derivatives_are_the_nodes_of_the_function_where_they_can_be(graph, xyz)
     assert differential.row(other) == {angle.index: one}
     new = {node.kind for node in graph.nodes[known:]} - {"constant"}
     assert new <= {"add", "sub"}  # on the way: none of them is part of a result
-    assert not set(Program(graph, xyz, [one, other]).order) - set(range(known))
+    assert not set(ScalarProgram(graph, xyz, [one, other]).order) - set(range(known))
 
 
 def test_a_second_direction_takes_one_product_more(graph, xyz):
@@ -80,7 +80,7 @@ def test_a_second_direction_takes_one_product_more(graph, xyz):
     f = traced(lambda x, y, z: jnp.exp(jnp.sin(x * y) / z), graph, x, y, z)
     dots = [graph.input(k, "tangent") for k in range(3)]
     results = [tangents(graph, [f], {x: d})[0] for d in dots]
-    counts = [sum(Program(graph, [x, y, z, *dots], results[:k]).count().values()) for k in (1, 2, 3)]
+    counts = [sum(ScalarProgram(graph, [x, y, z, *dots], results[:k]).count().values()) for k in (1, 2, 3)]
     assert counts[1] == counts[0] + 1 and counts[2] == counts[0] + 2
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.expressions import Graph, Program, frontier, trace
+from udkjax.expressions import Graph, ScalarProgram, frontier, trace
 
 X = np.array([0.3, -0.7, 1.1])
 
@@ -17,7 +17,7 @@ def test_floats_are_evaluated_without_compiling():
     x, y = (graph.input(name, "state") for name in "xy")
     f = lambda x, y: jnp.sqrt(jnp.sin(x) ** 2 + jnp.exp(jnp.tanh(y))) / jnp.cos(x - y)  # noqa: E731
     (result,) = trace(f, 0.1, 0.2)(graph, np.asarray(x, object), np.asarray(y, object))
-    program = Program(graph, [x, y], [result.item()])
+    program = ScalarProgram(graph, [x, y], [result.item()])
     compiled, listening = [], True
 
     def listen(event: str, duration_secs: float, **_):
@@ -45,7 +45,7 @@ def test_an_operation_is_traced_once_for_each_value_it_has(emit):
 def test_what_depends_on_some_inputs():
     graph = Graph()
     x, y = (graph.input(name, "state") for name in "xy")
-    program = Program(graph, [x, y], [x * x, x * y, y + 1.0, graph.constant(2.0), x])
+    program = ScalarProgram(graph, [x, y], [x * x, x * y, y + 1.0, graph.constant(2.0), x])
     assert program.depends_on([True, False]) == (True, True, False, False, True)
     assert program.depends_on([False, False]) == (False,) * 5
 
@@ -58,7 +58,11 @@ def split():
     q = graph.input("q", "state")
     output = graph.sqrt(m) * length * (q + 1.0 / m) + length * length
     early = frontier(graph, [output], lambda node: node.depends <= {"parameter"})
-    return Program(graph, [m, length], early), Program(graph, [*early, q], [output]), Program(graph, [m, length, q], [output])
+    return (
+        ScalarProgram(graph, [m, length], early),
+        ScalarProgram(graph, [*early, q], [output]),
+        ScalarProgram(graph, [m, length, q], [output]),
+    )
 
 
 def test_what_depends_on_parameters_alone_is_computed_early(split):
@@ -81,7 +85,7 @@ def test_an_output_that_is_early_itself_goes_through_the_frontier():
     outputs = [m * m, m * q, graph.constant(2.0)]
     early = frontier(graph, outputs, lambda node: node.depends <= {"parameter"})
     assert early == [m, m * m]
-    assert Program(graph, [*early, q], outputs)([3.0, 9.0, 2.0]) == [9.0, 6.0, 2.0]
+    assert ScalarProgram(graph, [*early, q], outputs)([3.0, 9.0, 2.0]) == [9.0, 6.0, 2.0]
 
 
 def test_what_opaque_nodes_take_can_be_replaced():
@@ -90,10 +94,10 @@ def test_what_opaque_nodes_take_can_be_replaced():
     q = graph.input("q", "state")
     (ordered,), bent = trace(jnp.sort, jnp.asarray(X))(graph, m), trace(jnp.tanh, 0.5)(graph, q * m[1])
     outputs = [ordered[2] * q, ordered[0] + bent[0].item()]
-    found = graph.replaced(outputs, {m[1].index: -q, q.index: q + 1.0})
+    found = graph.substitute(outputs, {m[1].index: -q, q.index: q + 1.0})
     values = [*map(float, X), 0.4]
-    expected = Program(graph, [*m, q], outputs)([values[0], -0.4, values[2], 1.4])
-    assert Program(graph, [*m, q], found)(values) == pytest.approx(expected)
+    expected = ScalarProgram(graph, [*m, q], outputs)([values[0], -0.4, values[2], 1.4])
+    assert ScalarProgram(graph, [*m, q], found)(values) == pytest.approx(expected)
 
 
 def test_an_early_opaque_node_hands_over_its_results():
@@ -103,7 +107,7 @@ def test_an_early_opaque_node_hands_over_its_results():
     (ordered,) = trace(jnp.sort, jnp.asarray(X))(graph, m)
     outputs = [ordered[2] * q, ordered[0] + q]
     early = frontier(graph, outputs, lambda node: node.depends <= {"parameter"})
-    prologue, later = Program(graph, list(m), early), Program(graph, [*early, q], outputs)
+    prologue, later = ScalarProgram(graph, list(m), early), ScalarProgram(graph, [*early, q], outputs)
     assert "sort" in prologue.count()
     assert later.count() == {"mul": 1, "add": 1}
     values = prologue([float(x) for x in X])
@@ -117,4 +121,4 @@ def test_a_branch_that_is_not_taken_may_divide_by_zero(x, y):
     inputs = [graph.input(name, "state") for name in "xy"]
     f = lambda x, y: jnp.hypot(x, y) + jnp.where(y > 0, x / jnp.maximum(y, 0.0), 0.0)  # noqa: E731
     (result,) = trace(f, 0.1, 0.2)(graph, *(np.asarray(s, object) for s in inputs))
-    assert Program(graph, inputs, [result.item()])([x, y])[0] == pytest.approx(float(f(x, y)), rel=1e-15)
+    assert ScalarProgram(graph, inputs, [result.item()])([x, y])[0] == pytest.approx(float(f(x, y)), rel=1e-15)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from udkjax.expressions import Graph, Program, Scalar
+from udkjax.expressions import Graph, Scalar, ScalarProgram
 
 
 def operations(graph: Graph) -> list[str]:
@@ -120,13 +120,13 @@ def test_every_argument_comes_before_its_use(graph, xyz):
 def test_an_input_that_is_missing_is_named(graph, xyz):
     x, y, _ = xyz
     with pytest.raises(ValueError, match=r"not given.*'y'"):
-        Program(graph, [x], [x + y])
+        ScalarProgram(graph, [x], [x + y])
 
 
 def test_what_is_not_asked_for_is_not_emitted(graph, xyz):
     x, y, z = xyz
     product, _ = x * y, graph.sqrt(z) / x
-    program = Program(graph, xyz, [product])
+    program = ScalarProgram(graph, xyz, [product])
     assert program.count() == {"mul": 1}
     assert [program.uses(s) for s in xyz] == [True, True, False]
     assert program([2.0, 3.0, math.nan]) == [6.0]
@@ -181,7 +181,7 @@ def test_simplified_expressions_have_the_same_value(tree, values):
     graph = Graph()
     inputs = [graph.input(k, "state") for k in range(3)]
     result = evaluated(tree, lambda k: inputs[k] if isinstance(k, int) else graph.constant(k), graph.sqrt)
-    program = Program(graph, inputs, [result])
+    program = ScalarProgram(graph, inputs, [result])
     assert sum(program.count().values()) <= size(tree)
     try:
         (found,) = program([float(v) for v in values])
@@ -198,15 +198,15 @@ def test_an_input_can_be_replaced_by_an_expression(tree, another, values):
     inputs = [graph.input(k, "state") for k in range(3)]
     built = lambda tree, inputs: evaluated(tree, lambda k: inputs[k] if isinstance(k, int) else graph.constant(k), graph.sqrt)  # noqa: E731
     whole, other = built(tree, inputs), built(another, inputs)
-    assert graph.replaced([whole, -whole], {}) == [whole, -whole]
-    replaced = graph.replaced([whole], {inputs[0].index: other})
+    assert graph.substitute([whole, -whole], {}) == [whole, -whole]
+    replaced = graph.substitute([whole], {inputs[0].index: other})
     with np.errstate(all="ignore"):
         known = lambda k: np.float64(values[k] if isinstance(k, int) else k)  # noqa: E731
         first = evaluated(another, known, np.sqrt)
         expected = evaluated(tree, lambda k: first if k == 0 and isinstance(k, int) else known(k), np.sqrt)
         if not np.isfinite(expected) or abs(expected) > 1e9:
             return
-        (found,) = Program(graph, inputs, replaced)([np.float64(v) for v in values])
+        (found,) = ScalarProgram(graph, inputs, replaced)([np.float64(v) for v in values])
     assert found == pytest.approx(float(expected), rel=1e-9, abs=1e-9)
 
 
@@ -219,7 +219,7 @@ def test_no_operation_is_emitted_twice(first, second):
     results = [evaluated(tree, leaf, graph.sqrt) for tree in (first, second, first)]
     assert results[0] == results[2]
     assert -(results[0] - results[1]) == results[1] - results[0]
-    program = Program(graph, inputs, results)
+    program = ScalarProgram(graph, inputs, results)
     keys = [(n.kind, tuple((a.index, a.sign) for a in n.arguments), n.detail) for n in (graph.nodes[i] for i in program.order)]
     assert len(set(keys)) == len(keys)
     assert all(isinstance(s, Scalar) for s in results)

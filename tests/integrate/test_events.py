@@ -259,7 +259,7 @@ def test_jump_keeps_constraints_and_energy(name):
     def hit():
         equations = prepare(mech, udk.SVD())
         _, v = equations.project(0.0, q, jnp.arange(1.0, n + 1))
-        D, root = uk.D(mech, 0.0, q, equations.weights), uk.root(mech)
+        D, root = uk.D(mech, 0.0, q, equations.weights), uk.inverse_sqrt_mass(mech)
         appended = jnp.concatenate([D, (root * normal)[None]])
         by_plus = root * (udk.SVD(1e-4)(appended) @ jnp.zeros(len(appended)).at[-1].set(-(1 + e) * (normal @ v)))
         null = jnp.eye(n) - udk.SVD(1e-4)(D) @ D

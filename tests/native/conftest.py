@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from udkjax.expressions import Graph, Program, trace
+from udkjax.expressions import Graph, ScalarProgram, trace
 from udkjax.native import machine
 from udkjax.native.ir import POINTER, Function
 from udkjax.native.program import write
@@ -53,7 +53,7 @@ def as_machine_code(function: Callable, width: int, *examples: Any) -> Callable[
         arrays.append(array)
     found = trace(lambda *a: jax.tree.leaves(function(*a)), *examples)(graph, *arrays)
     outputs = [s for o in found for s in o.flat]
-    program = Program(graph, inputs, outputs)
+    program = ScalarProgram(graph, inputs, outputs)
     places = [("x", k) for k in range(len(inputs))], [("y", k) for k in range(len(outputs))]
     run = loaded(write(program, "program", width, ("x", "y"), *places))
 

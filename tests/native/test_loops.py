@@ -14,7 +14,7 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scales import known_scales
-from udkjax.expressions.loop_program import Clear, Loop
+from udkjax.expressions.loop_program import KernelLoop, Reset
 from udkjax.native.loops import LoopWriter
 from udkjax.pinv.elimination_order import order_blocks
 from udkjax.pinv.rank_policy import RankPolicy
@@ -120,7 +120,7 @@ def test_corrections_take_residuals_away(at):
     if not at.code.row_count:
         return
     kept = at.weights > 0
-    root, A = uk.root(at.mechanism), np.asarray(constraints.psi_q(at.mechanism, at.t, at.q))[kept]
+    root, A = uk.inverse_sqrt_mass(at.mechanism), np.asarray(constraints.psi_q(at.mechanism, at.t, at.q))[kept]
     D = A * root
     psi, rate = (np.asarray(x)[kept] for x in (constraints.psi(at.mechanism, at.t, at.q), at.run("psi_dot")["psi"]))
     for name, x, array, residual in (("newton_q", at.q, "q1", psi), ("newton_v_and_psi", at.v, "v1", rate)):
@@ -167,11 +167,11 @@ def test_no_number_is_written_once_it_was_read():
     for program in programs:
         read: set[tuple[str, int]] = set()
         for part in program.parts:
-            if isinstance(part, Clear):
+            if isinstance(part, Reset):
                 written = {(part.array, k) for k in range(part.start, part.start + part.count)}
                 assert not written & read
                 continue
-            assert isinstance(part, Loop)
+            assert isinstance(part, KernelLoop)
             places = [
                 [(part.array(s.array), s.offset + (0 if s.base is None else int(row[s.base]))) for s in slots]
                 for row in part.table

@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 from numpy.testing import assert_allclose, assert_array_equal
 
-from udkjax.expressions import Graph, Program, cotangents, tangents, trace
+from udkjax.expressions import Graph, ScalarProgram, cotangents, tangents, trace
 from udkjax.native.program import UnsupportedError, write
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 2.0, 1e-9, -1e-9, 1e-300, 700.0, -700.0, 1e200, np.inf, -np.inf, np.nan])
@@ -163,7 +163,10 @@ def test_whatever_has_an_instruction_has_derivatives_that_have_one(code, name):
     (output,) = trace(SLOPED[name], 0.5)(graph, given)[0].flat
     derivatives = [*tangents(graph, [output], {x: graph.constant(1.0)}), *cotangents(graph, [output], [graph.constant(1.0)], [x])]
     places = [("x", 0)], [("y", 0), ("y", 1)]
-    run, points = code(write(Program(graph, [x], derivatives), "program", 1, ("x", "y"), *places)), np.array([-0.6, 0.3, 0.8])
+    run, points = (
+        code(write(ScalarProgram(graph, [x], derivatives), "program", 1, ("x", "y"), *places)),
+        np.array([-0.6, 0.3, 0.8]),
+    )
     for point in points:
         found = np.zeros(2)
         run(np.array([point]), found)

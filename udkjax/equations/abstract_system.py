@@ -113,7 +113,7 @@ class MechanismSystem(AbstractSystem):
         """Psi_q of all rows."""
 
     @abstractmethod
-    def weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+    def weighted_rows(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """D and Psi, their rows weighted by `Scales.weights`, and M^(-1/2), of all rows."""
 
     @abstractmethod

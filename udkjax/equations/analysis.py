@@ -23,8 +23,8 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.redundancy import redundant_rows
-from udkjax.equations.scalar_programs import scene_programs
 from udkjax.equations.scales import Scales, known_scales, traced_scales
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import is_large, structure
 from udkjax.scene.mechanism import Mechanism
 

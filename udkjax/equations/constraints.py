@@ -27,7 +27,7 @@ def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
     found = evaluate_by_kind(
         lambda c, *frames: vector(c.residual(t, *frames)), mechanism, [*mechanism.constraints.values()], bodies(q)
     )
-    return jnp.concatenate([jnp.ravel(rows) for _, rows in found])[_places(found)] if found else jnp.zeros(0)
+    return jnp.concatenate([jnp.ravel(rows) for _, rows in found])[_row_order(found)] if found else jnp.zeros(0)
 
 
 def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
@@ -37,7 +37,7 @@ def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
 
 def psi_dot(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
     """Psi_dot = Psi_q v + Psi_t, the rate of Psi along a motion (m/s, rad/s)."""
-    return along_motion(lambda t, q: psi(mechanism, t, q), t, q, v)
+    return rate_along_motion(lambda t, q: psi(mechanism, t, q), t, q, v)
 
 
 def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
@@ -45,7 +45,7 @@ def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array
 
     It is minus the rate of Psi_dot along the motion of constant v.
     """
-    return -along_motion(lambda t, q: psi_dot(mechanism, t, q, v), t, q, v)
+    return -rate_along_motion(lambda t, q: psi_dot(mechanism, t, q, v), t, q, v)
 
 
 def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
@@ -59,13 +59,13 @@ def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
     return [(name, k) for name, count in zip(names, size, strict=True) for k in range(count)]
 
 
-def _places(found: list[tuple[ElementKind, Any]]) -> np.ndarray:
+def _row_order(found: list[tuple[ElementKind, Any]]) -> np.ndarray:
     """Where the rows of all constraints in their order are among those of their kinds."""
     owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in found])
     return np.argsort(owner, kind="stable")
 
 
-def along_motion(f: Any, t: ArrayLike, q: State, v: State) -> Array:
+def rate_along_motion(f: Any, t: ArrayLike, q: State, v: State) -> Array:
     """df/dt + (df/dq) v of f(t, q)."""
     t, q, v = jnp.asarray(t, jnp.result_type(float)), vector(q), vector(v)
     return jax.jvp(f, (t, q), (jnp.ones_like(t), v))[1]

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from udkjax.equations.closing import close_position, driver_time_step, is_closed
-from udkjax.equations.scalar_programs import scene_programs
+from udkjax.equations.position_closure import close_position, driver_time_step, is_closed
 from udkjax.equations.scales import Scales, known_scales, rank_tolerance
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import leaves_as_scalars
-from udkjax.expressions import Program
+from udkjax.expressions import ScalarProgram
 from udkjax.scene.mechanism import Mechanism
 
 # Singular values of D with rows of length one at a closed position, relative to the largest. Up to half of the digits a singular
@@ -57,7 +57,7 @@ class DenseRows:
         self.root = self._run(self._programs.closure_terms, 0.0, np.zeros(self.size), np.zeros(self.size))[-self.size :]
         self.metric, self._tol = self.root, float(rank_tolerance(mechanism))
 
-    def _run(self, program: Program, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def _run(self, program: ScalarProgram, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         return np.array(program([*self._constants, t, *q.tolist(), *v.tolist()]), float)
 
     def violation(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -69,7 +69,7 @@ class DenseRows:
 
     def jacobian(self, t: float, q: np.ndarray) -> np.ndarray:
         """Psi_q (m, n)."""
-        values = self._run(self._programs.closure_terms, t, q, q)[: self._programs.pattern.slots]
+        values = self._run(self._programs.closure_terms, t, q, q)[: self._programs.pattern.value_count]
         return self._programs.pattern.dense(values, np) / self.root
 
     def plus(self, t: float, q: np.ndarray) -> TruncatedPseudoinverse:
@@ -90,7 +90,7 @@ class DenseRows:
         return q, v, *self.violation(t, q, v), plus.rank
 
 
-class Position(NamedTuple):
+class DensePosition(NamedTuple):
     """A closed position as the analysis sees it: the singular value decomposition of D with rows of length one."""
 
     t: float
@@ -139,15 +139,15 @@ class KinematicRows(DenseRows):
         length[length == 0.0] = 1.0
         return self._run(self._programs.psi, t, q, q), length, D / length[:, None]
 
-    def parts_of(self, positions: list[Position]) -> list[tuple[np.ndarray, list[Position]]]:
+    def split_rows(self, positions: list[DensePosition]) -> list[tuple[np.ndarray, list[DensePosition]]]:
         """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""
         return [(np.arange(self.count), positions)]
 
-    def close(self, t: float, q: np.ndarray) -> Position | None:
+    def close(self, t: float, q: np.ndarray) -> DensePosition | None:
         """Return a closed position near q, or None."""
         q = close_position(self, t, q, np)
         psi, _, D = self.at(t, q)
         still = np.zeros_like(q)
         if not np.all(np.isfinite(D)) or not is_closed(self.scales, q, still, psi, 0 * psi, np):
             return None
-        return Position(t, q, *np.linalg.svd(D))
+        return DensePosition(t, q, *np.linalg.svd(D))

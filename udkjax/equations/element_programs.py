@@ -6,12 +6,12 @@ from functools import lru_cache
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.elements import applied, differentiated
+from udkjax.equations.elements import differentiate_constraint, trace_force
 from udkjax.equations.structure import ElementStructure
 from udkjax.expressions import Graph, Scalar, frontier
 
-POSITIONS, VELOCITIES = ("x", "y", "angle"), ("vx", "vy", "omega")
-FREE = ("fx", "fy", "fangle")  # of a_F
+POSITION_INPUTS, VELOCITY_INPUTS = ("x", "y", "angle"), ("vx", "vy", "omega")
+FREE_INPUTS = ("fx", "fy", "fangle")  # of a_F
 
 
 class ElementPrograms:
@@ -28,8 +28,8 @@ class ElementPrograms:
             self.leaves.append(leaf)
         self.t = graph.input("t", "time")
         self.state: list[tuple[str, int, Scalar]] = []
-        self.q = [s for k in range(structure.body_count) for s in self._inputs(POSITIONS, k, "position")]
-        self.v = [s for k in range(structure.body_count) for s in self._inputs(VELOCITIES, k, "velocity")]
+        self.q = [s for k in range(structure.body_count) for s in self._inputs(POSITION_INPUTS, k, "position")]
+        self.v = [s for k in range(structure.body_count) for s in self._inputs(VELOCITY_INPUTS, k, "velocity")]
         self.outputs: dict[str, list[Scalar]] = {}
 
     def _inputs(self, names: Sequence[str], body: int, group: str) -> list[Scalar]:
@@ -56,14 +56,14 @@ class ConstraintPrograms(ElementPrograms):
     def __init__(self, structure: ElementStructure, baumgarte: bool, loaded: bool):
         super().__init__(structure)
         graph = self.graph
-        value, slopes, rate, gamma = differentiated(graph, structure, self.leaves, self.t, self.q, self.v)
+        value, slopes, rate, gamma = differentiate_constraint(graph, structure, self.leaves, self.t, self.q, self.v)
         self.row_count = len(value)
         self.roots = [graph.input((name, k), "parameter") for k in range(structure.body_count) for name in ("mass", "inertia")]
         root = [self.roots[2 * k + i] for k in range(structure.body_count) for i in (0, 0, 1)]  # M^(-1/2)
         # Without force elements every body falls freely.
         self.gravity = [graph.input(name, "parameter") for name in ("gx", "gy")]
         falling = [*self.gravity, graph.constant(0.0)] * structure.body_count
-        free = [s for k in range(structure.body_count) for s in self._inputs(FREE, k, "velocity")] if loaded else falling
+        free = [s for k in range(structure.body_count) for s in self._inputs(FREE_INPUTS, k, "velocity")] if loaded else falling
         self.gains = [graph.input(name, "parameter") for name in ("alpha", "beta")] if baumgarte else []
         zero = graph.constant(0.0)
         self.outputs = {"psi": value, "psi_dot": rate}
@@ -81,7 +81,7 @@ class ForcePrograms(ElementPrograms):
 
     def __init__(self, structure: ElementStructure):
         super().__init__(structure)
-        loads, stored = applied(self.graph, structure, self.leaves, self.t, self.q, self.v)
+        loads, stored = trace_force(self.graph, structure, self.leaves, self.t, self.q, self.v)
         self.outputs = {"loads": loads, "potential": [stored]}
         self._find_constants()
 

@@ -24,7 +24,7 @@ from udkjax.scene.joints import Constraint
 Row = dict[int, Scalar]
 
 
-def scalar(array: Any) -> Scalar:
+def as_scalar(array: Any) -> Scalar:
     """The scalar that an array of shape () holds."""
     return np.asarray(array, object).item()
 
@@ -47,28 +47,30 @@ def _frames(ground: tuple[bool, ...], q: Any, v: Any = None) -> list[Frame]:
     return frames
 
 
-def differentiated(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
+def differentiate_constraint(
+    graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]
+):
     """Psi, the rows of Psi_q over the columns of q, Psi_dot and gamma of a constraint on scalars."""
-    along, bend = _traced(*kind)
+    first_derivative, second_derivative = _trace_residual(*kind)
     one, zero = graph.constant(1.0), graph.constant(0.0)
 
     def derivative(program, dt, dq) -> list[list[Scalar]]:
         return _scalars(program(graph, leaves, [np.asarray(s, object) for s in (t, *q, dt, *dq)]))
 
-    value, rate = derivative(along, one, v)
-    (acceleration,) = derivative(bend, one, v)
+    value, rate = derivative(first_derivative, one, v)
+    (acceleration,) = derivative(second_derivative, one, v)
     rows: list[Row] = [{} for _ in value]
     for k in range(len(q)):
         unit = [one if i == k else zero for i in range(len(q))]
-        for row, entry in zip(rows, derivative(along, zero, unit)[1], strict=True):
+        for row, entry in zip(rows, derivative(first_derivative, zero, unit)[1], strict=True):
             if not entry.is_zero:
                 row[k] = entry
     if not any("time" in s.node.depends for s in value):
-        acceleration = _shorter(graph, rows, acceleration, _quadratic(graph, rows, q, v))
+        acceleration = _choose_shorter(graph, rows, acceleration, _gamma_by_entries(graph, rows, q, v))
     return value, rows, rate, [-s for s in acceleration]
 
 
-def _quadratic(graph: Graph, rows: list[Row], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
+def _gamma_by_entries(graph: Graph, rows: list[Row], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
     """(Psi_q v)_q v as the sum of (dPsi_q[k]/dq[j]) v[j] v[k]; None where an opaque expression is in the way."""
     entries = Differential(graph, [entry for row in rows for entry in row.values()], q)
     column = {s.index: j for j, s in enumerate(q)}
@@ -85,7 +87,7 @@ def _quadratic(graph: Graph, rows: list[Row], q: list[Scalar], v: list[Scalar]) 
     return total
 
 
-def _shorter(graph: Graph, known: list[Row], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
+def _choose_shorter(graph: Graph, known: list[Row], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
     """The one of two ways to write the same that takes fewer operations, with the entries of the rows known."""
     if other is None:
         return one
@@ -93,12 +95,12 @@ def _shorter(graph: Graph, known: list[Row], one: list[Scalar], other: list[Scal
     return other if operations(graph, given, other) < operations(graph, given, one) else one
 
 
-def applied(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
+def trace_force(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
     """The generalized loads of a force element over the columns of q, and its potential, on scalars."""
-    loads, energy = _traced_force(*kind)
+    loads, energy = _trace_loads(*kind)
     numbers = [np.asarray(s, object) for s in (t, *q, *v)]
     (stored,) = energy(graph, leaves, numbers)
-    return [scalar(s) for s in loads(graph, leaves, numbers)], scalar(stored)
+    return [as_scalar(s) for s in loads(graph, leaves, numbers)], as_scalar(stored)
 
 
 def has_pieces(element: Any) -> bool:
@@ -106,14 +108,16 @@ def has_pieces(element: Any) -> bool:
     return type(element).piece not in (Constraint.piece, ForceElement.piece)
 
 
-def piece(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]) -> Scalar:
+def trace_piece(
+    graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]
+) -> Scalar:
     """Which of its smooth pieces an element is in, on scalars."""
-    (found,) = _traced_piece(*kind)(graph, leaves, [np.asarray(s, object) for s in (t, *q, *v)])
-    return scalar(found)
+    (found,) = _trace_piece_number(*kind)(graph, leaves, [np.asarray(s, object) for s in (t, *q, *v)])
+    return as_scalar(found)
 
 
 @lru_cache(maxsize=256)
-def _traced_piece(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> Any:
+def _trace_piece_number(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> Any:
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
@@ -133,28 +137,28 @@ def _residual(element: Any, ground: tuple[bool, ...], t: Any, q: Any) -> jax.Arr
 
 
 @lru_cache(maxsize=256)
-def _traced(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
+def _trace_residual(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
     """Trace a residual's first and second derivative along (dt, dq)."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
 
-    def along(leaves, numbers):
+    def first_derivative(leaves, numbers):
         element = jax.tree.unflatten(tree, leaves)
         t, q, dt, dq = numbers[0], numbers[1 : 1 + n], numbers[1 + n], numbers[2 + n :]
         return jax.jvp(lambda t, q: _residual(element, ground, t, q), (t, q), (dt, dq))
 
-    def bend(leaves, numbers):
+    def second_derivative(leaves, numbers):
         t, q, dt, dq = numbers[0], numbers[1 : 1 + n], numbers[1 + n], numbers[2 + n :]
-        rate = lambda t, q: along(leaves, [t, *q, dt, *dq])[1]  # noqa: E731
+        rate = lambda t, q: first_derivative(leaves, [t, *q, dt, *dq])[1]  # noqa: E731
         return jax.jvp(rate, (t, q), (dt, dq))[1]
 
     numbers = [number] * (2 + 2 * n)
-    return trace(along, leaves, numbers), trace(bend, leaves, numbers)
+    return trace(first_derivative, leaves, numbers), trace(second_derivative, leaves, numbers)
 
 
 @lru_cache(maxsize=256)
-def _traced_force(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
+def _trace_loads(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
     """Trace a force element's generalized loads, -dV/dq of its potential plus what it states itself, and its potential."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
@@ -169,9 +173,9 @@ def _traced_force(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[A
         element = jax.tree.unflatten(tree, leaves)
         own = element.loads(numbers[0], *_frames(ground, numbers[1 : 1 + n], numbers[1 + n :]))
         own = [(0.0, 0.0, 0.0)] * len(ground) if own is None else own
-        moving = [c for load, fixed in zip(own, ground, strict=True) if not fixed for c in load]
+        components = [c for load, fixed in zip(own, ground, strict=True) if not fixed for c in load]
         slope = jax.grad(lambda q: potential(leaves, [numbers[0], *q, *numbers[1 + n :]]))(numbers[1 : 1 + n])
-        return [jnp.asarray(c, number.dtype) - s for c, s in zip(moving, slope, strict=True)]
+        return [jnp.asarray(c, number.dtype) - s for c, s in zip(components, slope, strict=True)]
 
     numbers = [number] * (1 + 2 * n)
     return trace(loads, leaves, numbers), trace(potential, leaves, numbers)

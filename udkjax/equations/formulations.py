@@ -20,7 +20,7 @@ from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
-from udkjax.pinv.rule import beyond
+from udkjax.pinv.rule import exceeds
 from udkjax.scene.fields import number
 
 
@@ -28,14 +28,14 @@ class Formulation(eqx.Module):
     """A way to the accelerations of a system. Given to `simulate(..., formulation=...)`."""
 
     @abstractmethod
-    def of(self, equations: AbstractSystem) -> AbstractSystem:
+    def formulate(self, equations: AbstractSystem) -> AbstractSystem:
         """The equations of a system, solved in this way."""
 
 
 class PointwiseFormulation(Formulation):
     """A formulation that is a way to solve for a at a given state, and nothing else."""
 
-    def of(self, equations: AbstractSystem) -> "FormulatedSystem":
+    def formulate(self, equations: AbstractSystem) -> "FormulatedSystem":
         return FormulatedSystem(equations, self)
 
     @abstractmethod
@@ -118,7 +118,7 @@ class NullSpaceSVD(PointwiseFormulation):
             return null_space_accelerations(M, F, jnp.eye(len(F)), jnp.zeros_like(F))
         u, sigma, vt = jnp.linalg.svd(A, full_matrices=True)
         size = len(sigma)
-        counts = beyond(sigma, self.rank_tol * sigma[0])
+        counts = exceeds(sigma, self.rank_tol * sigma[0])
         a_p = vt[:size].T @ (jnp.where(counts, 1 / jnp.where(counts, sigma, 1), 0) * (u[:, :size].T @ c))
         null = jnp.where(jnp.arange(len(F)) < counts.sum(), 0, vt.T)
         return null_space_accelerations(M, F, null, a_p)

@@ -24,8 +24,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 
-from udkjax.equations.scalar_programs import EliminationPrograms
-from udkjax.expressions import Differential, Graph, Program, Scalar, frontier
+from udkjax.equations.scene_programs import EliminationPrograms
+from udkjax.expressions import Differential, Graph, Scalar, ScalarProgram, frontier
 from udkjax.expressions.differential import Row, accumulate, common_factors, product
 
 
@@ -51,8 +51,8 @@ class ImplicitDerivative(ABC):
         early = frontier(graph, [*forward, *reverse], lambda node: not node.depends & {"tangent", "cotangent"})
         known = {s.index for s in self.given}
         self.stored = [s for s in early if s.index not in known]
-        self.forward = Program(graph, [*self.given, *self.stored, *tangents], forward)
-        self.reverse = Program(graph, [*self.given, *self.stored, *cotangents], reverse)
+        self.forward = ScalarProgram(graph, [*self.given, *self.stored, *tangents], forward)
+        self.reverse = ScalarProgram(graph, [*self.given, *self.stored, *cotangents], reverse)
 
     @property
     @abstractmethod
@@ -61,7 +61,7 @@ class ImplicitDerivative(ABC):
 
     @cached_property
     @abstractmethod
-    def evaluation(self) -> Program:
+    def evaluation(self) -> ScalarProgram:
         """The results that are not stored already, and `stored`."""
 
     @abstractmethod
@@ -86,9 +86,9 @@ class AccelerationDerivative(ImplicitDerivative):
         return self.programs.coordinate_count
 
     @cached_property
-    def evaluation(self) -> Program:
+    def evaluation(self) -> ScalarProgram:
         """a, safe and `stored`."""
-        return Program(self.programs.graph, self.given, [*self.programs.accelerations.outputs, *self.stored])
+        return ScalarProgram(self.programs.graph, self.given, [*self.programs.accelerations.outputs, *self.stored])
 
     def _prepare(self):
         programs = self.programs
@@ -98,23 +98,25 @@ class AccelerationDerivative(ImplicitDerivative):
         entries = [entry for row in rows for entry in row.values()]
         self.differential = d = self._differential([*b, *entries, *e.free, *programs.root], self.inputs)
         x = [r * s for r, s in zip(programs.root, programs.jt(programs.y), strict=True)]
-        self.direct: list[Row] = [dict(d.row(f)) for f in e.free]  # da_F + dM^(-1/2) x
-        self.turned: list[Row] = [{} for _ in x]  # M^(-1/2) dD^T y
+        self.free_part: list[Row] = [dict(d.row(f)) for f in e.free]  # da_F + dM^(-1/2) x
+        self.row_space_part: list[Row] = [{} for _ in x]  # M^(-1/2) dD^T y
         self.residual: list[Row] = [dict(d.row(s)) for s in b]  # db - dD x
         for k, root in enumerate(programs.root):
-            accumulate(self.direct[k], d.row(root), x[k])
+            accumulate(self.free_part[k], d.row(root), x[k])
         for residual, row, y in zip(self.residual, rows, programs.y, strict=True):
             for k, entry in row.items():
                 accumulate(residual, d.row(entry), -x[k])
-                accumulate(self.turned[k], d.row(entry), y)
-        self.turned = [{k: p * root for k, p in row.items()} for row, root in zip(self.turned, programs.root, strict=True)]
+                accumulate(self.row_space_part[k], d.row(entry), y)
+        self.row_space_part = [
+            {k: p * root for k, p in row.items()} for row, root in zip(self.row_space_part, programs.root, strict=True)
+        ]
         self.residual, self.factors = common_factors(self.residual, {s.index for s in self.given})
 
     def _forward(self, tangents: Sequence[Scalar]) -> list[Scalar]:
         programs, graph = self.programs, self.programs.graph
         known = self.differential.forward({s.index: t for s, t in zip(self.differential.inputs, tangents, strict=True)})
         scaled = {k: t * self.factors.get(k, 1.0) for k, t in known.items()}
-        direct, turned = ([product(row, known, graph) for row in rows] for rows in (self.direct, self.turned))
+        direct, turned = ([product(row, known, graph) for row in rows] for rows in (self.free_part, self.row_space_part))
         residual = [product(row, scaled, graph) for row in self.residual]
         dy = programs.solve_gram([r - _times(row, turned, graph) for r, row in zip(residual, self.rows, strict=True)])
         return [sum(parts, graph.constant(0.0)) for parts in zip(direct, turned, programs.minv_jt(dy), strict=True)]
@@ -128,7 +130,7 @@ class AccelerationDerivative(ImplicitDerivative):
             accumulate(scaled, row, seed)
         found = {k: c * self.factors.get(k, 1.0) for k, c in scaled.items()}
         seeds = _differences(w, programs.jt(u))
-        for row, seed in (*zip(self.turned, seeds, strict=True), *zip(self.direct, w, strict=True)):
+        for row, seed in (*zip(self.row_space_part, seeds, strict=True), *zip(self.free_part, w, strict=True)):
             accumulate(found, row, seed)
         return self.differential.reverse(found)
 
@@ -141,9 +143,9 @@ class ProjectionDerivative(ImplicitDerivative):
         return 2 * self.programs.coordinate_count
 
     @cached_property
-    def evaluation(self) -> Program:
+    def evaluation(self) -> ScalarProgram:
         """`stored`: q and v are given."""
-        return Program(self.programs.graph, self.given, self.stored)
+        return ScalarProgram(self.programs.graph, self.given, self.stored)
 
     def _prepare(self):
         e, independent = self.programs.equations, self.programs.independent_rows

@@ -4,9 +4,9 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 from udkjax.equations.scalar_equations import scalar_equations
-from udkjax.equations.scalar_programs import EliminationPrograms
+from udkjax.equations.scene_programs import EliminationPrograms
 from udkjax.equations.structure import structure
-from udkjax.expressions import Program
+from udkjax.expressions import ScalarProgram
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
@@ -18,14 +18,14 @@ class KinematicPrograms(EliminationPrograms):
         super()._eliminate()
         graph, e = self.graph, self.equations
         zero = graph.constant(0.0)
-        at_rest = graph.replaced([e.psi_dot[i] for i in self.independent_rows], {v.index: zero for v in e.v})
+        at_rest = graph.substitute([e.psi_dot[i] for i in self.independent_rows], {v.index: zero for v in e.v})
         first = [-x for x in self.minv_jt(self.solve_gram(at_rest))]
         rates = {v.index: x for v, x in zip(e.v, first, strict=True)}
-        second = self.minv_jt(self.solve_gram(graph.replaced([e.gamma[i] for i in self.independent_rows], rates)))
+        second = self.minv_jt(self.solve_gram(graph.substitute([e.gamma[i] for i in self.independent_rows], rates)))
         self._outputs["value_derivatives"] = [*first, *second, *e.psi, self._factors_dropping.distance(graph)]
 
     @cached_property
-    def value_derivatives(self) -> Program:
+    def value_derivatives(self) -> ScalarProgram:
         """q' and q'' of Psi_q q' = -Psi_s and Psi_q q'' = gamma; Psi of all rows; `SparseFactors.distance`."""
         return self._program("value_derivatives")
 

@@ -22,7 +22,7 @@ def mass(mechanism: Mechanism) -> Float[Array, "n"]:
 
 def force(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
     """F = -V_q + the loads that force elements state: force x, force y (N) and torque (N m) on each body."""
-    return stated_loads(mechanism, t, q, v) - jax.grad(lambda q: potential_energy(mechanism, t, q, v))(vector(q))
+    return element_loads(mechanism, t, q, v) - jax.grad(lambda q: potential_energy(mechanism, t, q, v))(vector(q))
 
 
 def kinetic_energy(mechanism: Mechanism, v: State) -> Float[Array, ""]:
@@ -33,11 +33,11 @@ def kinetic_energy(mechanism: Mechanism, v: State) -> Float[Array, ""]:
 def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, ""]:
     """V (J): of gravity, zero at the origin, and of the force elements that have one. It does not depend on v."""
     gravity = jnp.tile(jnp.append(mechanism.gravity, 0.0), len(mechanism.body_names))
-    found = _of_forces(lambda e, *frames: e.potential(t, *frames), mechanism, q, v)
+    found = _evaluate_forces(lambda e, *frames: e.potential(t, *frames), mechanism, q, v)
     return sum((jnp.sum(V) for _, V in found if V is not None), -(mass(mechanism) * gravity) @ vector(q))
 
 
-def stated_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
+def element_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
     """The loads of the force elements that state them: all that does not come from a potential."""
 
     def loads(element: Any, *frames: Any) -> Any:
@@ -45,11 +45,11 @@ def stated_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Floa
         return None if stated is None else jnp.stack([vector(list(load)) for load in stated])
 
     total = jnp.zeros((len(mechanism.body_names), 3))
-    for kind, found in _of_forces(loads, mechanism, q, v):
+    for kind, found in _evaluate_forces(loads, mechanism, q, v):
         if found is not None:
             total = total.at[kind.bodies.T].add(found[:, ~np.array(kind.structure.ground)])
     return total.ravel()
 
 
-def _of_forces(function: Any, mechanism: Mechanism, q: State, v: State) -> Any:
+def _evaluate_forces(function: Any, mechanism: Mechanism, q: State, v: State) -> Any:
     return evaluate_by_kind(function, mechanism, [*mechanism.forces.values()], bodies(q), bodies(v))

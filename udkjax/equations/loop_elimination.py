@@ -13,7 +13,7 @@ import numpy as np
 from udkjax.equations.loop_layout import DROP_TOL, ENTRIES, RIGHT, SAFE_TOL, ConstraintGroup, arrays_of_solve
 from udkjax.equations.loop_terms import LoopTerms, Parts, dot
 from udkjax.expressions import Scalar
-from udkjax.expressions.loop_program import ADD, LEAST, Clear, KernelWriter, Loop
+from udkjax.expressions.loop_program import ADD, MINIMUM, KernelLoop, KernelWriter, Reset
 from udkjax.expressions.selection import absolute, greater, where
 from udkjax.pinv.elimination_order import Fronts, order_blocks
 
@@ -57,15 +57,15 @@ class BlockElimination:
     def factorize(self) -> Parts:
         """Form and factorize D D^T of the entries in `D`."""
         if self._off_diagonal_size:
-            yield Clear("gram", self._off_diagonal_start, self._off_diagonal_size)
+            yield Reset("gram", self._off_diagonal_start, self._off_diagonal_size)
         yield from self._gram
-        yield Clear("ratio", 0, 1, np.inf)
+        yield Reset("ratio", 0, 1, np.inf)
         for e in self.order:
 
             def write(w: KernelWriter, e: Fronts = e):
                 _eliminate(w, e.size, e.later_sizes)
 
-            yield Loop(self.terms.kernel(("eliminate", e.size, e.later_sizes), write), self._front_table(e))
+            yield KernelLoop(self.terms.kernel(("eliminate", e.size, e.later_sizes), write), self._front_table(e))
 
     def solve(self, solve: int = 0) -> Parts:
         """x = (D D^T)^(-1) right, and jt_x = D^T x."""
@@ -75,39 +75,39 @@ class BlockElimination:
     def substitute(self, solve: int) -> Parts:
         """x = (D D^T)^(-1) right."""
         names = arrays_of_solve(solve)
-        yield Clear(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
+        yield Reset(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
         for e in self.order:
 
             def forward(w: KernelWriter, e: Fronts = e):
                 _substitute_forward(w, e.size, e.later_sizes)
 
-            yield Loop(self.terms.kernel(("forward", e.size, e.later_sizes), forward), self._front_table(e), names)
+            yield KernelLoop(self.terms.kernel(("forward", e.size, e.later_sizes), forward), self._front_table(e), names)
         for e in reversed(self.order):
 
             def backward(w: KernelWriter, e: Fronts = e):
                 _substitute_backward(w, e.size, e.later_sizes)
 
-            yield Loop(self.terms.kernel(("backward", e.size, e.later_sizes), backward), self._front_table(e)[::-1], names)
+            yield KernelLoop(self.terms.kernel(("backward", e.size, e.later_sizes), backward), self._front_table(e)[::-1], names)
 
-    def safe(self) -> Loop:
+    def safe(self) -> KernelLoop:
         """Whether all pivots exceed `safe_tol`."""
 
         def write(w: KernelWriter):
             w.write(greater(w.read("ratio", None), w.read("constants", None, SAFE_TOL)), "safe", None)
 
-        return self.terms.once("safe", write)
+        return self.terms.single_round("safe", write)
 
-    def distance(self) -> Loop:
+    def distance(self) -> KernelLoop:
         """The distance from dependence: the root of the smallest pivot relative to its diagonal entry."""
 
         def write(w: KernelWriter):
             w.write(w.graph.sqrt(w.read("ratio", None)), "distance", None)
 
-        return self.terms.once("distance", write)
+        return self.terms.single_round("distance", write)
 
     def rank(self) -> Parts:
         """How many rows the last factorization did not drop."""
-        yield Clear("rank", 0, 1)
+        yield Reset("rank", 0, 1)
         for p in sorted(set(self._sizes)):
 
             def count(w: KernelWriter, p: int = p):
@@ -117,19 +117,19 @@ class BlockElimination:
                     w.write(where(greater(absolute(inverse), zero), one, zero), "rank", None, 0, ADD)
 
             blocks = [start for start, size in zip(self._diagonals, self._sizes, strict=True) if size == p]
-            yield Loop(self.terms.kernel(("rank", p), count), np.array(blocks)[:, None])
+            yield KernelLoop(self.terms.kernel(("rank", p), count), np.array(blocks)[:, None])
 
     # --- D D^T
 
     @cached_property
-    def _gram(self) -> list[Loop]:
+    def _gram(self) -> list[KernelLoop]:
         found, start = [], 0
         for group in self.terms.layout.eliminated:
             found.append(self._diagonal_blocks(group, self._diagonals[start : start + len(group.members)]))
             start += len(group.members)
         return found + self._off_diagonal_blocks()
 
-    def _diagonal_blocks(self, group: ConstraintGroup, places: Sequence[int]) -> Loop:
+    def _diagonal_blocks(self, group: ConstraintGroup, places: Sequence[int]) -> KernelLoop:
         p, base = len(group.rows), group.table.shape[1]
 
         def write(w: KernelWriter):
@@ -142,9 +142,9 @@ class BlockElimination:
                         w.write(s, "gram", base, i)
 
         table = np.concatenate([group.table, np.array(places)[:, None]], 1)
-        return Loop(self.terms.kernel(("diagonal", group), write), table)
+        return KernelLoop(self.terms.kernel(("diagonal", group), write), table)
 
-    def _off_diagonal_blocks(self) -> list[Loop]:
+    def _off_diagonal_blocks(self) -> list[KernelLoop]:
         """The share of each body in the block of each pair of constraints that hold it, one loop for pairs that are alike."""
         holders: dict[int, list[tuple[int, int]]] = {}  # of each body: blocks, and which of their bodies it is
         for block, (group, i) in enumerate(self._elements):
@@ -159,7 +159,7 @@ class BlockElimination:
                         entries = self._place(late, ENTRIES), self._place(early, ENTRIES)
                         key = self._elements[late][0], r, self._elements[early][0], s
                         tables.setdefault(key, []).append([*entries, self._off_diagonal[late, early]])
-        return [Loop(self._product(*key), np.array(table)) for key, table in tables.items()]
+        return [KernelLoop(self._product(*key), np.array(table)) for key, table in tables.items()]
 
     def _product(self, g: ConstraintGroup, r: int, h: ConstraintGroup, s: int):
         def write(w: KernelWriter):
@@ -213,7 +213,7 @@ def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
         w.write(inverse, "factors", 0, p + triangle(j, j))
         S[j][j] = inverse
     for x in ratios:
-        w.write(x, "ratio", None, 0, LEAST)
+        w.write(x, "ratio", None, 0, MINIMUM)
     scaled = [[[s * S[j][j] for j, s in enumerate(row)] for row in block] for block in below]
     for a, block in enumerate(scaled):
         for i, row in enumerate(block):

@@ -25,7 +25,7 @@ from udkjax.expressions.loop_program import KernelWriter
 from udkjax.scene.mechanism import Mechanism
 
 # Columns of the table of bodies: where the coordinates of each, its sine and cosine, and its constants begin.
-COORDINATES, SINE, BODY_CONSTANTS = 0, 1, 2
+BODY_COORDINATES, SINE, BODY_CONSTANTS = 0, 1, 2
 # Columns of the table of a group, before three for each of its bodies as above: where the constants of each element, its entries
 # of D, its eliminated rows and all of its rows begin.
 OWN_CONSTANTS, ENTRIES, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
@@ -87,7 +87,7 @@ class ForceGroup(ElementGroup):
     programs: ForcePrograms
 
 
-class Layout:
+class LoopLayout:
     """The groups of a scene's elements, and the sizes of all arrays, for one choice of rows that are eliminated."""
 
     def __init__(self, mechanism: Mechanism, redundant_rows: tuple[int, ...], baumgarte: bool, every_row: bool):

@@ -1,4 +1,4 @@
-"""The programs of a large scene as loops: the same as scalar_programs.py has, with code that does not grow with the scene.
+"""The programs of a large scene as loops: the same as scene_programs.py has, with code that does not grow with the scene.
 
 Terms come from loops over elements of the same structure (loop_terms.py), linear systems from elimination by blocks
 (loop_elimination.py), and derivatives from loops, too (`DifferentiableProgram`).
@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.loop_elimination import BlockElimination
-from udkjax.equations.loop_layout import COORDINATES, DROP_TOL, Layout, abstract_mechanism
+from udkjax.equations.loop_layout import BODY_COORDINATES, DROP_TOL, LoopLayout, abstract_mechanism
 from udkjax.equations.loop_prologue import write_prologue
 from udkjax.equations.loop_terms import LoopTerms, Parts
 from udkjax.equations.structure import structure
 from udkjax.expressions.loop_derivative import LoopDerivative
-from udkjax.expressions.loop_program import Clear, Kernel, KernelWriter, Loop, LoopProgram, evaluate_loops
+from udkjax.expressions.loop_program import Kernel, KernelLoop, KernelWriter, LoopProgram, Reset, evaluate_loops
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
@@ -39,7 +39,7 @@ class DifferentiableProgram(NamedTuple):
     """
 
     program: LoopProgram
-    parts: Sequence[Loop | Clear]
+    parts: Sequence[KernelLoop | Reset]
     fixed: Collection[str]
 
     def derivative(self, fixed: Collection[str] = ()) -> LoopDerivative:
@@ -68,7 +68,7 @@ class LoopPrograms:
         self._settings = tree, shapes, redundant_rows, baumgarte, policy
         self._kernels = {} if kernels is None else kernels
         self.policy, self.redundant_rows = policy, redundant_rows
-        layout = self._layout = Layout(abstract_mechanism(tree, shapes), redundant_rows, baumgarte, every_row)
+        layout = self._layout = LoopLayout(abstract_mechanism(tree, shapes), redundant_rows, baumgarte, every_row)
         self._terms = LoopTerms(layout, self._kernels)
         self._elimination = BlockElimination(self._terms)
         self.scratch, self.row_names = layout.sizes, layout.row_names
@@ -123,14 +123,14 @@ class LoopPrograms:
     def newton_q(self) -> LoopProgram:
         """q1, q after a Newton step to Psi = 0; safe."""
         terms = self._terms
-        position = [terms.sincos(), *terms.elements(("D", "psi"))]
-        step = [*self._factorize, *self._elimination.solve(), terms.corrected("q", "q1", 0)]
+        position = [terms.sincos(), *terms.element_terms(("D", "psi"))]
+        step = [*self._factorize, *self._elimination.solve(), terms.subtract_solutions("q", "q1", 0)]
         return _program(position, step, [self._elimination.safe()])
 
     @cached_property
     def newton_v_and_psi(self) -> LoopProgram:
         """v1, v after the Newton step to Psi_dot = 0; and psi, of all rows."""
-        return _program(self._newton_v, self._terms.residuals("psi", "psi"))
+        return _program(self._newton_v, self._terms.row_terms("psi", "psi"))
 
     @cached_property
     def project_and_accelerate(self) -> LoopProgram:
@@ -140,7 +140,7 @@ class LoopPrograms:
     @cached_property
     def tangent_part(self) -> LoopProgram:
         """dq1 and dv1: what projection leaves of the changes dq and dv; distance."""
-        return _program([self._terms.sincos(), *self._terms.elements(("D",))], self._factorize, self._tangent_parts(0))
+        return _program([self._terms.sincos(), *self._terms.element_terms(("D",))], self._factorize, self._tangent_parts(0))
 
     @cached_property
     def end_of_step(self) -> LoopProgram:
@@ -150,12 +150,12 @@ class LoopPrograms:
     @cached_property
     def psi(self) -> LoopProgram:
         """psi: Psi of all rows."""
-        return _program([self._terms.sincos()], self._terms.residuals("psi", "psi"))
+        return _program([self._terms.sincos()], self._terms.row_terms("psi", "psi"))
 
     @cached_property
     def psi_dot(self) -> LoopProgram:
         """psi: Psi_dot of all rows."""
-        return _program([self._terms.sincos()], self._terms.residuals("psi_dot", "psi"))
+        return _program([self._terms.sincos()], self._terms.row_terms("psi_dot", "psi"))
 
     @cached_property
     def equation_terms(self) -> LoopProgram:
@@ -164,11 +164,11 @@ class LoopPrograms:
 
         def write(w: KernelWriter):
             for k in range(3):
-                free = w.read("free", COORDINATES, k) if self._layout.forces else w.graph.constant(0.0)
-                w.write(free, "terms", COORDINATES, k)
+                free = w.read("free", BODY_COORDINATES, k) if self._layout.forces else w.graph.constant(0.0)
+                w.write(free, "terms", BODY_COORDINATES, k)
 
         free = [terms.sincos(), *terms.free_accelerations("v"), terms.over_bodies("copy free", write)]
-        return _program(free, terms.residuals("b", "terms", self.coordinate_count))
+        return _program(free, terms.row_terms("b", "terms", self.coordinate_count))
 
     @cached_property
     def rank(self) -> LoopProgram:
@@ -187,31 +187,31 @@ class LoopPrograms:
         return self._elimination.factorize()
 
     @property
-    def _acceleration_system(self) -> list[Loop | Clear]:
+    def _acceleration_system(self) -> list[KernelLoop | Reset]:
         """D D^T, and b as the right-hand side."""
         terms = self._terms
-        return [terms.sincos(), *terms.free_accelerations("v"), *terms.elements(("D", "b"))]
+        return [terms.sincos(), *terms.free_accelerations("v"), *terms.element_terms(("D", "b"))]
 
-    def _a(self, *solves: int) -> Loop:
+    def _a(self, *solves: int) -> KernelLoop:
         return self._terms.constrained_accelerations(*solves)
 
     @property
-    def _newton_v(self) -> list[Loop | Clear]:
+    def _newton_v(self) -> list[KernelLoop | Reset]:
         terms = self._terms
-        rates = [terms.sincos(), *terms.elements(("D", "psi_dot"))]
-        return [*rates, *self._factorize, *self._elimination.solve(), terms.corrected("v", "v1", 0)]
+        rates = [terms.sincos(), *terms.element_terms(("D", "psi_dot"))]
+        return [*rates, *self._factorize, *self._elimination.solve(), terms.subtract_solutions("v", "v1", 0)]
 
     @property
-    def _project_and_accelerate(self) -> list[Loop | Clear]:
+    def _project_and_accelerate(self) -> list[KernelLoop | Reset]:
         terms = self._terms
-        system = [*terms.free_accelerations("v1"), *terms.elements(("b",), "v1", 1)]
+        system = [*terms.free_accelerations("v1"), *terms.element_terms(("b",), "v1", 1)]
         return [*self._newton_v, *system, *self._elimination.solve(1), self._a(1), self._elimination.safe()]
 
     def _tangent_parts(self, solve: int) -> Parts:
         for k, change in enumerate(("dq", "dv"), solve):
             yield from self._terms.rates(change, k)
             yield from self._elimination.solve(k)
-            yield self._terms.corrected(change, f"{change}1", k)
+            yield self._terms.subtract_solutions(change, f"{change}1", k)
         yield self._elimination.distance()
 
     # --- derivatives
@@ -219,32 +219,32 @@ class LoopPrograms:
     @cached_property
     def differentiable_accelerations(self) -> DifferentiableProgram:
         """a; safe."""
-        return self._refined(self._acceleration_system[1:], self._a(0, 1), self._elimination.safe())
+        return self._refine(self._acceleration_system[1:], self._a(0, 1), self._elimination.safe())
 
     @cached_property
     def differentiable_newton_q(self) -> DifferentiableProgram:
         """q1."""
-        return self._refined(list(self._terms.elements(("D", "psi"))), self._terms.corrected("q", "q1", 0, 1))
+        return self._refine(list(self._terms.element_terms(("D", "psi"))), self._terms.subtract_solutions("q", "q1", 0, 1))
 
     @cached_property
     def differentiable_newton_v(self) -> DifferentiableProgram:
         """v1."""
-        return self._refined(list(self._terms.elements(("D", "psi_dot"))), self._terms.corrected("v", "v1", 0, 1))
+        return self._refine(list(self._terms.element_terms(("D", "psi_dot"))), self._terms.subtract_solutions("v", "v1", 0, 1))
 
     @cached_property
     def differentiable_projection(self) -> DifferentiableProgram:
         """q1 and v1."""
         terms, solve = self._terms, self._elimination.solve
-        position = [terms.sincos(), *terms.elements(("psi",)), *solve(0), terms.corrected("q", "q1", 0)]
-        at_q1 = terms.elements(("psi_dot",), "v", 1, q="q1", sines="sines1")
-        velocity = [terms.sincos("q1", "sines1"), *at_q1, *solve(1), terms.corrected("v", "v1", 1)]
-        program = _program([terms.sincos(), *terms.elements(("D",))], self._factorize, position[1:], velocity)
+        position = [terms.sincos(), *terms.element_terms(("psi",)), *solve(0), terms.subtract_solutions("q", "q1", 0)]
+        at_q1 = terms.element_terms(("psi_dot",), "v", 1, q="q1", sines="sines1")
+        velocity = [terms.sincos("q1", "sines1"), *at_q1, *solve(1), terms.subtract_solutions("v", "v1", 1)]
+        program = _program([terms.sincos(), *terms.element_terms(("D",))], self._factorize, position[1:], velocity)
         return DifferentiableProgram(program, [*position, *velocity], {*NOT_DIFFERENTIATED, "D"})
 
-    def _refined(self, system: Sequence[Loop | Clear], result: Loop, *rest: Loop) -> DifferentiableProgram:
+    def _refine(self, system: Sequence[KernelLoop | Reset], result: KernelLoop, *rest: KernelLoop) -> DifferentiableProgram:
         terms, elimination = self._terms, self._elimination
         before = [terms.sincos(), *system]
-        after = [*terms.jt(0), *terms.remainder(0, 1), *elimination.solve(1), result]
+        after = [*terms.jt(0), *terms.residual_of_solve(0, 1), *elimination.solve(1), result]
         program = _program(before, self._factorize, elimination.substitute(0), after, rest)
         return DifferentiableProgram(program, [*before, *after], {*NOT_DIFFERENTIATED, "sum0", "y0", "x0"})
 
@@ -288,8 +288,8 @@ class LoopPrograms:
     @cached_property
     def _geometry(self) -> LoopProgram:
         terms = self._terms
-        rows = [*terms.residuals("psi", "psi"), *terms.residuals("psi_dot", "psi_dot")]
-        return _program([terms.sincos(), *terms.elements(("D",))], rows)
+        rows = [*terms.row_terms("psi", "psi"), *terms.row_terms("psi_dot", "psi_dot")]
+        return _program([terms.sincos(), *terms.element_terms(("D",))], rows)
 
     def _run_by_arrays(self, program: LoopProgram, numbers: Any, xp: Any) -> Callable[[Any, Any, Any], dict[str, Any]]:
         """Run a program in which no round of a loop takes anything from another, by NumPy or JAX."""
@@ -305,7 +305,7 @@ class LoopPrograms:
         return run
 
 
-def _program(*parts: Iterable[Loop | Clear]) -> LoopProgram:
+def _program(*parts: Iterable[KernelLoop | Reset]) -> LoopProgram:
     return LoopProgram([part for some in parts for part in some])
 
 

@@ -18,13 +18,13 @@ from udkjax.equations.loop_layout import (
     SAFE_TOL,
     WEIGHT,
     ElementGroup,
-    Layout,
+    LoopLayout,
 )
-from udkjax.expressions.loop_program import KernelWriter, Loop, LoopProgram
+from udkjax.expressions.loop_program import KernelLoop, KernelWriter, LoopProgram
 from udkjax.scene.mechanism import Mechanism
 
 
-def write_prologue(layout: Layout, places: Mechanism, number_count: int) -> LoopProgram:
+def write_prologue(layout: LoopLayout, places: Mechanism, number_count: int) -> LoopProgram:
     """Write the program from the array `numbers` to `constants`.
 
     Args:
@@ -48,14 +48,14 @@ def write_prologue(layout: Layout, places: Mechanism, number_count: int) -> Loop
         for start, value in ((ROOT, root), (COMPLIANCE, root * root), (WEIGHT, body.graph.constant(1.0) / root)):
             body.write(value, "constants", 2, start + k)
     bodies = [[int(b.mass), int(b.inertia), layout.of_body(k)] for k, b in enumerate(places.bodies.values())]
-    parts = [Loop(scene.kernel(), np.zeros((1, 1), int)), Loop(body.kernel(), np.array(bodies).reshape(-1, 3))]
+    parts = [KernelLoop(scene.kernel(), np.zeros((1, 1), int)), KernelLoop(body.kernel(), np.array(bodies).reshape(-1, 3))]
     constraints, forces = list(places.constraints.values()), list(places.forces.values())
     parts += [_group_constants(layout, group, constraints) for group in layout.constraints]
     parts += [_group_constants(layout, group, forces) for group in layout.forces]
     return LoopProgram(parts)
 
 
-def _group_constants(layout: Layout, group: ElementGroup, elements: Sequence[Any]) -> Loop:
+def _group_constants(layout: LoopLayout, group: ElementGroup, elements: Sequence[Any]) -> KernelLoop:
     programs, table = group.programs, group.table
     members = [jax.tree.leaves(elements[i]) for i in group.members]
     starts = np.array([[np.ravel(x)[0] if np.size(x) else 0 for x in leaves] for leaves in members], int)
@@ -70,4 +70,4 @@ def _group_constants(layout: Layout, group: ElementGroup, elements: Sequence[Any
             w.bind(s, "constants", None, (GAINS if layout.gains else layout.gravity) + k)
     for k, s in enumerate(programs.constants):
         w.write(s, "constants", OWN_CONSTANTS, k)
-    return Loop(w.kernel(), np.concatenate([table, starts.reshape(len(members), -1)], 1))
+    return KernelLoop(w.kernel(), np.concatenate([table, starts.reshape(len(members), -1)], 1))

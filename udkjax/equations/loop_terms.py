@@ -5,12 +5,12 @@ from collections.abc import Callable, Hashable, Iterator
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.element_programs import FREE, POSITIONS, VELOCITIES
+from udkjax.equations.element_programs import FREE_INPUTS, POSITION_INPUTS, VELOCITY_INPUTS
 from udkjax.equations.loop_layout import (
     BODIES,
     BODY_CONSTANTS,
+    BODY_COORDINATES,
     COMPLIANCE,
-    COORDINATES,
     ENTRIES,
     MASS_OR_INERTIA,
     OWN_CONSTANTS,
@@ -21,13 +21,13 @@ from udkjax.equations.loop_layout import (
     WEIGHT,
     ConstraintGroup,
     ElementGroup,
-    Layout,
+    LoopLayout,
     arrays_of_solve,
 )
 from udkjax.expressions import Graph, Scalar, trace
-from udkjax.expressions.loop_program import ADD, Clear, Kernel, KernelWriter, Loop
+from udkjax.expressions.loop_program import ADD, Kernel, KernelLoop, KernelWriter, Reset
 
-Parts = Iterator[Loop | Clear]
+Parts = Iterator[KernelLoop | Reset]
 Write = Callable[[KernelWriter], None]
 
 
@@ -37,9 +37,9 @@ def dot(graph: Graph, a: list[Scalar], b: list[Scalar]) -> Scalar:
 
 
 class LoopTerms:
-    """Loops that read and write the arrays of a `Layout`. Their kernels are made once, and shared."""
+    """Loops that read and write the arrays of a `LoopLayout`. Their kernels are made once, and shared."""
 
-    def __init__(self, layout: Layout, kernels: dict[Hashable, Kernel]):
+    def __init__(self, layout: LoopLayout, kernels: dict[Hashable, Kernel]):
         self.layout, self.kernels = layout, kernels
 
     # --- kinds of loops
@@ -52,22 +52,26 @@ class LoopTerms:
             self.kernels[key] = writer.kernel()
         return self.kernels[key]
 
-    def once(self, key: Hashable, write: Write) -> Loop:
+    def single_round(self, key: Hashable, write: Write) -> KernelLoop:
         """A loop of one round."""
-        return Loop(self.kernel(key, write), np.zeros((1, 1), int))
+        return KernelLoop(self.kernel(key, write), np.zeros((1, 1), int))
 
-    def over_bodies(self, key: Hashable, write: Write, **names: str) -> Loop:
+    def over_bodies(self, key: Hashable, write: Write, **names: str) -> KernelLoop:
         """A loop over all bodies; `names` are those of its arrays in the program, where they differ from the kernel's."""
-        return Loop(self.kernel(key, write), self.layout.body_table, names)
+        return KernelLoop(self.kernel(key, write), self.layout.body_table, names)
 
-    def over_group(self, key: Hashable, group: ElementGroup, write: Write, **names: str) -> Loop:
+    def over_group(self, key: Hashable, group: ElementGroup, write: Write, **names: str) -> KernelLoop:
         """A loop over the elements of a group, in whose graph the inputs of their programs are bound to the scene's arrays."""
         programs = group.programs
 
-        def bound(w: KernelWriter):
-            arrays = dict.fromkeys(POSITIONS, ("q", COORDINATES, 0)) | dict.fromkeys(VELOCITIES, ("v", COORDINATES, 0))
-            arrays |= dict.fromkeys(FREE, ("free", COORDINATES, 0)) | dict.fromkeys(("sin", "cos"), ("sines", SINE, 0))
-            order = [*POSITIONS, *VELOCITIES, *FREE, "sin", "cos"]
+        def bind_inputs(w: KernelWriter):
+            arrays = dict.fromkeys(POSITION_INPUTS, ("q", BODY_COORDINATES, 0)) | dict.fromkeys(
+                VELOCITY_INPUTS, ("v", BODY_COORDINATES, 0)
+            )
+            arrays |= dict.fromkeys(FREE_INPUTS, ("free", BODY_COORDINATES, 0)) | dict.fromkeys(
+                ("sin", "cos"), ("sines", SINE, 0)
+            )
+            order = [*POSITION_INPUTS, *VELOCITY_INPUTS, *FREE_INPUTS, "sin", "cos"]
             for k, s in enumerate(programs.constants):
                 w.bind(s, "constants", OWN_CONSTANTS, k)
             w.bind(programs.t, "t", None, 0)
@@ -76,15 +80,15 @@ class LoopTerms:
                 w.bind(s, array, BODIES + 3 * body + column, start + order.index(name) % 3 if name != "cos" else start + 1)
             write(w)
 
-        return Loop(self.kernel((key, group), bound, programs.graph), group.table, names)
+        return KernelLoop(self.kernel((key, group), bind_inputs, programs.graph), group.table, names)
 
     # --- terms of the equations
 
-    def sincos(self, q: str = "q", sines: str = "sines") -> Loop:
+    def sincos(self, q: str = "q", sines: str = "sines") -> KernelLoop:
         """The sine and the cosine of the angle of each body."""
 
         def write(w: KernelWriter):
-            angle = np.asarray(w.read("q", COORDINATES, 2), object)
+            angle = np.asarray(w.read("q", BODY_COORDINATES, 2), object)
             found = trace(lambda x: [jnp.sin(x), jnp.cos(x)], np.zeros(()))(w.graph, angle)
             for k, s in enumerate(found):
                 w.write(s.item(), "sines", SINE, k)
@@ -95,19 +99,19 @@ class LoopTerms:
         """a_F, where there are force elements: without them it is gravity."""
         if not self.layout.forces:
             return
-        yield Clear("load", 0, self.layout.coordinate_count)
+        yield Reset("load", 0, self.layout.coordinate_count)
         for group in self.layout.forces:
 
             def write_loads(w: KernelWriter, group: ElementGroup = group):
                 for k, s in enumerate(group.programs.outputs["loads"]):
-                    w.write(s, "load", BODIES + 3 * (k // 3) + COORDINATES, k % 3, ADD)
+                    w.write(s, "load", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
 
             yield self.over_group("loads", group, write_loads, v=v)
 
         def write(w: KernelWriter):
             for k, i in enumerate(MASS_OR_INERTIA):
-                load, inverse_mass = w.read("load", COORDINATES, k), w.read("constants", BODY_CONSTANTS, COMPLIANCE + i)
-                w.write(self._gravity(w, k) + inverse_mass * load, "free", COORDINATES, k)
+                load, inverse_mass = w.read("load", BODY_COORDINATES, k), w.read("constants", BODY_CONSTANTS, COMPLIANCE + i)
+                w.write(self._gravity(w, k) + inverse_mass * load, "free", BODY_COORDINATES, k)
 
         yield self.over_bodies("free", write)
 
@@ -116,9 +120,9 @@ class LoopTerms:
 
     def read_free(self, w: KernelWriter, k: int) -> Scalar:
         """Read a coordinate of a_F of a body."""
-        return w.read("free", COORDINATES, k) if self.layout.forces else self._gravity(w, k)
+        return w.read("free", BODY_COORDINATES, k) if self.layout.forces else self._gravity(w, k)
 
-    def elements(self, outputs: tuple[str, ...], v: str = "v", solve: int = 0, **names: str) -> Parts:
+    def element_terms(self, outputs: tuple[str, ...], v: str = "v", solve: int = 0, **names: str) -> Parts:
         """D, where `outputs` has it, and another output as the right-hand side of a linear system, of the eliminated rows."""
         for group in self.layout.eliminated:
 
@@ -133,7 +137,7 @@ class LoopTerms:
 
             yield self.over_group(outputs, group, write, v=v, right=f"right{solve}", **names)
 
-    def residuals(self, name: str, array: str, start: int = 0) -> Parts:
+    def row_terms(self, name: str, array: str, start: int = 0) -> Parts:
         """Psi, Psi_dot or b of all rows in their order, into an array."""
         for group in self.layout.constraints:
 
@@ -155,17 +159,17 @@ class LoopTerms:
                     for k in range(group.coordinates):
                         base = BODIES + 3 * (k // 3)
                         weight = w.read("constants", base + BODY_CONSTANTS, WEIGHT + MASS_OR_INERTIA[k % 3])
-                        change = w.read("change", base + COORDINATES, k % 3)
+                        change = w.read("change", base + BODY_COORDINATES, k % 3)
                         total = total + group.entry(w, row, k) * (weight * change)
                     w.write(total, "right", RIGHT, i)
 
             names = {"change": name, "right": f"right{solve}"}
-            yield Loop(self.kernel(("rates", group), write), group.table, names)
+            yield KernelLoop(self.kernel(("rates", group), write), group.table, names)
 
     def jt(self, solve: int) -> Parts:
         """jt_x = D^T x of a linear system."""
         names = arrays_of_solve(solve)
-        yield Clear(names["jt_x"], 0, self.layout.coordinate_count)
+        yield Reset(names["jt_x"], 0, self.layout.coordinate_count)
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -173,40 +177,40 @@ class LoopTerms:
                 for k in range(group.coordinates):
                     total = dot(w.graph, [group.entry(w, row, k) for row in group.rows], x)
                     if not total.is_zero:
-                        w.write(total, "jt_x", BODIES + 3 * (k // 3) + COORDINATES, k % 3, ADD)
+                        w.write(total, "jt_x", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
 
-            yield Loop(self.kernel(("jt", group), write), group.table, names)
+            yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
 
-    def remainder(self, solve: int, to: int) -> Parts:
+    def residual_of_solve(self, solve: int, to: int) -> Parts:
         """What a solution leaves of its right-hand side, right - D jt_x, as the right-hand side of another linear system."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 for i, row in enumerate(group.rows):
                     entries = group.entries(w, row)
-                    jt_x = [w.read("jt_x", BODIES + 3 * (k // 3) + COORDINATES, k % 3) for k in range(len(entries))]
+                    jt_x = [w.read("jt_x", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(len(entries))]
                     w.write(w.read("right", RIGHT, i) - dot(w.graph, entries, jt_x), "remainder", RIGHT, i)
 
             names = {"jt_x": f"jt_x{solve}", "right": f"right{solve}", "remainder": f"right{to}"}
-            yield Loop(self.kernel(("remainder", group), write), group.table, names)
+            yield KernelLoop(self.kernel(("remainder", group), write), group.table, names)
 
-    def constrained_accelerations(self, *solves: int) -> Loop:
+    def constrained_accelerations(self, *solves: int) -> KernelLoop:
         """a = a_F + M^(-1/2) D^T x, with the sum of some solutions as x."""
         return self._add_solutions("a_F", solves, lambda w, k, parts: sum(parts, self.read_free(w, k)), to="a")
 
-    def corrected(self, x: str, to: str, *solves: int) -> Loop:
+    def subtract_solutions(self, x: str, to: str, *solves: int) -> KernelLoop:
         """x - M^(-1/2) D^T y, with the sum of some solutions as y."""
         names = {"from": x, "to": to}
-        return self._add_solutions("from", solves, lambda w, k, parts: w.read("from", COORDINATES, k) - sum(parts), **names)
+        return self._add_solutions("from", solves, lambda w, k, parts: w.read("from", BODY_COORDINATES, k) - sum(parts), **names)
 
-    def _add_solutions(self, key: str, solves: tuple[int, ...], add: Callable[..., Scalar], **names: str) -> Loop:
+    def _add_solutions(self, key: str, solves: tuple[int, ...], add: Callable[..., Scalar], **names: str) -> KernelLoop:
         arrays = ["jt_x", "refinement"][: len(solves)]
 
         def write(w: KernelWriter):
             for k in range(3):
                 root = ROOT + MASS_OR_INERTIA[k]
-                parts = (w.read("constants", BODY_CONSTANTS, root) * w.read(name, COORDINATES, k) for name in arrays)
-                w.write(add(w, k, parts), "to", COORDINATES, k)
+                parts = (w.read("constants", BODY_CONSTANTS, root) * w.read(name, BODY_COORDINATES, k) for name in arrays)
+                w.write(add(w, k, parts), "to", BODY_COORDINATES, k)
 
         names |= {name: f"jt_x{solve}" for name, solve in zip(arrays, solves, strict=True)}
         return self.over_bodies(("solutions", key, len(solves)), write, **names)

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, Vector
-from udkjax.equations.closing import STRIDE
 from udkjax.equations.formulations import Formulation, WrappedSystem, null_space_accelerations
+from udkjax.equations.position_closure import STRIDE
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
@@ -45,7 +45,7 @@ class CoordinatePartitioning(Formulation):
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
 
-    def of(self, equations: AbstractSystem) -> "PartitionedSystem":
+    def formulate(self, equations: AbstractSystem) -> "PartitionedSystem":
         if not isinstance(equations, MechanismSystem):
             raise ValueError("CoordinatePartitioning takes a Mechanism: a ConstrainedSystem may have nonholonomic constraints")
         if equations.stabilized:
@@ -73,20 +73,20 @@ class PartitionedSystem(WrappedSystem):
     def rates(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """v and a at the state that the independent coordinates and velocities determine."""
         fixed = self.fix_partition(t, q, v)
-        closed, v = _complete(fixed, t, q, v)
+        closed, v = _solve_dependent(fixed, t, q, v)
         # Farther from where the step predicts it, it might be another assembly of the mechanism: a shorter step is taken.
         near = self.equations.size(closed - q) <= STRIDE
         return jnp.where(near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
     def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Solve the constraints for what is dependent."""
-        return _complete(self.fix_partition(t, q, v), t, q, v)
+        return _solve_dependent(self.fix_partition(t, q, v), t, q, v)
 
     def fix_partition(self, t: Any, q: Vector, v: Vector) -> "PartitionedSystem":
         """With the partition that pivoting chooses here."""
         if self.dependent is not None:
             return self
-        D = self.equations.weighted(t, q)[0]
+        D = self.equations.weighted_rows(t, q)[0]
         if not len(D):
             return PartitionedSystem(self.equations, self.formulation, jnp.zeros(len(q), bool))
         _, _, order, rank = complete_qr(D, self.formulation.rank_tol * jnp.linalg.norm(D, axis=0).max())
@@ -107,29 +107,29 @@ class PartitionedSystem(WrappedSystem):
 
 
 @jax.custom_jvp
-def _complete(fixed: PartitionedSystem, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+def _solve_dependent(fixed: PartitionedSystem, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     if not fixed.constrained:
         return q, v
     tol = jnp.sqrt(jnp.finfo(q.dtype).eps)  # Newton's method squares it in the step that it does not take any more
 
-    def unfinished(state):
+    def goes_on(state):
         _, change, k = state
         return (k < NEWTON_STEPS) & (change > tol)
 
     def step(state):
         q, _, k = state
-        ahead = _newton(fixed, t, q)
-        return ahead, fixed.equations.size(ahead - q), k + 1
+        following = _newton(fixed, t, q)
+        return following, fixed.equations.size(following - q), k + 1
 
-    q, change, _ = jax.lax.while_loop(unfinished, step, (q, jnp.array(jnp.inf, q.dtype), 0))
+    q, change, _ = jax.lax.while_loop(goes_on, step, (q, jnp.array(jnp.inf, q.dtype), 0))
     q = jnp.where(change <= tol, q, jnp.nan)
     return q, _velocity(fixed, t, q, v)
 
 
-@_complete.defjvp
+@_solve_dependent.defjvp
 def _(primals, tangents):
     fixed, t, q, v = primals
-    closed, rate = _complete(fixed, t, q, v)
+    closed, rate = _solve_dependent(fixed, t, q, v)
 
     def correct(fixed, t, q, v):
         start = jnp.where(fixed.dependent, jax.lax.stop_gradient(closed), q)
@@ -140,12 +140,12 @@ def _(primals, tangents):
 
 
 def _newton(fixed: PartitionedSystem, t: Any, q: Vector) -> Vector:
-    D, psi, root = fixed.equations.weighted(t, q)
+    D, psi, root = fixed.equations.weighted_rows(t, q)
     return jnp.where(fixed.dependent, q - root * (fixed._plus(D) @ psi), q)  # the rest stays to the bit
 
 
 def _velocity(fixed: PartitionedSystem, t: Any, q: Vector, v: Vector) -> Vector:
-    D, _, root = fixed.equations.weighted(t, q)
+    D, _, root = fixed.equations.weighted_rows(t, q)
     rate = fixed.equations.scales.weights * fixed.violation(t, q, v)[1]
     return jnp.where(fixed.dependent, v - root * (fixed._plus(D) @ rate), v)
 

@@ -41,7 +41,7 @@ def equations_of(
         equations: AbstractSystem = prepare_general(system, method, baumgarte)
     else:
         equations = prepare(system, method, baumgarte, analysis)
-    return equations if formulation is None else formulation.of(equations)
+    return equations if formulation is None else formulation.formulate(equations)
 
 
 def accelerations(
@@ -73,12 +73,12 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Any) -> Float[
 
     `solution` is anything with ts (T,), q and v (T, bodies, 3).
     """
-    return _along(mechanism, solution, _psi)
+    return _evaluate_along(mechanism, solution, _psi)
 
 
 def energy(mechanism: Mechanism, solution: Any) -> Energy:
     """Return kinetic energy v^T M v / 2 and potential energy (J) at each output time."""
-    return _along(mechanism, solution, _energy)
+    return _evaluate_along(mechanism, solution, _energy)
 
 
 # Functions of their own: what is compiled for one call serves the next.
@@ -99,7 +99,7 @@ def _energy(equations: Any, t: Any, q: Any, v: Any) -> Energy:
     return Energy(*equations.energy(t, q, v))
 
 
-def _along(mechanism: Any, solution: Any, quantity: Callable, method: Any = None, baumgarte: Any = None) -> Any:
+def _evaluate_along(mechanism: Any, solution: Any, quantity: Callable, method: Any = None, baumgarte: Any = None) -> Any:
     analysis, method = None, SVD() if method is None else method
     if isinstance(mechanism, Mechanism):
         analysis, mechanism = analyse(mechanism), mechanism.without_origin

@@ -39,7 +39,7 @@ About = Literal["centre", "joint"]
 ByBody = dict[str, dict[str, Any]]  # of a joint or driver, of a body
 
 # Of P K P relative to its largest eigenvalue: joints that are stiffer than the softest by more count as rigid.
-STIFFEST = 1e-10
+COMPLIANCE_TOL = 1e-10
 
 
 def reactions(
@@ -75,7 +75,7 @@ def reactions(
     soft = None if compliances is None else _compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
     by_row = _loads_by_row(mechanism.without_origin, analysis, *states, method, stabilization, soft)
-    return _by_body(mechanism, states[1], by_row, lambda part: part.sum(0), frame, about)
+    return _split_by_body(mechanism, states[1], by_row, lambda part: part.sum(0), frame, about)
 
 
 def unique_reactions(
@@ -96,14 +96,16 @@ def unique_reactions(
         size = jnp.max(jnp.linalg.norm(part, axis=0) / unit, axis=-1, keepdims=True)
         return jnp.linalg.norm(jnp.einsum("rtc,trk->tck", part, N), axis=-1) <= UNIQUE_TOL * unit * size
 
-    found = _by_body(mechanism, q, Psi_q / analysis.scales.rows[:, None], lambda part: part, frame, about)
+    found = _split_by_body(mechanism, q, Psi_q / analysis.scales.rows[:, None], lambda part: part, frame, about)
     return {
         name: {body: unique(part, N[:, [k for k, n in enumerate(rows) if n == name]]) for body, part in loads.items()}
         for name, loads in found.items()
     }
 
 
-def _by_body(mechanism: Mechanism, q: Array, by_row: Float[Array, "T m n"], total: Any, frame: Axes, about: About) -> ByBody:
+def _split_by_body(
+    mechanism: Mechanism, q: Array, by_row: Float[Array, "T m n"], total: Any, frame: Axes, about: About
+) -> ByBody:
     """Split what rows do to coordinates by joints and bodies, (rows, T, 3) each, in other axes and about another point."""
     if frame not in ("ground", "body", "joint") or about not in ("centre", "joint"):
         raise ValueError(f'frame is "ground", "body" or "joint", not {frame!r}; about is "centre" or "joint", not {about!r}')
@@ -122,11 +124,11 @@ def _by_body(mechanism: Mechanism, q: Array, by_row: Float[Array, "T m n"], tota
             load = total(jnp.moveaxis(by_row[:, own, 3 * places[body] : 3 * places[body] + 3], 1, 0))
             point = _joint_point(element, k, frames) if about == "joint" else None
             angle = frames[k].angle if frame == "body" else axes
-            found[name][body] = load if point is None and frame == "ground" else _seen_from(load, frames[k], point, angle)
+            found[name][body] = load if point is None and frame == "ground" else _transform_load(load, frames[k], point, angle)
     return found
 
 
-def _seen_from(load: Float[Array, "... 3"], body: Frame, point: Point | None, angle: Any) -> Float[Array, "... 3"]:
+def _transform_load(load: Float[Array, "... 3"], body: Frame, point: Point | None, angle: Any) -> Float[Array, "... 3"]:
     """A load about a centre of mass, in ground axes, about another point and in axes at an `angle` (rad) to these."""
     fx, fy, torque = load[..., 0], load[..., 1], load[..., 2]
     if point is not None:
@@ -193,7 +195,7 @@ def split_by_compliance(
     P = jnp.eye(len(soft)) - D @ SVD(rank_tol=STATIC_RANK_TOL)(D)
     K = soft * w**2
     K, mu = K / jnp.maximum(jnp.max(jax.lax.stop_gradient(K)), jnp.finfo(float).tiny), multipliers / w
-    z = SVD(rank_tol=STIFFEST)(P @ (K[:, None] * P)) @ (P @ (K * mu))
+    z = SVD(rank_tol=COMPLIANCE_TOL)(P @ (K[:, None] * P)) @ (P @ (K * mu))
     return w * (mu - P @ z)
 
 

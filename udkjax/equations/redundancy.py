@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.equations.closing import STRIDE
 from udkjax.equations.dense_rows import NEGLIGIBLE, KinematicRows
+from udkjax.equations.position_closure import STRIDE
 from udkjax.equations.structure import is_large
 from udkjax.scene.mechanism import Mechanism
 
@@ -26,15 +26,15 @@ ORDINARY = 0.05  # a position counts as ordinary if its smallest singular value 
 @np.errstate(all="ignore")  # what is not finite does not close
 def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     """Return the rows of Psi to leave out, or None: the guess cannot be closed or moved. All numbers are known."""
-    rows = rows_of(mechanism)
+    rows = kinematic_rows(mechanism)
     if not rows.count:
         return ()
-    positions = positions_of(rows, np.asarray(mechanism.q0, float).ravel())
-    return chosen_rows(rows, positions) if positions else None
+    positions = sample_positions(rows, np.asarray(mechanism.q0, float).ravel())
+    return choose_redundant_rows(rows, positions) if positions else None
 
 
 @np.errstate(all="ignore")
-def positions_of(rows: Any, q: np.ndarray) -> list[Any]:
+def sample_positions(rows: Any, q: np.ndarray) -> list[Any]:
     """Closed positions of the highest rank along a random motion from a guess q: one is enough where no row is redundant.
 
     None at all where the guess cannot be closed or moved.
@@ -66,20 +66,20 @@ def positions_of(rows: Any, q: np.ndarray) -> list[Any]:
     return [p for p in found if p.rank == rank]
 
 
-def chosen_rows(rows: Any, positions: list[Any]) -> tuple[int, ...]:
+def choose_redundant_rows(rows: Any, positions: list[Any]) -> tuple[int, ...]:
     """The rows to leave out, of positions of ordinary rank: those whose absence never makes the others dependent."""
     if positions[0].rank == rows.count:
         return ()
     chosen = []
-    for members, found in rows.parts_of(positions):
+    for members, found in rows.split_rows(positions):
         ordinary = [part for part in found if part.smallest > ORDINARY] or found
-        chosen += members[list(dispensable([part.null_space for part in ordinary]))].tolist()
+        chosen += members[list(choose_dispensable([part.null_space for part in ordinary]))].tolist()
     return tuple(sorted(chosen))
 
 
 def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...]:
     """Return the names of the constraints whose rows depend on each other at a closed position: those in the left null space."""
-    rows = rows_of(mechanism)
+    rows = kinematic_rows(mechanism)
     position = rows.close(0.0, np.asarray(q, float).ravel()) if rows.count else None
     if position is None:
         return ()
@@ -88,7 +88,7 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
     return tuple(dict.fromkeys(names))
 
 
-def rows_of(mechanism: Mechanism, large: bool | None = None) -> Any:
+def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> Any:
     """Psi and D of a mechanism with known numbers: `KinematicRows`, or for large scenes `SparseRows`."""
     if not (is_large(mechanism) if large is None else large):
         return KinematicRows(mechanism)
@@ -97,7 +97,7 @@ def rows_of(mechanism: Mechanism, large: bool | None = None) -> Any:
     return SparseRows(mechanism, kinematic=True)
 
 
-def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
+def choose_dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
     """Choose rows S, as many as each null space has columns, such that N[S] is as far from singular as it goes for every N.
 
     Greedy: the row whose smallest length over all N is largest; then each N gives up the direction of that row. Of rows that do

@@ -1,7 +1,7 @@
 """A mechanism's equations as one graph of scalar expressions, built once for each structure.
 
 Numbers are inputs of the graph, so one graph serves all values of masses, lengths and gains. It holds more than any run needs;
-the programs taken from it (expressions/emit.py) compute only the outputs that they are asked for.
+the programs taken from it (expressions/scalar_program.py) compute only the outputs that they are asked for.
 """
 
 from functools import cached_property, lru_cache
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.elements import Row, applied, differentiated, has_pieces, piece, scalar
+from udkjax.equations.elements import Row, as_scalar, differentiate_constraint, has_pieces, trace_force, trace_piece
 from udkjax.equations.structure import ElementStructure, element_structure
 from udkjax.expressions import Graph, Scalar
 from udkjax.scene.bodies import GROUND
@@ -76,7 +76,9 @@ class ScalarEquations:
     def _constraint(self, element: Any, scalars: Any):
         places = self._coordinates(element)
         state = [self.t, [self.q[k] for k in places], [self.v[k] for k in places]]
-        value, rows, rate, gamma = differentiated(self.graph, self._structure(element), jax.tree.leaves(scalars), *state)
+        value, rows, rate, gamma = differentiate_constraint(
+            self.graph, self._structure(element), jax.tree.leaves(scalars), *state
+        )
         return value, [{places[k]: entry for k, entry in row.items()} for row in rows], rate, gamma
 
     def _structure(self, element: Any) -> ElementStructure:
@@ -90,10 +92,10 @@ class ScalarEquations:
     @cached_property
     def mass(self) -> list[Scalar]:
         """The diagonal of M: m, m, I of each body."""
-        return [scalar(s) for body in self.scene.bodies.values() for s in (body.mass, body.mass, body.inertia)]
+        return [as_scalar(s) for body in self.scene.bodies.values() for s in (body.mass, body.mass, body.inertia)]
 
     @cached_property
-    def applied(self) -> list[Scalar]:
+    def element_loads(self) -> list[Scalar]:
         """F without the weights."""
         total = [self.graph.constant(0.0)] * len(self.q)
         for name, element in self.mechanism.forces.items():
@@ -106,16 +108,16 @@ class ScalarEquations:
     def gravity(self) -> list[Scalar]:
         """The acceleration of free fall, coordinate by coordinate."""
         x, y = self.scene.gravity
-        return [scalar(x), scalar(y), self.graph.constant(0.0)] * len(self.mechanism.body_names)
+        return [as_scalar(x), as_scalar(y), self.graph.constant(0.0)] * len(self.mechanism.body_names)
 
     @cached_property
     def force(self) -> list[Scalar]:
-        return [f + m * g for f, m, g in zip(self.applied, self.mass, self.gravity, strict=True)]
+        return [f + m * g for f, m, g in zip(self.element_loads, self.mass, self.gravity, strict=True)]
 
     @cached_property
     def free(self) -> list[Scalar]:
         """a_F = M^-1 F, in which a body's mass cancels from its weight."""
-        return [g + f / m for f, m, g in zip(self.applied, self.mass, self.gravity, strict=True)]
+        return [g + f / m for f, m, g in zip(self.element_loads, self.mass, self.gravity, strict=True)]
 
     @cached_property
     def kinetic_energy(self) -> Scalar:
@@ -130,7 +132,7 @@ class ScalarEquations:
     def _force(self, element: Any, scalars: Any) -> tuple[list[Scalar], Scalar]:
         places = self._coordinates(element)
         state = [self.t, [self.q[k] for k in places], [self.v[k] for k in places]]
-        return applied(self.graph, self._structure(element), jax.tree.leaves(scalars), *state)
+        return trace_force(self.graph, self._structure(element), jax.tree.leaves(scalars), *state)
 
     @cached_property
     def pieces(self) -> list[Scalar]:
@@ -143,7 +145,7 @@ class ScalarEquations:
             if has_pieces(element):
                 places = self._coordinates(element)
                 state = self.t, [self.q[k] for k in places], [self.v[k] for k in places]
-                found.append(piece(self.graph, self._structure(element), jax.tree.leaves(scalars), *state))
+                found.append(trace_piece(self.graph, self._structure(element), jax.tree.leaves(scalars), *state))
         return found
 
 

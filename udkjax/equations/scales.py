@@ -14,9 +14,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.equations.loop_programs import loop_programs
-from udkjax.equations.scalar_programs import scene_programs
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import is_large, leaves_as_scalars, leaves_as_vector
-from udkjax.expressions import Program
+from udkjax.expressions import ScalarProgram
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -59,7 +59,7 @@ def known_scales(mechanism: Mechanism) -> Scales:
     mechanism = jax.tree.map(np.asarray, mechanism)
     q, v = (np.asarray(x, float).ravel() for x in (mechanism.q0, mechanism.v0))
     with np.errstate(all="ignore"):  # what is not finite is no scale
-        found = _scales(mechanism, (_large if is_large(mechanism) else _small)(mechanism, q, v, np), np)
+        found = _scales(mechanism, (_large_scene_terms if is_large(mechanism) else _small_scene_terms)(mechanism, q, v, np), np)
     return jax.tree.map(number, found)
 
 
@@ -67,17 +67,19 @@ def traced_scales(mechanism: Mechanism) -> Scales:
     """The same in a trace; without derivatives."""
     mechanism = jax.lax.stop_gradient(mechanism)
     q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
-    return jax.lax.stop_gradient(_scales(mechanism, (_large if is_large(mechanism) else _small)(mechanism, q, v, jnp), jnp))
+    return jax.lax.stop_gradient(
+        _scales(mechanism, (_large_scene_terms if is_large(mechanism) else _small_scene_terms)(mechanism, q, v, jnp), jnp)
+    )
 
 
-def _small(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
+def _small_scene_terms(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
     """Where Psi_q has entries, their values, a_F, Psi_t and gamma at the initial guess, by the scene's programs."""
     programs = scene_programs(mechanism)
     rows, columns = programs.pattern.shape
     given = [*leaves_as_scalars(jax.tree.leaves(mechanism)), 0.0, 0.0]
     constants = programs.prologue([*map(float, given)] if xp is np else given)
 
-    def run(program: Program, v: Any) -> Any:
+    def run(program: ScalarProgram, v: Any) -> Any:
         state = [0.0, *leaves_as_scalars([q]), *leaves_as_scalars([v])] if xp is jnp else [0.0, *q.tolist(), *v.tolist()]
         return xp.stack([xp.asarray(x, float) for x in program([*constants, *state])])
 
@@ -85,14 +87,16 @@ def _small(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
         free, root = xp.split(run(programs.equation_terms, v), 2)
         none = xp.zeros(0)
         return (np.zeros(0, int), np.zeros(0, int)), none, free, none, none
-    slots = programs.pattern.slots
-    values, b, free, root = xp.split(run(programs.equation_terms, v), [slots, slots + rows, slots + rows + columns])
+    value_count = programs.pattern.value_count
+    values, b, free, root = xp.split(
+        run(programs.equation_terms, v), [value_count, value_count + rows, value_count + rows + columns]
+    )
     psi_q = programs.pattern.dense(values, xp) / root
-    places = np.nonzero(programs.pattern.dense(np.ones(slots), np))
+    places = np.nonzero(programs.pattern.dense(np.ones(value_count), np))
     return places, psi_q[places], free, run(programs.psi_dot, 0 * v), b + psi_q @ free
 
 
-def _large(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
+def _large_scene_terms(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
     """The same of a large scene, by its loops."""
     programs = loop_programs(mechanism)
     row, column, *_ = programs.d_entries
@@ -123,13 +127,13 @@ def _scales(mechanism: Mechanism, guess: tuple[Any, ...], xp: Any) -> Scales:
     pair, of_entry = np.unique(rows * len(mass) + columns // 3, return_inverse=True)  # of a row and a body
     turns = columns % 3 == 2
 
-    def summed(values: Any) -> Any:
+    def sum_by_pair(values: Any) -> Any:
         if xp is np:
             return np.bincount(of_entry, values, len(pair))
         return jnp.zeros(len(pair)).at[of_entry].add(values)
 
-    moved = xp.sqrt(summed(xp.where(turns, 0.0, psi_q**2)))
-    turned = summed(xp.where(turns, xp.abs(psi_q), 0.0))
+    moved = xp.sqrt(sum_by_pair(xp.where(turns, 0.0, psi_q**2)))
+    turned = sum_by_pair(xp.where(turns, xp.abs(psi_q), 0.0))
     if len(pair):
         by_place = moved > jnp.finfo(float).eps * xp.max(moved)
         arm = xp.where(by_place, turned / xp.where(by_place, moved, 1.0), 0.0)
@@ -145,14 +149,14 @@ def _scales(mechanism: Mechanism, guess: tuple[Any, ...], xp: Any) -> Scales:
         scale = jnp.zeros(count).at[row].max(change)
     scale = xp.where(xp.isfinite(scale) & (scale > 0.0), scale, length)  # a row that nothing moves here: as if in metres
 
-    def fastest(x: Any) -> Any:
+    def largest(x: Any) -> Any:
         return xp.max(xp.where(xp.isfinite(x), xp.abs(x), 0.0), initial=0.0)
 
     unit = xp.tile(xp.stack([length, length, xp.ones_like(length)]), len(mass))
     v = xp.asarray(mechanism.v0).ravel()
     # An acceleration a lets a pendulum of length L swing to and fro in pi sqrt(L / a) each.
-    swings = (xp.sqrt(fastest(x)) / np.pi for x in (free / unit, gamma / scale))
-    rates = [fastest(v / unit), fastest(psi_t / scale), *swings]
+    swings = (xp.sqrt(largest(x)) / np.pi for x in (free / unit, gamma / scale))
+    rates = [largest(v / unit), largest(psi_t / scale), *swings]
     return Scales(length, arm, reduce(xp.maximum, rates), xp.max(mass), scale)
 
 

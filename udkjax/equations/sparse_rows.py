@@ -16,9 +16,9 @@ from scipy.sparse import coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from udkjax.equations.closing import close_position, driver_time_step, is_closed
 from udkjax.equations.dense_rows import CLEAR, NEGLIGIBLE
 from udkjax.equations.loop_programs import loop_programs
+from udkjax.equations.position_closure import close_position, driver_time_step, is_closed
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
 from udkjax.equations.structure import leaves_as_vector
 from udkjax.pinv.elimination_order import minimum_degree
@@ -69,7 +69,7 @@ class SparsePosition(NamedTuple):
             return csc_array((rows, 0))
         independent = self.D[self.independent]
         solve = splu(csc_array(independent @ independent.T), **_SYMMETRIC).solve
-        parts = []
+        split_dependent_rows = []
         for start in range(0, count, COLUMNS):
             dependent = self.dependent[start : start + COLUMNS]
             right = (independent @ self.D[dependent].T).toarray()
@@ -77,17 +77,20 @@ class SparsePosition(NamedTuple):
             found[self.independent] = -solve(right)
             found[dependent, np.arange(len(dependent))] = 1.0
             found[np.abs(found) < NEGLIGIBLE] = 0.0
-            parts.append(coo_array(found))
-        return csc_array(_beside(parts, rows))
+            split_dependent_rows.append(coo_array(found))
+        return csc_array(_stack_columns(split_dependent_rows, rows))
 
 
 _SYMMETRIC: dict[str, Any] = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}, "diag_pivot_thresh": 0.0}
 
 
-def _beside(parts: list[Any], rows: int) -> Any:
-    shift = np.cumsum([0, *(p.shape[1] for p in parts)])
-    place = np.concatenate([p.row for p in parts]), np.concatenate([p.col + s for p, s in zip(parts, shift, strict=False)])
-    return coo_array((np.concatenate([p.data for p in parts]), place), shape=(rows, shift[-1]))
+def _stack_columns(split_dependent_rows: list[Any], rows: int) -> Any:
+    shift = np.cumsum([0, *(p.shape[1] for p in split_dependent_rows)])
+    place = (
+        np.concatenate([p.row for p in split_dependent_rows]),
+        np.concatenate([p.col + s for p, s in zip(split_dependent_rows, shift, strict=False)]),
+    )
+    return coo_array((np.concatenate([p.data for p in split_dependent_rows]), place), shape=(rows, shift[-1]))
 
 
 class SparseRows:
@@ -118,10 +121,10 @@ class SparseRows:
     def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
         """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
         psi, _, values = self._evaluate(t, q, q)
-        D, length = self._scaled(values)
+        D, length = self._normalize_rows(values)
         return psi, length, D
 
-    def _scaled(self, values: np.ndarray) -> tuple[Any, np.ndarray]:
+    def _normalize_rows(self, values: np.ndarray) -> tuple[Any, np.ndarray]:
         row, column, *_ = self._programs.d_entries
         D = csr_array((values * self._stretch[column], (row, column)), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
@@ -163,17 +166,17 @@ class SparseRows:
             v = v + self._solve(D, self._evaluate(t, q, v)[1] / length)
         return q, v, psi, self._evaluate(t, q, v)[1], rank
 
-    def parts_of(self, positions: list[SparsePosition]) -> list[tuple[np.ndarray, list["Part"]]]:
+    def split_rows(self, positions: list[SparsePosition]) -> list[tuple[np.ndarray, list["RowSubset"]]]:
         """Sets of rows that depend on each other, and how each stands in the positions."""
-        return parts(positions)
+        return split_dependent_rows(positions)
 
     def _position(self, t: float, q: np.ndarray, D: csr_array) -> SparsePosition:
-        pivots = remainders(csr_array(D @ D.T), self._order)
+        pivots = find_pivots(csr_array(D @ D.T), self._order)
         has_pivot = pivots > NO_PIVOT
         return SparsePosition(t, q, D, pivots, np.flatnonzero(has_pivot), np.flatnonzero(~has_pivot))
 
 
-def remainders(gram: csr_array, order: list[int]) -> np.ndarray:
+def find_pivots(gram: csr_array, order: list[int]) -> np.ndarray:
     """The pivots of D D^T in the order of elimination, for rows of length one; dependent rows are passed over."""
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))
@@ -197,26 +200,26 @@ def remainders(gram: csr_array, order: list[int]) -> np.ndarray:
     return pivots
 
 
-class Part(NamedTuple):
+class RowSubset(NamedTuple):
     """Some rows at one position, by themselves: an orthonormal basis of their left null space."""
 
     smallest: float  # singular value that counts, relative to the largest
     null_space: np.ndarray
 
 
-def parts(positions: list[SparsePosition]) -> list[tuple[np.ndarray, list[Part]]]:
+def split_dependent_rows(positions: list[SparsePosition]) -> list[tuple[np.ndarray, list[RowSubset]]]:
     """Split the rows into sets that depend on each other, and look at each set by itself."""
-    every = _beside([coo_array(p.null_space) for p in positions], len(positions[0].pivots))
+    every = _stack_columns([coo_array(p.null_space) for p in positions], len(positions[0].pivots))
     rows, columns = every.shape
     links = coo_array((np.ones(every.nnz), (every.row, rows + every.col)), shape=(rows + columns, rows + columns))
     involved = np.unique(every.row)
     _, label = np.unique(connected_components(links, directed=False)[1][involved], return_inverse=True)
     sets = [involved[label == k] for k in range(label.max(initial=-1) + 1)]
-    return [(members, [_part(p, members) for p in positions]) for members in sets]
+    return [(members, [_row_subset(p, members) for p in positions]) for members in sets]
 
 
-def _part(position: SparsePosition, members: np.ndarray) -> Part:
+def _row_subset(position: SparsePosition, members: np.ndarray) -> RowSubset:
     touched = position.D[members]
     u, sigma, _ = np.linalg.svd(touched[:, np.unique(touched.indices)].toarray())
     rank = len(members) - int(np.isin(members, position.dependent).sum())
-    return Part(float(sigma[rank - 1] / sigma[0]) if rank else 1.0, u[:, rank:])
+    return RowSubset(float(sigma[rank - 1] / sigma[0]) if rank else 1.0, u[:, rank:])

@@ -18,12 +18,12 @@ from udkjax.scene.mechanism import Mechanism, attached_bodies
 # Bodies, constraints and force elements beyond which the programs are loops over elements of the same structure. Straight-line
 # programs evaluate faster, up to several times this size, but take the longer to trace and compile, the larger the scene is
 # (python -m benchmarks scaling).
-LARGE = 40
+LARGE_SCENE = 40
 
 
 def is_large(mechanism: Mechanism) -> bool:
-    """Whether a scene has more than `LARGE` elements."""
-    return len(mechanism.body_names) + len(mechanism.constraints) + len(mechanism.force_names) > LARGE
+    """Whether a scene has more than `LARGE_SCENE` elements."""
+    return len(mechanism.body_names) + len(mechanism.constraints) + len(mechanism.force_names) > LARGE_SCENE
 
 
 def structure(mechanism: Mechanism) -> tuple[Any, tuple]:

@@ -71,10 +71,10 @@ class TextbookEquations(MechanismSystem):
         """Psi_q of all rows."""
         return constraints.psi_q(self.mechanism, t, q)
 
-    def weighted(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+    def weighted_rows(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """D and Psi, their rows weighted, and M^(-1/2), of all rows."""
         w = self.scales.weights
-        return uk.D(self.mechanism, t, q, w), w * constraints.psi(self.mechanism, t, q), uk.root(self.mechanism)
+        return uk.D(self.mechanism, t, q, w), w * constraints.psi(self.mechanism, t, q), uk.inverse_sqrt_mass(self.mechanism)
 
     def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Kinetic and potential energy (J)."""
@@ -83,15 +83,15 @@ class TextbookEquations(MechanismSystem):
     def linearized_position(self, t: Any, q: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
         mechanism, w = self.mechanism, self.weights
         return (
-            uk.plus(self.method, uk.D(mechanism, t, q, w)),
-            uk.weighted(w, constraints.psi(mechanism, t, q)),
-            uk.root(mechanism),
+            uk.pseudoinverse(self.method, uk.D(mechanism, t, q, w)),
+            uk.weigh(w, constraints.psi(mechanism, t, q)),
+            uk.inverse_sqrt_mass(mechanism),
         )
 
     def linearized_velocity(self, t: Any, q: Vector, v: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
         mechanism, w = self.mechanism, self.weights
-        rate = uk.weighted(w, constraints.psi_dot(mechanism, t, q, v))
-        return uk.plus(self.method, uk.D(mechanism, t, q, w)), rate, uk.root(mechanism)
+        rate = uk.weigh(w, constraints.psi_dot(mechanism, t, q, v))
+        return uk.pseudoinverse(self.method, uk.D(mechanism, t, q, w)), rate, uk.inverse_sqrt_mass(mechanism)
 
     @property
     def weights(self) -> Float[Array, "m"]:
@@ -146,17 +146,17 @@ def _project(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tupl
 @_project.defjvp
 def _(primals, tangents):
     equations, t, *_ = primals
-    return jax.jvp(_as_projected, (equations, t, *_project(*primals)), tangents)
+    return jax.jvp(_at_projection, (equations, t, *_project(*primals)), tangents)
 
 
 @jax.custom_jvp
-def _as_projected(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+def _at_projection(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     """A state on the manifold, with the derivatives that `project` has where it returns it."""
     del equations, t
     return q, v
 
 
-@_as_projected.defjvp
+@_at_projection.defjvp
 def _(primals, tangents):
     _, _, q, v = primals
     return (q, v), jax.jvp(TextbookEquations.correct, primals, tangents)[1]

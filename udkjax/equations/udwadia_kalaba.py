@@ -47,7 +47,7 @@ class Baumgarte(eqx.Module):
 
 def D(mechanism: Mechanism, t: ArrayLike, q: State, w: Weights = None) -> Float[Array, "m n"]:
     """D = Psi_q M^(-1/2)."""
-    return weighted(w, constraints.psi_q(mechanism, t, q) * root(mechanism))
+    return weigh(w, constraints.psi_q(mechanism, t, q) * inverse_sqrt_mass(mechanism))
 
 
 def a_F(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
@@ -63,7 +63,7 @@ def b(
     if baumgarte is not None:
         b = b - 2 * baumgarte.alpha * constraints.psi_dot(mechanism, t, q, v)
         b = b - baumgarte.beta**2 * constraints.psi(mechanism, t, q)
-    return weighted(w, b)
+    return weigh(w, b)
 
 
 def accelerations(
@@ -76,8 +76,8 @@ def accelerations(
     w: Weights = None,
 ) -> Float[Array, "n"]:
     """a = a_F + M^(-1/2) D^+ b (m/s^2, rad/s^2)."""
-    x = plus(method, D(mechanism, t, q, w)) @ b(mechanism, t, q, v, baumgarte, w)
-    return a_F(mechanism, t, q, v) + root(mechanism) * x
+    x = pseudoinverse(method, D(mechanism, t, q, w)) @ b(mechanism, t, q, v, baumgarte, w)
+    return a_F(mechanism, t, q, v) + inverse_sqrt_mass(mechanism) * x
 
 
 def multipliers(
@@ -90,8 +90,8 @@ def multipliers(
     w: Weights = None,
 ) -> Float[Array, "m"]:
     """lambda = -(D^+)^T D^+ b (N, N m): of all that keep M a + Psi_q^T lambda = F those of least norm, where w is None."""
-    D_plus = plus(method, D(mechanism, t, q, w))
-    return weighted(w, -(D_plus.T @ (D_plus @ b(mechanism, t, q, v, baumgarte, w))))
+    D_plus = pseudoinverse(method, D(mechanism, t, q, w))
+    return weigh(w, -(D_plus.T @ (D_plus @ b(mechanism, t, q, v, baumgarte, w))))
 
 
 def project(
@@ -103,11 +103,13 @@ def project(
     """
 
     def newton(_: Any, q: Any) -> Any:
-        return q - root(mechanism) * (plus(method, D(mechanism, t, q, w)) @ weighted(w, constraints.psi(mechanism, t, q)))
+        return q - inverse_sqrt_mass(mechanism) * (
+            pseudoinverse(method, D(mechanism, t, q, w)) @ weigh(w, constraints.psi(mechanism, t, q))
+        )
 
     q = jnp.asarray(jax.lax.fori_loop(0, steps, newton, vector(q)))
-    rate = weighted(w, constraints.psi_dot(mechanism, t, q, v))
-    return q, vector(v) - root(mechanism) * (plus(method, D(mechanism, t, q, w)) @ rate)
+    rate = weigh(w, constraints.psi_dot(mechanism, t, q, v))
+    return q, vector(v) - inverse_sqrt_mass(mechanism) * (pseudoinverse(method, D(mechanism, t, q, w)) @ rate)
 
 
 def tangent_part(
@@ -115,20 +117,22 @@ def tangent_part(
 ) -> Float[Array, "n"]:
     """(I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: the part of it within the manifold, which projection leaves."""
     matrix = D(mechanism, t, q, w)
-    return change - root(mechanism) * (plus(method, matrix) @ (matrix @ (change / root(mechanism))))
+    return change - inverse_sqrt_mass(mechanism) * (
+        pseudoinverse(method, matrix) @ (matrix @ (change / inverse_sqrt_mass(mechanism)))
+    )
 
 
-def root(mechanism: Mechanism) -> Float[Array, "n"]:
+def inverse_sqrt_mass(mechanism: Mechanism) -> Float[Array, "n"]:
     """The diagonal of M^(-1/2)."""
     return 1 / jnp.sqrt(loads.mass(mechanism))
 
 
-def weighted(w: Weights, rows: Array) -> Array:
+def weigh(w: Weights, rows: Array) -> Array:
     """Rows, or one number of each, times their weights."""
     return rows if w is None else (rows.T * jnp.asarray(w)).T
 
 
-def plus(method: Pseudoinverse, D: Float[Array, "m n"]) -> Any:
+def pseudoinverse(method: Pseudoinverse, D: Float[Array, "m n"]) -> Any:
     """D^+ as an operator, `D_plus @ b` and `D_plus.T @ x`; of no rows at all it is zero."""
     return method.plus(D) if len(D) else _Zero(D.shape)
 

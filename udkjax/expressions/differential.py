@@ -15,8 +15,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from udkjax.expressions.graph import Details, Graph, Node, Scalar
-from udkjax.expressions.read import read
+from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
+from udkjax.expressions.jaxpr_reader import read_jaxpr
 
 Row = dict[int, Scalar]  # partial derivatives, by the index of the node with respect to which they are taken
 
@@ -32,7 +32,7 @@ class Differential:
         given = {s.index for s in (*self.inputs, *fixed)}
         self._rows: dict[int, Row] = {s.index: {s.index: graph.constant(1.0, s.node.dtype)} for s in self.inputs}
         self._calls: dict[int, list[int]] = {}  # opaque nodes that move, and their results
-        for index in graph.needed((s.index for s in outputs), given):
+        for index in graph.dependencies((s.index for s in outputs), given):
             row = self._differentiate(index)
             if row:
                 self._rows[index] = row
@@ -57,8 +57,8 @@ class Differential:
             seeds = {k: known.pop(k) for k in results if k in known}
             if seeds:
                 arguments = self.graph.nodes[call].arguments
-                pulled = _pull_back(self.graph, call, seeds, [bool(self.row(a)) for a in arguments])
-                for argument, cotangent in zip(arguments, pulled, strict=True):
+                cotangents_of_arguments = _pull_back(self.graph, call, seeds, [bool(self.row(a)) for a in arguments])
+                for argument, cotangent in zip(arguments, cotangents_of_arguments, strict=True):
                     accumulate(known, self.row(argument), cotangent)
         return [known.get(s.index, self.graph.constant(0.0, s.node.dtype)) for s in self.inputs]
 
@@ -159,7 +159,7 @@ def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
         case "sqrt":
             return graph.constant(0.5, node.dtype) / value
     detail, dtypes = node.detail, tuple(a.node.dtype for a in node.arguments)
-    (slope,) = read(graph, _slope(detail, dtypes, k), [np.asarray(a, object) for a in node.arguments])
+    (slope,) = read_jaxpr(graph, _slope(detail, dtypes, k), [np.asarray(a, object) for a in node.arguments])
     return slope.item()
 
 
@@ -167,7 +167,7 @@ def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
 
 
 @lru_cache(maxsize=256)
-def _slope(detail: Details, dtypes: tuple, k: int) -> Any:
+def _slope(detail: BoundPrimitive, dtypes: tuple, k: int) -> Any:
     """The derivative of a primitive on scalars with respect to its k-th argument, as a jaxpr."""
 
     def slope(*scalars):
@@ -181,46 +181,46 @@ def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Seq
     """The tangents of what an opaque node returns."""
     node = graph.nodes[call]
     arrays, dots = _arrays(node, node.arguments), _arrays(node, tangents)
-    moving = [k for k, dot in enumerate(dots) if any(not s.is_zero for s in dot.flat)]
-    if not moving:
+    active = [k for k, dot in enumerate(dots) if any(not s.is_zero for s in dot.flat)]
+    if not active:
         return {}
     wanted = _outputs(graph, results)
 
     def pushed(arrays, dots):
-        return jax.jvp(_restrict(node.detail, arrays, moving, wanted), [arrays[k] for k in moving], dots)[1]
+        return jax.jvp(_restrict(node.detail, arrays, active, wanted), [arrays[k] for k in active], dots)[1]
 
-    jaxpr = jax.make_jaxpr(pushed)(_structs(arrays), _structs([dots[k] for k in moving]))
-    found = dict(zip(wanted, read(graph, jaxpr, [*arrays, *(dots[k] for k in moving)]), strict=True))
+    jaxpr = jax.make_jaxpr(pushed)(_structs(arrays), _structs([dots[k] for k in active]))
+    found = dict(zip(wanted, read_jaxpr(graph, jaxpr, [*arrays, *(dots[k] for k in active)]), strict=True))
     return {k: _pick(graph, k, found) for k in results if not _pick(graph, k, found).is_zero}
 
 
-def _pull_back(graph: Graph, call: int, seeds: Row, moves: Sequence[bool]) -> list[Scalar]:
+def _pull_back(graph: Graph, call: int, seeds: Row, flags: Sequence[bool]) -> list[Scalar]:
     """The cotangents of the arguments of an opaque node, from those of what it returns."""
     node = graph.nodes[call]
     arrays, wanted = _arrays(node, node.arguments), _outputs(graph, list(seeds))
-    moving = [k for k, flags in enumerate(_arrays(node, moves)) if flags.any()]
+    active = [k for k, flags in enumerate(_arrays(node, flags)) if flags.any()]
     shapes = jax.eval_shape(lambda *a: _restrict(node.detail, a, [], wanted)(), *_structs(arrays))
     cts = [np.full(s.shape, graph.constant(0.0, s.dtype), object) for s in shapes]
     for k, seed in seeds.items():
         output, flat = graph.nodes[k].detail
         cts[wanted.index(output)].reshape(-1)[flat] = seed
 
-    def pulled(arrays, cts):
-        return jax.vjp(_restrict(node.detail, arrays, moving, wanted), *(arrays[k] for k in moving))[1](cts)
+    def cotangents_of_arguments(arrays, cts):
+        return jax.vjp(_restrict(node.detail, arrays, active, wanted), *(arrays[k] for k in active))[1](cts)
 
-    jaxpr = jax.make_jaxpr(pulled)(_structs(arrays), list(shapes))
+    jaxpr = jax.make_jaxpr(cotangents_of_arguments)(_structs(arrays), list(shapes))
     result = [np.full(a.shape, graph.constant(0.0), object) for a in arrays]
-    for k, cotangent in zip(moving, read(graph, jaxpr, [*arrays, *cts]), strict=True):
+    for k, cotangent in zip(active, read_jaxpr(graph, jaxpr, [*arrays, *cts]), strict=True):
         result[k] = cotangent
     return [s for array in result for s in array.flat]
 
 
-def _restrict(detail: Details, arrays: Sequence[Any], moving: Sequence[int], wanted: Sequence[int]) -> Any:
+def _restrict(detail: BoundPrimitive, arrays: Sequence[Any], active: Sequence[int], wanted: Sequence[int]) -> Any:
     """An array primitive as a function of some of its arguments, with some of its results."""
 
     def function(*some):
         values = list(arrays)
-        for k, value in zip(moving, some, strict=True):
+        for k, value in zip(active, some, strict=True):
             values[k] = value
         results = detail.primitive.bind(*values, **detail.parameters)
         results = results if detail.primitive.multiple_results else [results]

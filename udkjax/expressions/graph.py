@@ -2,7 +2,7 @@
 
 Equal expressions are one node, zeros and ones vanish while the graph is built, and a sign costs nothing: a `Scalar` is a
 signed reference to a node, so that a - b, b - a and -(a - b) share one subtraction. What is built but not asked for is
-never emitted (emit.py), so a caller builds freely and chooses later.
+never emitted (scalar_program.py), so a caller builds freely and chooses later.
 """
 
 import math
@@ -55,7 +55,7 @@ class Scalar:
         return hash((self.index, self.sign))
 
     def __neg__(self):
-        return self.graph.negative(self)
+        return self.graph.negate(self)
 
     def __add__(self, other):
         return self.graph.add(self, self.graph.scalar(other))
@@ -115,7 +115,7 @@ class Graph:
 
     # --- arithmetic
 
-    def negative(self, a: Scalar) -> Scalar:
+    def negate(self, a: Scalar) -> Scalar:
         return a if a.is_zero else Scalar(self, a.index, -a.sign)
 
     def add(self, a: Scalar, b: Scalar) -> Scalar:
@@ -166,11 +166,11 @@ class Graph:
         """A JAX primitive on scalars; `fold` computes it where all arguments are known."""
         if all(a.constant is not None for a in arguments):
             return self.constant(np.asarray(fold(*(np.asarray(a.constant, a.node.dtype) for a in arguments))).item(), dtype)
-        detail = Details(primitive, parameters)
+        detail = BoundPrimitive(primitive, parameters)
         return Scalar(self, self._operation("apply", tuple(arguments), detail, np.dtype(dtype)))
 
     def call(
-        self, detail: "Details", arguments: tuple[Scalar, ...], outputs: list[tuple[tuple[int, ...], Any]]
+        self, detail: "BoundPrimitive", arguments: tuple[Scalar, ...], outputs: list[tuple[tuple[int, ...], Any]]
     ) -> list[np.ndarray]:
         """A JAX primitive on whole arrays: an opaque node, and a pick for each element of what it returns."""
         index = self._operation("call", arguments, detail, np.dtype(object))
@@ -183,7 +183,7 @@ class Graph:
             arrays.append(array)
         return arrays
 
-    def needed(self, wanted: Iterable[int], given: Collection[int] = ()) -> list[int]:
+    def dependencies(self, wanted: Iterable[int], given: Collection[int] = ()) -> list[int]:
         """The nodes that some nodes take, with themselves, in an order in which they can be evaluated; without those given."""
         found, stack = set(), list(wanted)
         while stack:
@@ -193,7 +193,7 @@ class Graph:
                 stack.extend(a.index for a in self.nodes[index].arguments)
         return sorted(found)
 
-    def replaced(self, wanted: Sequence[Scalar], others: Mapping[int, Scalar]) -> list[Scalar]:
+    def substitute(self, wanted: Sequence[Scalar], others: Mapping[int, Scalar]) -> list[Scalar]:
         """The same expressions, of others in place of some nodes."""
         found = dict(others)
 
@@ -202,7 +202,7 @@ class Graph:
             return new if a.sign > 0 else -new
 
         arithmetic = {"add": self.add, "mul": self.multiply, "div": self.divide, "sqrt": self.sqrt}
-        for index in self.needed([s.index for s in wanted], found):
+        for index in self.dependencies([s.index for s in wanted], found):
             node = self.nodes[index]
             values = tuple(map(other, node.arguments))
             if values == node.arguments:
@@ -228,7 +228,7 @@ class Graph:
         return index
 
 
-class Details:
+class BoundPrimitive:
     """A primitive with its parameters, and for arrays the shapes of its arguments; equal where the computation is."""
 
     def __init__(self, primitive: Any, parameters: dict, shapes: tuple = ()):
@@ -236,7 +236,7 @@ class Details:
         self._key = (primitive.name, shapes, tuple(sorted((k, str(v)) for k, v in parameters.items())))
 
     def __eq__(self, other):
-        return isinstance(other, Details) and self._key == other._key
+        return isinstance(other, BoundPrimitive) and self._key == other._key
 
     def __hash__(self):
         return hash(self._key)

@@ -18,7 +18,7 @@ def greater(a: Scalar, b: Scalar) -> Scalar:
     return a.graph.apply(lax.gt_p, {}, (a, b), bool, np.greater)
 
 
-def larger(a: Scalar, b: Scalar) -> Scalar:
+def maximum(a: Scalar, b: Scalar) -> Scalar:
     """max(a, b)."""
     return a.graph.apply(lax.max_p, {}, (a, b), a.node.dtype, np.maximum)
 

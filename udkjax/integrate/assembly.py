@@ -22,7 +22,9 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.closing import (
+from udkjax.equations.constraints import psi
+from udkjax.equations.dense_rows import DenseRows
+from udkjax.equations.position_closure import (
     CLOSED,
     ITERATIONS,
     TracedRows,
@@ -30,8 +32,6 @@ from udkjax.equations.closing import (
     damped_step,
     is_closed,
 )
-from udkjax.equations.constraints import psi
-from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large

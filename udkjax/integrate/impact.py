@@ -36,9 +36,9 @@ class Jump(NamedTuple):
 def jump(equations: TextbookEquations, t: Any, q: Float[Array, "n"], normal: Float[Array, "n"], rate: Any) -> Jump:
     """Bring g_dot, now `rate`, to zero by an impulse along `normal` = g_q, with all constraints kept."""
     mechanism, w = equations.mechanism, equations.weights
-    root, D = uk.root(mechanism), uk.D(mechanism, t, q, w)
+    root, D = uk.inverse_sqrt_mass(mechanism), uk.D(mechanism, t, q, w)
     u = root * normal
-    u_t = u - uk.plus(equations.method, D) @ (D @ u)
+    u_t = u - uk.pseudoinverse(equations.method, D) @ (D @ u)
     square = u_t @ u_t
     free = square > BLOCKED * (u @ u)
     return Jump(jnp.where(free, -rate / jnp.where(free, square, 1.0) * root * u_t, 0.0), free)

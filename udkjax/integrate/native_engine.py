@@ -11,8 +11,8 @@ from jaxtyping import Array
 
 from udkjax.equations.elements import has_pieces
 from udkjax.equations.loop_programs import LoopPrograms, loop_programs
-from udkjax.equations.scalar_programs import EliminationPrograms, elimination_programs, scene_programs
 from udkjax.equations.scales import Scales
+from udkjax.equations.scene_programs import EliminationPrograms, elimination_programs, scene_programs
 from udkjax.equations.structure import is_large, leaves_as_scalars
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.gradients import stop_gradients

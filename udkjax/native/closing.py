@@ -1,4 +1,4 @@
-"""Machine code that closes a mechanism: the loop of equations/closing.py, for numbers that are known when it runs.
+"""Machine code that closes a mechanism: the loop of equations/position_closure.py, for numbers that are known when it runs.
 
     q <- q - s M^(-1/2) D^+ Psi
 
@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.equations.closing import HALVINGS, ITERATIONS, ROUNDING, STRIDE
-from udkjax.equations.scalar_programs import ScenePrograms
+from udkjax.equations.position_closure import HALVINGS, ITERATIONS, ROUNDING, STRIDE
+from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.fallback import write_solve
 from udkjax.native.ir import INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
@@ -140,7 +140,7 @@ class Closing(Trajectory):
             f.store(f.load(work, i + p["psi"]), right, i)
         f.call("solve", work, f.const(0, INT), right, x, s.care)
         with f.each(n) as i:
-            root = f.load(work, i + (p["R"] + self.code.pattern.slots + m + n))
+            root = f.load(work, i + (p["R"] + self.code.pattern.value_count + m + n))
             f.store(-(root * f.load(x, i)), work, i + p[to])
 
     # What closing with derivatives does besides (closing_derivatives.py).

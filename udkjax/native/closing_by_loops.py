@@ -8,7 +8,7 @@ from typing import Any
 
 from udkjax.equations.loop_programs import LoopPrograms
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
-from udkjax.expressions.loop_program import Clear, LoopProgram
+from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.closing import POSITION, VELOCITY, Closing
 from udkjax.native.closing_derivatives import Along, Back
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
@@ -122,7 +122,7 @@ class ReverseByLoops(ClosingByLoops, Back):
         at = {"numbers": ("numbers", 0), "constants": ("work", p["constants"])}
         at |= {f"{COTANGENT}numbers": ("work", p["numbersbar"]), f"{COTANGENT}constants": ("work", p["cbar"])}
         back = LoopDerivative(self.code.prologue.parts, ()).reverse.parts
-        program = LoopProgram([Clear(f"{COTANGENT}numbers", 0, self.code.prologue_input_count), *back])
+        program = LoopProgram([Reset(f"{COTANGENT}numbers", 0, self.code.prologue_input_count), *back])
         self.loops.write(program, "prologue_back", ("numbers", "work"), at)
         for name, correction in self.corrections.items():
             correction.reverse()

@@ -20,9 +20,9 @@ vectors turn is left out, which costs as much of the derivative as their product
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from udkjax.equations.closing import ITERATIONS
-from udkjax.equations.scalar_programs import ScenePrograms
-from udkjax.expressions import Program, cotangents, tangents
+from udkjax.equations.position_closure import ITERATIONS
+from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.expressions import ScalarProgram, cotangents, tangents
 from udkjax.native.closing import POSITION, VELOCITIES, VELOCITY, Closing
 from udkjax.native.fallback import entries
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
@@ -187,7 +187,7 @@ class _WrittenOut(_Moving):
     def __init__(self, code: ScenePrograms, moving: tuple[bool, ...], vector: int):
         super().__init__(code, vector)
         graph, e = code.graph, code.equations
-        self.slots = code.pattern.slots
+        self.value_count = code.pattern.value_count
         self.changed = [*code.entries, *e.psi, *e.psi_dot, *code.root]
         inputs = code.prologue.inputs
         self.numbers = [s for s, m in zip(inputs, moving, strict=True) if m]
@@ -220,7 +220,7 @@ class _WrittenOut(_Moving):
         return self._at(f, "R", slot) * sign * self._weight(f, row)
 
     def _root(self, f: Function, i: Value) -> Value:
-        return self._at(f, "R", i + (self.slots + self.m + self.n))
+        return self._at(f, "R", i + (self.value_count + self.m + self.n))
 
     def _corrected(self, f: Function, kind: int):
         """x and y of the correction at the state in X, with A in R."""
@@ -262,11 +262,11 @@ class ClosingForward(_WrittenOut, Along):
         w = self.ways
         inputs = [*self.state_places(), *(("way", w["constants"] + k) for k in range(self.constants))]
         inputs += [("way", w[f"X {x}"] + k) for x in "qv" for k in range(self.n)]
-        program = Program(graph, [*self.given, *seeds.values()], changes)
+        program = ScalarProgram(graph, [*self.given, *seeds.values()], changes)
         places = [("way", w["changes"] + k) for k in range(len(changes))]
         self.write_program(program, "changes", ("work", "way"), inputs, places)
         seeds = {s: graph.input(("number", s.index), "tangent") for s in self.numbers}
-        program = Program(graph, [*self.code.prologue.inputs, *seeds.values()], tangents(graph, self.code.constants, seeds))
+        program = ScalarProgram(graph, [*self.code.prologue.inputs, *seeds.values()], tangents(graph, self.code.constants, seeds))
         inputs = [
             *numbered("numbers", len(self.code.prologue.inputs)),
             *(("way", w["numbers"] + k) for k in range(self.numbers_moving)),
@@ -282,7 +282,7 @@ class ClosingForward(_WrittenOut, Along):
         f, s = self.function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._corrected(f, kind)
         longest, which = self._longest(f)
-        residual, root = self.slots + (self.m if kind == VELOCITY else 0), self.slots + 2 * self.m
+        residual, root = self.value_count + (self.m if kind == VELOCITY else 0), self.value_count + 2 * self.m
         scale = f.given["scale"]
         with self._each_way(f):
             f.call("changes", f.given["work"], f.given["way"])
@@ -325,14 +325,14 @@ class ClosingReverse(_WrittenOut, Back):
         """LLVM's text of the whole module."""
         graph, n = self.graph, self.n
         seeds = [graph.input(("closing", k), "cotangent") for k in range(len(self.changed))]
-        program = Program(graph, [*self.given, *seeds], cotangents(graph, self.changed, seeds, self.state))
+        program = ScalarProgram(graph, [*self.given, *seeds], cotangents(graph, self.changed, seeds, self.state))
         inputs = [*self.state_places(), *self.work_places("bars", len(seeds))]
         found = [*self.work_places("G c", self.constants), *self.work_places("G q", n), *self.work_places("G v", n)]
         self.write_program(program, "pull_rows", ("work",), inputs, found)
         seeds = [graph.input(("constant", k), "cotangent") for k in range(self.constants)]
         back = cotangents(graph, self.code.constants, seeds, self.numbers)
         inputs = [*numbered("numbers", len(self.code.prologue.inputs)), *self.work_places("cbar", self.constants)]
-        program = Program(graph, [*self.code.prologue.inputs, *seeds], back)
+        program = ScalarProgram(graph, [*self.code.prologue.inputs, *seeds], back)
         places = self.work_places("numbersbar", self.numbers_moving)
         self.functions.append(write(program, "prologue_back", 1, ("numbers", "work"), inputs, places))
         self._shared()
@@ -344,7 +344,7 @@ class ClosingReverse(_WrittenOut, Back):
         f, _ = self.function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._corrected(f, kind)
         longest, which = self._longest(f)
-        residual, root = self.slots + (self.m if kind == VELOCITY else 0), self.slots + 2 * self.m
+        residual, root = self.value_count + (self.m if kind == VELOCITY else 0), self.value_count + 2 * self.m
         to = "B v" if kind == VELOCITY else "B q"
         with f.each(len(self.changed)) as i:
             self._set(f, "bars", i, f.const(0.0))

@@ -21,7 +21,7 @@ def entries(t: Module, f: Function) -> Any:
 def write_solve(t: Module):
     """`solve`: x = D^+ right of one lane, with the rows weighted; D is that of R."""
     n, m = t.n, t.m
-    table = [x for e in t.code.pattern.entries for x in (e.row, e.column, e.slot, e.sign)]
+    table = [x for e in t.code.pattern.entries for x in (e.row, e.column, e.value, e.sign)]
     t.loops.globals.append(f"@entries = private constant [{len(table)} x i64] [{', '.join(f'i64 {x}' for x in table)}]")
     arguments = [(POINTER, "work"), (INT, "lane"), (POINTER, "right"), (POINTER, "x"), (DOUBLE, "tol")]
     f, s = t.function("solve", arguments)
@@ -42,7 +42,7 @@ def write_solve(t: Module):
 def write_fallback(t: Module):
     """What a rank-revealing method on all rows finds, of lanes that want care, one after the other."""
     code, p, n, m, width = t.code, t.places, t.n, t.m, t.plan.width
-    slots, number, one = code.pattern.slots, t.lane_number, lambda f: f.const(1.0, DOUBLE, width)
+    slots, number, one = code.pattern.value_count, t.lane_number, lambda f: f.const(1.0, DOUBLE, width)
 
     def put(f: Function, name: str, k: Value, i: Value, x: Value):
         f.store(x, f.given["work"], (i + p[name]) * width + k)

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from udkjax.equations.implicit_derivative import acceleration_derivative, projection_derivative
 from udkjax.equations.loop_programs import DifferentiableProgram, LoopPrograms
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
-from udkjax.expressions.loop_program import Clear, LoopProgram
+from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.program import Place, numbered
 
 SUFFIXES = {"accelerations": "", "projection": "_projection", "position": "_position", "velocity": "_velocity"}
@@ -136,7 +136,7 @@ class ByLoops:
         found = {"constants": "G c", "q": "G q", "v": "G v", "q1": "Y q", "v1": "Y v"}
         at = self._at | self._along(COTANGENT) | {COTANGENT + x: ("work", p[place]) for x, place in found.items()}
         counts = self._sizes | {"constants": t.count, "q": t.n, "v": t.n}
-        cleared = [Clear(COTANGENT + x, 0, count) for x, count in counts.items() if x not in ("q1", "v1")]
+        cleared = [Reset(COTANGENT + x, 0, count) for x, count in counts.items() if x not in ("q1", "v1")]
         pointers = ("work", "kept")
         if self._name == "accelerations":
             pointers, at = ("work", "kept", "bar"), at | {"a": ("bar", 0), f"{COTANGENT}a": ("bar", 0)}

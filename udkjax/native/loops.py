@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from udkjax.expressions.loop_program import ADD, LEAST, Clear, Kernel, LoopProgram, Slot
+from udkjax.expressions.loop_program import ADD, MINIMUM, Address, Kernel, LoopProgram, Reset
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.program import Place, Writer, as_stored
 
@@ -34,7 +34,7 @@ class LoopWriter:
             return f.at(f.given[pointer], place * width)
 
         for part in program.parts:
-            if isinstance(part, Clear):
+            if isinstance(part, Reset):
                 with f.each(part.count) as i:
                     f.store(part.value, address(part.array), (i + part.start) * width, width)
             elif len(part.table):
@@ -58,7 +58,7 @@ class LoopWriter:
             row = f.at(f.given["table"], i * columns, "i32")
             bases: dict[tuple[str, int], Value] = {}
 
-            def address(slot: Slot) -> tuple[Value, int]:
+            def address(slot: Address) -> tuple[Value, int]:
                 if slot.base is None:
                     return f.given[slot.array], slot.offset * width
                 if (slot.array, slot.base) not in bases:
@@ -73,9 +73,9 @@ class LoopWriter:
                     writer.known[s.index] = as_stored(f, f.load(*address(slot), width), s.node.dtype)
             for value, slot in zip(writer.run(), kernel.outputs, strict=True):
                 new = f.like(value, DOUBLE, width)
-                if slot.how == ADD:
+                if slot.update == ADD:
                     new = f.load(*address(slot), width) + new
-                elif slot.how == LEAST:  # what is not a number stays
+                elif slot.update == MINIMUM:  # what is not a number stays
                     new = f.intrinsic("minimum", f.load(*address(slot), width), new)
                 f.store(new, *address(slot), width)
         return f

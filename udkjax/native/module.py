@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from udkjax.equations.loop_programs import LoopPrograms
-from udkjax.equations.scalar_programs import EliminationPrograms, ScenePrograms
-from udkjax.expressions import Program
+from udkjax.equations.scene_programs import EliminationPrograms, ScenePrograms
+from udkjax.expressions import ScalarProgram
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import INPUTS, LANE_NUMBERS, OUTPUTS, Lane, Layout, Plan
 from udkjax.native.loops import LoopWriter
@@ -163,7 +163,9 @@ class Module:
             wanted["psi_dot"] = code.psi_dot
         return wanted
 
-    def write_program(self, program: Program, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]):
+    def write_program(
+        self, program: ScalarProgram, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]
+    ):
         self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs, name in RARE))
 
     def work_places(self, name: str, count: int) -> list[Place]:

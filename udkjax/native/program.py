@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.expressions import Program
+from udkjax.expressions import ScalarProgram
 from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, typed
 
 SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
@@ -37,7 +37,7 @@ def numbered(pointer: str, count: int) -> list[Place]:
 
 
 def write(
-    program: Program,
+    program: ScalarProgram,
     name: str,
     width: int,
     pointers: Sequence[str],
@@ -66,7 +66,7 @@ def as_stored(f: Function, x: Value, dtype: Any) -> Value:
 class Writer:
     """The operations of a program, within a function that has put the values of its inputs into `known`."""
 
-    def __init__(self, f: Function, program: Program):
+    def __init__(self, f: Function, program: ScalarProgram):
         self.f, self.program, self.known = f, program, {}
         self._negative: dict[int, Value] = {}
         self._pairs: dict[str, tuple[Value, Value]] = {}

@@ -6,7 +6,7 @@ from udkjax.pinv.gram_schmidt import GramSchmidt as GramSchmidt
 from udkjax.pinv.greville import Greville as Greville
 from udkjax.pinv.householder import Householder as Householder
 from udkjax.pinv.rule import Dense as Dense
-from udkjax.pinv.rule import LeastSquares as LeastSquares
+from udkjax.pinv.rule import LeastSquaresSolution as LeastSquaresSolution
 from udkjax.pinv.rule import Plus as Plus
 from udkjax.pinv.rule import Pseudoinverse as Pseudoinverse
 from udkjax.pinv.svd import SVD as SVD

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.pinv.rule import Dense, beyond, dot
+from udkjax.pinv.rule import Dense, dot, exceeds
 
 
 class EliminationFactors(NamedTuple):
@@ -37,17 +37,17 @@ class Elimination(Dense):
         unit = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
         tol = float(jnp.finfo(D.dtype).eps) ** (1 / 3) if self.rank_tol is None else self.rank_tol
         threshold = tol if self.relative else tol * unit
-        L, kept, order = _cholesky(gram * unit[:, None] * unit, jnp.broadcast_to(threshold**2, unit.shape))
+        L, independent, order = _cholesky(gram * unit[:, None] * unit, jnp.broadcast_to(threshold**2, unit.shape))
         L = length[:, None] * L
         L = L[order]
-        dropped = jnp.diag((~kept).astype(D.dtype))
-        inverse = _inverse(jnp.where(kept[:, None], L, 0.0) + dropped)  # of L_K
+        dropped = jnp.diag((~independent).astype(D.dtype))
+        inverse = _inverse(jnp.where(independent[:, None], L, 0.0) + dropped)  # of L_K
         C = dot(L, inverse)
-        inner, _, again = _cholesky(dot(C.T, C) + dropped, jnp.zeros(len(gram)))
-        inner = _inverse(inner[again])[:, jnp.argsort(again)]
-        both = jnp.where(kept[:, None], dot(inverse.T, dot(inverse, dot(inner.T, dot(inner, C.T)))), 0.0)
-        back = jnp.argsort(order)
-        return EliminationFactors(D, both[back][:, back], jnp.sum(kept))
+        inner, _, inner_order = _cholesky(dot(C.T, C) + dropped, jnp.zeros(len(gram)))
+        inner = _inverse(inner[inner_order])[:, jnp.argsort(inner_order)]
+        S = jnp.where(independent[:, None], dot(inverse.T, dot(inverse, dot(inner.T, dot(inner, C.T)))), 0.0)
+        original = jnp.argsort(order)
+        return EliminationFactors(D, S[original][:, original], jnp.sum(independent))
 
     def apply(self, factors: EliminationFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         x = dot(factors.D.T, dot(factors.S, b))
@@ -68,13 +68,13 @@ def _cholesky(
     m = len(gram)
 
     def column(k, carry):
-        left, L, kept, order, waiting = carry
+        left, L, independent, order, waiting = carry
         j = jnp.argmax(jnp.where(waiting, jnp.diagonal(left), -jnp.inf))
-        keep = beyond(left[j, j], threshold[j])
-        root = jnp.sqrt(jnp.where(keep, left[j, j], 1.0))
-        entry = jnp.where(keep & waiting, left[:, j] / root, 0.0)
+        is_independent = exceeds(left[j, j], threshold[j])
+        root = jnp.sqrt(jnp.where(is_independent, left[j, j], 1.0))
+        entry = jnp.where(is_independent & waiting, left[:, j] / root, 0.0)
         left = left - entry[:, None] * entry
-        return left, L.at[:, k].set(entry), kept.at[k].set(keep), order.at[k].set(j), waiting.at[j].set(False)
+        return left, L.at[:, k].set(entry), independent.at[k].set(is_independent), order.at[k].set(j), waiting.at[j].set(False)
 
     start = (gram, jnp.zeros_like(gram), jnp.zeros(m, bool), jnp.zeros(m, int), jnp.ones(m, bool))
     return jax.lax.fori_loop(0, m, column, start)[1:4]

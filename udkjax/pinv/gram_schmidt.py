@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.pinv.orthogonal import Orthogonal, OrthogonalFactors, PivotedQR, divide
-from udkjax.pinv.rule import beyond, dot
+from udkjax.pinv.rule import dot, exceeds
 
 
 class GramSchmidt(Orthogonal):
@@ -41,7 +41,7 @@ def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: boo
             a = a - dot(q, again)
             above = above + again
         norm = jnp.linalg.norm(a)
-        goes_on = (rank == i) & beyond(norm, threshold)
+        goes_on = (rank == i) & exceeds(norm, threshold)
 
         unit = jnp.where(goes_on, a / jnp.where(goes_on, norm, 1), 0)
         used = used | (column == pivot)

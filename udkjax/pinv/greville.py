@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from udkjax.pinv.rule import Dense, beyond, dot
+from udkjax.pinv.rule import Dense, dot, exceeds
 
 
 class GrevilleFactors(NamedTuple):
@@ -40,7 +40,7 @@ class Greville(Dense):
             a, e = row  # the row of D, and its unit vector
             d = dot(a, plus)
             c = a - dot(d, D)  # d is zero from this row on, because the columns of plus still are
-            independent = beyond(jnp.linalg.norm(c), threshold)
+            independent = exceeds(jnp.linalg.norm(c), threshold)
             cc = jnp.where(independent, dot(c, c), 1)
             p = jnp.where(independent, c / cc, dot(plus, d) / (1 + dot(d, d)))
             return (plus + jnp.outer(p, e - d), rank + independent), None

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.pinv.orthogonal import Orthogonal, OrthogonalFactors, PivotedQR, divide
-from udkjax.pinv.rule import beyond, dot
+from udkjax.pinv.rule import dot, exceeds
 
 
 class Householder(Orthogonal):
@@ -34,8 +34,10 @@ class Householder(Orthogonal):
 def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
     """Householder's QR; each step takes the column with the largest remaining norm, and stops where it is at most `threshold`."""
     q, r, order, rank = complete_qr(D, threshold)
-    kept = jnp.arange(len(order)) < rank
-    return PivotedQR(jnp.where(kept, q[:, : len(order)], 0), jnp.where(kept[:, None], r[: len(order)], 0), order, rank)
+    significant = jnp.arange(len(order)) < rank
+    return PivotedQR(
+        jnp.where(significant, q[:, : len(order)], 0), jnp.where(significant[:, None], r[: len(order)], 0), order, rank
+    )
 
 
 def complete_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
@@ -53,7 +55,7 @@ def complete_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQ
         norms = jnp.linalg.norm(below, axis=0)
         pivot = jnp.argmax(jnp.where(used, -1, norms))
         a, norm = below[:, pivot], norms[pivot]
-        goes_on = (rank == i) & beyond(norm, threshold)
+        goes_on = (rank == i) & exceeds(norm, threshold)
 
         diagonal = jnp.where(a[i] > 0, -norm, norm)  # away from a[i]: no cancellation
         v = a.at[i].add(-diagonal)

@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 dot = partial(jnp.matmul, precision="highest")
 
 
-class LeastSquares(NamedTuple):
+class LeastSquaresSolution(NamedTuple):
     """The minimum-norm least-squares solution of D x = b, and the rank that was decided on the way."""
 
     x: Float[Array, "n *k"]
@@ -98,10 +98,10 @@ class Pseudoinverse(eqx.Module):
         method = jax.lax.stop_gradient(self)
         return Plus(method, jax.lax.stop_gradient(method.factor(jax.lax.stop_gradient(D))), D)
 
-    def solve(self, D: Any, b: Float[ArrayLike, "m *k"]) -> LeastSquares:
+    def solve(self, D: Any, b: Float[ArrayLike, "m *k"]) -> LeastSquaresSolution:
         """Minimum-norm least-squares solution x = D^+ b of D x = b, for one b (m,) or the columns of one (m, k); and rank(D)."""
         plus = self.plus(D)
-        return LeastSquares(plus @ jnp.asarray(b), plus.rank)
+        return LeastSquaresSolution(plus @ jnp.asarray(b), plus.rank)
 
     def rank(self, D: Any) -> Int[Array, ""]:
         """The numerical rank: how many directions lie above the threshold."""
@@ -148,7 +148,7 @@ class Dense(Pseudoinverse):
         return tol * scale if self.relative else tol
 
 
-def beyond(size: Float[Array, "*s"], threshold: Float[Array, ""]) -> Bool[Array, "*s"]:
+def exceeds(size: Float[Array, "*s"], threshold: Float[Array, ""]) -> Bool[Array, "*s"]:
     """Whether a size counts. NaN counts, so that an invalid matrix gives NaN and not a rank of zero and a plausible answer."""
     return ~(size <= threshold)
 

@@ -12,18 +12,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from udkjax.expressions import Graph, Scalar
-from udkjax.expressions.selection import absolute, greater, larger, where
+from udkjax.expressions.selection import absolute, greater, maximum, where
 from udkjax.pinv.elimination_order import minimum_degree
 
 Row = dict[int, Scalar]
 
 
-class Entry(NamedTuple):
-    """A nonzero entry: `sign` times the value number `slot`. Entries that are equal share their slot."""
+class PatternEntry(NamedTuple):
+    """A nonzero entry: `sign` times the value number `value`. Equal entries share their value."""
 
     row: int
     column: int
-    slot: int
+    value: int
     sign: int
 
 
@@ -31,22 +31,22 @@ class Pattern(NamedTuple):
     """Where the entries of an (m, n) matrix lie; the matrix itself is the vector of its distinct values."""
 
     shape: tuple[int, int]
-    entries: tuple[Entry, ...]
+    entries: tuple[PatternEntry, ...]
 
     @property
-    def slots(self) -> int:
-        return 1 + max((e.slot for e in self.entries), default=-1)
+    def value_count(self) -> int:
+        return 1 + max((e.value for e in self.entries), default=-1)
 
     def dense(self, values: Any, numpy: Any) -> Any:
-        """Return the matrix of the given values (slots,)."""
-        place, sign = np.full(self.shape, self.slots), np.zeros(self.shape)
+        """Return the matrix of the given values (value_count,)."""
+        place, sign = np.full(self.shape, self.value_count), np.zeros(self.shape)
         for e in self.entries:
-            place[e.row, e.column], sign[e.row, e.column] = e.slot, e.sign
+            place[e.row, e.column], sign[e.row, e.column] = e.value, e.sign
         return numpy.append(values, 0.0)[place] * sign
 
 
-def pattern(rows: Sequence[Row], columns: int) -> tuple[Pattern, list[Scalar]]:
-    """Return the pattern of rows of scalars, and the scalars that its slots stand for."""
+def find_pattern(rows: Sequence[Row], columns: int) -> tuple[Pattern, list[Scalar]]:
+    """Return the pattern of rows of scalars, and the distinct scalars themselves."""
     slots: dict[int, int] = {}
     values: list[Scalar] = []
     entries = []
@@ -55,7 +55,7 @@ def pattern(rows: Sequence[Row], columns: int) -> tuple[Pattern, list[Scalar]]:
             if scalar.index not in slots:
                 slots[scalar.index] = len(values)
                 values.append(Scalar(scalar.graph, scalar.index))
-            entries.append(Entry(i, k, slots[scalar.index], scalar.sign))
+            entries.append(PatternEntry(i, k, slots[scalar.index], scalar.sign))
     return Pattern((len(rows), columns), tuple(entries)), values
 
 
@@ -67,7 +67,7 @@ class SparseFactors(NamedTuple):
     inverse_pivots: list[Scalar]
     pivots: list[tuple[Scalar, Scalar]]  # each with its row's diagonal entry
 
-    def above(self, fraction: Scalar | float) -> list[Scalar]:
+    def exceeding(self, fraction: Scalar | float) -> list[Scalar]:
         """Which pivots exceed this fraction of their row's diagonal entry: booleans, in the order of elimination."""
         return [greater(pivot, diagonal * fraction) for pivot, diagonal in self.pivots]
 
@@ -76,7 +76,7 @@ class SparseFactors(NamedTuple):
         one = graph.constant(1.0)
         times = [absolute(diagonal * (one / pivot)) for pivot, diagonal in self.pivots]  # by the reciprocals that are there
         while len(times) > 1:  # by halves, so that few wait for others
-            times = [*map(larger, times[::2], times[1::2]), *times[len(times) // 2 * 2 :]]
+            times = [*map(maximum, times[::2], times[1::2]), *times[len(times) // 2 * 2 :]]
         return one / graph.sqrt(times[0]) if times else graph.constant(np.inf)
 
 
@@ -127,16 +127,18 @@ def eliminate(
     return inverse, pivots
 
 
-def multipliers(factors: SparseFactors, b: Sequence[Scalar]) -> list[Scalar]:
+def solve(factors: SparseFactors, b: Sequence[Scalar]) -> list[Scalar]:
     """y with D D^T y = b, zero where a row was dropped."""
-    y = backward(factors.lower, factors.inverse_pivots, forward(factors.lower, [b[i] for i in factors.order]))
+    y = substitute_backward(
+        factors.lower, factors.inverse_pivots, substitute_forward(factors.lower, [b[i] for i in factors.order])
+    )
     result: list[Scalar] = [b[0]] * len(b)
     for j, i in enumerate(factors.order):
         result[i] = y[j]
     return result
 
 
-def forward(lower: Sequence[dict[int, Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
+def substitute_forward(lower: Sequence[dict[int, Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
     """L^-1 b; of rows beyond the columns of L, what these leave."""
     y = list(b)
     for j, entries in enumerate(lower):
@@ -145,7 +147,9 @@ def forward(lower: Sequence[dict[int, Scalar]], b: Sequence[Scalar]) -> list[Sca
     return y
 
 
-def backward(lower: Sequence[dict[int, Scalar]], inverse_pivots: Sequence[Scalar], y: Sequence[Scalar]) -> list[Scalar]:
+def substitute_backward(
+    lower: Sequence[dict[int, Scalar]], inverse_pivots: Sequence[Scalar], y: Sequence[Scalar]
+) -> list[Scalar]:
     """x with diag(p) L^T x = y; beyond the columns of L, y is x."""
     x = list(y)
     for j in reversed(range(len(inverse_pivots))):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from udkjax.pinv.rule import Dense, beyond, dot
+from udkjax.pinv.rule import Dense, dot, exceeds
 
 
 class SVDFactors(NamedTuple):
@@ -25,8 +25,8 @@ class SVD(Dense):
 
     def factor(self, D: Float[Array, "m n"]) -> SVDFactors:
         u, sigma, vt = jnp.linalg.svd(D, full_matrices=False)
-        kept = beyond(sigma, self.threshold(D, sigma[0]))
-        return SVDFactors(u, jnp.where(kept, 1 / jnp.where(kept, sigma, 1), 0), vt.T, kept.sum())
+        significant = exceeds(sigma, self.threshold(D, sigma[0]))
+        return SVDFactors(u, jnp.where(significant, 1 / jnp.where(significant, sigma, 1), 0), vt.T, significant.sum())
 
     def apply(self, factors: SVDFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         return dot(factors.v, factors.inverse * dot(factors.u.T, b))

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.equations.closing import ROUNDING
 from udkjax.equations.constraints import gamma, psi
+from udkjax.equations.position_closure import ROUNDING
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD
 from udkjax.study.drive import Driven

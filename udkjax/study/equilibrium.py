@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations import loads
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.closing import HALVINGS, STRIDE
+from udkjax.equations.position_closure import HALVINGS, STRIDE
 from udkjax.integrate.assembly import State, close
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv import SVD

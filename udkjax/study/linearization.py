@@ -40,7 +40,7 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: Any, q: Fl
     N = M^(-1/2) (I - D^+ D) V with V a basis of the null space of D here: it spans that of D nearby, too, so that derivatives of
     whatever does not depend on the basis are exact.
     """
-    w, root, still = analysis.scales.weights, uk.root(mechanism), jnp.zeros_like(q)
+    w, root, still = analysis.scales.weights, uk.inverse_sqrt_mass(mechanism), jnp.zeros_like(q)
     F = lambda q, v: loads.force(mechanism, t, q, v)  # noqa: E731
     V = null_space(uk.D(mechanism, t, q, w), free) if mechanism.constraints else jnp.eye(len(q))
     if mechanism.constraints:

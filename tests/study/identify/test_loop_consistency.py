@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.equations.redundancy import rows_of
+from udkjax.equations.redundancy import kinematic_rows
 from udkjax.scene.joints import Gear, Revolute
 from udkjax.study.identify import loop_consistency
 from udkjax.study.identify.loop_consistency import loop_problems, tie_text
@@ -59,7 +59,7 @@ def test_three_cranks_must_stay_equal(problems):
 
 
 def test_sparse_arithmetic_says_the_same(linkage, problems, monkeypatch):
-    monkeypatch.setattr(loop_consistency, "rows_of", lambda mechanism: rows_of(mechanism, large=True))
+    monkeypatch.setattr(loop_consistency, "rows_of", lambda mechanism: kinematic_rows(mechanism, large=True))
     assert [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(CHOICES, (3, 1), strict=True)] == problems
     assert len(problems[0]) == 1 and problems[1] == []
 

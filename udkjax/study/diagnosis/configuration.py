@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.equations.closing import STRIDE
 from udkjax.equations.dense_rows import KinematicRows
+from udkjax.equations.position_closure import STRIDE
 
 STEP = 0.1  # of the characteristic length, and rad: from one position to the next of a neighbourhood
 POSITIONS = 12  # of a neighbourhood

@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 
 from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.redundancy import ORDINARY, chosen_rows, positions_of, rows_of
+from udkjax.equations.redundancy import ORDINARY, choose_redundant_rows, kinematic_rows, sample_positions
 from udkjax.equations.sparse_rows import SparseRows
 from udkjax.scene.checks import quote
 from udkjax.scene.fields import Numbers
@@ -95,18 +95,18 @@ class RedundantLoops:
     """
 
     def __init__(self, mechanism: Mechanism, changed: Callable[[np.ndarray], Mechanism], x: np.ndarray, steps: np.ndarray):
-        self._rows = lambda change: rows_of(changed(change))
+        self._rows = lambda change: kinematic_rows(changed(change))
         here = changed(np.zeros(len(x)))
-        self.x, rows = x, rows_of(here)
+        self.x, rows = x, kinematic_rows(here)
         with np.errstate(all="ignore"):
-            found = positions_of(rows, np.asarray(here.q0, float).ravel())
+            found = sample_positions(rows, np.asarray(here.q0, float).ravel())
         self.redundant = rows.count - found[0].rank if found else 0
         if not self.redundant:
             return
         self._drivers = mechanism.driver_names
         self._positions = [p for p in found if p.smallest > ORDINARY] or found
         self._names = [name for name, _ in rows.names]
-        self._redundant_rows = list(chosen_rows(rows, found))
+        self._redundant_rows = list(choose_redundant_rows(rows, found))
         self._measure(rows, steps, _size(here))
 
     def _measure(self, rows: KinematicRows | SparseRows, steps: np.ndarray, size: float):

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.expressions.graph import Details, Graph, Node, Scalar
+from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
 
-_PAIR = ("sin", "cos")
-_FLOATS = (*_PAIR, "tanh", "exp")  # of these names math and NumPy have functions, too
+_SINE_AND_COSINE = ("sin", "cos")
+_LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # of these names math and NumPy have functions, too
 # On floats, and traced: by what jax.lax has, since each operator on a JAX array is a function call, ten times as long to trace.
-_ARITHMETIC: dict[str, tuple[Callable, Callable]] = {
+_OPERATORS: dict[str, tuple[Callable, Callable]] = {
     "add": (operator.add, jax.lax.add),
     "sub": (operator.sub, jax.lax.sub),
     "mul": (operator.mul, jax.lax.mul),
@@ -26,7 +26,7 @@ _ARITHMETIC: dict[str, tuple[Callable, Callable]] = {
 }
 
 
-class Program:
+class ScalarProgram:
     """`program(values)` takes one value for each of `inputs` and returns one for each of `outputs`."""
 
     def __init__(self, graph: Graph, inputs: Sequence[Scalar], outputs: Sequence[Scalar]):
@@ -36,7 +36,9 @@ class Program:
         self.last_use.update((s.index, len(self.order)) for s in outputs)
         nodes = [graph.nodes[i] for i in self.order]
         self.angles = list(
-            dict.fromkeys(n.arguments[0].index for n in nodes if n.kind == "apply" and n.detail.primitive.name in _PAIR)
+            dict.fromkeys(
+                n.arguments[0].index for n in nodes if n.kind == "apply" and n.detail.primitive.name in _SINE_AND_COSINE
+            )
         )
         self._traced = jax.jit(self._run)  # traced once, wherever and however often it is called and differentiated
 
@@ -62,13 +64,13 @@ class Program:
                 return [np.array(x, float) for x in zip(*found, strict=True)]
             return [np.broadcast_to(np.asarray(x), (rows,)) for x in self._run(values)]
 
-    def depends_on(self, moves: Sequence[bool]) -> tuple[bool, ...]:
+    def depends_on(self, flags: Sequence[bool]) -> tuple[bool, ...]:
         """Which outputs depend on any of the inputs that are marked."""
-        moving = {s.index for s, m in zip(self.inputs, moves, strict=True) if m}
+        reached = {s.index for s, m in zip(self.inputs, flags, strict=True) if m}
         for index in self.order:
-            if any(a.index in moving for a in self.graph.nodes[index].arguments):
-                moving.add(index)
-        return tuple(s.index in moving for s in self.outputs)
+            if any(a.index in reached for a in self.graph.nodes[index].arguments):
+                reached.add(index)
+        return tuple(s.index in reached for s in self.outputs)
 
     def _typed(self, values: Sequence[Any]) -> list[Any]:
         given = zip(values, (s.node.dtype for s in self.inputs), strict=True)
@@ -86,7 +88,7 @@ class Program:
         for index in self.order:
             node = self.graph.nodes[index]
             name = str(node.detail) if node.kind in ("apply", "call") else node.kind
-            if name not in (*_PAIR, "constant", "pick", "input"):
+            if name not in (*_SINE_AND_COSINE, "constant", "pick", "input"):
                 counts[name] = counts.get(name, 0) + 1
         return counts | ({"sincos": len(self.angles)} if self.angles else {})
 
@@ -105,11 +107,11 @@ def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bo
 
 def operations(graph: Graph, given: Sequence[Scalar], outputs: Sequence[Scalar]) -> int:
     """How many nodes outputs take, once `given` and whatever that is made of are known."""
-    return len({*graph.needed(s.index for s in outputs)}.difference(graph.needed(s.index for s in given)))
+    return len({*graph.dependencies(s.index for s in outputs)}.difference(graph.dependencies(s.index for s in given)))
 
 
 def _needed(graph: Graph, given: set[int], wanted: Sequence[int]) -> list[int]:
-    needed = graph.needed(wanted, given)
+    needed = graph.dependencies(wanted, given)
     missing = [graph.nodes[i].detail for i in needed if graph.nodes[i].kind == "input"]
     if missing:
         raise ValueError(f"the outputs need inputs that are not given: {missing}")
@@ -135,7 +137,7 @@ def _evaluate(node: Node, known: dict[int, Any]) -> Any:
     values = [_signed(known, a) for a in node.arguments]
     match node.kind:
         case "add" | "sub" | "mul" | "div":
-            on_floats, traced = _ARITHMETIC[node.kind]
+            on_floats, traced = _OPERATORS[node.kind]
             if not any(isinstance(v, jax.Array) for v in values):
                 return on_floats(*values)
             return traced(*(v if isinstance(v, jax.Array) else node.dtype.type(v) for v in values))
@@ -155,7 +157,7 @@ def _library(x: Any) -> Any:
 
 def _apply(node: Node, values: list[Any]) -> Any:
     name = node.detail.primitive.name
-    if name in _FLOATS and isinstance(values[0], float | np.ndarray):
+    if name in _LIBRARY_FUNCTIONS and isinstance(values[0], float | np.ndarray):
         return getattr(_library(values[0]), name)(values[0])
     floats = all(isinstance(v, float | int | bool | np.generic) for v in values)
     primitive, parameters = node.detail.primitive, node.detail.parameters
@@ -168,7 +170,7 @@ def _apply(node: Node, values: list[Any]) -> Any:
         return found[()] if any(isinstance(v, np.generic) for v in values) else found.item()  # Python's floats raise where 1/0 is
 
 
-def _call(details: Details, arguments: Sequence[Scalar], values: list[Any]) -> list[Any]:
+def _call(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Any]) -> list[Any]:
     primitive, parameters = details.primitive, details.parameters
     if not all(isinstance(v, float | int | bool | np.generic) for v in values):
         result = primitive.bind(*_arrays(details, arguments, values), **parameters)
@@ -178,7 +180,7 @@ def _call(details: Details, arguments: Sequence[Scalar], values: list[Any]) -> l
         return [np.asarray(r) for r in (result if primitive.multiple_results else [result])]
 
 
-def _arrays(details: Details, arguments: Sequence[Scalar], values: list[Any]) -> list[Any]:
+def _arrays(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Any]) -> list[Any]:
     arrays, start = [], 0
     for shape in details.shapes:
         size = int(np.prod(shape))

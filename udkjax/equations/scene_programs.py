@@ -6,18 +6,18 @@ from typing import Any
 
 from udkjax.equations.scalar_equations import ScalarEquations, scalar_equations
 from udkjax.equations.structure import structure
-from udkjax.expressions import Program, Scalar, frontier
+from udkjax.expressions import Scalar, ScalarProgram, frontier
 from udkjax.expressions.selection import all_of
 from udkjax.pinv.rank_policy import RankPolicy
-from udkjax.pinv.sparse import Row, SparseFactors, factorize, multipliers, pattern, transpose_times
+from udkjax.pinv.sparse import Row, SparseFactors, factorize, find_pattern, solve, transpose_times
 from udkjax.scene.mechanism import Mechanism
 
 
 class ScenePrograms:
     """Programs over the graph of a scene that need no elimination.
 
-    Each takes the `constants`, t, q and v as one list of scalars. D stands as the distinct values of its entries: `pattern` says
-    where they lie.
+    Each takes the `constants`, t, q and v as one list of scalars. D is given by the distinct values of its entries; `pattern`
+    holds their places.
     """
 
     def __init__(self, equations: ScalarEquations, baumgarte: bool):
@@ -29,7 +29,7 @@ class ScenePrograms:
         self.root = [graph.constant(1.0) / graph.sqrt(m) for m in equations.mass]
         self.coordinate_count, self.row_count = len(equations.q), len(equations.psi)
         self.D: list[Row] = [{k: entry * self.root[k] for k, entry in row.items()} for row in equations.psi_q]
-        self.pattern, self.entries = pattern(self.D, self.coordinate_count)
+        self.pattern, self.entries = find_pattern(self.D, self.coordinate_count)
         self._outputs: dict[str, list[Scalar]] = {
             "equation_terms": [*self.entries, *(self.b(i) for i in range(self.row_count)), *equations.free, *self.root],
             "closure_terms": [*self.entries, *equations.psi, *self.root],
@@ -49,44 +49,44 @@ class ScenePrograms:
         return frontier(self.graph, wanted, lambda node: node.depends <= {"parameter"})
 
     @cached_property
-    def prologue(self) -> Program:
+    def prologue(self) -> ScalarProgram:
         """The constants, from all numbers of the scene, the gains, `drop_tol` and `safe_tol` (in every kind of programs)."""
         inputs = [*self.equations.inputs, *self.gains, self.drop_tol, self.safe_tol]
-        return Program(self.graph, inputs, self.constants)
+        return ScalarProgram(self.graph, inputs, self.constants)
 
     @cached_property
-    def equation_terms(self) -> Program:
+    def equation_terms(self) -> ScalarProgram:
         """D, b, a_F and M^(-1/2), of all rows."""
         return self._program("equation_terms")
 
     @cached_property
-    def closure_terms(self) -> Program:
+    def closure_terms(self) -> ScalarProgram:
         """D, Psi and M^(-1/2), of all rows."""
         return self._program("closure_terms")
 
     @cached_property
-    def psi(self) -> Program:
+    def psi(self) -> ScalarProgram:
         """Psi of all rows."""
         return self._program("psi")
 
     @cached_property
-    def psi_dot(self) -> Program:
+    def psi_dot(self) -> ScalarProgram:
         """Psi_dot of all rows."""
         return self._program("psi_dot")
 
     @cached_property
-    def pieces(self) -> Program:
+    def pieces(self) -> ScalarProgram:
         """In which of its smooth pieces each element is that has several."""
         return self._program("pieces")
 
     @cached_property
-    def energy(self) -> Program:
+    def energy(self) -> ScalarProgram:
         """The kinetic and the potential energy."""
         return self._program("energy")
 
-    def _program(self, name: str, more: Sequence[Scalar] = ()) -> Program:
+    def _program(self, name: str, more: Sequence[Scalar] = ()) -> ScalarProgram:
         e = self.equations
-        return Program(self.graph, [*self.constants, e.t, *e.q, *e.v, *more], self._outputs[name])
+        return ScalarProgram(self.graph, [*self.constants, e.t, *e.q, *e.v, *more], self._outputs[name])
 
     @property
     def term_count(self) -> int:
@@ -152,11 +152,11 @@ class EliminationPrograms(ScenePrograms):
         safe = self._safe(self._factors)  # looked at when all else is done: nothing waits for it
         self._outputs["accelerations"] = [*self.a, safe]
         psi, psi_dot = ([residual[i] for i in self.independent_rows] for residual in (e.psi, e.psi_dot))
-        self._outputs["newton_q"] = [*self._corrected(e.q, psi), self._safe(self._factors_dropping)]
-        self._outputs["newton_v_and_psi"] = [*self._corrected(e.v, psi_dot), *e.psi]
-        v = self._corrected(e.v, psi_dot, dropping=False)
+        self._outputs["newton_q"] = [*self._correct(e.q, psi), self._safe(self._factors_dropping)]
+        self._outputs["newton_v_and_psi"] = [*self._correct(e.v, psi_dot), *e.psi]
+        v = self._correct(e.v, psi_dot, dropping=False)
         projected = dict(zip((x.index for x in e.v), v, strict=True))
-        loads = graph.replaced([*e.free, *(self.b(i) for i in self.independent_rows)], projected)
+        loads = graph.substitute([*e.free, *(self.b(i) for i in self.independent_rows)], projected)
         a = [f + s for f, s in zip(loads[:n], self.minv_jt(self.solve_gram(loads[n:])), strict=True)]
         self._outputs["project_and_accelerate"] = [*v, *a, safe]
         self.changes = [graph.input(f"d{k}", "change") for k in range(2 * n)]
@@ -166,32 +166,32 @@ class EliminationPrograms(ScenePrograms):
     # --- programs
 
     @cached_property
-    def accelerations(self) -> Program:
+    def accelerations(self) -> ScalarProgram:
         """a; safe."""
         return self._program("accelerations")
 
     @cached_property
-    def newton_q(self) -> Program:
+    def newton_q(self) -> ScalarProgram:
         """q after a Newton step to Psi = 0, without dependent rows; safe."""
         return self._program("newton_q")
 
     @cached_property
-    def newton_v_and_psi(self) -> Program:
+    def newton_v_and_psi(self) -> ScalarProgram:
         """v after the Newton step to Psi_dot = 0, without dependent rows; and Psi of all rows."""
         return self._program("newton_v_and_psi")
 
     @cached_property
-    def project_and_accelerate(self) -> Program:
+    def project_and_accelerate(self) -> ScalarProgram:
         """v after the Newton step to Psi_dot = 0, and a there; safe."""
         return self._program("project_and_accelerate")
 
     @cached_property
-    def tangent_part(self) -> Program:
+    def tangent_part(self) -> ScalarProgram:
         """What projection leaves of changes of q and v (after v), without dependent rows; `SparseFactors.distance`."""
         return self._program("tangent_part", self.changes)
 
     @cached_property
-    def end_of_step(self) -> Program:
+    def end_of_step(self) -> ScalarProgram:
         """v, a and the tangent part of changes, all by the same factors; their distance; safe."""
         return self._program("end_of_step", self.changes)
 
@@ -199,7 +199,7 @@ class EliminationPrograms(ScenePrograms):
 
     def solve_gram(self, b: Sequence[Scalar], dropping: bool = False) -> list[Scalar]:
         """y with D D^T y = b; zero for a row that was dropped, if `dropping` is asked for or the policy drops."""
-        return multipliers(self._factors_dropping if dropping else self._factors, b) if b else []
+        return solve(self._factors_dropping if dropping else self._factors, b) if b else []
 
     def jt(self, y: Sequence[Scalar]) -> list[Scalar]:
         """Psi_q^T y."""
@@ -210,7 +210,7 @@ class EliminationPrograms(ScenePrograms):
         """M^(-1) Psi_q^T y."""
         return [c * s for c, s in zip(self.compliance, self.jt(y), strict=True)]
 
-    def _corrected(self, x: Sequence[Scalar], residual: Sequence[Scalar], dropping: bool = True) -> list[Scalar]:
+    def _correct(self, x: Sequence[Scalar], residual: Sequence[Scalar], dropping: bool = True) -> list[Scalar]:
         """x - M^(-1) Psi_q^T (D D^T)^(-1) residual: x without what makes the residual."""
         return [c - s for c, s in zip(x, self.minv_jt(self.solve_gram(residual, dropping)), strict=True)]
 
@@ -219,11 +219,11 @@ class EliminationPrograms(ScenePrograms):
         found, n = [], self.coordinate_count
         for change in (self.changes[:n], self.changes[n:]):
             residual = [sum((entry * change[k] for k, entry in row.items()), zero) for row in rows]
-            found += self._corrected(change, residual, dropping)
+            found += self._correct(change, residual, dropping)
         return found
 
     def _safe(self, factors: SparseFactors) -> Scalar:
-        return all_of(factors.above(self.safe_tol) if self.policy.reports else [], self.graph)
+        return all_of(factors.exceeding(self.safe_tol) if self.policy.reports else [], self.graph)
 
 
 @lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from udkjax.expressions.graph import Details, Graph, Scalar
+from udkjax.expressions.graph import BoundPrimitive, Graph, Scalar
 
 _INLINED = (
     "jit",
@@ -27,7 +27,7 @@ _INLINED = (
     "remat2",
     "checkpoint",
 )
-UNROLLED = 20_000  # operations of a loop of known length, of all rounds together: beyond it takes too long to compile
+UNROLLED_OPERATIONS = 20_000  # operations of a loop of known length, of all rounds together: beyond it takes too long to compile
 _ELEMENTWISE = frozenset(
     """abs acos acosh and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma eq erf erf_inv
     erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p logistic lt max min ne nextafter not one_minus_square or
@@ -38,10 +38,12 @@ _ELEMENTWISE = frozenset(
 def trace(function: Callable, *examples: Any) -> Callable[..., list[np.ndarray]]:
     """Trace a function once; the result reads it into a graph, for arguments given as arrays of Scalars, as often as wanted."""
     jaxpr = jax.make_jaxpr(function)(*examples)
-    return lambda graph, *arguments: read(graph, jaxpr, jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, np.ndarray)))
+    return lambda graph, *arguments: read_jaxpr(
+        graph, jaxpr, jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, np.ndarray))
+    )
 
 
-def read(graph: Graph, closed: Any, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+def read_jaxpr(graph: Graph, closed: Any, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the outputs of a closed jaxpr as arrays of Scalars."""
     constants = [_constants(graph, c) for c in closed.consts]
     return _read(graph, closed.jaxpr, constants, arguments)
@@ -73,11 +75,14 @@ def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
     name, parameters = equation.primitive.name, equation.params
     if name in _INLINED:
         inner = next(parameters[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in parameters)
-        return _inner(graph, inner, inputs)
+        return _read_inner(graph, inner, inputs)
     if name in _SHAPES:
         return [np.asarray(_SHAPES[name](*inputs, **parameters), object)]
-    if name == "scan" and parameters["length"] * len(getattr(parameters["jaxpr"], "jaxpr", parameters["jaxpr"]).eqns) <= UNROLLED:
-        return _unrolled(graph, equation, inputs)
+    if (
+        name == "scan"
+        and parameters["length"] * len(getattr(parameters["jaxpr"], "jaxpr", parameters["jaxpr"]).eqns) <= UNROLLED_OPERATIONS
+    ):
+        return _unroll(graph, equation, inputs)
     shape, dtype = equation.outvars[0].aval.shape, np.dtype(equation.outvars[0].aval.dtype)
     if name in _ARITHMETIC and np.issubdtype(dtype, np.floating):
         return [_elementwise(partial(_ARITHMETIC[name], **parameters), shape, inputs)]
@@ -97,17 +102,17 @@ def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
     if name == "split":
         return np.split(inputs[0], np.cumsum(parameters["sizes"])[:-1], parameters["axis"])
     if all(s.constant is not None for i in inputs for s in i.flat) and not equation.effects:
-        return _known(graph, equation, inputs)
-    details = Details(equation.primitive, parameters, tuple(i.shape for i in inputs))
+        return _evaluate_constants(graph, equation, inputs)
+    details = BoundPrimitive(equation.primitive, parameters, tuple(i.shape for i in inputs))
     scalars = tuple(s for i in inputs for s in i.flat)
     return graph.call(details, scalars, [(v.aval.shape, v.aval.dtype) for v in equation.outvars])
 
 
-def _inner(graph: Graph, jaxpr: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    return read(graph, jaxpr, inputs) if hasattr(jaxpr, "consts") else _read(graph, jaxpr, [], inputs)
+def _read_inner(graph: Graph, jaxpr: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    return read_jaxpr(graph, jaxpr, inputs) if hasattr(jaxpr, "consts") else _read(graph, jaxpr, [], inputs)
 
 
-def _unrolled(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _unroll(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """A loop of known length, round by round."""
     body, order = equation.params["jaxpr"], range(equation.params["length"])
     inner = getattr(body, "jaxpr", body)
@@ -118,7 +123,7 @@ def _unrolled(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
     fixed, state, each = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
     found: dict[int, list[np.ndarray]] = {}
     for k in reversed(order) if equation.params["reverse"] else order:
-        outputs = _inner(graph, body, [*fixed, *state, *(np.asarray(x[k], object) for x in each)])
+        outputs = _read_inner(graph, body, [*fixed, *state, *(np.asarray(x[k], object) for x in each)])
         state, found[k] = outputs[:carries], outputs[carries:]
     columns = zip(*(found[k] for k in order), strict=True)
     return [*state, *(np.stack([np.asarray(x, object) for x in column]) for column in columns)]
@@ -146,7 +151,7 @@ def _fold(primitive: Any, parameters: dict, values: Sequence[Any]) -> Any:
         return np.asarray(primitive.bind(*map(jax.numpy.asarray, values), **parameters))
 
 
-def _known(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _evaluate_constants(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """What a primitive gives for known values, such as indices."""
     values = [_values(i).astype(v.aval.dtype) for i, v in zip(inputs, equation.invars, strict=True)]  # an empty one has no type
     with jax.ensure_compile_time_eval():

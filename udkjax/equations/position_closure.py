@@ -71,27 +71,27 @@ def damped_step(rows: Rows, t: Any, q: Any, xp: Any = jnp) -> tuple[Any, Any]:
     """One step, halved until the residual falls, and whether it does; no step where the residual is rounding."""
     loop, stop = (_python_loop, lambda x: x) if xp is np else (jax.lax.while_loop, jax.lax.stop_gradient)
     step = limited_step(rows, t, q, xp)
-    fixed, here, ahead = stop((rows, q, step))
-    size = xp.linalg.norm(fixed.residual(t, here))
+    fixed, current, fixed_step = stop((rows, q, step))
+    size = xp.linalg.norm(fixed.residual(t, current))
 
-    def worse(trial: Any) -> Any:
+    def is_worse(trial: Any) -> Any:
         scale, k = trial
-        return (k < HALVINGS) & ~(xp.linalg.norm(fixed.residual(t, here + scale * ahead)) < size)
+        return (k < HALVINGS) & ~(xp.linalg.norm(fixed.residual(t, current + scale * fixed_step)) < size)
 
-    scale, k = loop(worse, lambda trial: (0.5 * trial[0], trial[1] + 1), (xp.ones(()), 0))
-    better = (k < HALVINGS) & (size > rounding(rows.scales, here, xp))
-    return xp.where(better, q + scale * step, q), better
+    scale, k = loop(is_worse, lambda trial: (0.5 * trial[0], trial[1] + 1), (xp.ones(()), 0))
+    improves = (k < HALVINGS) & (size > rounding(rows.scales, current, xp))
+    return xp.where(improves, q + scale * step, q), improves
 
 
 def close_position(rows: Rows, t: Any, q: Any, xp: Any = jnp) -> Any:
     """Steps until the residual is rounding, or none makes it smaller."""
     loop = _python_loop if xp is np else jax.lax.while_loop
 
-    def unfinished(state: Any) -> Any:
-        _, better, k = state
-        return better & (k < ITERATIONS)
+    def goes_on(state: Any) -> Any:
+        _, improves, k = state
+        return improves & (k < ITERATIONS)
 
-    return loop(unfinished, lambda state: (*damped_step(rows, t, state[0], xp), state[2] + 1), (q, xp.asarray(True), 0))[0]
+    return loop(goes_on, lambda state: (*damped_step(rows, t, state[0], xp), state[2] + 1), (q, xp.asarray(True), 0))[0]
 
 
 def driver_time_step(scales: Scales) -> float:
