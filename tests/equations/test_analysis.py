@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import dense_rows, redundancy, scales, sparse_rows
+from udkjax.equations import dense_rows, position_closure, redundancy, scales, sparse_rows
 
 
 def test_a_duplicated_joint_is_named():

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
+from udkjax.deprecation import renamed_attributes, renamed_methods
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import Pseudoinverse
@@ -26,6 +27,9 @@ from udkjax.scene.fields import number
 
 class Formulation(eqx.Module):
     """A way to the accelerations of a system. Given to `simulate(..., formulation=...)`."""
+
+    __getattr__ = renamed_attributes("Formulation", of="formulate")
+    __init_subclass__ = renamed_methods(of="formulate")
 
     @abstractmethod
     def formulate(self, equations: AbstractSystem) -> AbstractSystem:

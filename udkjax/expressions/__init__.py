@@ -1,5 +1,6 @@
 """Graphs of scalar expressions, recorded once: what is structurally zero vanishes, what is repeated is computed once."""
 
+from udkjax.deprecation import deprecated_getattr
 from udkjax.expressions.differential import Differential as Differential
 from udkjax.expressions.differential import cotangents as cotangents
 from udkjax.expressions.differential import tangents as tangents
@@ -10,3 +11,5 @@ from udkjax.expressions.jaxpr_reader import trace as trace
 from udkjax.expressions.scalar_program import ScalarProgram as ScalarProgram
 from udkjax.expressions.scalar_program import frontier as frontier
 from udkjax.expressions.scalar_program import operations as operations
+
+__getattr__ = deprecated_getattr(__name__, {"Program": "ScalarProgram", "read": "read_jaxpr"})

@@ -1,7 +1,7 @@
 """Programs of large scenes: loops over elements that are alike, each running a small straight-line program.
 
-A `Kernel` is the program with the addresses of its inputs and outputs, relative to some bases; a `KernelLoop` runs it for every row
-of a table of bases, in order. The code grows with the number of kinds of elements, the tables with the number of elements.
+A `Kernel` is the program with the addresses of its inputs and outputs, relative to some bases; a `KernelLoop` runs it for every
+row of a table of bases, in order. The code grows with the number of kinds of elements, the tables with the number of elements.
 """
 
 from collections.abc import Mapping, Sequence
