@@ -17,18 +17,18 @@ class Emitted(NamedTuple):
 
     def __call__(self, *arguments: Any) -> tuple[Any, ...]:
         """The program on arrays, as the function itself would be called."""
-        return self.shaped(self.program([a[place] for a in map(jnp.asarray, arguments) for place in np.ndindex(*a.shape)]))
+        return self.shaped(self.program([a[place] for a in map(jnp.asarray, arguments) for place in np.ndindex(*a.shape)]), jnp)
 
     def on_floats(self, *arguments: Any) -> tuple[Any, ...]:
         """The program on Python numbers."""
-        return self.shaped(self.program([x.item() for a in arguments for x in np.asarray(a).flat]))
+        return self.shaped(self.program([x.item() for a in arguments for x in np.asarray(a).flat]), np)
 
-    def shaped(self, outputs: list[Any]) -> tuple[Any, ...]:
+    def shaped(self, outputs: list[Any], xp: Any) -> tuple[Any, ...]:
         results, start = [], 0
         for shape in self.shapes:
             size = int(np.prod(shape))
-            part = [jnp.asarray(x) for x in outputs[start : start + size]]
-            results.append(jnp.stack(part).reshape(shape) if part else jnp.zeros(shape))
+            part = [xp.asarray(x) for x in outputs[start : start + size]]
+            results.append(xp.stack(part).reshape(shape) if part else xp.zeros(shape))
             start += size
         return tuple(results)
 

@@ -34,6 +34,20 @@ def test_floats_are_evaluated_without_compiling():
     assert compiled, "the listener would not have noticed"
 
 
+def test_numbers_of_python_give_what_jax_gives(emit):
+    """Also where they are none."""
+
+    def f(x, y):
+        several = [jnp.abs(x), jnp.arctan2(x, y), x**3, x**-2, jnp.maximum(x, y), jnp.minimum(x, y), jnp.square(y), -x]
+        compared = [x == y, x != y, x < y, x <= y, x > y, x >= y]
+        return jnp.stack([*several, *(jnp.where(c, x, y + 1.0) for c in compared)])
+
+    samples = np.array(np.meshgrid(*[[-2.0, 0.0, 1.5, np.inf, np.nan]] * 2)).reshape(2, -1)
+    program = emit(f, 0.1, 0.2)
+    found = np.array([program.on_floats(x, y)[0] for x, y in samples.T])
+    np.testing.assert_allclose(found, jax.jit(jax.vmap(f))(*samples), rtol=1e-15)
+
+
 def test_an_operation_is_traced_once_for_each_value_it_has(emit):
     """What the jaxpr of a program holds is what the program counts."""
     program = emit(lambda x: (x[0] - x[1]) * jnp.sin(x[2]) + (x[1] - x[0]) / x[2], X).program

@@ -84,7 +84,6 @@ def function(request):
 
 def test_read(function, emit):
     name, f = function
-    close(emit(f, X, Y).on_floats(X, Y), f(jnp.asarray(X), jnp.asarray(Y)))
 
     def total(outputs):
         return sum(jnp.sum(jnp.asarray(o, float) ** 2) for o in jax.tree.leaves(outputs))
@@ -98,6 +97,7 @@ def test_read(function, emit):
         f = lambda x, y: 2.0 * x + jax.nn.relu(y) + jax.nn.silu(x)  # noqa: E731
     found, expected = jax.jit(lambda x, y: tuple(everything(g)(x, y) for g in (program, f)))(XS, YS)
     close(jax.tree.leaves(found), expected)
+    close(program.on_floats(X, Y), [x[0] for x in jax.tree.leaves(expected[0])])  # the first of the batch
 
 
 @pytest.mark.parametrize("name", WRITTEN_OUT)

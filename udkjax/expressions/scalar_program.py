@@ -15,8 +15,21 @@ import numpy as np
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
 
+<<<<<<< HEAD:udkjax/expressions/scalar_program.py
 _SINE_AND_COSINE = ("sin", "cos")
 _LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # of these names math and NumPy have functions, too
+# Of Python's numbers: what other primitives compute, without a call of JAX, which takes some hundred times as long.
+_NUMBER_FUNCTIONS: dict[str, Callable] = {
+    **{name: getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge")},
+    "abs": abs,
+    "atan2": math.atan2,
+    "integer_pow": lambda x, y: x**y,
+    "max": lambda a, b: a if a > b or a != a else b,  # not a number where one of both is not
+    "min": lambda a, b: a if a < b or a != a else b,
+    "neg": operator.neg,
+    "select_n": lambda which, *cases: cases[int(which)],
+    "square": lambda x: x * x,
+}
 # On floats, and traced: by what jax.lax has, since each operator on a JAX array is a function call, ten times as long to trace.
 _OPERATORS: dict[str, tuple[Callable, Callable]] = {
     "add": (operator.add, jax.lax.add),
@@ -159,6 +172,9 @@ def _apply(node: Node, values: list[Any]) -> Any:
     name = node.detail.primitive.name
     if name in _LIBRARY_FUNCTIONS and isinstance(values[0], float | np.ndarray):
         return getattr(_library(values[0]), name)(values[0])
+    if name in _NUMBER_FUNCTIONS and all(type(v) in (float, int, bool) for v in values):
+        exponent = [node.detail.parameters["y"]] if name == "integer_pow" else []
+        return _NUMBER_FUNCTIONS[name](*values, *exponent)
     floats = all(isinstance(v, float | int | bool | np.generic) for v in values)
     primitive, parameters = node.detail.primitive, node.detail.parameters
     if not floats:
