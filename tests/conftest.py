@@ -1,5 +1,6 @@
 """What more than one floor is tested with."""
 
+import gc
 import json
 import os
 import shutil
@@ -19,6 +20,11 @@ jax.config.update("jax_compilation_cache_dir", f"{CACHE}/jax")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 from udkjax.native import operation
+
+# Tracing makes many small objects that live; Python looks through all of them again and again, a tenth of the time.
+gc.collect()
+gc.freeze()
+gc.set_threshold(20_000, 20, 20)
 
 DATA = Path(__file__).parent / "data"
 MAPS = 20_000  # pieces of memory; Linux lets a process have 65,530

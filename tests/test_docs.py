@@ -15,7 +15,18 @@ def name_of(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=name_of)
+# With the slow tests, and where all checks run: the other pages, each of which compiles programs of its own.
+FIRST = "README.md", "docs/getting-started.md", "docs/tutorial.md"
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(p, id=name_of(p), marks=[] if name_of(p) in FIRST else pytest.mark.slow)
+        for p in PAGES
+        if BLOCK.search(p.read_text())
+    ],
+)
 def test_its_blocks_run(page, tmp_path, monkeypatch):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-SHOW = "import os, sys; print(jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir, os.environ.get('XLA_FLAGS'))"
-ORDERS = {"jax first": "import jax, udkjax", "udkjax first": "import udkjax, jax"}
+SHOW = "import os; print(jax.numpy.result_type(float), jax.config.jax_compilation_cache_dir, os.environ.get('XLA_FLAGS'))"
+JAX_FIRST, UDKJAX_FIRST = "import jax, udkjax", "import udkjax, jax"
 
 
 def python(code: str, **environment: object) -> str:
@@ -16,10 +16,18 @@ def python(code: str, **environment: object) -> str:
     return done.stdout.strip()
 
 
-@pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)
-@pytest.mark.parametrize(("given", "float64"), [({}, True), ({"JAX_ENABLE_X64": "0"}, False)])
-def test_float64_is_on_unless_the_environment_says_no(tmp_path, order, given, float64):
-    assert python(f"{order}; {SHOW}", HOME=tmp_path, **given) == f"{float64} None None"
+@pytest.mark.parametrize(
+    ("order", "given", "dtype"),
+    [
+        (JAX_FIRST, {}, "float64"),
+        (UDKJAX_FIRST, {}, "float64"),
+        (UDKJAX_FIRST, {"JAX_ENABLE_X64": "1"}, "float64"),
+        (JAX_FIRST, {"JAX_ENABLE_X64": "0"}, "float32"),
+        (UDKJAX_FIRST, {"JAX_ENABLE_X64": "False"}, "float32"),
+    ],
+)
+def test_float64_is_on_unless_the_environment_says_no(tmp_path, order, given, dtype):
+    assert python(f"{order}; {SHOW}", HOME=tmp_path, **given) == f"{dtype} None None"
     assert list(tmp_path.iterdir()) == []
 
 

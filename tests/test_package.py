@@ -221,20 +221,3 @@ def test_no_warning_is_given_by_importing_and_running():
     clean = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu", "UDKJAX_CACHE": os.environ["UDKJAX_CACHE"]}
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], env=clean, capture_output=True, text=True, check=False)
     assert (done.stdout, done.stderr) == ("quiet\n", "")
-
-
-FLOAT = "print(jnp.result_type(float))"
-
-
-@pytest.mark.parametrize("code", [f"import udkjax, jax.numpy as jnp; {FLOAT}", f"import jax.numpy as jnp, udkjax; {FLOAT}"])
-@pytest.mark.parametrize(
-    ("environment", "dtype"),
-    [
-        ({}, "float64"),
-        ({"JAX_ENABLE_X64": "1"}, "float64"),
-        ({"JAX_ENABLE_X64": "0"}, "float32"),
-        ({"JAX_ENABLE_X64": "False"}, "float32"),
-    ],
-)
-def test_float64_is_on_unless_the_environment_says_no(code, environment, dtype):
-    assert python(code, **environment) == dtype

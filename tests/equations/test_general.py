@@ -17,6 +17,10 @@ STABILIZATIONS = {"projection": udk.Projection(), "Baumgarte": udk.Baumgarte(5.0
 DENSE = {m.__name__: m() for m in (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)}
 TS = np.linspace(0.0, 2.0, 9)
 every_stabilization = pytest.mark.parametrize("stabilization", STABILIZATIONS.values(), ids=STABILIZATIONS)
+by_projection = pytest.mark.parametrize(  # the others by one motion, the bead's
+    "stabilization",
+    [pytest.param(s, id=k, marks=pytest.mark.slow if k != "projection" else ()) for k, s in STABILIZATIONS.items()],
+)
 every_method = pytest.mark.parametrize("method", DENSE.values(), ids=DENSE)
 
 
@@ -63,7 +67,7 @@ def in_angles():
     return np.stack([np.sin(y[0]) * np.cos(y[1]), np.sin(y[0]) * np.sin(y[1]), -np.cos(y[0])], 1)
 
 
-@every_stabilization
+@by_projection
 def test_spherical_pendulum(in_angles, stabilization):
     sol = run(BALL.system(), *BALL_START, stabilization)
     assert sol.q.shape == (len(TS), 3)
@@ -80,8 +84,8 @@ def test_every_method_and_redundancy(method):
     """Three times the same constraint moves as one does; its multiplier is shared."""
     q, v = BALL_START
     triple = Ball(BALL.weight, BALL.radius, 3).system()
-    one, force = udk.accelerations(BALL.system(), 0.0, q, v, method, multipliers=True)
-    three, forces = udk.accelerations(triple, 0.0, q, v, method, multipliers=True)
+    solve = lambda system, q, v: udk.accelerations(system, 0.0, q, v, method, multipliers=True)  # noqa: E731
+    (one, force), (three, forces) = jax.jit(lambda q, v: [solve(system, q, v) for system in (BALL.system(), triple)])(q, v)
     pull = 1.5**2 - G * q[2]  # towards the centre, per mass; lambda = weight pull / (2 radius)
     assert_allclose(one, -pull * q + jnp.array([0.0, 0.0, -G]), atol=1e-13)
     assert_allclose(force, pull, atol=1e-13)
@@ -138,7 +142,7 @@ def knife(steer=0.0):
     )
 
 
-@every_stabilization
+@by_projection
 def test_a_blade_on_ice_runs_in_a_circle(stabilization):
     speed, turn = 2.0, 1.3
     sol = run(knife(), [0.0, 0.0, 0.0], [speed, 0.0, turn], stabilization)
@@ -218,8 +222,8 @@ def test_a_mass_matrix_that_is_not_diagonal():
     u = jnp.ones(2)
     plain = double(False)
     expected = jnp.linalg.solve(plain.mass(q) + 1e-3 * jnp.outer(u, u), plain.force(0.0, q, v))
-    for method in DENSE.values():
-        a = udk.accelerations(double(True), 0.0, jnp.append(q, q.sum()), jnp.append(v, v.sum()), method)
+    by_all = jax.jit(lambda q, v: [udk.accelerations(double(True), 0.0, q, v, method) for method in DENSE.values()])
+    for a in by_all(jnp.append(q, q.sum()), jnp.append(v, v.sum())):
         assert_allclose(a, jnp.append(expected, expected.sum()), atol=1e-11)
     assert_allclose(udk.accelerations(plain, 0.0, q, v), jnp.linalg.solve(plain.mass(q), plain.force(0.0, q, v)), atol=1e-13)
 
@@ -237,7 +241,7 @@ def test_without_constraints_it_is_an_ordinary_equation():
     assert_allclose(sol.q, expected[:2].T, atol=1e-8)
 
 
-@every_stabilization
+@by_projection
 def test_mass_redundancy_and_constraints_along_a_motion(stabilization):
     q, v = np.array([1.0, -0.4]), np.array([0.3, 1.2])
     sol = run(double(True), [*q, q.sum()], [*v, v.sum()], stabilization)

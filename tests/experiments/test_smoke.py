@@ -9,8 +9,18 @@ pytest.importorskip("experiments", reason="not in a source tree")
 
 from experiments.common import HERE, NAMES, described, load, run, tracked
 
-# studies whose small runs compile for long
-SLOW: set[str] = {"singular_crossing", "inconsistent_starts", "precision", "gains", "threshold_map", "tune_gains"}
+# Studies whose small runs compile for long; what they found is held against their claims by `test_committed`, the orders of
+# integrators are tested in tests/integrate.
+SLOW: set[str] = {
+    "long_runs",
+    "convergence",
+    "singular_crossing",
+    "inconsistent_starts",
+    "precision",
+    "gains",
+    "threshold_map",
+    "tune_gains",
+}
 README = (HERE / "README.md").read_text(encoding="utf-8")
 
 

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.choices import fast
 from tests.scaling import scaled
 
 SCENES = {
@@ -34,16 +35,16 @@ TOL = 1e-9
 POSITION, RATE = 1e-10, 10 * TOL
 
 
-def deviation(mechanism, units, method=None):
+def deviation(mechanism, units, method=None, times=TS):
     """How far the motion in other units is from that in our own: coordinates and velocities, in our own."""
     length, time, _ = units
     run = lambda mech, ts: udk.simulate(mech, ts, rtol=TOL, atol=TOL, method=method)  # noqa: E731
-    own, other = run(mechanism, TS), run(scaled(mechanism, *units), TS * time)
+    own, other = run(mechanism, times), run(scaled(mechanism, *units), times * time)
     unit = np.array([length, length, 1.0])
     return np.abs(other.q / unit - own.q).max(), np.abs(other.v * time / unit - own.v).max()
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", fast(["parallelogram", "slider crank", "planetary gear", "trammel"], SCENES))
 def test_the_motion_is_the_same_in_all_units(name):
     for units in UNITS:
         dq, dv = deviation(SCENES[name](), units)
@@ -56,10 +57,10 @@ def test_to_the_last_digit_where_the_units_are_powers_of_two(name):
         assert deviation(SCENES[name](), units) == (0.0, 0.0), units
 
 
-@pytest.mark.parametrize("method", [udk.SVD(), udk.Varga()], ids=["SVD", "Varga"])
+@pytest.mark.parametrize("method", [udk.SVD(), pytest.param(udk.Varga(), marks=pytest.mark.slow)], ids=["SVD", "Varga"])
 def test_and_by_methods_that_compare_rows_of_metres_with_rows_of_radians(method):
-    for units in UNITS:
-        dq, dv = deviation(udk.library.slider_crank(), units, method)
+    for units in UNITS[::2]:
+        dq, dv = deviation(udk.library.slider_crank(), units, method, TS[:5])
         assert dq < POSITION and dv < RATE, units
 
 
@@ -86,13 +87,13 @@ def test_the_same_is_refused_in_all_units(units):
     assert udk.check(mechanism).closed and udk.check(mechanism).redundant == (("B2", 1),)
 
 
-@pytest.mark.parametrize("radius", [1.0, 1e-2, 1e-4, 1e-7])
+@pytest.mark.parametrize("radius", [1.0, 1e-7])
 def test_a_block_on_a_rail_is_held_however_small_its_radius_of_gyration(radius):
     """One row of a prismatic joint is in metres, the other in radians."""
     block = udk.Mechanism(
         {"block": udk.Body(2.0, 2.0 * radius**2)}, {"rail": udk.Prismatic(["ground", "block"], np.zeros((2, 2)), 0.0)}
     )
-    for method in (udk.SVD(), udk.Varga(), udk.Auto()):
+    for method in (udk.SVD(), udk.Auto()):
         sol = udk.simulate(block, [0.0, 1.0], method=method)
         assert_allclose(sol.q, 0.0, atol=1e-12)
         assert_allclose(udk.reactions(block, sol, method)["rail"]["block"][-1], [0.0, 2.0 * 9.81, 0.0], atol=1e-9)

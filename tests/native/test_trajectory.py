@@ -19,6 +19,8 @@ import udkjax as udk
 from udkjax.equations import analysis, constraints, loads, structure
 
 TOL = 1e-9
+# Loops know no pieces of the state; and what does not depend on how the equations are written is tested once.
+WRITTEN_OUT = pytest.mark.parametrize("served", ["written out"], indirect=True)
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
 LARGE = ("chain", "excavator", "n_four_bar", "peaucellier", "planetary_gear", "scissor_lift", "driven_pendulum", "four_bar")
 
@@ -92,8 +94,17 @@ def served(monkeypatch, request):
         assert all(seen)
 
 
+LOOPS = "parallelogram", "andrews_squeezer"  # by loops, too, in the fast tests
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LARGE)) for name in sorted(udk.library.__all__)]
+    ("served", "name"),
+    [
+        pytest.param(way, name, marks=[pytest.mark.slow] * (name in LARGE or (way == "loops" and name not in LOOPS)))
+        for way in ("written out", "loops")
+        for name in sorted(udk.library.__all__)
+    ],
+    indirect=["served"],
 )
 def test_the_library(name):
     mechanism = getattr(udk.library, name)()
@@ -162,7 +173,12 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("served", "name"),
+    [("written out", name) for name in SCENES]
+    + [("loops", "slides and springs"), *(pytest.param("loops", name, marks=pytest.mark.slow) for name in ("wheels", "driven"))],
+    indirect=["served"],
+)
 def test_joints_drivers_and_forces(name):
     solution = agrees(SCENES[name](), np.linspace(0.0, 1.0, 6))
     assert solution.result == udk.Result.successful
@@ -195,6 +211,7 @@ def test_stabilizations(double, stabilization):
     assert drift < (1e-11 if stabilization == udk.Projection() else 1e-6)
 
 
+@WRITTEN_OUT
 @pytest.mark.parametrize(
     "solver", [diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Bosh3(), diffrax.Heun(), diffrax.Ralston(), diffrax.Midpoint()], ids=str
 )
@@ -211,6 +228,7 @@ def test_explicit_methods(double, solver):
     assert stats["right_hand_sides"] >= stats["steps"] * (stages - 1)
 
 
+@WRITTEN_OUT
 @pytest.mark.parametrize("projected", [True, False])
 def test_errors_follow_the_tolerance(projected):
     """Also those of outputs between steps."""
@@ -275,15 +293,12 @@ def turned_by_a_cam(lift=0.2):
     )
 
 
-WRITTEN_OUT = pytest.mark.parametrize("served", ["written out"], indirect=True)  # loops know no pieces of the state
-
-
 @WRITTEN_OUT
 def test_cams():
     """Also between steps, close to where one cubic of the profile meets the next."""
     mechanism, ts = turned_by_a_cam(), np.linspace(0.0, 1.5, 61)
     solution = agrees(mechanism, ts, atol=1e-7)
-    batch = jax.vmap(lambda tol: udk.simulate(mechanism, ts, rtol=tol, atol=tol, throw=False))(jnp.full(8, TOL))
+    batch = jax.jit(jax.vmap(lambda tol: udk.simulate(mechanism, ts, rtol=tol, atol=tol, throw=False)))(jnp.full(8, TOL))
     assert_allclose(batch.q, np.broadcast_to(solution.q, batch.q.shape), atol=1e-9)
 
 
@@ -301,8 +316,9 @@ def test_derivatives_along_cams():
     radius = turned_by_a_cam().joints["contact"].profile.radius
     along = jnp.cos(jnp.arange(8) * jnp.pi / 4)
     slope = (lifted(0.2 + 1e-4) - lifted(0.2 - 1e-4)) / 2e-4
-    assert_allclose(jax.jvp(traced, (radius,), (along,))[1], slope, rtol=2e-6)
-    assert_allclose(jnp.vdot(jax.grad(traced)(radius), along), slope, rtol=2e-6)
+    forward, gradient = jax.jit(lambda r: (jax.jvp(traced, (r,), (along,))[1], jax.grad(traced)(r)))(radius)
+    assert_allclose(forward, slope, rtol=2e-6)
+    assert_allclose(gradient @ along, slope, rtol=2e-6)
 
 
 def test_a_first_step_is_taken_as_given():
@@ -373,6 +389,7 @@ def test_what_was_reached_before_a_run_failed_is_right():
     assert q.shape == short.q.shape
 
 
+@WRITTEN_OUT
 def test_a_mechanism_that_cannot_be_closed_is_no_run(served):
     del served
     far = udk.Mechanism(
@@ -425,6 +442,7 @@ def traced(mechanism, **choices):
     jax.eval_shape(lambda start: udk.simulate(mechanism, [0.0, 0.1], start, **choices).q, udk.State(mechanism.q0, mechanism.v0))
 
 
+@WRITTEN_OUT
 def test_what_has_no_machine_code_is_integrated_by_another_engine(served):
     scene = udk.library.compound_pendulum()
 
@@ -453,6 +471,7 @@ def test_a_small_network_is_integrated_by_either_engine(served):
     agrees(mechanism, np.linspace(0.0, 0.5, 4))
 
 
+@WRITTEN_OUT
 @pytest.mark.parametrize("choices", [{"method": udk.SVD()}, {"solver": diffrax.Kvaerno3()}], ids=["SVD", "implicit"])
 def test_other_methods_and_solvers_are_not_served(served, choices):
     traced(udk.library.compound_pendulum(), **choices)

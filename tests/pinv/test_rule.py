@@ -86,7 +86,7 @@ def derivatives(method):
         lambda a: jax.jacrev(jax.jacrev(x, 1), 1)(a, jnp.zeros(2)),
         jax.grad(lambda a: jnp.sum(WEIGHTS * method(a))),
     ]
-    return lambda a: [compiled(jax.vmap(f))(a) for f in functions]
+    return compiled(jax.vmap(lambda a: [f(a) for f in functions]))
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,6 @@ import numpy as np
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
 
-<<<<<<< HEAD:udkjax/expressions/scalar_program.py
 _SINE_AND_COSINE = ("sin", "cos")
 _LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # of these names math and NumPy have functions, too
 # Of Python's numbers: what other primitives compute, without a call of JAX, which takes some hundred times as long.
