@@ -27,6 +27,7 @@ from benchmarks.common import Compiled, Work, alternate, at_equal_error, frontie
 from benchmarks.scripts import by_cholesky, by_pinv  # noqa: E402
 
 
+@pytest.mark.slow
 def test_right_hand_side(tmp_path, capsys):
     right_hand_side.main(smoke=True, out=tmp_path / "figures.json")
     written = json.loads((tmp_path / "figures.json").read_text())

@@ -24,8 +24,8 @@ def but_slow(names):
     return [pytest.param(name, marks=pytest.mark.slow) for name in names.split()]
 
 
-REGULAR = ["slider_crank"]
-REGULAR += but_slow("driven_pendulum simple_pendulum compound_pendulum double_pendulum four_bar elliptic_trammel")
+# In the fast tests: the driven double pendulum below.
+REGULAR = but_slow("slider_crank driven_pendulum simple_pendulum compound_pendulum double_pendulum four_bar elliptic_trammel")
 REDUNDANT = ["parallelogram", *but_slow("n_four_bar scissor_lift peaucellier planetary_gear")]
 T0 = jnp.array(0.0)
 

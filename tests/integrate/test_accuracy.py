@@ -51,48 +51,60 @@ def test_linkage(angle, rate, bound):
     assert error(mech, sol) <= bound
     # At an angle of 1e-5 from the singular configuration, the row left out is closed to rounding over that angle.
     assert jnp.abs(udk.violation(mech, sol)).max() <= 1e-10
-    # In line at rest 377 to 421, by rounding: each return dwells there.
-    assert sol.stats["steps"] < 480
     energy = udk.energy(mech, sol).total
     assert_allclose(energy, energy[0], atol=20 * bound)
 
 
 def test_an_ordinary_run_has_no_step_rejected():
-    """Aiming higher, one in ten is, and as exact a run takes 15 % more. Foreseeing what would be takes 3 % more steps here."""
+    """Aiming higher, one in ten is, and as exact a run takes 15 % more."""
     mech = udk.library.parallelogram(np.deg2rad(-45))
     sol = udk.simulate(mech, TS, rtol=1e-9, atol=1e-9)
     assert error(mech, sol) <= 3e-10
-    assert sol.stats["rejected"] <= 2 and sol.stats["steps"] < 246
+    assert sol.stats["rejected"] < 0.01 * sol.stats["steps"]
 
 
-@pytest.mark.parametrize(("scene", "rejected"), [("four_bar", 40), ("scissor_lift", 45), ("double_pendulum", 60)])
-def test_steps_that_would_be_rejected_are_foreseen(scene, rejected):
-    """In 10 s: without that 47, 92 and 67."""
+@pytest.mark.parametrize("scene", ["four_bar", "scissor_lift", "double_pendulum"])
+def test_steps_that_would_be_rejected_are_foreseen(scene):
+    """Without that from 0.18 (the pendulum) to 0.28 (the lift) of them are."""
     sol = udk.simulate(getattr(udk.library, scene)(), np.linspace(0.0, 10.0, 201), rtol=3e-8, atol=3e-8)
-    assert sol.stats["rejected"] < rejected
+    assert sol.stats["rejected"] < 0.18 * sol.stats["steps"]
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    """Steps of the run that meets no singular configuration, by its tolerance."""
+    mech, known = udk.library.parallelogram(np.deg2rad(-45)), {}
+
+    def steps(tol):
+        if tol not in known:
+            known[tol] = int(udk.simulate(mech, TS, rtol=tol, atol=tol).stats["steps"])
+        return known[tol]
+
+    return steps
 
 
 @pytest.mark.parametrize("angle", [45, 60])
-def test_singular_configurations_cost_few_steps(angle):
-    """Against a run that meets none, which takes 425 at the first tolerance; without care for what projection takes back 1,600.
+def test_singular_configurations_cost_few_steps(angle, undisturbed):
+    """Against a run that meets none; without care for what projection takes back four times as many.
 
-    Steps that do not know where the next one is are rejected 330 and 490 times.
+    Of steps that do not know where the next one is a third is rejected.
     """
     mech = udk.library.parallelogram(np.deg2rad(angle))
-    for tol, steps, rejected in ((1e-11, 700, 70), (3e-12, 820, 120), (1e-12, 1000, 160)):
+    for tol in (1e-11, 3e-12, 1e-12):
         sol = udk.simulate(mech, TS, rtol=tol, atol=tol)
         assert error(mech, sol) <= 200 * tol
-        assert sol.stats["steps"] < steps and sol.stats["rejected"] < rejected
+        assert sol.stats["steps"] < 1.75 * undisturbed(tol) and sol.stats["rejected"] < 0.12 * sol.stats["steps"]
         assert sol.stats["right_hand_sides"] < 13.5 * sol.stats["steps"]  # hardly one was taken again with care
 
 
 @pytest.mark.parametrize("angle", [-0.01, 0.0, 0.01, 0.3])
-def test_runs_may_turn_back_in_singular_configurations(angle):
-    """Or just short of them, or just behind. Where steps beside one are tried shorter before they get care, 3,500 to 52,000."""
+def test_runs_may_turn_back_in_singular_configurations(angle, undisturbed):
+    """Or just short of them, or just behind. Where steps beside one are tried shorter first, it takes 6 to 90 times as many."""
     mech = udk.library.parallelogram(np.deg2rad(angle))
     sol = udk.simulate(mech, TS, rtol=1e-12, atol=1e-12)
     assert error(mech, sol) <= 200e-12
-    assert sol.stats["steps"] < 2000 and sol.stats["rejected"] < 700  # 820 to 1,650, by rounding
+    assert sol.stats["steps"] < 3.6 * undisturbed(1e-12)  # 1.5 to 3, by rounding
+    assert sol.stats["rejected"] < 0.35 * sol.stats["steps"]
     assert sol.stats["right_hand_sides"] < 22 * sol.stats["steps"]
 
 

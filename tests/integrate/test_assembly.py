@@ -24,9 +24,20 @@ def motor():
     return udk.Mechanism(rod.bodies, rod.joints, {"motor": turn})
 
 
+@jax.jit
+def rows(mech, t, q, v):
+    return constraints.psi(mech, t, q), constraints.psi_dot(mech, t, q, v), constraints.psi_q(mech, t, q)
+
+
+def evaluate(mech, q, v=None, t=0.0):
+    """Psi, Psi_dot and Psi_q, as arrays of NumPy."""
+    q = np.ravel(q)
+    return [np.asarray(x) for x in rows(mech.without_origin, float(t), q, np.zeros_like(q) if v is None else np.ravel(v))]
+
+
 def violation(mech, state, t=0.0):
-    q, v, t = state.q.ravel(), state.v.ravel(), jnp.asarray(t, float)
-    return jnp.abs(constraints.psi(mech, t, q)).max(), jnp.abs(constraints.psi_dot(mech, t, q, v)).max()
+    psi, psi_dot, _ = evaluate(mech, state.q, state.v, t)
+    return np.abs(psi).max(), np.abs(psi_dot).max()
 
 
 # --- closing
@@ -103,11 +114,11 @@ def apart(mech, by):
 
 def test_names_what_stays_open_and_makes_nothing_worse():
     mech = apart(udk.library.four_bar(), 9.0)
-    before = jnp.linalg.norm(constraints.psi(mech, 0.0, mech.q0.ravel()))
+    before = np.linalg.norm(evaluate(mech, mech.q0)[0])
     with pytest.raises(udk.AssemblyError, match=r'cannot be closed.*"[ABCD]" \([0-9.]+\).*closer') as caught:
         udk.assemble(mech)
     best = caught.value.state
-    assert jnp.linalg.norm(constraints.psi(mech, 0.0, best.q.ravel())) < before
+    assert np.linalg.norm(evaluate(mech, best.q)[0]) < before
     assert_allclose(udk.assemble(mech, throw=False).q, best.q)
 
 
@@ -138,7 +149,7 @@ def test_never_worse(linkage):
     assemble = jax.jit(lambda q: udk.assemble(stuck, state=udk.State(q, jnp.zeros((4, 3)))).q)
     for seed in range(8):
         q = stuck.q0 + np.random.default_rng(seed).uniform(-2, 2, (4, 3))
-        before, after = (jnp.linalg.norm(constraints.psi(stuck, 0.0, x.ravel())) for x in (q, assemble(q)))
+        before, after = (np.linalg.norm(evaluate(stuck, x)[0]) for x in (q, assemble(q)))
         assert after <= before
 
 
@@ -320,18 +331,13 @@ ALONG = {
 }
 
 
-@jax.jit
-def psi_q(mechanism, q):
-    return constraints.psi_q(mechanism, jnp.array(0.0), q)
-
-
 @pytest.mark.parametrize(("make", "start"), ALONG.values(), ids=ALONG)
 def test_what_stays_has_full_rank_elsewhere(make, start):
     """The rows that stay are as many as the rank, and independent, along the motion; also from a singular start."""
     mech = make(start)
     redundant = list(udk.analyse(mech).redundant_rows or ())
     for angle in (start + 0.35, start + 0.7):
-        A = np.asarray(psi_q(mech.without_origin, make(angle).q0.ravel()))
+        A = evaluate(mech, make(angle).q0)[2]
         kept = np.delete(A, redundant, axis=0)
         assert len(kept) == np.linalg.matrix_rank(A, tol=1e-7)
         assert np.linalg.svd(kept, compute_uv=False)[-1] > 1e-3

@@ -99,7 +99,7 @@ def test_outputs_of_a_motion_by_a_spline(tol):
     mech = pendulum(udk.Spline(KNOTS, VALUES))
     sol = udk.simulate(mech, TS, start(KNOTS), rtol=tol, atol=tol)
     assert_within([sol.q[:, 1, 2], sol.v[:, 1, 2]], reference(kick=0.0), tol)
-    assert sol.stats["steps"] < 40 and sol.stats["rejected"] <= 4  # 44 and 65 where steps come upon the knots, 27 rejected
+    assert sol.stats["rejected"] <= 0.1 * sol.stats["steps"]  # two of five where steps come upon the knots
 
 
 @pytest.fixture(scope="module")

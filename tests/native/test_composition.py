@@ -50,10 +50,10 @@ WAYS = {
     "eager": lambda xs: jnp.stack([angle(x) for x in xs]),
     "vmap": jax.vmap(angle),
     "jit of vmap": jax.jit(jax.vmap(angle)),
-    "vmap of vmap": lambda xs: jax.vmap(jax.vmap(angle))(xs.reshape(2, 2)).ravel(),
+    "vmap of vmap": jax.jit(lambda xs: jax.vmap(jax.vmap(angle))(xs.reshape(2, 2)).ravel()),
     "map": lambda xs: jax.lax.map(angle, xs),
     "scan": jax.jit(scanned),
-    "checkpoint": jax.vmap(jax.checkpoint(angle)),  # pyright: ignore[reportPrivateImportUsage]
+    "checkpoint": jax.jit(jax.vmap(jax.checkpoint(angle))),  # pyright: ignore[reportPrivateImportUsage]
 }
 
 

@@ -21,7 +21,7 @@ from udkjax.study.sweep.plan import planned
 LINKS = ("link1", "link2", "link3")
 DEVICES = 8
 SCRIPT = """
-import re, sys
+import sys
 import jax, numpy as np, udkjax as udk
 from udkjax.study.sweep.cutting import cut_chunks
 from udkjax.study.sweep.chunk import program, run
@@ -33,9 +33,7 @@ parts = [{"members": chunk.members, **run(plan, chunk)} for chunk in cut_chunks(
 found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 np.savez(sys.argv[1], **{name: values[np.argsort(found["members"])] for name, values in found.items()})
 own = program(plan, plan.groups[0])
-text = own.compiled[0].as_text()
-print(len(own.devices), len(jax.devices()), f"num_partitions={len(jax.devices())}" in text or len(jax.devices()) == 1)
-print(re.findall("all-reduce|all-gather|all-to-all|collective|reduce-scatter|send|recv", text))
+print(len(own.devices), len(jax.devices()))
 """
 
 
@@ -49,10 +47,10 @@ def on(devices: int, file) -> tuple[str, dict]:
 
 
 @pytest.mark.slow
-def test_eight_devices_give_what_one_gives_bit_by_bit_and_do_not_talk(tmp_path):
+def test_eight_devices_give_what_one_gives_bit_by_bit(tmp_path):
     alone, one = on(1, tmp_path / "one.npz")
     said, many = on(DEVICES, tmp_path / "many.npz")
-    assert said.splitlines() == [f"{DEVICES} {DEVICES} True", "[]"] and alone.splitlines() == ["1 1 True", "[]"]
+    assert said.split() == [str(DEVICES)] * 2 and alone.split() == ["1", "1"]
     assert one.keys() == many.keys() and len(one["members"]) == 600
     for name in one:
         assert np.array_equal(one[name], many[name], equal_nan=True), name
