@@ -17,7 +17,9 @@ CACHE = os.environ.setdefault("UDKJAX_CACHE", OWN_CACHE or "")
 # XLA compiles in less than half of the time what it does not optimize; no test is about how fast that runs.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 jax.config.update("jax_compilation_cache_dir", f"{CACHE}/jax")
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+jax.config.update(
+    "jax_persistent_cache_min_compile_time_secs", 0.0
+)  # what one process has compiled, however small, serves the other
 
 from udkjax.native import operation
 

@@ -13,6 +13,7 @@ from experiments.common import HERE, NAMES, described, load, run, tracked
 # integrators are tested in tests/integrate.
 SLOW: set[str] = {
     "long_runs",
+    "wire_law",
     "convergence",
     "singular_crossing",
     "inconsistent_starts",

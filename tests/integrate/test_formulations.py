@@ -88,16 +88,15 @@ def test_the_linkage(formulation):
 # --- partitioning
 
 
-@pytest.fixture(scope="module")
-def partitioned():
-    """The linkage by partitioning and no stabilization."""
-    mech = udk.library.parallelogram(np.deg2rad(-50))
-    return mech, tsit5(mech, udk.CoordinatePartitioning(), stabilization=None)
+LINKAGE = udk.library.parallelogram(np.deg2rad(-50))
 
 
-def test_constraints_hold_without_stabilization(partitioned):
+@pytest.mark.parametrize(
+    "mech", [udk.library.compound_pendulum(), pytest.param(LINKAGE, marks=pytest.mark.slow)], ids=["pendulum", "linkage"]
+)
+def test_constraints_hold_without_stabilization(mech):
     """To rounding at every output, positions and velocities; and the motion is the exact one."""
-    mech, sol = partitioned
+    sol = tsit5(mech, udk.CoordinatePartitioning(), stabilization=None)
     assert_allclose(sol.q, exact(mech, sol), atol=2e-8)
     equations = equations_of(mech)
     rest = jax.jit(jax.vmap(equations.violation))(TS, sol.q.reshape(len(TS), -1), sol.v.reshape(len(TS), -1))
@@ -105,9 +104,9 @@ def test_constraints_hold_without_stabilization(partitioned):
     assert sol.settings["stabilization"] == "NoneType"
 
 
-def test_only_what_is_independent_is_judged(partitioned):
+def test_only_what_is_independent_is_judged():
     """One step of a size that would fail: the error has one coordinate and its velocity; the others are zero."""
-    mech, _ = partitioned
+    mech = LINKAGE
     equations = equations_of(mech, None, None, udk.CoordinatePartitioning())
     y0 = jnp.concatenate([mech.q0.ravel(), mech.v0.ravel()])
     solver, term = Constrained(diffrax.Tsit5(), True), diffrax.ODETerm(derivative)
@@ -129,9 +128,10 @@ def test_only_what_is_independent_is_judged(partitioned):
 
 
 @pytest.mark.slow
-def test_a_multistep_method(partitioned):
+def test_a_multistep_method():
     """It is told to judge its errors by the independent components, and keeps its history when others become independent."""
-    mech, reference = partitioned
+    mech = LINKAGE
+    reference = tsit5(mech, udk.CoordinatePartitioning(), stabilization=None)
     sol = udk.simulate(mech, TS, rtol=1e-9, atol=1e-9, solver=udk.Adams(), formulation=udk.CoordinatePartitioning())
     assert_allclose(sol.q, reference.q, atol=1e-7)
     assert sol.stats["right_hand_sides"] < reference.stats["right_hand_sides"]

@@ -19,6 +19,7 @@ from udkjax.equations.analysis import analyse
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scales import known_scales
 from udkjax.expressions.loop_program import KernelLoop, Reset
+from udkjax.native import machine
 from udkjax.native.loops import LoopWriter
 from udkjax.pinv.elimination_order import order_blocks
 from udkjax.pinv.rank_policy import RankPolicy
@@ -239,6 +240,7 @@ def test_constants_by_jax_are_those_of_the_loops(at):
     assert_allclose(found[2:], at.constants[2:], rtol=1e-14, atol=1e-14)
 
 
+@pytest.mark.parametrize("width", [1, machine.lanes()], indirect=True)
 @pytest.mark.parametrize("name", ["end_of_step", "equation_terms"])
 def test_machine_code_runs_the_loops(at, name, code, width):
     program = getattr(at.code, name)

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.choices import fast
+
+SCENES = {"driven pendulum": udk.library.driven_pendulum, "slider crank": lambda: udk.library.slider_crank(0.3, 4.0)}
 
 
 def test_the_torque_of_a_slider_crank_is_that_of_its_closed_form():
@@ -31,8 +34,9 @@ def test_the_torque_of_a_slider_crank_is_that_of_its_closed_form():
     assert float(jnp.max(found.residual)) < 1e-12
 
 
-def test_what_is_fed_forward_reproduces_the_motion():
-    mech = udk.library.slider_crank(0.3, 4.0)
+@pytest.mark.parametrize("name", fast(["driven pendulum"], SCENES))
+def test_what_is_fed_forward_reproduces_the_motion(name):
+    mech = SCENES[name]()
     h = 1 / 400
     knots = h * np.arange(-16, 217)
     free = udk.feed_forward(mech, udk.inverse_dynamics(mech, knots))
@@ -60,9 +64,10 @@ def test_redundant_joints_and_redundant_drivers():
     assert float(jnp.max(three.residual)) < 1e-11
 
 
-def test_efforts_are_what_the_drivers_reactions_say():
+@pytest.mark.parametrize("name", fast(["driven pendulum"], SCENES))
+def test_efforts_are_what_the_drivers_reactions_say(name):
     """For as many drivers as degrees of freedom: -lambda of the driver's row, found by forward dynamics."""
-    mech = udk.library.slider_crank(0.3, 4.0)
+    mech = SCENES[name]()
     ts = np.linspace(0.0, 0.4, 3)
     found = udk.inverse_dynamics(mech, ts)
     moved = found.motion
@@ -71,6 +76,25 @@ def test_efforts_are_what_the_drivers_reactions_say():
     np.testing.assert_allclose(found.efforts["motor"], -forces[:, -1], rtol=0, atol=1e-10)
 
 
+def test_derivatives_of_a_torque_are_those_of_its_closed_form():
+    """(I + m r^2) theta'' + m g r cos(theta) of a driven pendulum, by the mass and the arm, forward and reverse."""
+    mech = udk.library.driven_pendulum()
+
+    def torque(x):
+        changed = mech.with_parameters({"body.rod.mass": x[0], "joint.pin.points[1][0]": -x[1]})
+        return udk.inverse_dynamics(changed, jnp.array([0.2])).efforts["motor"][0]
+
+    def exact(x):
+        theta, curvature = 0.8 * jnp.sin(0.6), -0.8 * 9.0 * jnp.sin(0.6)
+        return (1.0 / 12.0 + x[0] * x[1] ** 2) * curvature + x[0] * 9.81 * x[1] * jnp.cos(theta)
+
+    x = jnp.array([1.0, 0.5])
+    found, expected = (jax.jit(lambda x, f=f: (f(x), jax.jacfwd(f)(x), jax.grad(f)(x)))(x) for f in (torque, exact))
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10)
+
+
+@pytest.mark.slow
 def test_derivatives_of_a_torque():
     mech = udk.library.slider_crank(0.3, 4.0)
 

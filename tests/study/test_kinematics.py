@@ -157,12 +157,36 @@ def test_drivers_along_time_and_other_drivers_held():
     np.testing.assert_allclose(along.q[:, 2, 0], 0.5 * np.cos(s) + np.sqrt(1.5**2 - 0.25 * np.sin(s) ** 2), atol=1e-13)
 
 
-def test_derivatives_of_positions_by_numbers_of_the_scene():
-    mech = udk.library.four_bar(np.pi / 3, **CRANK_ROCKER)
+def hung():
+    """A rod whose pin is on a line, 1 m from a point above it."""
+    pin = [-0.75, 0.0]
+    joints = {
+        "line": udk.Slot(["ground", "rod"], [[0.0, 0.0], pin]),
+        "D": udk.Distance(["ground", "rod"], [[0.0, 0.3], pin], 1.0),
+    }
+    return udk.Mechanism({"rod": udk.Body(1.0, 0.2, [1.4, -0.5], -0.8)}, joints)
+
+
+DIFFERENTIATED = {
+    "hung rod": (hung, "joint.D.length", "body.rod.x", VALUES + 0.2, 0),
+    "crank-rocker": (
+        lambda: udk.library.four_bar(np.pi / 3, **CRANK_ROCKER),
+        "joint.D.points[0][0]",
+        "body.crank.angle",
+        VALUES,
+        2,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", fast(["hung rod"], DIFFERENTIATED))
+def test_derivatives_of_positions_by_numbers_of_the_scene(name):
+    make, number, driver, values, body = DIFFERENTIATED[name]
+    mech = make()
 
     def f(g):
-        found = udk.kinematics(mech.with_parameters({"joint.D.points[0][0]": g}), "body.crank.angle", VALUES)
-        return jnp.stack([found.q[1, 2, 2], found.v[1, 2, 2], found.a[1, 2, 2]])
+        found = udk.kinematics(mech.with_parameters({number: g}), driver, values)
+        return jnp.stack([found.q[1, body, 2], found.v[1, body, 2], found.a[1, body, 2]])
 
     @jax.jit
     def all_of(g):
