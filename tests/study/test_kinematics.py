@@ -161,7 +161,7 @@ def hung():
     """A rod whose pin is on a line, 1 m from a point above it."""
     pin = [-0.75, 0.0]
     joints = {
-        "line": udk.Slot(["ground", "rod"], [[0.0, 0.0], pin]),
+        "line": udk.Slot(["ground", "rod"], [[0.0, 0.0], pin], axis=0.0),
         "D": udk.Distance(["ground", "rod"], [[0.0, 0.3], pin], 1.0),
     }
     return udk.Mechanism({"rod": udk.Body(1.0, 0.2, [1.4, -0.5], -0.8)}, joints)
