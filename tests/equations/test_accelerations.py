@@ -49,7 +49,8 @@ def moved(request, linkage, placed, data):
     known = reference(data, "rest_-50deg")
     states = [[x.ravel() for x in np.meshgrid(angles, [0.0, -1.0, 7.0])], IN_LINE, (known["theta"], known["thetad"])]
     theta, rate = (np.concatenate(x) for x in zip(*states, strict=True))
-    found = along(linkage, *jax.vmap(placed)(theta, rate), METHODS[request.param])
+    q, v = jax.vmap(placed)(theta, rate)
+    found = along(linkage, q, v, METHODS[request.param])
     ends = np.cumsum([len(x) for x, _ in states])[:-1]
     parts = zip(*(np.split(np.asarray(x), ends) for x in (theta, rate, *found)), strict=True)
     return request.param, dict(zip(("ordinary", "in line", "known"), parts, strict=True))

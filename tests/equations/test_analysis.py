@@ -85,7 +85,7 @@ def test_a_mechanism_made_while_something_is_traced():
     trace(1.5)
     assert [known for known, _ in seen] == [True, True, False, False]
     rows = udk.analyse(rail(1.0, 0.5)).redundant_rows
-    assert len(rows) == 1
+    assert rows is not None and len(rows) == 1
     assert [found for _, found in seen] == [udk.analyse(udk.library.parallelogram()).redundant_rows, rows, rows, None]
 
 

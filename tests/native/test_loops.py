@@ -312,7 +312,7 @@ def test_derivatives_of_runs_are_those_of_code_that_is_written_out(name, assembl
     at, along = (0.0, guess.q, guess.v), (1.0, jnp.asarray(dq), jnp.asarray(dv))
     found = []
     for large in (10**6, 0):
-        monkeypatch.setattr(size, "LARGE", large)
+        monkeypatch.setattr(size, "LARGE_SCENE", large)
         jax.clear_caches()  # which do not know of it, nor shall others
         value, slope = jax.jit(lambda *x: jax.jvp(measure, x, along))(*at)
         gradient = jax.jit(jax.grad(measure, (0, 1, 2)))(*at)
@@ -326,7 +326,7 @@ def test_derivatives_of_runs_are_those_of_code_that_is_written_out(name, assembl
 def test_scales_are_those_of_code_that_is_written_out(name, monkeypatch):
     found = []
     for large in (10**6, 0):
-        monkeypatch.setattr(size, "LARGE", large)
+        monkeypatch.setattr(size, "LARGE_SCENE", large)
         found.append(jax.tree.leaves(known_scales(SCENES[name]())))
     for one, other in zip(*found, strict=True):
         assert_allclose(other, one, rtol=1e-12)

@@ -78,7 +78,7 @@ def forgotten():
 def served(monkeypatch, request):
     """All of these runs are by machine code, but for those of tests that look themselves."""
     if request.param == "loops":
-        monkeypatch.setattr(structure, "LARGE", 0)
+        monkeypatch.setattr(structure, "LARGE_SCENE", 0)
         monkeypatch.setattr(analysis, "_analyses", analysis._Cache())  # what is found by loops is not left to other tests
     seen, module = [], sys.modules["udkjax.integrate.simulate"]
     reason = module.reason_for_diffrax
