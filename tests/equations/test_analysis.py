@@ -123,7 +123,7 @@ def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, name
     for module in homes:
         monkeypatch.setattr(module, name, factor * getattr(module, name))
     choose = redundancy.kinematic_rows
-    monkeypatch.setattr(redundancy, "rows_of", lambda mechanism: choose(mechanism, large))
+    monkeypatch.setattr(redundancy, "kinematic_rows", lambda mechanism: choose(mechanism, large))
     for kind, mechanism in scenes.items():
         rows = redundancy.redundant_rows(mechanism)
         assert rows is not None and len(rows) == len(expected[kind])

@@ -51,7 +51,7 @@ def test_sparse_analysis_finds_as_many_rows_as_singular_values_which_do_as_well(
     mech, choose = REDUNDANT[name](), redundancy.kinematic_rows
     q, found = np.asarray(mech.q0).ravel(), []
     for size in (False, True):
-        monkeypatch.setattr(redundancy, "rows_of", lambda mech, size=size: choose(mech, size))
+        monkeypatch.setattr(redundancy, "kinematic_rows", lambda mech, size=size: choose(mech, size))
         found.append(redundancy.redundant_rows(mech))
     dense = choose(mech, False)
     null_spaces = [p.null_space for p in redundancy.sample_positions(dense, q) if p.smallest > redundancy.ORDINARY]

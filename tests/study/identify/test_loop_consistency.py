@@ -59,7 +59,7 @@ def test_three_cranks_must_stay_equal(problems):
 
 
 def test_sparse_arithmetic_says_the_same(linkage, problems, monkeypatch):
-    monkeypatch.setattr(loop_consistency, "rows_of", lambda mechanism: kinematic_rows(mechanism, large=True))
+    monkeypatch.setattr(loop_consistency, "kinematic_rows", lambda mechanism: kinematic_rows(mechanism, large=True))
     assert [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(CHOICES, (3, 1), strict=True)] == problems
     assert len(problems[0]) == 1 and problems[1] == []
 
@@ -79,7 +79,7 @@ def test_all_three_tied_are_legal_and_so_are_masses(linkage):
 
 
 def test_of_masses_nothing_is_looked_at(linkage, monkeypatch):
-    monkeypatch.setattr(loop_consistency, "positions_of", None)
+    monkeypatch.setattr(loop_consistency, "sample_positions", None)
     assert asked(linkage, "body.link1.mass", "gravity[1]") == []
 
 
@@ -138,7 +138,7 @@ def test_a_tie_that_is_legal_at_one_position_only_is_refused(monkeypatch):
     assert "larger cannot move by itself" in problem
     monkeypatch.setattr(loop_consistency.RedundantLoops, "_closes", lambda *_: True)
     assert loop_problems(mechanism, apply, [0.0], ["larger"]) == [problem]
-    monkeypatch.setattr(loop_consistency, "positions_of", lambda rows, q: [rows.close(0.0, q)])
+    monkeypatch.setattr(loop_consistency, "sample_positions", lambda rows, q: [rows.close(0.0, q)])
     assert loop_problems(mechanism, apply, [0.0], ["larger"]) == []
 
 
