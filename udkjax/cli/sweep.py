@@ -101,11 +101,11 @@ def _arguments(grid: Path) -> dict[str, Any]:
 
 def _estimate(mech: Any, arguments: dict[str, Any], memory: int, json: bool) -> None:
     from udkjax.show.sweep_summary import estimate_summary
-    from udkjax.study.sweep.dry_run import estimate
-    from udkjax.study.sweep.plan import planned
+    from udkjax.study.sweep.dry_run import estimate_cost
+    from udkjax.study.sweep.plan import make_plan
 
-    plan = planned(mech, **arguments)
-    found = estimate(plan, memory)
+    plan = make_plan(mech, **arguments)
+    found = estimate_cost(plan, memory)
     show(asdict(found), estimate_summary(plan, found), json)
 
 
@@ -132,7 +132,7 @@ def _client(engine: str, scheduler: str | None) -> Iterator[Any]:
     if engine != "dask" and scheduler is None:
         yield None
         return
-    from udkjax.study.sweep.executors import started
+    from udkjax.study.sweep.executors import start_client
 
-    with started(scheduler) as client:
+    with start_client(scheduler) as client:
         yield client

@@ -9,24 +9,24 @@ from udkjax.integrate import Result
 from udkjax.show.summary import table
 from udkjax.show.sweep_figures import RESULT, scalars
 from udkjax.study.sweep.chunk import bytes_per_member, variables_of
-from udkjax.study.sweep.dry_run import Estimate
+from udkjax.study.sweep.dry_run import SweepCost
 from udkjax.study.sweep.plan import Plan
 from udkjax.study.sweep.sweep_progress import duration
 from udkjax.study.wording import plural
 
 
-def estimate_summary(plan: Plan, estimate: Estimate) -> str:
+def estimate_summary(plan: Plan, cost: SweepCost) -> str:
     """Describe what a sweep will take."""
     shape = " x ".join(f"{dimension.size} {dimension.name}" for dimension in plan.dimensions)
-    tried = "" if estimate.tried == estimate.groups else f", {estimate.tried} of which were tried"
-    computing, compiling = duration(estimate.computing), duration(estimate.compiling)
+    tried = "" if cost.tried == cost.groups else f", {cost.tried} of which were tried"
+    computing, compiling = duration(cost.computing), duration(cost.compiling)
     lines = {
-        "members": f"{estimate.members}: {shape}",
+        "members": f"{cost.members}: {shape}",
         "kept of each": f"{bytes_per_member(plan)} bytes: {', '.join(variables_of(plan))}",
-        "programs": plural(estimate.groups, "program") + tried,
-        "chunks": f"{estimate.chunks}",
-        "dataset": size(estimate.kept),
-        "memory": f"{size(estimate.memory)} at most" if estimate.memory else "not known on this system",
+        "programs": plural(cost.groups, "program") + tried,
+        "chunks": f"{cost.chunks}",
+        "dataset": size(cost.kept),
+        "memory": f"{size(cost.memory)} at most" if cost.memory else "not known on this system",
         "time": f"about {computing} on the devices of this process, and {compiling} to compile",
     }
     return table(f"{plan.mechanism.name or 'mechanism'}: a sweep", lines)

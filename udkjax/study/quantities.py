@@ -2,9 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
 
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.scene.reshaping import with_angle, with_length
 
 
@@ -15,7 +18,7 @@ class Length:
     bodies: tuple[str, ...]
     as_rod: bool = False
 
-    def __call__(self, mechanism: Mechanism, value: Any) -> Mechanism:
+    def __call__(self, mechanism: Mechanism, value: ArrayLike) -> Mechanism:
         return with_length(mechanism, self.bodies, value, self.as_rod)
 
     def __str__(self) -> str:
@@ -28,7 +31,7 @@ class Angle:
 
     bodies: tuple[str, ...]
 
-    def __call__(self, mechanism: Mechanism, value: Any) -> Mechanism:
+    def __call__(self, mechanism: Mechanism, value: ArrayLike) -> Mechanism:
         return with_angle(mechanism, self.bodies, value)
 
 
@@ -38,5 +41,12 @@ class Scaled:
 
     factors: Mapping[str, float]
 
-    def __call__(self, mechanism: Mechanism, value: Any) -> Mechanism:
-        return mechanism.with_parameters({name: factor * value for name, factor in self.factors.items()})
+    def __call__(self, mechanism: Mechanism, value: ArrayLike) -> Mechanism:
+        return mechanism.with_parameters({name: factor * jnp.asarray(value) for name, factor in self.factors.items()})
+
+
+def parameter_value(mechanism: Mechanism, name: str) -> Array:
+    """Return the value of a parameter that is there, or one entry of it (`joint.A.points[1][0]`)."""
+    known = parameters_of(mechanism)
+    owner, index = split_index(name, known)
+    return jnp.asarray(known[owner].value)[index]

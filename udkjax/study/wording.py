@@ -12,7 +12,7 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def listed(names: Sequence[str]) -> str:
+def join_names(names: Sequence[str]) -> str:
     """Return names as they stand in a sentence: "a, b and c"."""
     if len(names) > MOST_LISTED:
         return f"{', '.join(names[:MOST_LISTED])} and {len(names) - MOST_LISTED} more"
@@ -24,7 +24,7 @@ def ratio(values: Sequence[float] | np.ndarray) -> str:
     return " : ".join(f"{v / values[0]:.4g}" for v in values)
 
 
-def aligned(cells: Sequence[Sequence[str]]) -> list[str]:
+def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:
     """Return the lines of a table, its columns below each other."""
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  " + "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip() for row in cells]

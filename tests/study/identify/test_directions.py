@@ -2,19 +2,19 @@
 
 import numpy as np
 
-from udkjax.study.identify.directions import connected, echelon, null_space, row_space
-from udkjax.study.wording import listed, ratio
+from udkjax.study.identify.directions import connected_columns, echelon, null_space, row_space
+from udkjax.study.wording import join_names, ratio
 
 
 def test_spaces_of_rows():
     matrix = np.array([[2.0, -4.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [2.0, -4.0, 0.0, 3.0]])
     np.testing.assert_allclose(row_space(matrix, 1e-9), [[1.0, -2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]], atol=1e-12)
     np.testing.assert_allclose(echelon(null_space(matrix, 1e-9)), [[1.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], atol=1e-12)
-    assert connected(row_space(matrix, 1e-9)) == [[0, 1], [3]]
-    assert connected(np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, 0.0]])) == [[0, 1, 2, 3]]
+    assert connected_columns(row_space(matrix, 1e-9)) == [[0, 1], [3]]
+    assert connected_columns(np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, 0.0]])) == [[0, 1, 2, 3]]
 
 
 def test_words():
-    assert listed(["a"]) == "a" and listed(["a", "b", "c"]) == "a, b and c"
-    assert listed([str(k) for k in range(10)]) == "0, 1, 2, 3, 4, 5, 6, 7 and 2 more"
+    assert join_names(["a"]) == "a" and join_names(["a", "b", "c"]) == "a, b and c"
+    assert join_names([str(k) for k in range(10)]) == "0, 1, 2, 3, 4, 5, 6, 7 and 2 more"
     assert ratio([2.0, 1.0, -4.0]) == "1 : 0.5 : -2"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.study.identify.estimate import Estimate, rounded
+from udkjax.study.identify.estimate import Estimate, format_value
 from udkjax.study.identify.least_squares import squares
 from udkjax.study.identify.records import Record, labels
 
@@ -29,7 +29,7 @@ from udkjax.study.identify.records import Record, labels
     ],
 )
 def test_values_are_said_as_far_as_they_are_known(value, error, said):
-    assert rounded(value, error) == said
+    assert format_value(value, error) == said
 
 
 def test_records_without_a_name_of_their_own_are_numbered():

@@ -13,7 +13,7 @@ import pytest
 
 from udkjax.extras import MissingExtraError
 from udkjax.study.sweep import executors as cluster
-from udkjax.study.sweep.executors import ClusterError, dask
+from udkjax.study.sweep.executors import ClusterError, dask_engine
 from udkjax.study.sweep.plan import Chunk
 
 dask_config = pytest.importorskip("dask.config", reason="dask is not installed: pip install 'udkjax[dask]'")
@@ -54,7 +54,7 @@ def test_every_chunk_is_computed_once_and_few_are_under_way(client, monkeypatch)
 
     compute(monkeypatch, run)
     found = {}
-    for chunk, data, seconds in dask(client)(PLAN, CHUNKS):
+    for chunk, data, seconds in dask_engine(client)(PLAN, CHUNKS):
         handed += 1
         found[chunk.index] = data["square"]
         assert 0 <= seconds < 10
@@ -74,11 +74,11 @@ def test_what_raises_once_is_tried_again_and_what_always_does_is_told(client, mo
 
     compute(monkeypatch, run)
     failures = cluster.RETRIES + 1
-    assert len(list(dask(client)(PLAN, CHUNKS[:5]))) == 5
+    assert len(list(dask_engine(client)(PLAN, CHUNKS[:5]))) == 5
     assert tried.count(3) == failures and tried.count(2) == 1
     failures, tried = 10**6, []
     with pytest.raises(OSError, match="no space left"):
-        list(dask(client)(PLAN, CHUNKS))
+        list(dask_engine(client)(PLAN, CHUNKS))
 
 
 def test_a_sweep_that_is_given_up_leaves_nothing_on_the_cluster(client, monkeypatch):
@@ -91,7 +91,7 @@ def test_a_sweep_that_is_given_up_leaves_nothing_on_the_cluster(client, monkeypa
 
     compute(monkeypatch, run)
     mine: Any = SimpleNamespace(factor=3.0)
-    results = dask(client)(mine, CHUNKS)
+    results = dask_engine(client)(mine, CHUNKS)
     next(results)
     results.close()
     gate.set()
@@ -103,7 +103,7 @@ def test_a_sweep_that_is_given_up_leaves_nothing_on_the_cluster(client, monkeypa
 
 def test_workers_with_other_versions_are_refused(client, monkeypatch):
     compute(monkeypatch, squares)
-    engine = dask(client)
+    engine = dask_engine(client)
     mine, main = cluster._deciding(), threading.current_thread()
     other = mine | {"jax": "0.1"}
     monkeypatch.setattr(cluster, "_deciding", lambda: mine if threading.current_thread() is main else other)
@@ -127,14 +127,14 @@ def test_a_chunk_that_kills_its_workers_is_named():
         distributed.Client(local) as client,
         pytest.raises(ClusterError, match=r"chunk 0 \(3 members\) was being computed by several workers that died"),
     ):
-        list(dask(client)(deadly, CHUNKS[:1]))
+        list(dask_engine(client)(deadly, CHUNKS[:1]))
 
 
 def test_without_dask_or_a_client_the_cure_is_told(monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(distributed, "default_client", lambda: (_ for _ in ()).throw(ValueError))
         with pytest.raises(ClusterError, match=r"client=distributed\.Client"):
-            dask()
+            dask_engine()
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'udkjax\[dask\]'"):
-        dask()
+        dask_engine()

@@ -6,17 +6,17 @@ import sys
 import numpy as np
 
 from udkjax.study.sweep import store as disk
-from udkjax.study.sweep.store import packed, unpacked, write_whole
+from udkjax.study.sweep.store import pack, unpack, write_whole
 
 
 def test_an_archive_with_any_bit_changed_or_cut_off_is_none(tmp_path):
-    content = packed({"q": np.arange(3.0)})
-    np.testing.assert_array_equal((unpacked(content) or {})["q"], np.arange(3.0))
+    content = pack({"q": np.arange(3.0)})
+    np.testing.assert_array_equal((unpack(content) or {})["q"], np.arange(3.0))
     for place in range(len(content)):
         damaged = bytearray(content)
         damaged[place] ^= 1 << place % 8
-        assert unpacked(bytes(damaged)) is None
-        assert unpacked(content[:place]) is None
+        assert unpack(bytes(damaged)) is None
+        assert unpack(content[:place]) is None
     (tmp_path / "chunk.npz").write_bytes(content)  # which anyone can read
     np.testing.assert_array_equal(np.load(tmp_path / "chunk.npz")["q"], np.arange(3.0))
 

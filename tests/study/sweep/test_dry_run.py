@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from udkjax.study.sweep import dry_run
-from udkjax.study.sweep.dry_run import estimate
+from udkjax.study.sweep.dry_run import estimate_cost
 
 GROUPS = [SimpleNamespace(index=k, members=np.arange(1000 * k, 1000 * k + 1000)) for k in range(5)]
 PLAN: Any = SimpleNamespace(size=5000, groups=GROUPS)
@@ -34,7 +34,7 @@ def tried(monkeypatch):
 
 
 def test_a_sample_of_some_groups_says_how_long_all_take(tried):
-    found = estimate(PLAN)
+    found = estimate_cost(PLAN)
     assert sorted(set(tried)) == [0, 2, 4]
     assert (found.members, found.groups, found.tried, found.chunks, found.kept) == (5000, 5, 3, 7, 500_000)
     assert found.compiling == pytest.approx(15.0)

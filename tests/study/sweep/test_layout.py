@@ -8,10 +8,10 @@ import scipy.stats
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.sweep.axes import spread
+from udkjax.study.sweep.axes import scale_to_range
 from udkjax.study.sweep.fingerprint import fingerprint
-from udkjax.study.sweep.layout import laid_out
-from udkjax.study.sweep.plan import planned
+from udkjax.study.sweep.layout import lay_out
+from udkjax.study.sweep.plan import make_plan
 
 TS = [0.0, 1.0]
 
@@ -23,7 +23,7 @@ def linkage():
 
 def problems(mechanism, axes, measure="final", **arguments):
     with pytest.raises(udk.SweepError) as raised:
-        planned(mechanism, axes, TS, measure, **arguments)
+        make_plan(mechanism, axes, TS, measure, **arguments)
     return raised.value.problems
 
 
@@ -33,14 +33,14 @@ def test_a_grid_has_its_axes_as_dimensions_and_zipped_ones_share_one(linkage):
         "both": udk.Zipped({"rtol": [1e-4, 1e-8], "method": [udk.SVD(), udk.Varga()]}),
         "tol": udk.Axis([1e-9], of=["atol", "rank_tol"]),
     }
-    dimensions = laid_out(linkage, axes)
+    dimensions = lay_out(linkage, axes)
     assert [(d.name, d.size, [c.name for c in d.columns]) for d in dimensions] == [
         ("body.link1.mass", 3, ["body.link1.mass"]),
         ("both", 2, ["rtol", "method"]),
         ("tol", 1, ["tol"]),
     ]
     assert dimensions[0].columns[0].units == "kg"
-    plan = planned(linkage, axes, TS)
+    plan = make_plan(linkage, axes, TS)
     assert plan.size == 6 and plan.shape == (3, 2, 1)
     assert plan.places(np.array([0, 3, 5]))["method"].tolist() == [0, 1, 1]
     assert [group.members.tolist() for group in plan.groups] == [[0, 2, 4], [1, 3, 5]]
@@ -52,7 +52,7 @@ def test_choices_that_differ_by_numbers_share_a_program(linkage):
         "stabilization": [udk.Baumgarte(0.0, 0.0), udk.Baumgarte(1000.0, 100.0), None],
         "mechanism": [udk.library.parallelogram(angle) for angle in (-0.7, -0.5)],
     }
-    plan = planned(linkage, axes, TS)
+    plan = make_plan(linkage, axes, TS)
     assert [len(group.members) for group in plan.groups] == [4, 2]
     (column, mechanisms) = plan.columns
     assert column.labels == ("Baumgarte(alpha=0, beta=0)", "Baumgarte(alpha=1000, beta=100)", "none")
@@ -62,19 +62,19 @@ def test_choices_that_differ_by_numbers_share_a_program(linkage):
 @pytest.mark.parametrize("design", [udk.Sobol(16, seed=3), udk.LatinHypercube(16, seed=3), udk.Random(16, seed=3)])
 def test_a_design_fills_ranges_and_distributions_and_repeats_itself(linkage, design):
     axes = {"body.link1.mass": (1.0, 3.0), "rtol": scipy.stats.loguniform(1e-8, 1e-4), "method": [udk.SVD(), udk.Varga()]}
-    member, method = laid_out(linkage, axes, design)
+    member, method = lay_out(linkage, axes, design)
     assert (member.name, member.size, method.size) == ("member", 16, 2)
     mass, rtol = (column.values for column in member.columns)
     assert np.all((mass > 1) & (mass < 3) & (rtol > 1e-8) & (rtol < 1e-4)) and len(set(mass)) == 16
-    again = laid_out(linkage, axes, design)[0].columns[0].values
+    again = lay_out(linkage, axes, design)[0].columns[0].values
     assert_allclose(again, mass, rtol=0)
-    assert not np.allclose(laid_out(linkage, axes, type(design)(16, seed=4))[0].columns[0].values, mass)
+    assert not np.allclose(lay_out(linkage, axes, type(design)(16, seed=4))[0].columns[0].values, mass)
 
 
 def test_a_latin_hypercube_has_one_member_in_each_part():
     unit = udk.LatinHypercube(50).unit(3)
     assert np.all(np.sort(np.floor(50 * unit), axis=0) == np.arange(50)[:, None])
-    assert spread((2.0, 1.0), unit[:, 0]) is None
+    assert scale_to_range((2.0, 1.0), unit[:, 0]) is None
 
 
 @pytest.mark.parametrize(
@@ -116,13 +116,13 @@ def test_all_mistakes_are_named_at_once(linkage):
 
 
 def test_gains_are_varied_of_a_stabilization_that_has_some(linkage):
-    assert isinstance(planned(linkage, {"alpha": [1.0, 2.0]}, TS).settings["stabilization"], udk.Baumgarte)
+    assert isinstance(make_plan(linkage, {"alpha": [1.0, 2.0]}, TS).settings["stabilization"], udk.Baumgarte)
 
 
 def test_the_fingerprint_tells_what_decides_the_results(linkage):
     def of(values=(1e-4, 1e-6), measure: object = "final", mechanism=linkage, factor=2.0, **settings):
         length = udk.Axis([1.0], of=lambda m, x: m.with_parameters({"body.coupler.mass": factor * x}))
-        return fingerprint(planned(mechanism, {"rtol": values, "x": length}, TS, measure, **settings))
+        return fingerprint(make_plan(mechanism, {"rtol": values, "x": length}, TS, measure, **settings))
 
     def last(power):
         return {"angle": lambda m, s: s.q[-1, 0, 2] ** power}

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.study.exact import exact_coordinates
-from udkjax.study.sweep.measures import NOT_REACHED, guessed, measures_of
+from udkjax.study.sweep.measures import NOT_REACHED, guess_label, measures_of
 
 TS = np.linspace(0.0, 1.0, 6)
 
@@ -27,10 +27,10 @@ def test_only_what_needs_all_output_times_gets_them():
 
 
 def test_a_users_arrays_are_labelled_by_their_shapes():
-    assert guessed("x", (6, 4, 3), 6, 4).dims == ("time", "body", "coordinate")
-    assert guessed("x", (6, 2), 6, 4).dims == ("time", "x_1")
-    assert guessed("x", (4, 3), 6, 4).dims == ("body", "coordinate")
-    assert guessed("x", (), 6, 4).dims == ()
+    assert guess_label("x", (6, 4, 3), 6, 4).dims == ("time", "body", "coordinate")
+    assert guess_label("x", (6, 2), 6, 4).dims == ("time", "x_1")
+    assert guess_label("x", (4, 3), 6, 4).dims == ("body", "coordinate")
+    assert guess_label("x", (), 6, 4).dims == ()
 
 
 @pytest.mark.slow

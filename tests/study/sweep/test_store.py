@@ -12,7 +12,7 @@ import pytest
 
 from udkjax.study.sweep import store
 from udkjax.study.sweep.plan import Chunk
-from udkjax.study.sweep.store import Memory, Store, StoreError, opened
+from udkjax.study.sweep.store import FolderStore, MemoryStore, StoreError, open_store
 
 FINGERPRINT = {"settings": {"rtol": 1e-8}, "scene": "format = 1\nmass = 1.0\n", "axes": [1.0, 2.0, float("nan")]}
 
@@ -29,7 +29,7 @@ def data(chunk):
 
 
 def not_done(kept, chunks=CHUNKS):
-    return store.left(chunks, kept.done("result")[0])
+    return store.unfinished_chunks(chunks, kept.done("result")[0])
 
 
 def collected(kept):
@@ -44,7 +44,7 @@ def files(folder):
 @pytest.mark.parametrize("place", ["folder", None])
 def test_what_is_finished_is_left_out_and_given_back(tmp_path, place):
     out = place and tmp_path / place
-    with opened(out, FINGERPRINT) as kept:
+    with open_store(out, FINGERPRINT) as kept:
         assert not_done(kept) == CHUNKS
         kept.write(CHUNKS[1], data(CHUNKS[1]))
         assert not_done(kept) == [CHUNKS[0], CHUNKS[2]]
@@ -55,12 +55,12 @@ def test_what_is_finished_is_left_out_and_given_back(tmp_path, place):
         np.testing.assert_array_equal(members, [0, 5])
         assert {name: values.dtype.kind for name, values in found.items()} == {"result": "i", "q": "f"}
         np.testing.assert_array_equal(found["q"], data(CHUNKS[1])["q"])
-    assert isinstance(kept, Memory if place is None else Store)
+    assert isinstance(kept, MemoryStore if place is None else FolderStore)
 
 
 def test_what_is_kept_may_have_any_name(tmp_path):
     given = {name: np.array([k, 2 * k]) for k, name in enumerate(("file", "members", "allow_pickle", "kept/x", "a b"))}
-    with Store(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as kept:
         kept.write(CHUNKS[0], given)
         ((members, found),) = kept.finished()
     np.testing.assert_array_equal(members, CHUNKS[0].members)
@@ -68,9 +68,9 @@ def test_what_is_kept_may_have_any_name(tmp_path):
 
 
 def test_a_sweep_goes_on_where_it_was_cut_into_other_chunks(tmp_path):
-    with Store(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as kept:
         kept.write(CHUNKS[0], data(CHUNKS[0]))
-    with Store(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as kept:
         left = not_done(kept, [chunk(0, [0, 1, 2]), chunk(1, [3, 4]), chunk(2, [5])])
         assert [c.members.tolist() for c in left] == [[0, 2], [3], [5]]
         assert [(c.index, c.work) for c in left] == [(0, 4.0), (1, 3.0), (2, 6.0)]
@@ -84,13 +84,13 @@ def test_a_sweep_goes_on_where_it_was_cut_into_other_chunks(tmp_path):
     "damage", [lambda content: content[: len(content) // 2], lambda content: b"", lambda content: b"\0" * len(content)]
 )
 def test_a_damaged_chunk_is_computed_again_and_no_other(tmp_path, damage):
-    with Store(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as kept:
         for c in CHUNKS:
             kept.write(c, data(c))
         whole = collected(kept)
         broken = files(tmp_path)[1]
         broken.write_bytes(damage(broken.read_bytes()))
-    with Store(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as kept:
         with pytest.warns(UserWarning, match=f"{broken.name} is damaged"):
             left = not_done(kept)
         assert left == [CHUNKS[1]]
@@ -99,12 +99,12 @@ def test_a_damaged_chunk_is_computed_again_and_no_other(tmp_path, damage):
 
 
 def test_another_sweep_is_refused_and_the_difference_spelled_out(tmp_path):
-    with Store(tmp_path, FINGERPRINT):
+    with FolderStore(tmp_path, FINGERPRINT):
         pass
     before = (tmp_path / "sweep.json").read_bytes()
     other = {"settings": {"rtol": 1e-9}, "scene": "format = 1\nmass = 2.0\n", "axes": [1.0, 2.5, float("nan")]}
     with pytest.raises(StoreError) as caught:
-        Store(tmp_path, other)
+        FolderStore(tmp_path, other)
     for line in (
         "settings.rtol: was 1e-08, is 1e-09",
         "scene: was mass = 1.0",
@@ -114,7 +114,7 @@ def test_another_sweep_is_refused_and_the_difference_spelled_out(tmp_path):
         assert line in str(caught.value)
     assert "format = 1" not in str(caught.value) and "axes[2]" not in str(caught.value)
     assert (tmp_path / "sweep.json").read_bytes() == before
-    with Store(tmp_path, FINGERPRINT):  # which gave the lock back
+    with FolderStore(tmp_path, FINGERPRINT):  # which gave the lock back
         pass
 
 
@@ -122,13 +122,13 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
     (tmp_path / "chunks").mkdir()
     (tmp_path / "chunks" / "0.npz").write_bytes(b"")
     with pytest.raises(StoreError, match=r"no sweep\.json that says of which sweep"):
-        Store(tmp_path, FINGERPRINT)
+        FolderStore(tmp_path, FINGERPRINT)
     (tmp_path / "sweep.json").write_text("{")
     with pytest.raises(StoreError, match="no description of a sweep"):
-        Store(tmp_path, FINGERPRINT)
+        FolderStore(tmp_path, FINGERPRINT)
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot write to the folder"):
-        Store(tmp_path / "file", FINGERPRINT)
+        FolderStore(tmp_path / "file", FINGERPRINT)
 
 
 def test_two_processes_do_not_write_the_same_sweep(tmp_path):
@@ -142,25 +142,25 @@ def test_two_processes_do_not_write_the_same_sweep(tmp_path):
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout and other.stdout.readline() == "taken\n"
         with pytest.raises(StoreError, match=f"is being written to by process {other.pid} on "):
-            Store(tmp_path, FINGERPRINT)
+            FolderStore(tmp_path, FINGERPRINT)
         other.send_signal(signal.SIGKILL)
-    with Store(tmp_path, FINGERPRINT), pytest.raises(StoreError, match=f"by process {os.getpid()} on "):
-        Store(tmp_path, FINGERPRINT)
+    with FolderStore(tmp_path, FINGERPRINT), pytest.raises(StoreError, match=f"by process {os.getpid()} on "):
+        FolderStore(tmp_path, FINGERPRINT)
 
 
 def test_what_was_being_written_when_the_process_died_is_removed(tmp_path):
-    with Store(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as kept:
         kept.write(CHUNKS[0], data(CHUNKS[0]))
     torn = tmp_path / "chunks" / f"000001-abc.npz.123{store.UNFINISHED}"
     torn.write_bytes(b"half")
-    with Store(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as kept:
         assert not torn.exists()
         assert not_done(kept) == CHUNKS[1:]
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
 def test_a_full_disk_is_named_and_what_is_finished_stays_valid(tmp_path, monkeypatch, call):
-    with Store(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as kept:
         kept.write(CHUNKS[0], data(CHUNKS[0]))
 
         def full(*_):
@@ -171,12 +171,12 @@ def test_a_full_disk_is_named_and_what_is_finished_stays_valid(tmp_path, monkeyp
             with pytest.raises(StoreError, match=r"No space left on device; 1 chunks in .* stay valid.*run the same sweep again"):
                 kept.write(CHUNKS[1], data(CHUNKS[1]))
         assert len(files(tmp_path)) == 1
-    with Store(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as kept:
         assert not_done(kept) == CHUNKS[1:]
 
 
 def test_the_manifest_says_what_the_sweep_is(tmp_path):
-    with Store(tmp_path, FINGERPRINT):
+    with FolderStore(tmp_path, FINGERPRINT):
         pass
     said = json.loads((tmp_path / "sweep.json").read_text())
     assert said["settings"] == {"rtol": 1e-8} and said["scene"] == FINGERPRINT["scene"]

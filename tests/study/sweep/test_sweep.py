@@ -14,7 +14,7 @@ import udkjax as udk
 from udkjax.study.sweep.chunk import program, run
 from udkjax.study.sweep.cutting import SECONDS, _cut, cut_chunks, lane_steps
 from udkjax.study.sweep.dataset import NOT_COMPUTED, assemble
-from udkjax.study.sweep.plan import planned
+from udkjax.study.sweep.plan import make_plan
 
 LINKS = ("link1", "link2", "link3")
 TS = np.linspace(0.0, 1.0, 6)
@@ -41,7 +41,7 @@ def reference(pendulum):
 
 @pytest.fixture(scope="module")
 def plan(pendulum, reference):
-    return planned(pendulum, AXES, TS, ["final", "error", "counts", swing], reference=reference, max_steps=STEPS)
+    return make_plan(pendulum, AXES, TS, ["final", "error", "counts", swing], reference=reference, max_steps=STEPS)
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from udkjax.integrate.assembly import close
 from udkjax.study.exact import exact_coordinates
 from udkjax.study.sweep.chunk import program, run
 from udkjax.study.sweep.cutting import cut_chunks
-from udkjax.study.sweep.plan import planned
+from udkjax.study.sweep.plan import make_plan
 
 LINKS = ("link1", "link2", "link3")
 DEVICES = 8
@@ -103,7 +103,7 @@ def spread():
         "angle": udk.Axis((-0.9, -0.6), of=lambda m, x: udk.with_angle(m, LINKS, x)),
         "tol": udk.Axis(scipy.stats.loguniform(1e-10, 1e-3), of=["rtol", "atol"]),
     }
-    return planned(udk.library.parallelogram(), axes, [0.0, 10.0], design=udk.Sobol(4096))
+    return make_plan(udk.library.parallelogram(), axes, [0.0, 10.0], design=udk.Sobol(4096))
 
 
 @pytest.mark.slow
@@ -166,7 +166,7 @@ def test_the_papers_table_is_one_sweep():
     settings = {"solver": udk.Adams(), "dt0": 0.66e-2, "drift_tol": np.inf, "max_steps": 200_000}
     exact = exact_coordinates(linkage, ts, linkage.q0, linkage.v0)
     assert exact is not None
-    plan = planned(linkage, axes, ts, ["error", "counts", "rank"], reference=exact, **settings)
+    plan = make_plan(linkage, axes, ts, ["error", "counts", "rank"], reference=exact, **settings)
     assert len(plan.groups) == 5  # gains are numbers
     data = udk.sweep(linkage, axes, ts, ["error", "counts", "rank"], reference=exact, progress=False, **settings)
     assert data.angle_error.shape == (5, 3, 2) and np.all(data.result == 0)

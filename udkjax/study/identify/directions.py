@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.study.wording import listed
+from udkjax.study.wording import join_names
 
 # Of the largest singular value of a Jacobian: directions below it do not show in what was measured. A change that leaves the
 # equations of motion as they are has 1e-16, whatever the tolerance; derivatives integrated at 1e-7 have errors of 1e-8.
@@ -73,7 +73,7 @@ def echelon(rows: Float[np.ndarray, "R K"], tol: float = COEFFICIENT) -> Float[n
     return np.where(np.abs(rows) > tol * np.abs(rows).max(axis=1, keepdims=True, initial=0.0), rows, 0.0)
 
 
-def connected(relations: Float[np.ndarray, "R K"]) -> list[list[int]]:
+def connected_columns(relations: Float[np.ndarray, "R K"]) -> list[list[int]]:
     """Return the sets of columns that rows connect; columns of zeros are in none."""
     sets: list[set[int]] = []
     for row in relations:
@@ -109,7 +109,7 @@ def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Dir
     relative = np.array([kind != "free" and value != 0.0 for kind, value in zip(kinds, x, strict=True)])
     factors = np.where(relative, change / np.where(relative, x, 1.0), 0.0)
     if len(there) > 1 and relative.all() and np.all(np.abs(factors / factors[0] - 1.0) < COMMON):
-        text = f"{listed(names)} by a common factor"
+        text = f"{join_names(names)} by a common factor"
     else:
         reference = factors if relative.any() else coefficients[there]
         unit = 0.01 / reference[np.argmax(np.abs(reference))]
@@ -117,5 +117,5 @@ def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Dir
             f"{name} {100 * unit * f:+.3g} %" if percent else f"{name} {unit * dx:+.3g} {values.units[k]}".rstrip()
             for name, percent, f, dx, k in zip(names, relative, factors, change, there, strict=True)
         ]
-        text = parts[0] + (f" with {listed(parts[1:])}" if len(parts) > 1 else "")
+        text = parts[0] + (f" with {join_names(parts[1:])}" if len(parts) > 1 else "")
     return Direction(tuple(names), coefficients[there] / np.abs(coefficients).max(), text)

@@ -27,7 +27,7 @@ from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikeliho
 from udkjax.study.identify.records import IdentificationError, labels
 from udkjax.study.identify.uncertainty import Uncertainty, Whiteness
 from udkjax.study.identify.unknowns import apply_values
-from udkjax.study.wording import aligned, listed, plural
+from udkjax.study.wording import join_names, plural, table_lines
 
 if TYPE_CHECKING:
     import xarray
@@ -191,7 +191,7 @@ class Estimate:
         cells = [("parameter", "value", "standard error", "unit", "first guess", "")]
         for row in self.rows():
             error = "unknown" if not math.isfinite(row.standard_error) else f"{row.standard_error:.2g}"
-            value = rounded(row.value, row.standard_error)
+            value = format_value(row.value, row.standard_error)
             cells.append((row.parameter, value, error, row.units, f"{row.first_guess:.6g}", row.note))
         return cells
 
@@ -214,13 +214,13 @@ class Estimate:
                 if own.any():
                     sigma = np.nanmedian(self.noise[int(problem.index[np.argmax(own), 0])][channel.name])
                     found.append(f"{channel.name} {sigma:.3g} {channel.units}".rstrip())
-            facts["noise, estimated"] = listed(found)
+            facts["noise, estimated"] = join_names(found)
         return facts
 
     def __str__(self) -> str:
         facts = self._facts()
         width = max(map(len, facts))
-        lines = [self._head(), *aligned(self._cells()), *(f"  {name:<{width}}  {text}" for name, text in facts.items())]
+        lines = [self._head(), *table_lines(self._cells()), *(f"  {name:<{width}}  {text}" for name, text in facts.items())]
         return "\n".join([*lines, self.message])
 
     def _repr_html_(self) -> str:
@@ -366,7 +366,7 @@ def profiles_dataset(
     return xarray.Dataset(data, {"profile": [found.name for found in profiles], "end": ["low", "high"]})
 
 
-def rounded(value: float, error: float) -> str:
+def format_value(value: float, error: float) -> str:
     """Return a value with as many digits as its standard error allows, and one more."""
     if not (math.isfinite(error) and error > 0 and value):
         return f"{value:.6g}"

@@ -30,7 +30,7 @@ from udkjax.study.identify.problem import Problem, Residuals
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.records import labels as record_labels
-from udkjax.study.wording import aligned, listed
+from udkjax.study.wording import join_names, table_lines
 
 AGREEMENT = 3.0  # floors: a floor is a sum of sizes, each of which was measured once
 USEFUL = 0.1  # of the derivative's size: where the floor is higher, agreement says little
@@ -284,7 +284,7 @@ def _sentences(check: GradientCheck) -> list[str]:
         if sentence := _sentence(check, d, s):
             found.setdefault(sentence, []).append(name)
     count = len(check.names)
-    return [f"{'all directions' if len(names) == count > 1 else listed(names)}: {text}" for text, names in found.items()]
+    return [f"{'all directions' if len(names) == count > 1 else join_names(names)}: {text}" for text, names in found.items()]
 
 
 def _sentence(check: GradientCheck, d: int, s: int) -> str:
@@ -323,4 +323,4 @@ def _table(check: GradientCheck) -> str:
         where = [check.labels[s]] if several else []
         cells.append((name, *where, f"{size:.3g} {check.units[s]}".rstrip(), *relative, f"{check.step[d, s]:.0e}", verdict))
     title = f"{check.title}: derivatives against differences, at a tolerance of {check.tol[0]:.1g}"
-    return "\n".join([title, *aligned(cells), check.message])
+    return "\n".join([title, *table_lines(cells), check.message])

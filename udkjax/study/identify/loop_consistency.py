@@ -25,8 +25,8 @@ from udkjax.equations.sparse_rows import SparseRows
 from udkjax.scene.checks import quote
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.identify.directions import COEFFICIENT, connected, echelon, null_space, row_space
-from udkjax.study.wording import listed, ratio
+from udkjax.study.identify.directions import COEFFICIENT, connected_columns, echelon, null_space, row_space
+from udkjax.study.wording import join_names, ratio
 
 # Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions
 # that are closed to 1e-11 leave 5e-12 of it; a parameter that opens a loop leaves a tenth or more.
@@ -72,7 +72,7 @@ def loop_problems(
     loops = RedundantLoops(mechanism, lambda change: placed(x + change @ at), x[moving], steps[moving])
     if redundant and loops.redundant < len(redundant):
         return [
-            f"the first guesses of {listed(names)} open a loop that closes with the scene's own values: it has more "
+            f"the first guesses of {join_names(names)} open a loop that closes with the scene's own values: it has more "
             "constraints than it needs, and only certain values satisfy all of them; start from such values"
         ]
     return loops.problems(names) if loops.redundant else []
@@ -137,11 +137,11 @@ class RedundantLoops:
         """One message for each set of parameters that depend on each other."""
         found = []
         relations = row_space(self._unclosed, DEPENDENT)
-        sets = connected(relations)
+        sets = connected_columns(relations)
         free = sorted(set(range(len(self.x))) - {i for members in sets for i in members})
         if free and not self._closes(np.eye(len(self.x))[free]):
             ties = self._ties(free, np.eye(len(free)))
-            for part in connected(row_space(null_space(ties, COEFFICIENT), COEFFICIENT)):
+            for part in connected_columns(row_space(null_space(ties, COEFFICIENT), COEFFICIENT)):
                 members = [free[i] for i in part]
                 inside = [i for i in range(len(ties)) if np.any(ties[i, part])]
                 found.append(self._message(names, members, ties[np.ix_(inside, part)]))
@@ -199,7 +199,7 @@ class RedundantLoops:
         ties = np.where(np.abs(ties) > COEFFICIENT, ties, 0.0)
         ties = ties[np.count_nonzero(ties, axis=1) > 1] * self._unit[members]
         own, x = [names[i] for i in members], self.x[members]
-        who = listed(own)
+        who = join_names(own)
         stuck = [name for name, tied in zip(own, np.any(ties, axis=0), strict=True) if not tied]
         if len(own) == 1:
             return (
@@ -212,7 +212,7 @@ class RedundantLoops:
                 "that they have; leave them fixed"
             )
         condition = ", for ".join(tie_text(own, x, u) for u in ties)
-        leave = f"tie them, and leave {listed(stuck)} fixed" if stuck else "tie them, or leave them fixed"
+        leave = f"tie them, and leave {join_names(stuck)} fixed" if stuck else "tie them, or leave them fixed"
         return f"{who} cannot move each by itself: {self._loop_text(members)} that only holds for {condition}; {leave}"
 
     def _loop_text(self, members: Sequence[int]) -> str:
@@ -223,7 +223,7 @@ class RedundantLoops:
         involved = np.abs(circuits).max((0, 2)) > COEFFICIENT
         constraints = list(dict.fromkeys(name for name, there in zip(self._names, involved, strict=True) if there))
         what = "constraints" if set(constraints) & set(self._drivers) else "joints"
-        return f"{what} {listed([quote(name) for name in constraints])} close a loop"
+        return f"{what} {join_names([quote(name) for name in constraints])} close a loop"
 
 
 def _dense(matrix: np.ndarray | csr_array) -> np.ndarray:
@@ -238,7 +238,7 @@ def tie_text(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:
     if same and np.allclose(x, x[0], rtol=1e-9):
         return " = ".join(names)
     if np.all(x != 0) and np.allclose(u / x, u[0] / x[0], rtol=1e-3):
-        return f"{listed(names)} in proportion {ratio(x)}"
+        return f"{join_names(names)} in proportion {ratio(x)}"
     if same:
-        return f"{listed(names)} changing by the same amount"
-    return f"{listed(names)} changing in proportion {ratio(u)}"
+        return f"{join_names(names)} changing by the same amount"
+    return f"{join_names(names)} changing in proportion {ratio(u)}"

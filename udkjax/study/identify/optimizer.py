@@ -97,7 +97,7 @@ class Minimizer:
             )
         return minimize_squares(problem, z, tol, horizon, steps, settled, undamped, self.method, self.loss, self.report)
 
-    def labelled(self, what: str) -> "Minimizer":
+    def with_label(self, what: str) -> "Minimizer":
         """Return the same one, with reports that begin with what is fitted."""
         return replace(self, report=lambda text: self.report(f"{what}: {text}"))
 

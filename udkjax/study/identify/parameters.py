@@ -15,8 +15,8 @@ from udkjax.scene.number_fields import owner_of, parameters_of, split_index
 from udkjax.scene.reshaping import length_of
 from udkjax.scene.schema import keys
 from udkjax.study.identify.records import IdentificationError
-from udkjax.study.identify.unknowns import Setter, Target, Transform, Unknown, Unknowns, value_of
-from udkjax.study.quantities import Length
+from udkjax.study.identify.unknowns import Setter, Target, Transform, Unknown, Unknowns
+from udkjax.study.quantities import Length, parameter_value
 from udkjax.study.units import units_of
 
 
@@ -196,7 +196,7 @@ def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
             problems.append(f"{quote(name)} is absent from the scene: set it there first")
     if problems or not names:
         raise ValueError("; ".join(problems) or "names nothing")
-    values = [np.asarray(value_of(mechanism, name)) for name in names]
+    values = [np.asarray(parameter_value(mechanism, name)) for name in names]
     if len({v.shape for v in values}) > 1:
         raise ValueError(f"cannot be tied: their shapes are {', '.join(str(v.shape) for v in values)}")
     if scaled:

@@ -99,7 +99,7 @@ class Problem:
         """Arrange all records in tables of one length; shorter ones are padded with times at which nothing was measured."""
         tables = [_with_start(record) for record in self.records]
         length = max(2, *(len(ts) for ts, _ in tables))
-        self.ts = np.stack([_padded(ts, length) for ts, _ in tables])
+        self.ts = np.stack([_pad(ts, length) for ts, _ in tables])
         shape = len(self.records), length, len(keys)
         self.y, sigma = np.full(shape, np.nan), np.full(shape, np.nan)
         for r, (record, (ts, first)) in enumerate(zip(self.records, tables, strict=True)):
@@ -144,7 +144,7 @@ class Problem:
         shift = np.where(self.columns < 0, 0.0, z[:, self.columns]).reshape(sets * N, S)
         runs = np.tile(np.arange(N), sets)
         found = self.members_of(runs, x, shift)
-        return found if horizon is None else found._replace(ts=np.stack([_until(ts, horizon) for ts in self.runs.ts])[runs])
+        return found if horizon is None else found._replace(ts=np.stack([_times_until(ts, horizon) for ts in self.runs.ts])[runs])
 
     def members_of(self, runs: Int[np.ndarray, "M"], x: Float[np.ndarray, "M P"], shift: Float[np.ndarray, "M S"]) -> Members:
         """Return the members of some runs, with these parameters and unknowns of their initial states."""
@@ -204,7 +204,7 @@ def _with_start(record: Record) -> tuple[np.ndarray, int]:
     return (record.times, 0) if record.t0 == record.times[0] else (np.concatenate([[record.t0], record.times]), 1)
 
 
-def _padded(ts: np.ndarray, length: int) -> np.ndarray:
+def _pad(ts: np.ndarray, length: int) -> np.ndarray:
     span = max(ts[-1] - ts[0], PADDING)
     return np.concatenate([ts, ts[-1] + PADDING * span * np.arange(1, length - len(ts) + 1)])
 
@@ -213,10 +213,10 @@ def _end(ts: np.ndarray, horizon: float) -> np.ndarray:
     return ts[..., 0] + horizon * (ts[..., -1] - ts[..., 0])
 
 
-def _until(ts: np.ndarray, horizon: float) -> np.ndarray:
+def _times_until(ts: np.ndarray, horizon: float) -> np.ndarray:
     """Return the times up to a part of a record, padded to the same length."""
     last = max(1, int(np.searchsorted(ts, _end(ts, horizon), side="right")) - 1)
-    return _padded(ts[: last + 1], len(ts))
+    return _pad(ts[: last + 1], len(ts))
 
 
 def _guessed_states(mechanism: Mechanism, records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:

@@ -69,14 +69,14 @@ def search(
         if found := fit_in_pieces(problem, np.concatenate([along.z, z]), tol, minimizer):
             return found._replace(history=along.history + found.history)
     ways, tried = ["whole records"], [z]
-    fit = minimizer.labelled("whole records").minimize(problem, z, loose, None, SOME_STEPS, LOOSE_STEP)
+    fit = minimizer.with_label("whole records").minimize(problem, z, loose, None, SOME_STEPS, LOOSE_STEP)
     history = list(fit.history)
     if not explains(problem, fit, loose):
         ways.append("growing records")
         other = fit_growing_parts(problem, z, loose, minimizer)
         history += other.history
         tried = [other.z, z]
-        fit = _better_of_each(fit, other)
+        fit = _choose_better(fit, other)
     if more and not explains(problem, fit, loose):
         ways.append(f"{more} more first guesses")
         guesses = sample_guesses(problem.unknowns, z[0], more, seed)
@@ -84,7 +84,7 @@ def search(
         history += other.history
         z = np.concatenate([z, guesses])
         tried.append(other.z)
-        fit = _concatenated(fit, other)
+        fit = _concatenate(fit, other)
     best = int(np.argmin(fit.cost))
     there = np.abs(fit.z - fit.z[best]).max(1) <= SAME_MINIMUM * (1.0 + np.abs(fit.z[best]).max())
     agreeing = int((there & np.isfinite(fit.cost)).sum())
@@ -111,7 +111,7 @@ def fit_in_pieces(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances
         if explains(pieces, fit, loose):
             found = SearchResult(fit, 1, k + 1, ("records in pieces",), fit.history, pieces)
             along = fit.z[:, : problem.K]
-            whole = minimizer.labelled("whole records").minimize(problem, along, tol, None, SOME_STEPS, LOOSE_STEP, True)
+            whole = minimizer.with_label("whole records").minimize(problem, along, tol, None, SOME_STEPS, LOOSE_STEP, True)
             if explains(problem, whole, tol):
                 return found._replace(fit=whole, history=fit.history + whole.history, problem=problem)
             return found
@@ -138,11 +138,11 @@ def fit_growing_parts(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolera
     """Fit more and more of the records, each time from where the fits of the part before have ended."""
     history: History = []
     for part in horizons(problem)[:-1]:
-        one = minimizer.labelled(f"{part:.0%} of the records")
+        one = minimizer.with_label(f"{part:.0%} of the records")
         fit = one.minimize(problem, z, tol, part, FEW_STEPS, COARSE_STEP)
         z = np.where(np.isfinite(fit.cost)[:, None], fit.z, z)
         history += fit.history
-    fit = minimizer.labelled("whole records").minimize(problem, z, tol, None, STEPS, LOOSE_STEP)
+    fit = minimizer.with_label("whole records").minimize(problem, z, tol, None, STEPS, LOOSE_STEP)
     return fit._replace(history=history + fit.history)
 
 
@@ -179,7 +179,7 @@ def is_white(r: np.ndarray) -> bool:
     return len(r) < 3 or power == 0.0 or abs(r[1:] @ r[:-1]) / power <= WHITE_CORRELATION / np.sqrt(len(r))
 
 
-def _better_of_each(one: Fit, two: Fit) -> Fit:
+def _choose_better(one: Fit, two: Fit) -> Fit:
     """Return the better of two fits from each guess."""
     which = two.cost < one.cost
     z = np.where(which[:, None], two.z, one.z)
@@ -187,7 +187,7 @@ def _better_of_each(one: Fit, two: Fit) -> Fit:
     return Fit(z, cost, settled, one.history)
 
 
-def _concatenated(one: Fit, two: Fit) -> Fit:
+def _concatenate(one: Fit, two: Fit) -> Fit:
     """Return fits from some guesses, then those from others."""
     z, cost, settled = (np.concatenate(pair) for pair in zip(one[:3], two[:3], strict=True))
     return Fit(z, cost, settled, one.history)

@@ -206,7 +206,7 @@ def fit_pieces(
     fit, history = Fit(shooting.guess[None], np.full(1, np.inf), np.zeros(1, bool), []), []
     for weight in WEIGHTS:
         shooting.weight = weight
-        one = minimizer.labelled(f"pieces held together by {weight:.0e}")
+        one = minimizer.with_label(f"pieces held together by {weight:.0e}")
         steps, settled = (STEPS, FINE_STEP) if weight == WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
         # From one weight to the next the Gauss-Newton step is right, but for a few: these take damped ones.
         for undamped in (False,) if weight == WEIGHTS[0] else (True, False):

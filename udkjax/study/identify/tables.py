@@ -51,12 +51,12 @@ def read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
         return
     delimiter = next((d for d in _DELIMITERS if d in lines[first]), ",")
     reader = csv.reader(lines[first:], delimiter=delimiter, skipinitialspace=True)
-    header, rows, places = _joined_points(_without_empty_end(next(reader)), delimiter), [], []
+    header, rows, places = _join_points(_cut_empty_end(next(reader)), delimiter), [], []
     for cells in reader:
         if not any(cell.strip() for cell in cells):
             continue
         line = f"line {first + reader.line_num}"
-        cells = cells[: max(len(header), len(_without_empty_end(cells)))]
+        cells = cells[: max(len(header), len(_cut_empty_end(cells)))]
         if len(cells) == len(header):
             rows.append(cells)
             places.append(line)
@@ -67,12 +67,12 @@ def read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
     yield table_of_columns(str(path), named, problems, places, path.stem)
 
 
-def _without_empty_end(cells: list[str]) -> list[str]:
+def _cut_empty_end(cells: list[str]) -> list[str]:
     """Cut off empty cells at the end of a row: spreadsheets write such."""
     return cells[: max((k + 1 for k, cell in enumerate(cells) if cell.strip()), default=0)]
 
 
-def _joined_points(cells: Sequence[str], delimiter: str) -> list[str]:
+def _join_points(cells: Sequence[str], delimiter: str) -> list[str]:
     """Join headings that were split at the comma of a point, as in `body.rod(0.5, 0).x` without quotes."""
     found: list[str] = []
     for cell in cells:

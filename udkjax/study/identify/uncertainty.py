@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from scipy.special import chdtr, chdtrc
 
 from udkjax.study.identify.directions import INVISIBLE, Direction, UnknownValues, describe, null_space, simplest_basis
-from udkjax.study.wording import listed
+from udkjax.study.wording import join_names
 
 POOR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
 CORRELATED = 0.98  # of two parameters: their difference is known ten times worse than their sum
@@ -120,7 +120,7 @@ def estimate_uncertainty(
     sigma, vt, u, shown = _with_priors(before[:, alive], sigma, vt, u, shown)
     x, dx_dz = (np.asarray(part, float)[alive] for part in (values.x, values.dx_dz))
     free = simplest_basis(null_space(vt[shown], 0.5), x, dx_dz, [values.kinds[k] for k in alive.tolist()])
-    directions, flats = (_expanded(rows, alive, K) for rows in (vt, free))
+    directions, flats = (_insert_columns(rows, alive, K) for rows in (vt, free))
     lost = np.any(flats != 0.0, axis=0)
     lost[np.setdiff1d(np.arange(K), alive)] = True
     root = directions[shown].T / sigma[shown] * np.asarray(values.dx_dz)[:, None]  # (K, D)
@@ -160,7 +160,7 @@ def _with_priors(
     return sigma, vt, np.concatenate([u[:, shown], rows], axis=1), np.ones(len(sigma), bool)
 
 
-def _expanded(rows: np.ndarray, columns: np.ndarray, count: int) -> np.ndarray:
+def _insert_columns(rows: np.ndarray, columns: np.ndarray, count: int) -> np.ndarray:
     whole = np.zeros((len(rows), count))
     whole[:, columns] = rows
     return whole
@@ -192,7 +192,7 @@ def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray
 def _sentences(known: Uncertainty) -> Iterator[str]:
     values = known.values
     if known.dead:
-        yield f"no measured quantity depends on {listed(known.dead)}: leave out what does not show, or measure what does"
+        yield f"no measured quantity depends on {join_names(known.dead)}: leave out what does not show, or measure what does"
     for flat in known.flat:
         one = "fix one of them, give one a prior, or measure more" if len(flat.names) > 1 else "fix it, or measure more"
         yield f"no measured quantity shows {flat.text}: {one}"

@@ -9,16 +9,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import parameters_of, split_index
+from udkjax.study.quantities import parameter_value
 
 Transform = Literal["positive", "bounded", "free"]
-Setter: TypeAlias = Callable[[Mechanism, Numbers], Mechanism]  # (mechanism, value) -> mechanism
+Setter: TypeAlias = Callable[[Mechanism, ArrayLike], Mechanism]  # (mechanism, value) -> mechanism
 AT_BOUND = 1e-3  # of the distance between the bounds: a value as near to one of them is said to be at it
 FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
 GUESS_RADIUS = 0.5  # of a value: how far other guesses are from the first
@@ -135,15 +133,8 @@ def apply_values(mechanism: Mechanism, targets: Sequence[Target], x: Float[Array
             mechanism = target.function(mechanism.with_parameters(values) if values else mechanism, x[k])
             values = {}
         else:
-            values |= {name: x[k] * value_of(base, name) if target.scaled else x[k] for name in target.names}
+            values |= {name: x[k] * parameter_value(base, name) if target.scaled else x[k] for name in target.names}
     return mechanism.with_parameters(values) if values else mechanism
-
-
-def value_of(mechanism: Mechanism, name: str) -> Array:
-    """Return a parameter of a mechanism, or one entry of it."""
-    known = parameters_of(mechanism)
-    owner, index = split_index(name, known)
-    return jnp.asarray(known[owner].value)[index]
 
 
 def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int) -> Float[np.ndarray, "B K"]:

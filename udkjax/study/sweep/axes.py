@@ -145,7 +145,7 @@ class Sobol(Design):
 
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="The balance properties", category=UserWarning)
-            return qmc.Sobol(dimensions, **_seeded(qmc.Sobol, self.seed)).random(self.n)
+            return qmc.Sobol(dimensions, **_generator(qmc.Sobol, self.seed)).random(self.n)
 
 
 class LatinHypercube(Design):
@@ -154,7 +154,7 @@ class LatinHypercube(Design):
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
         from scipy.stats import qmc
 
-        return qmc.LatinHypercube(dimensions, **_seeded(qmc.LatinHypercube, self.seed)).random(self.n)
+        return qmc.LatinHypercube(dimensions, **_generator(qmc.LatinHypercube, self.seed)).random(self.n)
 
 
 class Random(Design):
@@ -164,13 +164,13 @@ class Random(Design):
         return np.random.default_rng(self.seed).random((self.n, dimensions))
 
 
-def _seeded(engine: Any, seed: int) -> dict[str, Any]:
+def _generator(engine: Any, seed: int) -> dict[str, Any]:
     """SciPy calls it `rng` since 1.15."""
     name = "rng" if "rng" in inspect.signature(engine).parameters else "seed"
     return {name: np.random.default_rng(seed)}
 
 
-def spread(values: Any, unit: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:
+def scale_to_range(values: Any, unit: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:
     """Points of the unit interval in a range (low, high) or a frozen distribution of scipy.stats; None: it is neither."""
     if hasattr(values, "ppf"):
         return np.asarray(values.ppf(unit), float)

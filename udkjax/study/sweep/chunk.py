@@ -20,8 +20,8 @@ from udkjax.equations.analysis import analyse
 from udkjax.integrate.solution import Result
 from udkjax.study.machine import CHUNKED, MEMBERS
 from udkjax.study.sweep.layout import SweepError
-from udkjax.study.sweep.measures import Named, guessed
-from udkjax.study.sweep.member import END, RESULT, STEPS, Kept, Recipe
+from udkjax.study.sweep.measures import Label, guess_label
+from udkjax.study.sweep.member import END, RESULT, STEPS, Outputs, Own, Recipe, Shared
 from udkjax.study.sweep.plan import Chunk, Group, Plan, Variable
 from udkjax.study.units import units_of
 
@@ -32,9 +32,9 @@ WIDE = 4096  # members of a piece where a device takes them all at once
 TOGETHER, MANY = 8, 16
 PROGRAMS = 64  # that are kept: a program holds its plan
 LABELS = {
-    RESULT: Named((), "1", "how the run ended"),
-    END: Named((), "s", "time that was reached"),
-    STEPS: Named((), "1", "steps tried"),
+    RESULT: Label((), "1", "how the run ended"),
+    END: Label((), "s", "time that was reached"),
+    STEPS: Label((), "1", "steps tried"),
 }
 _programs: OrderedDict[Any, "Program"] = OrderedDict()
 _lock = threading.Lock()
@@ -63,17 +63,17 @@ class Program:
         """How many members wait for each other; None: none does."""
         return None if self.devices[0].platform in CHUNKED else self.piece
 
-    def _computed(self, shared: Any, own: Any) -> tuple[Kept, Kept]:
+    def _compute(self, shared: Shared, own: Own) -> tuple[Outputs, Outputs]:
         """What is kept, and the derivatives of it by each name, last."""
         names = self.recipe.names
 
-        def members(shift: Any) -> Kept:
+        def members(shift: Any) -> Outputs:
             return jax.vmap(lambda own: self.recipe(shared, own, shift))(own)
 
         if not names:
             return members({}), {}
 
-        def shifted(shift: Any) -> tuple[Kept, Kept]:
+        def shifted(shift: Any) -> tuple[Outputs, Outputs]:
             kept = members(dict(zip(names, shift, strict=True)))
             return {k: x for k, x in kept.items() if jnp.issubdtype(x.dtype, jnp.floating) and k != END}, kept
 
@@ -82,7 +82,7 @@ class Program:
 
     def _lower(self) -> Any:
         if self._lowered is None:
-            function = self._computed
+            function = self._compute
             if len(self.devices) > 1:
                 from jax.sharding import AxisType, Mesh, PartitionSpec
 
@@ -98,7 +98,9 @@ class Program:
         """What is kept of one member: shapes and types."""
         with self._lock:
             kept, slopes = self._lower().out_info
-        return {k: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for k, x in _named(self.recipe.names, kept, slopes).items()}
+        return {
+            k: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for k, x in _outputs_by_name(self.recipe.names, kept, slopes).items()
+        }
 
     @property
     def compiled(self) -> tuple[Any, Any]:
@@ -118,10 +120,10 @@ class Program:
         started = [compiled(shared, jax.tree.map(lambda x, k=k: x[k : k + size], own)) for k in range(0, len(full), size)]
         parts = [jax.tree.map(np.asarray, part) for part in started]
         joined = jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
-        return _named(self.recipe.names, *joined)
+        return _outputs_by_name(self.recipe.names, *joined)
 
 
-def _named(names: Sequence[str], kept: Any, slopes: Any) -> dict[str, Any]:
+def _outputs_by_name(names: Sequence[str], kept: Any, slopes: Any) -> dict[str, Any]:
     """Derivatives under names of their own."""
     found = dict(kept)
     for name, slope in slopes.items():
@@ -154,14 +156,14 @@ def run(plan: Plan, chunk: Chunk) -> dict[str, np.ndarray]:
     mine = program(plan, group)
     found = mine(chunk.members)
     if mine.recipe.redundant and mine.recipe.varied:
-        for rows, which in _others(mine.recipe, chunk.members, found[RESULT]).items():
+        for rows, which in _other_redundant_rows(mine.recipe, chunk.members, found[RESULT]).items():
             again = program(plan, group, rows)(chunk.members[which])
             for name, values in again.items():
                 found[name][which] = values
     return found
 
 
-def _others(recipe: Recipe, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
+def _other_redundant_rows(recipe: Recipe, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
     """Which of those that drifted, although they were projected, have other redundant rows; by these."""
     drifted = np.flatnonzero(result == Result.drift)
     found: dict[tuple[int, ...], list[int]] = {}
@@ -179,7 +181,7 @@ def _mechanisms(recipe: Recipe, members: np.ndarray) -> list[Any]:
     return [recipe.mechanism(recipe.shared, jax.tree.map(lambda x, k=k: x[k], own), {}) for k in range(len(members))]
 
 
-def described(plan: Plan, group: Group) -> dict[str, Variable]:
+def describe_group(plan: Plan, group: Group) -> dict[str, Variable]:
     """What is kept of each member of a group."""
     bodies, found = len(plan.choice(group, "mechanism").body_names), {}
     known = {name: label for measure in plan.measures for name, label in measure.variables.items()} | LABELS
@@ -188,9 +190,9 @@ def described(plan: Plan, group: Group) -> dict[str, Variable]:
     for name, info in outputs.items():
         if name in slopes:
             of, by = slopes[name]
-            label = Named(found[of].dims, _per(found[of].units, by, plan), f"derivative of {of} by {by}")
+            label = Label(found[of].dims, _per(found[of].units, by, plan), f"derivative of {of} by {by}")
         else:
-            label = known.get(name) or guessed(name, info.shape, len(plan.ts), bodies)
+            label = known.get(name) or guess_label(name, info.shape, len(plan.ts), bodies)
         found[name] = Variable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
     return found
 
@@ -210,7 +212,7 @@ def variables_of(plan: Plan) -> Mapping[str, Variable]:
     """
     found: dict[str, Variable] = {}
     for group in plan.groups:
-        for name, variable in described(plan, group).items():
+        for name, variable in describe_group(plan, group).items():
             other = found.setdefault(name, variable)
             if len(other.shape) != len(variable.shape):
                 raise SweepError([f"measure {name!r} has {other.shape} entries for some members and {variable.shape} for others"])

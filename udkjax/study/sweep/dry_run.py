@@ -17,7 +17,7 @@ FEW = 4  # members of a sample where these are computed one after another
 
 
 @dataclass(frozen=True)
-class Estimate:
+class SweepCost:
     """What a sweep will take in this process, on its devices."""
 
     members: int
@@ -30,7 +30,7 @@ class Estimate:
     computing: float  # s
 
 
-def estimate(plan: Plan, memory: int = MEMORY) -> Estimate:
+def estimate_cost(plan: Plan, memory: int = MEMORY) -> SweepCost:
     """Run a sample of some groups of a plan, and say what all of it will take.
 
     A sample takes a few seconds, most of them to compile. A lane waits for the slowest of its sample, but in the sweep members
@@ -38,15 +38,15 @@ def estimate(plan: Plan, memory: int = MEMORY) -> Estimate:
     """
     count = len(plan.groups)
     chosen = [plan.groups[k] for k in np.unique(np.linspace(0, count - 1, min(count, GROUPS)).astype(int))]
-    tried = [_tried(plan, group) for group in chosen]
+    tried = [_measure_group(plan, group) for group in chosen]
     compiling = count * float(np.mean([seconds for seconds, _ in tried]))
     computing = plan.size * float(np.mean([seconds for _, seconds in tried])) / concurrent_chunks()
     kept = plan.size * bytes_per_member(plan)
     used = _resident() + min(memory, kept) + kept
-    return Estimate(plan.size, count, len(tried), len(cut_chunks(plan, memory)), kept, used, compiling, computing)
+    return SweepCost(plan.size, count, len(tried), len(cut_chunks(plan, memory)), kept, used, compiling, computing)
 
 
-def _tried(plan: Plan, group: Group) -> tuple[float, float]:
+def _measure_group(plan: Plan, group: Group) -> tuple[float, float]:
     """How long the program of a group takes to compile, and then a member of it (s)."""
     own = program(plan, group)
     size = min(len(group.members), own.piece * len(own.devices) if own.piece > 1 else FEW)

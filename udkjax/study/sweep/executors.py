@@ -22,7 +22,7 @@ AHEAD = 2  # tasks for each thread of the cluster, so that none waits for the ne
 AT_LEAST = 16  # tasks, so that a cluster that grows by what is asked of it sees that something is
 
 
-def devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
+def compute_on_devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
     """Compute chunks, and hand each over when it is done."""
     waiting, width = deque(chunks), concurrent_chunks()
     with ThreadPoolExecutor(width, thread_name_prefix="sweep") as pool:
@@ -30,7 +30,7 @@ def devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
         try:
             while waiting or running:
                 while waiting and len(running) < width:
-                    running.add(pool.submit(_timed, plan, waiting.popleft()))
+                    running.add(pool.submit(_run_timed, plan, waiting.popleft()))
                 done, running = wait(running, return_when=FIRST_COMPLETED)
                 for future in done:
                     yield future.result()
@@ -39,7 +39,7 @@ def devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
                 future.cancel()
 
 
-def _timed(plan: Plan, chunk: Chunk) -> Done:
+def _run_timed(plan: Plan, chunk: Chunk) -> Done:
     begun = time.perf_counter()
     data = computing.run(plan, chunk)
     return chunk, data, time.perf_counter() - begun
@@ -49,7 +49,7 @@ class ClusterError(RuntimeError):
     """A cluster cannot do a sweep."""
 
 
-def dask(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]:
+def dask_engine(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]:
     """Return the engine on the workers of a `distributed.Client`; without one, the client that was made last.
 
     Workers may come and go: what a lost one had not delivered is computed by another. Each result is handed over when it
@@ -67,7 +67,7 @@ def dask(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done
             ) from None
 
     def engine(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
-        wanted = _deciding()
+        wanted = _deciding_versions()
         # Not scattered: data that was scattered is gone with the worker that held it, what a task returned is made again.
         shared = client.submit(_same, plan, pure=False)
         waiting, running, results = deque(chunks), {}, distributed.as_completed()
@@ -85,7 +85,7 @@ def dask(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done
             for future in results:
                 chunk, _ = running[future.key]
                 try:
-                    data, seconds = future.result()
+                    done = future.result()
                 except distributed.KilledWorker as error:
                     raise ClusterError(
                         f"chunk {chunk.index} ({len(chunk.members)} members) was being computed by several workers that died; "
@@ -94,7 +94,7 @@ def dask(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done
                 del running[future.key]
                 future.release()
                 fill()
-                yield chunk, data, seconds
+                yield done
         finally:
             client.cancel([shared, *(future for _, future in running.values())])
 
@@ -102,7 +102,7 @@ def dask(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done
 
 
 @contextmanager
-def started(scheduler: str | None = None) -> Iterator[Any]:
+def start_client(scheduler: str | None = None) -> Iterator[Any]:
     """A client of the scheduler at this address; without one, of a process for each core of this machine, ended afterwards."""
     distributed = _distributed()
     if scheduler is not None:
@@ -124,17 +124,15 @@ def _same(plan: Plan) -> Plan:
     return plan
 
 
-def _run(plan: Plan, chunk: Chunk, wanted: dict[str, str]) -> tuple[dict[str, np.ndarray], float]:
-    """On a worker: compute a chunk; how long it took (s) comes with it."""
-    if (found := _deciding()) != wanted:
+def _run(plan: Plan, chunk: Chunk, wanted: dict[str, str]) -> Done:
+    """Compute a chunk on a worker."""
+    if (found := _deciding_versions()) != wanted:
         differing = ", ".join(f"{name} {found[name]} instead of {wanted[name]}" for name in wanted if found[name] != wanted[name])
         raise ClusterError(f"a worker has other versions of what decides the results: {differing}")
-    begun = time.perf_counter()
-    data = computing.run(plan, chunk)
-    return data, time.perf_counter() - begun
+    return _run_timed(plan, chunk)
 
 
-def _deciding() -> dict[str, str]:
+def _deciding_versions() -> dict[str, str]:
     return {name: version for name, version in versions().items() if name != "python"}
 
 

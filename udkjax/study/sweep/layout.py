@@ -10,10 +10,10 @@ import numpy as np
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import State
 from udkjax.pinv import Auto
-from udkjax.scene.checks import SceneError, abbreviate, quote, suggestion
+from udkjax.scene.checks import Mistakes, SceneError, quote, abbreviate, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
-from udkjax.study.sweep.axes import CHOICES, Axis, Column, Design, Dimension, Zipped, labels_of, spread
+from udkjax.study.sweep.axes import CHOICES, Axis, Column, Design, Dimension, Zipped, labels_of, scale_to_range
 from udkjax.study.units import NUMBERS, units_of
 
 MEMBER = "member"  # the dimension of a design
@@ -21,18 +21,13 @@ MEMBER = "member"  # the dimension of a design
 TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
 
 
-class SweepError(ValueError):
+class SweepError(Mistakes):
     """A sweep cannot be what it says. `problems` lists every mistake."""
 
-    def __init__(self, problems: Sequence[str]):
-        self.problems = list(problems)
-        super().__init__(problems[0] if len(problems) == 1 else f"{len(problems)} mistakes:\n  " + "\n  ".join(problems))
-
-    def __reduce__(self):
-        return type(self), (self.problems,)
+    of = "sweep"
 
 
-def laid_out(mechanism: Mechanism, axes: Mapping[str, Any], design: Design | None = None) -> tuple[Dimension, ...]:
+def lay_out(mechanism: Mechanism, axes: Mapping[str, Any], design: Design | None = None) -> tuple[Dimension, ...]:
     """Return the dimensions of a sweep over `axes`. Raises `SweepError`."""
     problems: list[str] = []
     ranges = [name for name, given in axes.items() if design is not None and not isinstance(given, Zipped) and _is_range(given)]
@@ -79,7 +74,7 @@ def _column(mechanism: Mechanism, name: str, given: Any, unit: np.ndarray | None
     before = len(problems)
     if not callable(of):
         problems += _unknown(mechanism, name, of)
-    values = axis.values if unit is None else spread(axis.values, unit)
+    values = axis.values if unit is None else scale_to_range(axis.values, unit)
     if values is None:
         problems.append(f"axis {quote(name)}: with a design its values are a range (low, high), or a frozen distribution")
     elif hasattr(values, "ppf"):
@@ -112,8 +107,8 @@ def _choices(name: str, of: tuple[str, ...], values: Any, problems: list[str]) -
     return Column(name, values, of, "", labels_of(of[0], values))
 
 
-def _states(stacked: State) -> tuple[State, ...]:
-    return tuple(State(q, v) for q, v in zip(np.asarray(stacked.q), np.asarray(stacked.v), strict=True))
+def _states(stack_choices: State) -> tuple[State, ...]:
+    return tuple(State(q, v) for q, v in zip(np.asarray(stack_choices.q), np.asarray(stack_choices.v), strict=True))
 
 
 def _numbers(values: Any) -> np.ndarray | None:

@@ -29,7 +29,7 @@ class Run(NamedTuple):
     reference: Any  # (T, bodies, 3), or a function (mechanism, ts) of it, or None
 
 
-class Named(NamedTuple):
+class Label(NamedTuple):
     """How a dataset labels a variable."""
 
     dims: tuple[str, ...]
@@ -44,7 +44,7 @@ class Measure:
     name: str
     along: bool  # whether it needs all output times, not only the end
     compute: Callable[[Run], Mapping[str, Array]]
-    labels: Mapping[str, Named]  # empty: of a user's function
+    labels: Mapping[str, Label]  # empty: of a user's function
     reference: Any = None
     renamed: str = ""  # the key that it was given under
 
@@ -54,14 +54,14 @@ class Measure:
         return {self._key(name): jnp.asarray(value) for name, value in found.items()}
 
     @property
-    def variables(self) -> dict[str, Named]:
+    def variables(self) -> dict[str, Label]:
         """How its variables are labelled, by their names in the dataset; those of a user's function are not known."""
         return {self._key(name): label for name, label in self.labels.items()}
 
     @property
     def function(self) -> Callable[[Mechanism, Solution], Any] | None:
         """The user's function, if it is one."""
-        return self.compute.function if isinstance(self.compute, _Own) else None
+        return self.compute.function if isinstance(self.compute, _UserMeasure) else None
 
     def _key(self, name: str) -> str:
         if not self.renamed or not self.labels:
@@ -69,14 +69,14 @@ class Measure:
         return self.renamed if len(self.labels) == 1 else f"{self.renamed}_{name}"
 
 
-def guessed(name: str, shape: tuple[int, ...], outputs: int, bodies: int) -> Named:
+def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) -> Label:
     """Label what a user's function returned, by its shape."""
     dims = [f"{name}_{k}" for k in range(len(shape))]
     if shape[-2:] == (bodies, 3):
         dims[-2:] = "body", "coordinate"
     if shape and shape[0] == outputs and dims[0] != "body":
         dims[0] = "time"
-    return Named(tuple(dims), "", "")
+    return Label(tuple(dims), "", "")
 
 
 def measures_of(given: Any, reference: Any, ts: np.ndarray) -> tuple[Measure, ...]:
@@ -103,11 +103,11 @@ def _measure(key: str, given: Any, reference: Any, ts: np.ndarray) -> Measure:
     if not callable(given):
         raise ValueError(f"measure {quote(key or str(given))}: must be a name or a function of (mechanism, solution)")
     name = key or getattr(given, "__name__", "measure").strip("<>")
-    return Measure(name, True, _Own(given, name), {})
+    return Measure(name, True, _UserMeasure(given, name), {})
 
 
 @dataclass(frozen=True)
-class _Own:
+class _UserMeasure:
     """A user's function, whose single array goes by the measure's name."""
 
     function: Callable[[Mechanism, Solution], Any]
@@ -179,42 +179,42 @@ def _rank(run: Run) -> dict[str, Array]:
 
 _STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
 # Whether all output times are needed, the function, and its variables.
-BY_NAME: dict[str, tuple[bool, Callable[[Run], dict[str, Array]], dict[str, Named]]] = {
+BY_NAME: dict[str, tuple[bool, Callable[[Run], dict[str, Array]], dict[str, Label]]] = {
     "final": (
         False,
         _final,
         {
-            "q_end": Named(_STATE, "m, m, rad", "coordinates at the end"),
-            "v_end": Named(_STATE, "m/s, m/s, rad/s", "velocities at the end"),
+            "q_end": Label(_STATE, "m, m, rad", "coordinates at the end"),
+            "v_end": Label(_STATE, "m/s, m/s, rad/s", "velocities at the end"),
         },
     ),
     "states": (
         True,
         _states,
         {
-            "q": Named(_OVER_TIME, "m, m, rad", "coordinates: centre of mass and angle"),
-            "v": Named(_OVER_TIME, "m/s, m/s, rad/s", "velocities"),
+            "q": Label(_OVER_TIME, "m, m, rad", "coordinates: centre of mass and angle"),
+            "v": Label(_OVER_TIME, "m/s, m/s, rad/s", "velocities"),
         },
     ),
-    "violation": (True, _violation, {"violation": Named((), "m, rad", "largest constraint violation at an output time")}),
-    "energy_drift": (True, _energy_drift, {"energy_drift": Named((), "J", "largest change of the total energy")}),
+    "violation": (True, _violation, {"violation": Label((), "m, rad", "largest constraint violation at an output time")}),
+    "energy_drift": (True, _energy_drift, {"energy_drift": Label((), "J", "largest change of the total energy")}),
     "error": (
         True,
         _error,
         {
-            "position_error": Named((), "m", "largest error of a coordinate of a centre of mass"),
-            "angle_error": Named((), "rad", "largest error of an angle"),
+            "position_error": Label((), "m", "largest error of a coordinate of a centre of mass"),
+            "angle_error": Label((), "rad", "largest error of an angle"),
         },
     ),
     "counts": (
         False,
         _counts,
         {
-            "accepted": Named((), "1", "steps accepted"),
-            "rejected": Named((), "1", "steps rejected"),
-            "right_hand_sides": Named((), "1", "evaluations of the accelerations; -1: not known"),
-            "projections": Named((), "1", "returns to the constraint manifold"),
+            "accepted": Label((), "1", "steps accepted"),
+            "rejected": Label((), "1", "steps rejected"),
+            "right_hand_sides": Label((), "1", "evaluations of the accelerations; -1: not known"),
+            "projections": Label((), "1", "returns to the constraint manifold"),
         },
     ),
-    "rank": (True, _rank, {"rank": Named(("time",), "1", "rank of D by the method's own rule; -1: not reached")}),
+    "rank": (True, _rank, {"rank": Label(("time",), "1", "rank of D by the method's own rule; -1: not reached")}),
 }

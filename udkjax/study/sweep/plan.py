@@ -15,7 +15,7 @@ from udkjax.equations.analysis import analyse
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import Column, Design, Dimension, structure_of
-from udkjax.study.sweep.layout import SweepError, check_settings, check_tangents, laid_out
+from udkjax.study.sweep.layout import SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, measures_of
 
 OUTSIDE = ("throw", "progress", "adjoint")  # arguments of simulate that a sweep decides about
@@ -90,7 +90,9 @@ class Plan:
         """One for each combination of structures that occurs among the choices."""
         chosen = [column for column in self.columns if column.chosen]
         places = self.places(np.arange(self.size))
-        kinds = np.stack([_kinds(column)[places[column.name]] for column in chosen] or [np.zeros(self.size, int)], axis=1)
+        kinds = np.stack(
+            [_number_structures(column)[places[column.name]] for column in chosen] or [np.zeros(self.size, int)], axis=1
+        )
         _, number = np.unique(kinds, axis=0, return_inverse=True)
         number = number.ravel()
         found = []
@@ -124,7 +126,7 @@ class Plan:
         return tuple(dict.fromkeys(name for group in self.groups for name in self.choice(group, "mechanism").body_names))
 
 
-def planned(
+def make_plan(
     mechanism: Mechanism,
     axes: Mapping[str, Any],
     ts: Any,
@@ -144,7 +146,7 @@ def planned(
         problems.append("ts: must be at least two output times (s), increasing from the start on")
     dimensions: tuple[Dimension, ...] = ()
     try:
-        dimensions = laid_out(mechanism, axes, design)
+        dimensions = lay_out(mechanism, axes, design)
     except SweepError as error:
         problems += error.problems
     targets = {target for d in dimensions for c in d.columns if not callable(c.of) for target in c.of}
@@ -163,7 +165,7 @@ def planned(
     return Plan(mechanism, dimensions, kept, settings, measures, tuple(derivatives), design)
 
 
-def _kinds(column: Column) -> np.ndarray:
+def _number_structures(column: Column) -> np.ndarray:
     """For each of the choices of an axis the number of its structure."""
     structures = [
         (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in column.values
@@ -171,7 +173,7 @@ def _kinds(column: Column) -> np.ndarray:
     return np.array([structures.index(structure) for structure in structures])
 
 
-def stacked(choices: Sequence[Any]) -> tuple[Any, Any]:
+def stack_choices(choices: Sequence[Any]) -> tuple[Any, Any]:
     """Choices of one structure: their numbers one behind the other, and everything else."""
     parts = [eqx.partition(choice, eqx.is_array) for choice in choices]
     return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(arrays for arrays, _ in parts)), parts[0][1]

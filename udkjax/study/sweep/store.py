@@ -36,10 +36,10 @@ class StoreError(OSError):
     """A sweep cannot be written where it should be, or is not the one that was begun there."""
 
 
-class Kept(abc.ABC):
+class ChunkStore(abc.ABC):
     """What a sweep has finished. A context manager: outside of it nothing is written."""
 
-    def __enter__(self) -> "Kept":
+    def __enter__(self) -> "ChunkStore":
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -60,7 +60,7 @@ class Kept(abc.ABC):
         """Iterate over what is finished, one chunk at a time: members, and their data."""
 
 
-class Memory(Kept):
+class MemoryStore(ChunkStore):
     """What a sweep has finished, where nothing is to outlive the process."""
 
     def __init__(self):
@@ -73,7 +73,7 @@ class Memory(Kept):
         yield from self._done
 
 
-class Store(Kept):
+class FolderStore(ChunkStore):
     """What a sweep has finished, in a folder that only one process may write to at a time.
 
     `fingerprint` says what decides the result. A folder in which another sweep was begun is refused, and the difference spelled
@@ -114,13 +114,13 @@ class Store(Kept):
         members = np.asarray(chunk.members)
         self._write(
             f"{CHUNKS}/{_name(chunk.index, members)}",
-            packed({MEMBERS: members, **{KEPT + name: values for name, values in data.items()}}),
+            pack({MEMBERS: members, **{KEPT + name: values for name, values in data.items()}}),
         )
 
     def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
         """Iterate over what is finished, one file at a time: members, and their data. Damaged files are removed."""
         for file in self._files():
-            data = unpacked(file.read_bytes())
+            data = unpack(file.read_bytes())
             if data is None:
                 warnings.warn(f"{file} is damaged: what it held is computed again", stacklevel=2)
                 file.unlink()
@@ -159,7 +159,7 @@ class Store(Kept):
             raise StoreError(f"cannot write {name}: {error.strerror or error}; {kept}; {advice}") from error
 
 
-def left(chunks: Sequence[Chunk], done: np.ndarray) -> list[Chunk]:
+def unfinished_chunks(chunks: Sequence[Chunk], done: np.ndarray) -> list[Chunk]:
     """Leave out the members that are done, and the chunks of which none is left.
 
     By member, since the chunks are not the same with another memory or another number of devices.
@@ -175,9 +175,9 @@ def left(chunks: Sequence[Chunk], done: np.ndarray) -> list[Chunk]:
     return found
 
 
-def opened(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Any]) -> Kept:
+def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Any]) -> ChunkStore:
     """Return what keeps the finished chunks: the folder `out`, or, without one, memory."""
-    return Memory() if out is None else Store(out, fingerprint)
+    return MemoryStore() if out is None else FolderStore(out, fingerprint)
 
 
 def _name(index: int, members: np.ndarray) -> str:
@@ -188,7 +188,7 @@ def _name(index: int, members: np.ndarray) -> str:
 # --- files that are whole: each is there as it was written, or it is not there
 
 
-def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
+def pack(arrays: Mapping[str, np.ndarray]) -> bytes:
     """Return an NPZ archive of the arrays whose comment is the SHA-256 of everything before it."""
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **arrays)
@@ -196,7 +196,7 @@ def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
     return body + struct.pack("<H", DIGEST) + hashlib.sha256(body).hexdigest().encode()
 
 
-def unpacked(content: bytes) -> dict[str, np.ndarray] | None:
+def unpack(content: bytes) -> dict[str, np.ndarray] | None:
     """Return the arrays of an archive that `packed` made, or None where a bit of it is not as it was."""
     body, length, digest = content[: -DIGEST - 2], content[-DIGEST - 2 : -DIGEST], content[-DIGEST:]
     if length != struct.pack("<H", DIGEST) or digest != hashlib.sha256(body).hexdigest().encode():

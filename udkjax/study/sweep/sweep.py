@@ -9,12 +9,12 @@ from udkjax.study.progress import ProgressOption, reporting
 from udkjax.study.sweep.axes import Design
 from udkjax.study.sweep.cutting import MEMORY, cut_chunks
 from udkjax.study.sweep.dataset import assemble
-from udkjax.study.sweep.executors import dask, devices
+from udkjax.study.sweep.executors import compute_on_devices, dask_engine
 from udkjax.study.sweep.fingerprint import fingerprint
 from udkjax.study.sweep.layout import SweepError
 from udkjax.study.sweep.member import RESULT
-from udkjax.study.sweep.plan import Chunk, Plan, planned
-from udkjax.study.sweep.store import left, opened
+from udkjax.study.sweep.plan import Chunk, Plan, make_plan
+from udkjax.study.sweep.store import open_store, unfinished_chunks
 from udkjax.study.sweep.sweep_progress import Watch
 
 ENGINES = ("auto", "devices", "dask")
@@ -65,12 +65,12 @@ def sweep(
     if engine not in ENGINES:
         raise SweepError([f"engine: there is no {engine!r}; known are {', '.join(ENGINES)}"])
     require("xarray")
-    plan = planned(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
+    plan = make_plan(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
     compute = _engine(engine, client)
-    with opened(out, fingerprint(plan) if out is not None else {}) as kept:
+    with open_store(out, fingerprint(plan) if out is not None else {}) as kept:
         done, codes = kept.done(RESULT)
         with reporting(progress, plan.size, "sweep") as report:
-            todo = left(cut_chunks(plan, memory), done) if len(done) < plan.size else []
+            todo = unfinished_chunks(cut_chunks(plan, memory), done) if len(done) < plan.size else []
             watch = Watch(plan.size, todo, report.show, codes)
             for chunk, data, seconds in compute(plan, todo):
                 kept.write(chunk, data)
@@ -80,4 +80,4 @@ def sweep(
 
 def _engine(engine: str, client: Any) -> Callable[[Plan, Sequence[Chunk]], Generator[Any, None, None]]:
     """What computes chunks: a client that is given is there to be used."""
-    return dask(client) if engine == "dask" or (engine == "auto" and client is not None) else devices
+    return dask_engine(client) if engine == "dask" or (engine == "auto" and client is not None) else compute_on_devices

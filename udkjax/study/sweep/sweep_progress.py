@@ -56,7 +56,7 @@ class Watch:
         self.work, self.work_done, self.new = sum(chunk.work for chunk in left), 0.0, 0
         self.begun = time.monotonic()
         self.first: tuple[float, float] | None = None  # when the first chunk came, and its work: a compilation was part of it
-        failures = _failed({}, codes)
+        failures = _count_failures({}, codes)
         done = members - sum(len(chunk.members) for chunk in left)
         self.state = SweepProgress("sweep", done, members, 0.0, _message(failures), failures=failures)
         self.show(self.state)
@@ -67,9 +67,9 @@ class Watch:
         self.new += len(chunk.members)
         self.work_done += chunk.work
         self.first = self.first or (now, self.work_done)
-        failures = _failed(before.failures, data["result"])
-        slowest = _slower(before.slowest, chunk.members, data.get(STEPS))
-        slowest_chunk = _slower(before.slowest_chunk, [chunk.index], seconds)
+        failures = _count_failures(before.failures, data["result"])
+        slowest = _find_slowest(before.slowest, chunk.members, data.get(STEPS))
+        slowest_chunk = _find_slowest(before.slowest_chunk, [chunk.index], seconds)
         self.state = SweepProgress(
             before.what,
             before.done + len(chunk.members),
@@ -101,7 +101,7 @@ def _message(
     return "; ".join(said)
 
 
-def _failed(before: Mapping[str, int], codes: ArrayLike) -> dict[str, int]:
+def _count_failures(before: Mapping[str, int], codes: ArrayLike) -> dict[str, int]:
     """Add to the numbers of members that ended with each `Result`; successes are left out."""
     found = Counter(before)
     for code, count in zip(*np.unique(np.asarray(codes, int), return_counts=True), strict=True):
@@ -110,7 +110,7 @@ def _failed(before: Mapping[str, int], codes: ArrayLike) -> dict[str, int]:
     return dict(found)
 
 
-def _slower(before: tuple[int, Any] | None, who: ArrayLike, values: ArrayLike | None) -> tuple[int, Any] | None:
+def _find_slowest(before: tuple[int, Any] | None, who: ArrayLike, values: ArrayLike | None) -> tuple[int, Any] | None:
     """Return the largest of the values and whose it is, unless one before was as large."""
     if values is None:
         return before
