@@ -9,7 +9,7 @@ from udkjax.integrate import Result
 from udkjax.show.summary import table
 from udkjax.show.sweep_figures import RESULT, scalars
 from udkjax.study.sweep.chunk import bytes_per_member, variables_of
-from udkjax.study.sweep.dry_run import SweepCost
+from udkjax.study.sweep.cost import SweepCost
 from udkjax.study.sweep.plan import Plan
 from udkjax.study.sweep.sweep_progress import duration
 from udkjax.study.wording import plural

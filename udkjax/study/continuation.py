@@ -15,7 +15,7 @@ Source: Allgower, Georg, Introduction to Numerical Continuation Methods (2003), 
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,7 +26,8 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.equations.constraints import gamma, psi
 from udkjax.equations.position_closure import ROUNDING
 from udkjax.equations.scales import RANK_TOL
-from udkjax.pinv import SVD
+from udkjax.pinv import SVD, Plus
+from udkjax.scene.mechanism import Mechanism
 from udkjax.study.drive import Driven
 from udkjax.study.sequential import sequential
 
@@ -71,12 +72,13 @@ class _State(NamedTuple):
 
 
 _FOLD = -1
+_Correction = tuple[Array, Array, Array]  # X, corrections so far, whether it is closed
 
 
 class Curve(eqx.Module):
     """The positions of a driven mechanism, as a curve in scaled coordinates and value."""
 
-    mechanism: Any
+    mechanism: Mechanism
     weights: Float[Array, "m"]
     units: Float[Array, "n+1"]
     rows: Float[Array, "m"]
@@ -87,53 +89,53 @@ class Curve(eqx.Module):
         units = jnp.append(scales.coordinates(driven.analysis.coordinates), driven.unit)
         return cls(driven.mechanism, scales.weights, units, scales.rows)
 
-    def residual(self, X: Any) -> Float[Array, "m"]:
+    def residual(self, X: Float[Array, "n+1"]) -> Float[Array, "m"]:
         x = X * self.units
         return self.weights * psi(self.mechanism, x[-1], x[:-1])
 
-    def slopes(self, X: Any) -> Float[Array, "m n+1"]:
+    def slopes(self, X: Float[Array, "n+1"]) -> Float[Array, "m n+1"]:
         return jax.jacfwd(self.residual)(X)
 
-    def is_closed(self, X: Any) -> Bool[Array, ""]:
+    def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
         """Whether the residual is what rounding leaves of it."""
         size = jnp.max(jnp.abs(self.residual(X) / (self.weights * self.rows)))
         return size <= ROUNDING * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
 
-    def correct(self, X: Any, fixed: Any = False) -> tuple[Array, Bool[Array, ""]]:
-        """The nearest point of the curve; `fixed`: of the same value. And whether there is one."""
+    def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
+        """Return the nearest point of the curve; `fixed`: of the same value. And whether there is one."""
 
-        def body(state: Any) -> Any:
+        def body(state: _Correction) -> _Correction:
             X, k, _ = state
             E = self.slopes(X)
             E = jnp.where(fixed & (jnp.arange(len(X)) == len(X) - 1), 0.0, E)
             return X - plus(E) @ self.residual(X), k + 1, self.is_closed(X)
 
-        def unfinished(state: Any) -> Any:  # the last correction is that of a closed point, to rounding
+        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last correction is that of a closed point, to rounding
             _, k, closed = state
             return (k < NEWTON) & ~closed
 
-        X, _, closed = jax.lax.while_loop(unfinished, body, (X, 0, jnp.asarray(False)))
+        X, _, closed = jax.lax.while_loop(is_unfinished, body, (X, jnp.asarray(0), jnp.asarray(False)))
         return X, closed
 
-    def tangent(self, X: Any, before: Any) -> Float[Array, "n+1"]:
+    def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> Float[Array, "n+1"]:
         E = self.slopes(X)
         tau = before - plus(E) @ (E @ before)
         size = jnp.linalg.norm(tau)
         return tau / jnp.where(size > 0, size, 1.0)
 
-    def derivatives(self, X: Any) -> tuple[Array, Array, Array]:
-        """dq/ds and d2q/ds2, unscaled, and the rank of Psi_q."""
+    def derivatives(self, X: Float[Array, "n+1"]) -> tuple[Array, Array, Array]:
+        """Return dq/ds and d2q/ds2, unscaled, and the rank of Psi_q."""
         x = X * self.units
         return derivatives(self, x[-1], x[:-1])
 
 
-def plus(E: Any) -> Any:
-    """E^+, truncated."""
+def plus(E: Float[Array, "m n"]) -> Plus:
+    """Return E^+, truncated."""
     return SVD(RANK_TOL).plus(E)
 
 
-def derivatives(curve: Curve, s: Any, q: Any) -> tuple[Array, Array, Array]:
-    """dq/ds (n,) and d2q/ds2 (n,) where positions are closed, and the rank of Psi_q: Psi_q q' = -Psi_s, Psi_q q'' = gamma."""
+def derivatives(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
+    """Return q' = dq/ds and q'' (n,) at a closed position, and the rank of Psi_q: Psi_q q' = -Psi_s, Psi_q q'' = gamma."""
     W, w, mechanism = curve.units[:-1], curve.weights, curve.mechanism
     E = w[:, None] * jax.jacfwd(lambda q: psi(mechanism, s, q))(q) * W
     inverse = plus(E)
@@ -142,15 +144,24 @@ def derivatives(curve: Curve, s: Any, q: Any) -> tuple[Array, Array, Array]:
     return dq, W * (inverse @ (w * gamma(mechanism, s, q, dq))), inverse.rank
 
 
-def follow(curve: Curve, s: Any, q: Any, values: Float[Array, "T"], points: Points, first: Any) -> Points:
-    """Positions at values[first:], one after another, from a position q at the value s; those before are in `points`.
+def follow(
+    curve: Curve,
+    s: Float[Array, ""],
+    q: Float[Array, "n"],
+    values: Float[Array, "T"],
+    points: Points,
+    first: int | Int[Array, ""],
+) -> Points:
+    """Find positions at values[first:], one after another, from a position q at the value s; those before are in `points`.
 
     Of a batch one member follows another: side by side all would take as many steps as the slowest. Without derivatives.
     """
     return sequential(_follow, curve, s, q, values, points, first)
 
 
-def _follow(curve: Curve, s: Any, q: Any, values: Any, points: Points, first: Any) -> Points:
+def _follow(
+    curve: Curve, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], points: Points, first: Int[Array, ""]
+) -> Points:
     X, closed = curve.correct(jnp.append(q, s) / curve.units, fixed=True)
     targets = values / curve.units[-1]
     tau = curve.tangent(X, jnp.zeros_like(X).at[-1].set(1.0))
@@ -158,24 +169,24 @@ def _follow(curve: Curve, s: Any, q: Any, values: Any, points: Points, first: An
     start = jnp.where(closed, Reached.closed, Reached.open)
     state = _State(X, tau, one, first, jnp.asarray(0), start, points)
 
-    def unfinished(state: _State) -> Any:
+    def is_unfinished(state: _State) -> Bool[Array, ""]:
         return (state.k < len(values)) & (state.event == Reached.closed)
 
     def body(state: _State) -> _State:
-        state = jax.lax.while_loop(unfinished, lambda state: _step(curve, targets, state), state)
-        return _at_fold(curve, targets, state)
+        state = jax.lax.while_loop(is_unfinished, lambda state: _step(curve, targets, state), state)
+        return _find_fold(curve, targets, state)
 
-    def go_on(state: _State) -> Any:
-        return unfinished(state) & (state.trials < TRIALS + 4 * len(values))
+    def goes_on(state: _State) -> Bool[Array, ""]:
+        return is_unfinished(state) & (state.trials < TRIALS + 4 * len(values))
 
-    state = jax.lax.while_loop(go_on, body, state)
-    event = jnp.where(unfinished(state), Reached.lost, state.event)
+    state = jax.lax.while_loop(goes_on, body, state)
+    event = jnp.where(is_unfinished(state), Reached.lost, state.event)
     status = jnp.where(jnp.arange(len(values)) >= state.k, event, state.points.status)
     return state.points._replace(status=status)
 
 
-def _step(curve: Curve, targets: Any, state: _State) -> _State:
-    """One step towards the next value, or right to it."""
+def _step(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
+    """Take one step towards the next value, or right to it."""
     X, tau, h, k, trials, event, points = state
     target = targets[k]
     way = jnp.where(target >= X[-1], 1.0, -1.0)
@@ -204,50 +215,48 @@ def _step(curve: Curve, targets: Any, state: _State) -> _State:
         k=k + lands,
         trials=trials + 1,
         event=jnp.where(folds, _FOLD, jnp.where(lost | (trials > TRIALS + 4 * len(targets)), Reached.lost, event)),
-        points=_recorded(curve, points, k, at, lands),
+        points=_record(curve, points, k, at, lands),
     )
 
 
-def _recorded(curve: Curve, points: Points, k: Any, X: Any, which: Any) -> Points:
-    """A point of the curve, where it is that at values[k]."""
+def _record(curve: Curve, points: Points, k: Int[Array, ""], X: Float[Array, "n+1"], which: Bool[Array, ""]) -> Points:
+    """Store a point of the curve as that of values[k], where `which` is true."""
     dq, ddq, rank = curve.derivatives(X)
-    full = jnp.minimum(len(curve.weights), len(X) - 1)
-    del full
     status = jnp.where(rank < len(X) - 1, Reached.singular, Reached.closed)
     new = {"q": (X * curve.units)[:-1], "dq": dq, "ddq": ddq, "status": status}
     return points._replace(**{name: _set(getattr(points, name), k, x, which) for name, x in new.items()})
 
 
-def _set(array: Array, k: Any, x: Any, which: Any) -> Array:
+def _set(array: Array, k: Int[Array, ""], x: Array, which: Bool[Array, ""]) -> Array:
     return array.at[k].set(jnp.where(which, x, array[k]))
 
 
-def _at_fold(curve: Curve, targets: Any, state: _State) -> _State:
+def _find_fold(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
     """Find the toggle within the next step, if there is one, and the next value if it lies before."""
     X, tau, h, k, _, event, points = state
     folds, k = event == _FOLD, jnp.minimum(k, len(targets) - 1)
     target, way = targets[k], jnp.sign(tau[-1])
 
-    def on(sigma: Any) -> tuple[Array, Array]:
+    def point_at(sigma: Float[Array, ""]) -> tuple[Array, Array]:
         at = curve.correct(X + sigma * tau)[0]
         return at, curve.tangent(at, tau)
 
-    def found(end: Any, of_value: Any) -> tuple[Any, Any]:
-        """Where the tangent turns back, or where the target is, before `end`."""
+    def find(end: Float[Array, ""], of_value: Bool[Array, ""]) -> tuple[Array, tuple[Array, Array, Array]]:
+        """Return where the tangent turns back, or where the target is, before `end`."""
 
-        def ahead(sigma: Any) -> Any:
-            at, tangent = on(sigma)
+        def ahead(sigma: Float[Array, ""]) -> Float[Array, ""]:
+            at, tangent = point_at(sigma)
             return way * jnp.where(of_value, target - at[-1], tangent[-1])
 
         sigma = _root(ahead, end)
-        return sigma, (sigma, *on(sigma))
+        return sigma, (sigma, *point_at(sigma))
 
-    _, (sigma, (fold, landed), (_, turned)) = jax.lax.scan(found, h, jnp.array([False, True]))
+    _, (sigma, (fold, landed), (_, turned)) = jax.lax.scan(find, h, jnp.array([False, True]))
     room = SAME * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.abs(fold[-1]))
     before = (target - fold[-1]) * way <= room
     lands, ends = folds & before, folds & ~before
     x = fold * curve.units
-    points = _recorded(curve, points, k, landed, lands)
+    points = _record(curve, points, k, landed, lands)
     points = points._replace(
         limit=jnp.where(ends, x[-1], points.limit),
         limit_q=jnp.where(ends, x[:-1], points.limit_q),
@@ -262,14 +271,14 @@ def _at_fold(curve: Curve, targets: Any, state: _State) -> _State:
     )
 
 
-def _root(f: Callable[[Any], Any], end: Any) -> Any:
-    """Where f, positive at 0, becomes negative before `end`, to rounding; the end, where it does not.
+def _root(f: Callable[[Array], Array], end: Float[Array, ""]) -> Float[Array, ""]:
+    """Return where f, positive at 0, becomes negative before `end`, to rounding; the end, where it does not.
 
     By the rule of Illinois: secants of a bracket, of which a side that stays counts half.
     """
     rounding = 2 * float(jnp.finfo(end.dtype).eps)
 
-    def closer(state: Any) -> Any:
+    def halve(state: tuple[Array, ...]) -> tuple[Array, ...]:
         a, fa, b, fb, k, _ = state
         slope = fb - fa
         c = jnp.clip(b - fb * (b - a) / jnp.where(slope != 0, slope, 1.0), jnp.minimum(a, b), jnp.maximum(a, b))
@@ -280,12 +289,12 @@ def _root(f: Callable[[Any], Any], end: Any) -> Any:
 
     # One evaluation for both ends: what is traced once compiles in half the time.
     at_start, at_end = jax.lax.map(f, jnp.stack([jnp.zeros_like(end), end]))
-    state = jnp.zeros_like(end), at_start, end, at_end, 0, at_end >= 0
-    return jax.lax.while_loop(lambda s: (s[4] < SECANTS) & ~s[5], closer, state)[2]
+    state = jnp.zeros_like(end), at_start, end, at_end, jnp.asarray(0), at_end >= 0
+    return jax.lax.while_loop(lambda s: (s[4] < SECANTS) & ~s[5], halve, state)[2]
 
 
 def no_points(count: int, n: int) -> Points:
-    """Points of which none is known yet."""
+    """Return points of which none is known yet."""
     nothing = jnp.full((count, n), jnp.nan)
     status = jnp.full(count, int(Reached.lost))
     return Points(nothing, nothing, nothing, status, jnp.asarray(np.nan), jnp.full(n, jnp.nan))

@@ -104,9 +104,9 @@ def test_a_sweep_that_is_given_up_leaves_nothing_on_the_cluster(client, monkeypa
 def test_workers_with_other_versions_are_refused(client, monkeypatch):
     compute(monkeypatch, squares)
     engine = dask_engine(client)
-    mine, main = cluster._deciding(), threading.current_thread()
+    mine, main = cluster._deciding_versions(), threading.current_thread()
     other = mine | {"jax": "0.1"}
-    monkeypatch.setattr(cluster, "_deciding", lambda: mine if threading.current_thread() is main else other)
+    monkeypatch.setattr(cluster, "_deciding_versions", lambda: mine if threading.current_thread() is main else other)
     with pytest.raises(ClusterError, match=rf"jax 0\.1 instead of {mine['jax']}$"):
         list(engine(PLAN, CHUNKS))
 

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.study.sweep.chunk import program, run
-from udkjax.study.sweep.cutting import SECONDS, _cut, cut_chunks, lane_steps
+from udkjax.study.sweep.cost import SECONDS, _cut, cut_chunks, lane_steps
 from udkjax.study.sweep.dataset import NOT_COMPUTED, assemble
 from udkjax.study.sweep.plan import make_plan
 

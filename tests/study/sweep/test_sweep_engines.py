@@ -15,7 +15,7 @@ import udkjax as udk
 from udkjax.integrate.assembly import close
 from udkjax.study.exact import exact_coordinates
 from udkjax.study.sweep.chunk import program, run
-from udkjax.study.sweep.cutting import cut_chunks
+from udkjax.study.sweep.cost import cut_chunks
 from udkjax.study.sweep.plan import make_plan
 
 LINKS = ("link1", "link2", "link3")
@@ -23,7 +23,7 @@ DEVICES = 8
 SCRIPT = """
 import sys
 import jax, numpy as np, udkjax as udk
-from udkjax.study.sweep.cutting import cut_chunks
+from udkjax.study.sweep.cost import cut_chunks
 from udkjax.study.sweep.chunk import program, run
 from udkjax.study.sweep.plan import planned
 

@@ -11,7 +11,7 @@ from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.bodies import COORDINATES
 from udkjax.study.sweep.axes import Column, Dimension
 from udkjax.study.sweep.chunk import program, variables_of
-from udkjax.study.sweep.cutting import lane_steps
+from udkjax.study.sweep.cost import lane_steps
 from udkjax.study.sweep.member import RESULT, STEPS
 from udkjax.study.sweep.plan import Plan, Variable
 

@@ -7,7 +7,7 @@ from udkjax.extras import require
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.progress import ProgressOption, reporting
 from udkjax.study.sweep.axes import Design
-from udkjax.study.sweep.cutting import MEMORY, cut_chunks
+from udkjax.study.sweep.cost import MEMORY, cut_chunks
 from udkjax.study.sweep.dataset import assemble
 from udkjax.study.sweep.executors import compute_on_devices, dask_engine
 from udkjax.study.sweep.fingerprint import fingerprint

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from udkjax.study.sweep import dry_run
-from udkjax.study.sweep.dry_run import estimate_cost
+from udkjax.study.sweep import cost
+from udkjax.study.sweep.cost import estimate_cost
 
 GROUPS = [SimpleNamespace(index=k, members=np.arange(1000 * k, 1000 * k + 1000)) for k in range(5)]
 PLAN: Any = SimpleNamespace(size=5000, groups=GROUPS)
@@ -24,12 +24,12 @@ def tried(monkeypatch):
         assert set(chunk.members) <= set(GROUPS[chunk.group].members) and len(set(chunk.members)) == 64
         return {"steps": np.where(np.arange(64) < 32, 50, 100)}
 
-    monkeypatch.setattr(dry_run, "run", run)
-    monkeypatch.setattr(dry_run, "program", lambda plan, group: SimpleNamespace(piece=64, lanes=64, devices=[None]))
-    monkeypatch.setattr(dry_run, "time", SimpleNamespace(perf_counter=lambda: clock.now))
-    monkeypatch.setattr(dry_run, "concurrent_chunks", lambda: 2)
-    monkeypatch.setattr(dry_run, "bytes_per_member", lambda plan: 100)
-    monkeypatch.setattr(dry_run, "cut_chunks", lambda plan, memory: [None] * 7)
+    monkeypatch.setattr(cost, "run", run)
+    monkeypatch.setattr(cost, "program", lambda plan, group: SimpleNamespace(piece=64, lanes=64, devices=[None]))
+    monkeypatch.setattr(cost, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+    monkeypatch.setattr(cost, "concurrent_chunks", lambda: 2)
+    monkeypatch.setattr(cost, "bytes_per_member", lambda plan: 100)
+    monkeypatch.setattr(cost, "cut_chunks", lambda plan, memory: [None] * 7)
     return seen
 
 
