@@ -10,7 +10,7 @@ import numpy as np
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import State
 from udkjax.pinv import Auto
-from udkjax.scene.checks import Mistakes, SceneError, quote, abbreviate, suggestion
+from udkjax.scene.checks import Mistakes, SceneError, abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.study.sweep.axes import CHOICES, Axis, Column, Design, Dimension, Zipped, labels_of, scale_to_range
