@@ -118,7 +118,7 @@ class _TableReader:
                 yield from self.record(label, places, times, values, noise)
 
     def channels(self, headings: Sequence[str]) -> list[_ChannelColumns]:
-        """The channels, with their columns."""
+        """Return the channels, with their columns."""
         found: dict[str, _ChannelColumns] = {}
         for heading in headings:
             of = heading.removesuffix(NOISE)
@@ -140,7 +140,7 @@ class _TableReader:
         return list(found.values())
 
     def numbers(self, heading: str, column: Column, wanted: str) -> np.ndarray:
-        """The numbers of a column in SI units; gaps are not a number."""
+        """Return the numbers of a column in SI units; gaps are not a number."""
         scale, cells, count = 1.0, column.values, len(self.table.rows)
         try:
             scale = conversion_factor(column.units, wanted) if column.units else 1.0
@@ -159,7 +159,7 @@ class _TableReader:
         return scale * found
 
     def rows_by_record(self) -> list[tuple[str, np.ndarray]]:
-        """The records by name, and which rows they have."""
+        """Return the records by name, and which rows they have."""
         if RECORD not in self.columns:
             return [(self.table.name, np.arange(len(self.table.rows)))]
         labels = [_label(cell) for cell in self.columns[RECORD].values]
@@ -177,7 +177,7 @@ class _TableReader:
         self.add_each(time, there[late], lambda k: f"{times[k]:g} s does not exceed the one before, {before[k]:g} s")
 
     def record(self, label: str, places: np.ndarray, times: np.ndarray, values: ByChannel, noise: ByChannel) -> Iterator[Record]:
-        """The record that some rows make, of those channels that were measured in it."""
+        """Make a record of some rows, of those channels that were measured in it."""
         own = {name: x[places] for name, x in values.items()}
         own = {name: x for name, x in own.items() if not np.isnan(x).all()}
         if self.table.padded and own:
@@ -202,8 +202,8 @@ class _TableReader:
             self.add(heading, f"and so in {len(rows) - MOST_SHOWN} more rows")
 
 
-def _number(cell: Any) -> float:
-    """A cell as a number: infinite where it is none."""
+def _number(cell: str | float | None) -> float:
+    """Return a cell as a number: infinite where it is none."""
     if cell is None or (isinstance(cell, str) and not cell.strip()):
         return math.nan
     try:
@@ -212,8 +212,8 @@ def _number(cell: Any) -> float:
         return math.inf
 
 
-def _label(cell: Any) -> str:
-    """A cell as the name of a record: empty where it is none."""
+def _label(cell: str | float | None) -> str:
+    """Return a cell as the name of a record: empty where it is none."""
     if isinstance(cell, str):
         return cell.strip()
     return "" if cell is None or cell != cell else f"{cell:g}"
@@ -274,7 +274,7 @@ class _DataReader:
             self.problems.append(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})")
 
     def channel(self, given: object) -> Channel | Quantity:
-        """The channel of a name, or the user's own. Raises ValueError."""
+        """Return the channel of a name, or the user's own. Raises ValueError."""
         own = given if isinstance(given, Quantity) else self.quantities.get(str(given))
         return channel_of(self.mechanism, str(given)) if own is None else own
 
@@ -299,7 +299,7 @@ class _DataReader:
         if list(values) == list(record.values) or len(values) != len(record.values):
             return record
         noise = dict(zip(values, record.noise.values(), strict=True))
-        return Record(record.times, values, noise, record.start, record.t0, record.conditions, record.name)
+        return record.with_channels(values, noise)
 
     def with_noise(self, record: Record, given: Noise) -> Record:
         """Return the record with the `given` standard deviation for those channels that have none of their own."""
@@ -308,7 +308,7 @@ class _DataReader:
             return record
         noise = {channel: sigma.get(channel) if own is None else own for channel, own in record.noise.items()}
         try:
-            return Record(record.times, record.values, noise, record.start, record.t0, record.conditions, record.name)
+            return record.with_channels(record.values, noise)
         except IdentificationError as error:
             self.problems += error.problems
             return record

@@ -105,6 +105,10 @@ class Record:
         """Return the same record with another start."""
         return Record(self.times, self.values, self.noise, start, self.t0, self.conditions, self.name)
 
+    def with_channels(self, values: Mapping[Key, np.ndarray], noise: Mapping[Key, ArrayLike | None]) -> "Record":
+        """Return the same record with other values and noise."""
+        return Record(self.times, values, noise, self.start, self.t0, self.conditions, self.name)
+
     def __repr__(self) -> str:
         return f"Record({len(self.times)} times, {', '.join(map(str, self.values))})"
 
