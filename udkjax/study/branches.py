@@ -44,7 +44,7 @@ def branches(
     """
     driven = drive(mechanism, driver, 0.0, held)
     guesses = random_positions(mechanism, starts, seed)
-    q, closed = _closed(driven.mechanism, driven.analysis, number(value), guesses)
+    q, closed = _close(driven.mechanism, driven.analysis, number(value), guesses)
     kept = np.asarray(q)[distinct(q, closed, driven.analysis.scales)]
     kept[..., 2] = np.angle(np.exp(1j * kept[..., 2]))
     order = np.lexsort(np.round(kept[..., 2], 6).T[::-1])
@@ -52,7 +52,7 @@ def branches(
 
 
 @eqx.filter_jit
-def _closed(mechanism: Mechanism, analysis: Analysis, s: Any, guesses: Any) -> tuple[Array, Array]:
+def _close(mechanism: Mechanism, analysis: Analysis, s: Any, guesses: Any) -> tuple[Array, Array]:
     def one(q: Any) -> tuple[Array, Array]:
         found = close(mechanism, s, State(q, jnp.zeros_like(q)), analysis=analysis)
         return found.state.q, found.is_closed

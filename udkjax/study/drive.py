@@ -90,7 +90,7 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Any, held: Mapping[str, Array
     for key, value in (held or {}).items():
         mechanism = _with_driver(mechanism, *_element(mechanism, key), _constant(value))
     name, element = _element(mechanism, driver)
-    found = _driven(mechanism, name, element, t)
+    found = _add_driver(mechanism, name, element, t)
     analysis = analyse(_from_guess(found, name))
     _require_determinate(found, analysis, driver if isinstance(driver, str) else element.coordinate)
     row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
@@ -103,7 +103,7 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[An
     places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
 
     def value(q: Any) -> Any:
-        return measured(element, *(STILL if k is None else _frame(q[k]) for k in places))
+        return coordinate_value(element, *(STILL if k is None else _frame(q[k]) for k in places))
 
     return value
 
@@ -120,7 +120,7 @@ def _frame(q: Any) -> Frame:
     return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle))
 
 
-def measured(element: Any, *frames: Frame) -> Any:
+def coordinate_value(element: Any, *frames: Frame) -> Any:
     """Return the value (rad, m) of a coordinate, of anything that has `bodies`, `coordinate` and `points`, from its frames."""
     return Driver(element.bodies, element.coordinate, _constant(0.0), element.points).complete().residual(0.0, *frames)[0]
 
@@ -155,21 +155,21 @@ def _element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coord
         found = mechanism.drivers[driver]
         return driver, Coordinate(found.bodies, found.coordinate, found.points)
     element = coordinate_of(mechanism, driver) if isinstance(driver, str) else driver
-    return unused("value", mechanism.constraints), element
+    return choose_name("value", mechanism.constraints), element
 
 
-def unused(name: str, taken: Mapping[str, Any]) -> str:
+def choose_name(name: str, taken: Mapping[str, Any]) -> str:
     """Return a name that is not taken."""
     while name in taken:
         name += "'"
     return name
 
 
-def _driven(mechanism: Mechanism, name: str, element: Coordinate, t: Any) -> Mechanism:
+def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Any) -> Mechanism:
     """With one driver of this name along its value, and the others held."""
     known = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
-        origin = known and Origin(_driven(known, name, _known_element(known, name, element), _known(t, 0.0)))
+        origin = known and Origin(_add_driver(known, name, _known_element(known, name, element), _known(t, 0.0)))
     held = {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
     held[name] = Driver(element.bodies, element.coordinate, Value(), element.points)
     return with_drivers(mechanism, held, origin=origin)

@@ -46,9 +46,9 @@ def exact_coordinates(mech: Mechanism, ts, q0, v0, tol: float = 1e-8) -> Float[n
 
     q = np.repeat(q0[None], len(ts), axis=0)
     for link, pivot, centre in zip(links, pivots, centres, strict=True):
-        q[:, link, :2] = pivot + _turned(centre, turn)
+        q[:, link, :2] = pivot + _rotate(centre, turn)
         q[:, link, 2] += turn
-    q[:, coupler, :2] += _turned(arm, turn) - arm
+    q[:, coupler, :2] += _rotate(arm, turn) - arm
     return q
 
 
@@ -103,14 +103,14 @@ def parallelogram(mech: Mechanism, q0, tol: float) -> Parallelogram | None:
     place = {name: number for number, name in enumerate(mech.bodies)}
     angle = {name: q0[number, 2] for name, number in place.items()}
     pivots = np.array([pin[GROUND] for pin in below.values()])
-    arms = np.array([_turned(above[link][link] - below[link][link], angle[link]) for link in below])
-    spacing = np.array([_turned(above[link][coupler], angle[coupler]) for link in below]) - pivots
+    arms = np.array([_rotate(above[link][link] - below[link][link], angle[link]) for link in below])
+    spacing = np.array([_rotate(above[link][coupler], angle[coupler]) for link in below]) - pivots
     if np.abs(arms - arms[0]).max() + np.abs(spacing - spacing[0]).max() > tol * np.hypot(*arms[0]):
         return None
-    centres = np.array([_turned(-below[link][link], angle[link]) for link in below])
+    centres = np.array([_rotate(-below[link][link], angle[link]) for link in below])
     return Parallelogram([place[link] for link in below], place[coupler], pivots, centres, arms[0])
 
 
-def _turned(vector, angle):
+def _rotate(vector, angle):
     x, y = vector
     return np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y], axis=-1)

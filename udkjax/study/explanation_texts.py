@@ -23,7 +23,7 @@ def as_text(e: Any) -> str:
         parts += [_constraints(e, rows, columns), _rank(e, rows)]
     parts += [_masses(e, columns)]
     if rows:
-        parts += [_asked(e, rows), _pseudoinverse(e, rows, columns)]
+        parts += [_right_hand_side(e, rows), _pseudoinverse(e, rows, columns)]
     parts += [_accelerations(e, columns)]
     if rows:
         parts += [_multipliers(e, rows)]
@@ -112,7 +112,7 @@ def _masses(e: Any, columns: list[str]) -> str:
     )
 
 
-def _asked(e: Any, rows: list[str]) -> str:
+def _right_hand_side(e: Any, rows: list[str]) -> str:
     done = e.psi_q @ e.a_F
     lines = [
         _title(4, "What the constraints still ask: b = gamma - Psi_q a_F"),

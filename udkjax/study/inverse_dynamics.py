@@ -27,7 +27,7 @@ from udkjax.scene.drivers import Motion, Spline
 from udkjax.scene.fields import number, optional_number
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.drive import Coordinate, element_of, measured, unused, value_of, without_drivers
+from udkjax.study.drive import Coordinate, choose_name, coordinate_value, element_of, value_of, without_drivers
 from udkjax.study.free_directions import free_part
 from udkjax.study.kinematics import Kinematics, kinematics
 
@@ -60,7 +60,7 @@ class Effort(ForceElement):
     points: Float[Array, "2 2"] | None = eqx.field(converter=optional_number, default=None)
 
     def potential(self, t, *frames):
-        return -self.law(t) * measured(self, *frames)
+        return -self.law(t) * coordinate_value(self, *frames)
 
     @property
     def breakpoints(self):
@@ -123,7 +123,7 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
     forces = dict(mechanism.forces)
     for name, effort in found.efforts.items():
         e = elements[name]
-        forces[unused(f"{name} effort", forces)] = Effort(e.bodies, e.coordinate, Spline(found.ts, effort), e.points)
+        forces[choose_name(f"{name} effort", forces)] = Effort(e.bodies, e.coordinate, Spline(found.ts, effort), e.points)
     return without_drivers(mechanism, forces)
 
 

@@ -160,7 +160,7 @@ def is_known(tree: Any) -> bool:
 
 @eqx.filter_jit
 def _kinematics(driven: Driven, q: Any, values: Any, rate: Any, acceleration: Any, bodies: tuple[str, ...]) -> Kinematics:
-    points = _solved(driven, driven.value(q) if driven.name else values[0], q, values)
+    points = _solve(driven, driven.value(q) if driven.name else values[0], q, values)
     rate, acceleration = (jnp.broadcast_to(x, values.shape) for x in (rate, acceleration))
     v = points.dq * rate[:, None]
     a = points.ddq * rate[:, None] ** 2 + points.dq * acceleration[:, None]
@@ -172,7 +172,7 @@ def _kinematics(driven: Driven, q: Any, values: Any, rate: Any, acceleration: An
 def _travel(driven: Driven, q: Any, far: Any) -> Travel:
     s = driven.value(q)
     ways = jnp.array([-1.0, 1.0])
-    down_up = jax.vmap(lambda way: _solved(driven, s, q, jax.lax.stop_gradient(s + way * far)[None], False))(ways)
+    down_up = jax.vmap(lambda way: _solve(driven, s, q, jax.lax.stop_gradient(s + way * far)[None], False))(ways)
     down, up = (jax.tree.map(lambda x, k=k: x[k], down_up) for k in (0, 1))
     lower, upper = (jnp.where(p.status[0] == Reached.beyond_limit, p.limit, way * jnp.inf) for p, way in ((down, -1), (up, 1)))
     lower_q, upper_q = (p.limit_q.reshape(-1, 3) for p in (down, up))
@@ -183,19 +183,19 @@ def _start(mechanism: Mechanism, driver: Drive, values: Any, state: State | None
     """The mechanism driven, and the closed position that it starts from."""
     driven = drive(mechanism, driver, 0.0, held)
     if driver is None:
-        return driven, _assembled(driven.mechanism, values[0], state, driven.analysis)
-    q = _assembled(mechanism, 0.0, state, analyse(mechanism))
+        return driven, _assemble(driven.mechanism, values[0], state, driven.analysis)
+    q = _assemble(mechanism, 0.0, state, analyse(mechanism))
     if held:
         still = State(q.reshape(-1, 3), jnp.zeros((len(q) // 3, 3)))
-        q = _assembled(driven.mechanism, driven.value(q), still, driven.analysis)
+        q = _assemble(driven.mechanism, driven.value(q), still, driven.analysis)
     return driven, q
 
 
-def _assembled(mechanism: Mechanism, t: Any, state: State | None, analysis: Any) -> Any:
+def _assemble(mechanism: Mechanism, t: Any, state: State | None, analysis: Any) -> Any:
     return jnp.ravel(assemble(mechanism, t, state, throw=False, analysis=analysis).q)
 
 
-def _solved(driven: Driven, s: Any, q: Any, values: Any, fast: bool = True) -> Points:
+def _solve(driven: Driven, s: Any, q: Any, values: Any, fast: bool = True) -> Points:
     """By machine code as far as that is to be relied on, if it may be `fast`, and with care from there on."""
     curve = Curve.of(driven)
     points, first = no_points(len(values), len(q)), jnp.asarray(0)

@@ -51,11 +51,11 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: Any, q: Fl
     else:
         N, multipliers = root[:, None] * V, jnp.zeros(0)
 
-    def unbalanced(q: Any) -> Any:
+    def residual_force(q: Any) -> Any:
         pull = jax.grad(lambda q: jnp.sum(multipliers * constraints.psi(mechanism, t, q)))(q)
         return pull - F(q, still)
 
-    K = jax.jacfwd(unbalanced)(q)
+    K = jax.jacfwd(residual_force)(q)
     C = -jax.jacfwd(lambda v: F(q, v))(still)
     M = loads.mass(mechanism)
     return Linearization(N, N.T @ (M[:, None] * N), N.T @ C @ N, N.T @ K @ N, N.T @ F(q, still), multipliers)

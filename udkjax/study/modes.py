@@ -72,7 +72,7 @@ def _modes(mechanism: Any, analysis: Analysis, free: int, t: Any, q: Any) -> Mod
     unit = jax.lax.stop_gradient(jnp.sqrt(jnp.max(jnp.abs(K), initial=0.0)))
     unit = jnp.where(unit > 0, unit, 1.0)
     companion = jnp.block([[jnp.zeros_like(K), jnp.eye(free)], [-K / unit**2, -C / unit]])
-    s = _sorted(jnp.linalg.eigvals(companion))
+    s = _sort(jnp.linalg.eigvals(companion))
     values, vectors = jnp.linalg.eig(jax.lax.stop_gradient(companion))
     damped = (jax.lax.stop_gradient(N) @ vectors[:free, _order(values)]).T
     damped = damped / jnp.linalg.norm(damped, axis=1, keepdims=True)
@@ -85,5 +85,5 @@ def _order(s: Any) -> Any:
     return jnp.lexsort((s.real, s.imag))
 
 
-def _sorted(s: Any) -> Any:
+def _sort(s: Any) -> Any:
     return s[_order(s)]

@@ -89,24 +89,24 @@ def _walk(positions: Positions, start: Configuration, rank: int, side: float) ->
             heading = onward / np.linalg.norm(onward)
         if len(path) > 3 and positions.distance(start, moved, turns=False) < STEP:
             return path[1:], True
-        if len(path) > 2 and more > BESIDE and _kinked([c.sigma[rank - 1] for c in path[-3:]]):
+        if len(path) > 2 and more > BESIDE and _has_kink([c.sigma[rank - 1] for c in path[-3:]]):
             more = BESIDE
     return path[1:], False
 
 
-def _kinked(sigma: list[float]) -> bool:
+def _has_kink(sigma: list[float]) -> bool:
     """Whether three values have a minimum that may be one of zero: not above the rise on either side."""
     return sigma[1] <= min(sigma[0], sigma[2]) and sigma[1] <= max(sigma[0], sigma[2]) - sigma[1]
 
 
 def _step(positions: Positions, at: Configuration, heading: np.ndarray, step: float, side: float) -> Configuration | None:
     t = at.t if heading.any() else at.t + side * positions.rows.driver_time_step * step
-    return positions.displaced(at, heading, step, t)
+    return positions.displace(at, heading, step, t)
 
 
 def _root(positions: Positions, path: list, way: np.ndarray, sigma: np.ndarray, k: int, rank: int) -> RankChange | None:
     """The configuration beside the k-th position where sigma vanishes, if it does."""
-    if not _kinked(sigma[k - 1 : k + 2].tolist()):
+    if not _has_kink(sigma[k - 1 : k + 2].tolist()):
         return None
     near = slice(max(0, k - BESIDE), k + BESIDE + 1)
     for turned in (k, k + 1):  # from where on sigma has the other sign

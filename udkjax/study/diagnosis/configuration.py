@@ -59,7 +59,7 @@ class Positions:
     def at(self, t: float, q: np.ndarray) -> Configuration:
         """The configuration of coordinates that are closed."""
         J = self.rows.jacobian(t, q) * self.unit / self.row_unit[:, None]
-        return Configuration(t, q, J, *decomposed(J, self.rank_tol))
+        return Configuration(t, q, J, *decompose(J, self.rank_tol))
 
     def near(self, t: float, q: np.ndarray) -> Configuration | None:
         """The closed position nearest to q, or None."""
@@ -68,7 +68,7 @@ class Positions:
         position = self.rows.close(t, q)
         return None if position is None else self.at(t, position.q)
 
-    def displaced(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
+    def displace(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
         """The closed position next to one that is displaced by a step along a direction, in scaled coordinates."""
         return self.near(start.t if t is None else t, start.q + step * self.unit * direction)
 
@@ -89,7 +89,7 @@ class Positions:
             size = np.linalg.norm(allowed)
             t += self.rows.driver_time_step * STEP / STRIDE
             direction = allowed / size if size > 0.0 else allowed
-            moved = self.displaced(last, direction, STEP, t) or self.displaced(last, direction, STEP, last.t)
+            moved = self.displace(last, direction, STEP, t) or self.displace(last, direction, STEP, last.t)
             if moved is None or self.distance(moved, last) < MOVED * STEP:
                 heading = random.standard_normal(len(heading))
                 continue
@@ -98,7 +98,7 @@ class Positions:
         return found
 
 
-def decomposed(J: np.ndarray, rank_tol: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+def decompose(J: np.ndarray, rank_tol: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """U, the singular values, V^T and the rank of a matrix; of one without entries, too."""
     if not J.size:
         return np.eye(len(J)), np.zeros(0), np.eye(J.shape[1]), 0

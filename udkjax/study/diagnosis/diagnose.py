@@ -10,7 +10,7 @@ from udkjax.integrate.assembly import State, close, require_closed
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.clearance import clearance
-from udkjax.study.diagnosis.configuration import Configuration, Positions, decomposed
+from udkjax.study.diagnosis.configuration import Configuration, Positions, decompose
 from udkjax.study.diagnosis.dependence import Dependency, dependencies
 from udkjax.study.diagnosis.diagnosis import Diagnosis, JointForces, Redundancy
 from udkjax.study.diagnosis.fixes import Fix, fixes_of
@@ -83,7 +83,7 @@ def diagnose(
         rows=rows.count,
         rank=here.rank,
         ordinary_rank=ordinary,
-        joint_rank=decomposed(here.J[of_joints], rank_tol)[3],
+        joint_rank=decompose(here.J[of_joints], rank_tol)[3],
         joint_rows=len(of_joints),
         can_move=bool(around),
         redundancies=tuple(found),
@@ -106,7 +106,7 @@ def _dependencies(
     if here.rank == best.rank:
         return permanent, []
     # Here: the combinations that vanish, less those that vanish everywhere, each of which gives up one row.
-    spared = _spared(best.left)
+    spared = _choose_redundant(best.left)
     N = here.left
     for row in spared:
         if np.linalg.norm(N[row]) > UNIQUE_TOL:
@@ -114,7 +114,7 @@ def _dependencies(
     return permanent, dependencies(N, owners, attached)
 
 
-def _spared(N: np.ndarray) -> list[int]:
+def _choose_redundant(N: np.ndarray) -> list[int]:
     """Rows, as many as N has columns, without which the others are independent where N vanishes on J."""
     chosen: list[int] = []
     while N.shape[1]:

@@ -15,7 +15,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Angle, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.diagnosis.configuration import Configuration, Positions, decomposed
+from udkjax.study.diagnosis.configuration import Configuration, Positions, decompose
 from udkjax.study.diagnosis.dependence import Dependency, stress_of
 
 STEEP = 1e-3  # the smallest singular value relative to the largest: a fix that leaves less is as good as none
@@ -77,14 +77,14 @@ def fixes_of(
                 aligned = min(change.alignment(force, c.q, _places(mechanism, name)) for force, c in zip(forces, at, strict=True))
                 options.append((removes, round(aligned, 6), round(conditioning, 12), change))
         for removes, _, conditioning, change in sorted(options, key=lambda option: option[:3], reverse=True):
-            changed = applied(mechanism, name, change)
-            if changed is not None and _verified(changed, removes, at, positions.rank_tol):
+            changed = apply_change(mechanism, name, change)
+            if changed is not None and _removes_redundancy(changed, removes, at, positions.rank_tol):
                 found.append(Fix(name, change.text, removes, conditioning, changed))
                 break
     return sorted(found, key=lambda fix: (-fix.removes, -fix.conditioning))
 
 
-def applied(mechanism: Mechanism, name: str, change: Change) -> Mechanism | None:
+def apply_change(mechanism: Mechanism, name: str, change: Change) -> Mechanism | None:
     """Return the mechanism with a constraint changed, or None where something else needs it as it is: friction in a revolute."""
     joints, drivers = dict(mechanism.joints), dict(mechanism.drivers)
     if change.element is not None:
@@ -146,13 +146,13 @@ def _effect(
     for position in at:
         rest = np.delete(position.J, own, axis=0)
         kept = np.concatenate([rest, change.kept(position.J[own], position.q, places)])
-        _, sigma, _, rank = decomposed(kept, rank_tol)
+        _, sigma, _, rank = decompose(kept, rank_tol)
         falls.add(position.redundancy - (len(kept) - rank) if rank == position.rank else -1)
         conditioning = min(conditioning, sigma[rank - 1] / sigma[0] if rank else 1.0)
     return falls.pop() if len(falls) == 1 else -1, float(conditioning)
 
 
-def _verified(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
+def _removes_redundancy(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
     """Whether the changed mechanism itself is closed in all positions, has the same mobility there, and fewer redundant rows."""
     positions = Positions(KinematicRows(after), rank_tol)
     seen = [positions.at(position.t, position.q) for position in at]

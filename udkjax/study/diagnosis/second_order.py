@@ -41,7 +41,7 @@ def branches(mechanism: Mechanism, positions: Positions, at: Configuration) -> l
     if not V.shape[1]:
         return []
     found = zeros_of(A) if N.shape[1] else [Zeros(np.eye(V.shape[1]), V.shape[1])]
-    return [_followed(positions, at, V @ zeros.space, zeros.dimension) for zeros in found]
+    return [_follow(positions, at, V @ zeros.space, zeros.dimension) for zeros in found]
 
 
 def quadratic_forms(mechanism: Mechanism, positions: Positions, at: Configuration) -> np.ndarray:
@@ -75,7 +75,7 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
     if size < ZERO:
         return [Zeros(np.eye(d), d)]
     A, random = A / size, np.random.default_rng(0)
-    x = _solved(A, np.concatenate([np.eye(d), random.standard_normal((STARTS, d))]))
+    x = _solve(A, np.concatenate([np.eye(d), random.standard_normal((STARTS, d))]))
     found: list[Zeros] = []
     for direction in x:
         if any(np.linalg.norm(direction - z.space @ (z.space.T @ direction)) < SAME for z in found):
@@ -87,7 +87,7 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
     return found
 
 
-def _solved(A: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Zeros on the unit sphere, by Gauss-Newton from many directions x (s, d)."""
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     for _ in range(ITERATIONS):
@@ -105,7 +105,7 @@ def _around(A: np.ndarray, x: np.ndarray) -> Zeros:
     if kernel.shape[1] > 1:
         if np.abs(np.einsum("ia,kij,jb->kab", kernel, A, kernel)).max(initial=0.0) < SAME**2:
             return Zeros(kernel, kernel.shape[1])
-        near = _solved(A, x + ASIDE * kernel.T)
+        near = _solve(A, x + ASIDE * kernel.T)
         if np.any(np.linalg.norm(near - (near @ x)[:, None] * x, axis=1) > ASIDE / 2):
             return Zeros(x[:, None], kernel.shape[1])
     return Zeros(x[:, None], 1)
@@ -115,16 +115,16 @@ def _inside(one: np.ndarray, two: np.ndarray) -> bool:
     return one.shape[1] < two.shape[1] and bool(np.linalg.norm(one - two @ (two.T @ one)) < SAME)
 
 
-def _followed(positions: Positions, at: Configuration, tangents: np.ndarray, dimension: int) -> Branch:
+def _follow(positions: Positions, at: Configuration, tangents: np.ndarray, dimension: int) -> Branch:
     tangent = tangents @ np.ones(tangents.shape[1]) / np.sqrt(tangents.shape[1])
     size = positions.rows.scales.size(positions.unit * tangent, np)
     tangent = tangent / size * np.sign(tangent[np.argmax(np.abs(tangent))])
     tangent[np.abs(tangent) < DOUBLE] = 0.0
-    ends = [positions.displaced(at, tangent, side * STEP) for side in (1.0, -1.0)]
-    reached = [end for end, side in zip(ends, (1.0, -1.0), strict=True) if _reached(positions, at, end, side * STEP * tangent)]
+    ends = [positions.displace(at, tangent, side * STEP) for side in (1.0, -1.0)]
+    reached = [end for end, side in zip(ends, (1.0, -1.0), strict=True) if _reaches(positions, at, end, side * STEP * tangent)]
     rank = max((end.rank for end in reached if end is not None), default=at.rank)
     return Branch((positions.unit * tangent).reshape(-1, 3), dimension, rank, len(reached) == 2)
 
 
-def _reached(positions: Positions, at: Configuration, end: Configuration | None, way: np.ndarray) -> bool:
+def _reaches(positions: Positions, at: Configuration, end: Configuration | None, way: np.ndarray) -> bool:
     return end is not None and float(np.linalg.norm((end.q - at.q) / positions.unit - way)) < ASTRAY * float(np.linalg.norm(way))

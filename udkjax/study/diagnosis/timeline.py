@@ -83,7 +83,7 @@ def timeline(mechanism: Mechanism, solution: Any, rank_tol: float, tol: float | 
     changes = []
     for k in _kinks(sigma):
         low, high = fine[max(k - 1, 0)], fine[min(k + 1, len(fine) - 1)]
-        found = _located(_renewed(mechanism, analysis, solution, ts, low, high) or path, low, high, ordinary, rank_tol, tol)
+        found = _locate(_renew(mechanism, analysis, solution, ts, low, high) or path, low, high, ordinary, rank_tol, tol)
         changes += [] if found is None else [found]
     k = int(np.argmin(sigma))
     least, when = min([(float(sigma[k]), float(fine[k])), *((c.smallest, c.time) for c in changes)])
@@ -102,7 +102,7 @@ def _kinks(sigma: np.ndarray) -> list[int]:
     return np.flatnonzero((sigma < before) & (sigma <= after) & (sigma <= KINKED * rise)).tolist()
 
 
-def _located(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> Change | None:
+def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> Change | None:
     """The minimum of a singular value in a bracket, if the rank is lower there."""
     start, end, at, values = low, high, low, np.zeros(0)
     while True:
@@ -119,7 +119,7 @@ def _located(path: "_Path", low: float, high: float, rank: int, rank_tol: float,
     return Change(float(at), float(max(start, at - tol)), float(min(end, at + tol)), found, float(values[rank - 1] / values[0]))
 
 
-def _renewed(mechanism: Mechanism, analysis: Analysis, solution: Any, ts: np.ndarray, low: float, high: float) -> "_Path | None":
+def _renew(mechanism: Mechanism, analysis: Analysis, solution: Any, ts: np.ndarray, low: float, high: float) -> "_Path | None":
     """The trajectory between two times, integrated anew from the output before."""
     if not isinstance(solution, Solution):
         return None

@@ -138,7 +138,7 @@ def design_experiment(
     ]
     problem = build_problem(mechanism if given is None else given.mechanism, records, parameters, settings)
     names = problem.unknowns.names
-    wanted = _wanted(names, of)
+    wanted = _select_parameters(names, of)
     before = _prior_information(problem, given)
     dx_dz = problem.unknowns.dx_dz(np.zeros(len(names)))[wanted]
     roots = _information_of_records(problem, (tol, tol))
@@ -178,7 +178,7 @@ def _candidate(given: Candidate | Mapping[str, ArrayLike] | Start | State, k: in
     return found if found.name else Candidate(found.conditions, found.initial_state, f"candidate {k + 1}")
 
 
-def _wanted(names: Sequence[str], of: Sequence[str] | None) -> np.ndarray:
+def _select_parameters(names: Sequence[str], of: Sequence[str] | None) -> np.ndarray:
     asked = names if of is None else [of] if isinstance(of, str) else of
     problems = [f"of: {name} is not among the parameters{suggestion(name, names)}" for name in asked if name not in names]
     if problems or not asked:

@@ -237,7 +237,7 @@ class _LossAlongWalk:
         self.worst = np.inf
         self.best, self.best_z = _LossPoint(np.inf, np.zeros(0), np.inf), np.zeros(0)
         self.history: History = []
-        self._at = lru_cache(maxsize=8)(self._computed)
+        self._at = lru_cache(maxsize=8)(self._compute)
 
         @jax.custom_vjp
         def differentiable(z):
@@ -263,7 +263,7 @@ class _LossAlongWalk:
         return self.best.step <= self.settled or not np.isfinite(self.best.value)
 
     @jax.disable_jit(False)
-    def _computed(self, z: tuple[float, ...]) -> _LossPoint:
+    def _compute(self, z: tuple[float, ...]) -> _LossPoint:
         found = self.transform(self.problem.evaluate(np.array([z]), self.tol, self.horizon))
         if not found.ok[0]:
             return _LossPoint(self.worst, np.zeros(len(z)), np.inf)

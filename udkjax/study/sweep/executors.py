@@ -30,7 +30,7 @@ def compute_on_devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, N
         try:
             while waiting or running:
                 while waiting and len(running) < width:
-                    running.add(pool.submit(_run_timed, plan, waiting.popleft()))
+                    running.add(pool.submit(_time_run, plan, waiting.popleft()))
                 done, running = wait(running, return_when=FIRST_COMPLETED)
                 for future in done:
                     yield future.result()
@@ -39,7 +39,7 @@ def compute_on_devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, N
                 future.cancel()
 
 
-def _run_timed(plan: Plan, chunk: Chunk) -> Done:
+def _time_run(plan: Plan, chunk: Chunk) -> Done:
     begun = time.perf_counter()
     data = computing.run(plan, chunk)
     return chunk, data, time.perf_counter() - begun
@@ -56,7 +56,7 @@ def dask_engine(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generat
     arrives, and kept nowhere else. Raises `ClusterError` where there is no client, where a worker has
     other versions of the packages that decide the results, and where workers die time and again over one chunk.
     """
-    distributed = _distributed()
+    distributed = _import_distributed()
     if client is None:
         try:
             client = distributed.default_client()
@@ -104,7 +104,7 @@ def dask_engine(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generat
 @contextmanager
 def start_client(scheduler: str | None = None) -> Iterator[Any]:
     """A client of the scheduler at this address; without one, of a process for each core of this machine, ended afterwards."""
-    distributed = _distributed()
+    distributed = _import_distributed()
     if scheduler is not None:
         try:
             client = distributed.Client(scheduler)
@@ -129,14 +129,14 @@ def _run(plan: Plan, chunk: Chunk, wanted: dict[str, str]) -> Done:
     if (found := _deciding_versions()) != wanted:
         differing = ", ".join(f"{name} {found[name]} instead of {wanted[name]}" for name in wanted if found[name] != wanted[name])
         raise ClusterError(f"a worker has other versions of what decides the results: {differing}")
-    return _run_timed(plan, chunk)
+    return _time_run(plan, chunk)
 
 
 def _deciding_versions() -> dict[str, str]:
     return {name: version for name, version in versions().items() if name != "python"}
 
 
-def _distributed() -> Any:
+def _import_distributed() -> Any:
     with OptionalImport():
         import distributed
     return distributed

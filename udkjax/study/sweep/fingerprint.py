@@ -110,10 +110,10 @@ def differences(before: Any, now: Any, path: str = "") -> list[str]:
 
     Of texts of several lines, such as scenes, the lines that differ are shown.
     """
-    return list(_between(before, now, path))
+    return list(_compare(before, now, path))
 
 
-def _between(before: Any, now: Any, path: str) -> Iterator[str]:
+def _compare(before: Any, now: Any, path: str) -> Iterator[str]:
     if isinstance(before, dict) and isinstance(now, dict):
         for key in {**before, **now}:
             place = f"{path}.{key}" if path else key
@@ -122,7 +122,7 @@ def _between(before: Any, now: Any, path: str) -> Iterator[str]:
             elif key not in before:
                 yield f"{place}: was not there, is {abbreviate(now[key])}"
             else:
-                yield from _between(before[key], now[key], place)
+                yield from _compare(before[key], now[key], place)
     elif isinstance(before, list) and isinstance(now, list):
         yield from _lists(before, now, path)
     elif isinstance(before, str) and isinstance(now, str) and "\n" in before + now:
@@ -135,7 +135,7 @@ def _lists(before: list, now: list, path: str) -> Iterator[str]:
     if len(before) != len(now):
         yield f"{path}: was {abbreviate(before)} ({len(before)} entries), is {abbreviate(now)} ({len(now)} entries)"
         return
-    found = [line for k, pair in enumerate(zip(before, now, strict=True)) for line in _between(*pair, f"{path}[{k}]")]
+    found = [line for k, pair in enumerate(zip(before, now, strict=True)) for line in _compare(*pair, f"{path}[{k}]")]
     yield from found[:MOST_LINES]
     if len(found) > MOST_LINES:
         yield f"{path}: and {len(found) - MOST_LINES} more"

@@ -173,7 +173,7 @@ def _rank(run: Run) -> dict[str, Array]:
         method = type(method)(rank_tolerance(run.mechanism))
     equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))
     reached = jnp.all(jnp.isfinite(q), axis=1)
-    ranks = jax.vmap(lambda t, q: method.rank(equations.weighted(t, q)[0]))(ts, jnp.where(reached[:, None], q, q[0]))
+    ranks = jax.vmap(lambda t, q: method.rank(equations.weighted_rows(t, q)[0]))(ts, jnp.where(reached[:, None], q, q[0]))
     return {"rank": jnp.where(reached, ranks, NOT_REACHED)}
 
 
