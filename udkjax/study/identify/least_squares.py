@@ -36,6 +36,7 @@ ORTHOGONAL = 1e-5
 # square. Where a minimum is near there is none to speak of. Of FIRST_DAMPING from 10 to 1000 and factors of 3.5 or 10, with these
 # the most fits from 50 % off settle along the whole record.
 FIRST_DAMPING, NO_DAMPING = 30.0, 1e8
+TINY = 1e-300  # in the place of a zero that is divided by: quotients stay finite
 SHORT_STEP = 0.3  # of an unknown: where the first Gauss-Newton step is no longer, a minimum is taken to be near
 GOOD_DECREASE, DAMPING_FACTOR = 0.75, 10.0  # part of the decrease promised from which on the damping falls, and by how much
 MOST_REFUSED = 8  # steps one after another, before a fit is given up
@@ -111,7 +112,7 @@ def minimize_squares(
         better = costs < best
         if count == 0:
             going &= np.isfinite(costs)
-            largest = np.array([max(np.linalg.norm(t[:-1, :-1], 2), 1e-300) for t in triangles])
+            largest = np.array([max(np.linalg.norm(t[:-1, :-1], 2), TINY) for t in triangles])
             bold = undamped | (_gauss_newton(triangles)[0] <= SHORT_STEP)
             unit = np.where(bold, NO_DAMPING, FIRST_DAMPING) / largest
         refused = np.where(better, 0, refused + 1)
@@ -161,7 +162,7 @@ def _gauss_newton(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         part = u.T @ T[:-1, -1]
         shows = s > INVISIBLE * s[0]
         sizes[k] = np.abs(vt[shows].T @ (part[shows] / s[shows])).max(initial=0.0)
-        cosines[k] = np.linalg.norm(part) / max(np.linalg.norm(T[:, -1]), 1e-300)
+        cosines[k] = np.linalg.norm(part) / max(np.linalg.norm(T[:, -1]), TINY)
     return sizes, cosines
 
 

@@ -21,6 +21,7 @@ from scipy.sparse import csr_array
 from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.redundancy import ORDINARY, choose_redundant_rows, kinematic_rows, sample_positions
+from udkjax.equations.scales import known_scales
 from udkjax.equations.sparse_rows import SparseRows
 from udkjax.scene.checks import quote
 from udkjax.scene.fields import Numbers
@@ -38,6 +39,8 @@ DIFFERENCE_STEP = 1e-5  # of a parameter's value: the step of the central differ
 CLOSING_STEP = 1e-2
 SMALL_VALUE = 1e-5  # of the size by effect: a value as small as this, such as that of a coordinate, counts as zero
 MOST_POSITIONS = 4  # positions that are closed again
+SAME_CHANGE = 1e-3  # relative: changes, found by differences, that are said to be the same or in proportion
+SAME_VALUE = 1e-9  # relative: values, as they are given, that are said to be the same
 
 
 def loop_problems(
@@ -61,7 +64,7 @@ def loop_problems(
         lambda x: apply(mechanism, x).without_origin
     )  # traced, so that no step of differences is refused for its sign
     x = np.asarray(x, float)
-    steps = DIFFERENCE_STEP * np.where(x != 0.0, np.abs(x), min(_size(placed(x)), 1.0))
+    steps = DIFFERENCE_STEP * np.where(x != 0.0, np.abs(x), min(_length(placed(x)), 1.0))
     moving = [
         i for i, step in enumerate(np.diag(steps)) if _constraint_bytes(placed(x + step)) != _constraint_bytes(placed(x - step))
     ]
@@ -78,9 +81,9 @@ def loop_problems(
     return loops.problems(names) if loops.redundant else []
 
 
-def _size(mechanism: Mechanism) -> float:
-    """Return how far its bodies are apart (m); 1 where there is one."""
-    return float(np.ptp(np.asarray(mechanism.q0, float)[:, :2], axis=0).max()) or 1.0
+def _length(mechanism: Mechanism) -> float:
+    """Return its characteristic length (m)."""
+    return float(known_scales(mechanism).length)
 
 
 def _constraint_bytes(mechanism: Mechanism) -> list[bytes]:
@@ -107,9 +110,9 @@ class RedundantLoops:
         self._positions = [p for p in found if p.smallest > ORDINARY] or found
         self._names = [name for name, _ in rows.names]
         self._redundant_rows = list(choose_redundant_rows(rows, found))
-        self._measure(rows, steps, _size(here))
+        self._measure(rows, steps, _length(here))
 
-    def _measure(self, rows: KinematicRows | SparseRows, steps: np.ndarray, size: float):
+    def _measure(self, rows: KinematicRows | SparseRows, steps: np.ndarray, length_scale: float):
         """Differentiate Psi by each parameter, and project on what no motion makes up for."""
         at = [rows.at(p.t, p.q) for p in self._positions]
         columns = []
@@ -120,7 +123,7 @@ class RedundantLoops:
         slope = np.stack(columns, -1)  # (positions, rows, P)
         # The natural size of a row: the longest arm at which it turns a body, which is 1 for rows of angles.
         arms = np.max([length * np.abs(_dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in at], axis=0)
-        most = np.abs(slope / np.where(arms > 0.0, arms, size)[:, None]).max((0, 1))
+        most = np.abs(slope / np.where(arms > 0.0, arms, length_scale)[:, None]).max((0, 1))
         by_effect = 1.0 / np.where(most > 0.0, most, np.inf)
         own = np.abs(self.x)
         self._size = np.where(own < SMALL_VALUE * by_effect, by_effect, np.minimum(own, by_effect))
@@ -234,10 +237,10 @@ def tie_text(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:
     """Return how parameters with the values x have to move together, where u are their changes."""
     there = np.flatnonzero(u).tolist()
     names, x, u = [names[i] for i in there], x[there], u[there]
-    same = np.allclose(u, u[0], rtol=1e-3)
-    if same and np.allclose(x, x[0], rtol=1e-9):
+    same = np.allclose(u, u[0], rtol=SAME_CHANGE)
+    if same and np.allclose(x, x[0], rtol=SAME_VALUE):
         return " = ".join(names)
-    if np.all(x != 0) and np.allclose(u / x, u[0] / x[0], rtol=1e-3):
+    if np.all(x != 0) and np.allclose(u / x, u[0] / x[0], rtol=SAME_CHANGE):
         return f"{join_names(names)} in proportion {ratio(x)}"
     if same:
         return f"{join_names(names)} changing by the same amount"

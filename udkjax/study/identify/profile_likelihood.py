@@ -25,6 +25,7 @@ from udkjax.study.identify.unknowns import FAR, Unknowns
 CONFIDENCE = 0.95
 STEPS_TO_END = 4.0  # from the estimate to the end of the interval, where the curve is a straight line
 UNKNOWN_ERROR = 0.5  # of a dimensionless unknown: taken for a standard error that is not known
+TINY = 1e-300  # in the place of a zero that is divided by: quotients stay finite
 STRETCH, SHRINK = 2.0, 0.1  # by how much a step may be longer than the one before, and by how much shorter
 AT_END = 1e-3  # of psi at the end of the interval: near enough to it
 MOST_FITS = 30  # to one side
@@ -241,7 +242,7 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
             continue
         slope = (reached - psi) / abs(fixed - current[index])
         # Where the curve falls there may be another minimum: no longer steps there.
-        wanted = abs(step) if slope < 0.0 else min(end / STEPS_TO_END, end - reached) / max(slope, 1e-300)
+        wanted = abs(step) if slope < 0.0 else min(end / STEPS_TO_END, end - reached) / max(slope, TINY)
         step = sign * np.clip(wanted, SHRINK * abs(step), STRETCH * abs(step))
         before, inside = current, (trial, reached)
         if fixed == bound:

@@ -21,6 +21,7 @@ from udkjax.study.identify.unknowns import sample_guesses
 N_STARTS = 15  # guesses besides the first, where it does not lead to a fit
 MOST_PIECEWISE = 4  # guesses from which the records are fitted in pieces
 PART_GROWTH = 2.0  # from one part of the records that is fitted to the next
+SHORTEST_PART = 1e-6  # of the records: the first that is fitted, where all was measured when they began
 CHAOTIC_GROWTH = 100.0  # of derivatives, from the first halves of records to the second: t^2 makes 4 of it
 EXPLAINED_PART = 1e-3  # of what the channels show: smaller residuals are taken for a fit, where their noise is not known
 LIKELY_SQUARE = 2.0  # mean square of residuals whose noise is known, up to which they are taken for a fit
@@ -152,7 +153,7 @@ def horizons(problem: Problem) -> list[float]:
     ts = problem.ts
     passed = np.sort((ts[record, time] - ts[record, 0]) / (ts[record, -1] - ts[record, 0]))
     enough = min(int(RESIDUALS_PER_UNKNOWN * problem.K), len(passed) - 1)
-    first = max(float(passed[enough]), 1e-6)
+    first = max(float(passed[enough]), SHORTEST_PART)
     count = max(0, int(np.ceil(np.log(1.0 / first) / np.log(PART_GROWTH))))
     return [PART_GROWTH ** (k - count) for k in range(count)] + [1.0]
 
