@@ -1,15 +1,47 @@
-"""What an integrator asks of equations of motion, whoever writes them."""
+"""The interface of equations of motion: the functions that an integrator calls."""
 
 from abc import abstractmethod
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Protocol, Self
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.equations.scales import Scales
+from udkjax.equations.structure import Time as Time
 
 Vector = Float[Array, "n"]
+
+
+class PseudoinverseOperator(Protocol):
+    """A pseudoinverse that is known by its products: `D_plus @ b`, `D_plus.T @ x`, and its rank."""
+
+    @property
+    def T(self) -> "PseudoinverseOperator": ...
+
+    @property
+    def rank(self) -> Int[Array, ""]: ...
+
+    def __matmul__(self, b: Array) -> Array: ...
+
+
+class StateHistory(Protocol):
+    """Times and states, such as those of a `Solution`."""
+
+    @property
+    def ts(self) -> Float[ArrayLike, "T"]:
+        """Times (s)."""
+        ...
+
+    @property
+    def q(self) -> Float[ArrayLike, "T bodies 3"]:
+        """Coordinates (m, rad)."""
+        ...
+
+    @property
+    def v(self) -> Float[ArrayLike, "T bodies 3"]:
+        """Velocities (m/s, rad/s)."""
+        ...
 
 
 class TangentPart(NamedTuple):
@@ -36,43 +68,43 @@ class AbstractSystem(eqx.Module):
         return jnp.max(jnp.abs(psi), initial=0.0)
 
     @abstractmethod
-    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
-        """a."""
+    def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
+        """The accelerations a."""
 
     @abstractmethod
-    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
-        """lambda of all rows, of minimum norm."""
+    def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
+        """The multipliers lambda of all rows, of minimum norm."""
 
     @abstractmethod
     def matrices(
-        self, t: Any, q: Vector, v: Vector
+        self, t: Time, q: Vector, v: Vector
     ) -> tuple[Float[Array, "n n"], Vector, Float[Array, "m n"], Float[Array, "m"]]:
         """M, F, A and c of M a + A^T lambda = F and A a = c, with Baumgarte's terms in c."""
 
     @abstractmethod
-    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """q and v returned to the constraint manifold."""
 
-    def tangent_part(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """What projection at q leaves of small changes of positions and velocities. By default: all of them."""
+    def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
+        """The part of small changes of q and v that a projection at q does not remove. By default all of it."""
         return TangentPart(dq, dv)
 
     @abstractmethod
-    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Float[Array, "m"], Float[Array, "k"]]:
+    def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m"], Float[Array, "k"]]:
         """Psi and the residuals of the velocities, of all rows."""
 
     @abstractmethod
-    def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
+    def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         """Whether all terms of the equations are finite."""
 
-    # Where only some coordinates are integrated. By default it is all of them.
+    # For formulations that integrate some coordinates alone. By default all of them are integrated.
 
-    def rates(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """What an integrator integrates: the rates of q and of v."""
+    def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """The rates of q and of v that an integrator integrates."""
         return v, self.accelerations(t, q, v)
 
-    def fix_partition(self, t: Any, q: Vector, v: Vector) -> Self:
-        """The same system with what is chosen at the start of a step fixed until its end."""
+    def fix_partition(self, t: Time, q: Vector, v: Vector) -> Self:
+        """The same system with the partition of this state, which is fixed until the end of a step."""
         return self
 
     @property
@@ -105,21 +137,21 @@ class MechanismSystem(AbstractSystem):
         """Whether Baumgarte's terms are fed back."""
 
     @abstractmethod
-    def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Kinetic and potential energy (J)."""
 
     @abstractmethod
-    def jacobian(self, t: Any, q: Vector) -> Float[Array, "m n"]:
+    def jacobian(self, t: Time, q: Vector) -> Float[Array, "m n"]:
         """Psi_q of all rows."""
 
     @abstractmethod
-    def weighted_rows(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+    def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """D and Psi, their rows weighted by `Scales.weights`, and M^(-1/2), of all rows."""
 
     @abstractmethod
-    def linearized_position(self, t: Any, q: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
+    def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
         """D^+ by the method and Psi, their rows weighted, and M^(-1/2)."""
 
     @abstractmethod
-    def linearized_velocity(self, t: Any, q: Vector, v: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
+    def linearized_velocity(self, t: Time, q: Vector, v: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
         """D^+ by the method and Psi_dot, their rows weighted, and M^(-1/2)."""

@@ -1,4 +1,4 @@
-"""What the numbers of a mechanism say before it moves: rank, redundant rows, and characteristic length, time and mass.
+"""Analysis of a mechanism before it moves: rank, redundant rows, and characteristic length, time and mass.
 
 Every threshold of the package that compares lengths, times or rows of unlike units takes its unit from here, so that a mechanism
 of a micrometre and one of a kilometre behave alike.
@@ -11,15 +11,15 @@ L, or a turn of one radian, changes in it.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from threading import Lock
-from typing import Any
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.redundancy import redundant_rows
@@ -32,7 +32,7 @@ CACHE_SIZE = 256  # analyses at hand; the one that was made first makes room
 
 
 class Analysis(eqx.Module):
-    """What `analyse` finds of a mechanism. A pytree: its scales are arrays, everything else is static."""
+    """The result of `analyse`. A pytree: its scales are arrays, everything else is static."""
 
     scales: Scales
     coordinates: int = eqx.field(static=True)
@@ -92,14 +92,17 @@ def analyse(mechanism: Mechanism) -> Analysis:
     return _analyses.get((kind, _bytes_of(mechanism)), lambda: _analyse(mechanism, kind))
 
 
-class _Cache:
-    """What was made for each key, until too much was made since."""
+Stored = TypeVar("Stored")
+
+
+class _Cache(Generic[Stored]):
+    """The `CACHE_SIZE` values that were asked for last, by their keys."""
 
     def __init__(self):
-        self._found: OrderedDict[Any, Any] = OrderedDict()
+        self._found: OrderedDict[Hashable, Stored] = OrderedDict()
         self._lock = Lock()
 
-    def get(self, key: Any, make: Callable[[], Any]) -> Any:
+    def get(self, key: Hashable, make: Callable[[], Stored]) -> Stored:
         with self._lock:
             if key in self._found:
                 self._found.move_to_end(key)
@@ -112,10 +115,11 @@ class _Cache:
         return found
 
 
-_analyses, _redundant = _Cache(), _Cache()
+_analyses: _Cache[Analysis] = _Cache()
+_redundant: _Cache[tuple[int, ...] | None] = _Cache()
 
 
-def _analyse(mechanism: Mechanism, kind: Any) -> Analysis:
+def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
     with jax.ensure_compile_time_eval():  # while something else is traced, too
         scales = known_scales(mechanism)
         # Masses and loads decide nothing about rows: mechanisms that differ in them alone share what was found.
@@ -132,7 +136,7 @@ def _rows_of_known_geometry(mechanism: Mechanism) -> tuple[int, ...] | None:
         return _analyse(known, structure(mechanism)).redundant_rows
 
 
-def _geometry(mechanism: Mechanism) -> Any:
+def _geometry(mechanism: Mechanism) -> PyTree[Array]:
     return list(mechanism.constraints.values()), [(body.position, body.angle) for body in mechanism.bodies.values()]
 
 
@@ -142,5 +146,5 @@ def _row_names(mechanism: Mechanism) -> tuple[tuple[str, int], ...]:
     return tuple(scene_programs(mechanism).equations.row_names)
 
 
-def _bytes_of(tree: Any) -> bytes:
+def _bytes_of(tree: PyTree[Array]) -> bytes:
     return b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree))

@@ -9,7 +9,7 @@ one after another: flat (n,), or (bodies, 3), which is made flat. The m rows are
 of the drivers (`row_names`); a row is in m or in rad.
 """
 
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.structure import ElementKind, element_kinds, evaluate_by_kind
+from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 
 State = Float[ArrayLike, "n"] | Float[ArrayLike, "n/3 3"]
@@ -59,25 +60,25 @@ def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
     return [(name, k) for name, count in zip(names, size, strict=True) for k in range(count)]
 
 
-def _row_order(found: list[tuple[ElementKind, Any]]) -> np.ndarray:
-    """Where the rows of all constraints in their order are among those of their kinds."""
+def _row_order(found: Sequence[tuple[ElementKind, Array]]) -> np.ndarray:
+    """Return the places of the rows, in the order of their constraints, among the rows ordered by kinds."""
     owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in found])
     return np.argsort(owner, kind="stable")
 
 
-def rate_along_motion(f: Any, t: ArrayLike, q: State, v: State) -> Array:
-    """df/dt + (df/dq) v of f(t, q)."""
+def rate_along_motion(f: Callable[[Array, Array], Array], t: ArrayLike, q: State, v: State) -> Array:
+    """df/dt + (df/dq) v, the rate of f(t, q) along a motion with velocities v."""
     t, q, v = jnp.asarray(t, jnp.result_type(float)), vector(q), vector(v)
     return jax.jvp(f, (t, q), (jnp.ones_like(t), v))[1]
 
 
 def bodies(state: State) -> Float[Array, "n/3 3"]:
-    """q or v, body by body."""
+    """q or v as an array (bodies, 3)."""
     return vector(state).reshape(-1, 3)
 
 
-def vector(values: Any) -> Float[Array, "n"]:
-    """Numbers, a list or an array of them, as one vector."""
+def vector(values: ArrayLike | Sequence[Number]) -> Float[Array, "n"]:
+    """A number, a list of numbers or an array as a vector of floats."""
     if isinstance(values, list | tuple):
         return jnp.stack([jnp.asarray(x, jnp.result_type(float)) for x in values]) if values else jnp.zeros(0)
     return jnp.ravel(jnp.asarray(values, jnp.result_type(float)))

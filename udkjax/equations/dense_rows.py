@@ -3,12 +3,13 @@
 With them a mechanism is closed, and its redundant rows are found (redundancy.py).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from udkjax.equations.position_closure import close_position, driver_time_step, is_closed
+from udkjax.equations.abstract_system import Time
+from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed
 from udkjax.equations.scales import Scales, known_scales, rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import leaves_as_scalars
@@ -57,29 +58,29 @@ class DenseRows:
         self.root = self._run(self._programs.closure_terms, 0.0, np.zeros(self.size), np.zeros(self.size))[-self.size :]
         self.metric, self._tol = self.root, float(rank_tolerance(mechanism))
 
-    def _run(self, program: ScalarProgram, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def _run(self, program: ScalarProgram, t: Time, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         return np.array(program([*self._constants, t, *q.tolist(), *v.tolist()]), float)
 
-    def violation(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Psi and Psi_dot."""
         return self._run(self._programs.psi, t, q, v), self._run(self._programs.psi_dot, t, q, v)
 
-    def residual(self, t: float, q: np.ndarray) -> np.ndarray:
+    def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
         return self._run(self._programs.psi, t, q, q) / self.scales.rows
 
-    def jacobian(self, t: float, q: np.ndarray) -> np.ndarray:
+    def jacobian(self, t: Time, q: np.ndarray) -> np.ndarray:
         """Psi_q (m, n)."""
         values = self._run(self._programs.closure_terms, t, q, q)[: self._programs.pattern.value_count]
         return self._programs.pattern.dense(values, np) / self.root
 
-    def plus(self, t: float, q: np.ndarray) -> TruncatedPseudoinverse:
+    def plus(self, t: Time, q: np.ndarray) -> TruncatedPseudoinverse:
         """D^+ of weighted rows in the metric."""
         return TruncatedPseudoinverse.of(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
 
-    def correction(self, t: float, q: np.ndarray) -> np.ndarray:
+    def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
         return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._run(self._programs.psi, t, q, q)))
 
-    def assemble(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
+    def assemble(self, t: Time, q: np.ndarray, v: np.ndarray) -> Assembly[np.ndarray]:
         """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
         if not self.count:
             return q, v, *self.violation(t, q, v), 0
@@ -93,7 +94,7 @@ class DenseRows:
 class DensePosition(NamedTuple):
     """A closed position as the analysis sees it: the singular value decomposition of D with rows of length one."""
 
-    t: float
+    t: Time
     q: np.ndarray
     u: np.ndarray
     sigma: np.ndarray
@@ -132,7 +133,7 @@ class KinematicRows(DenseRows):
         self.metric = np.tile([float(self.scales.arm), float(self.scales.arm), 1.0], self.size // 3)
         self.driver_time_step = driver_time_step(self.scales)
 
-    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
@@ -143,7 +144,7 @@ class KinematicRows(DenseRows):
         """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""
         return [(np.arange(self.count), positions)]
 
-    def close(self, t: float, q: np.ndarray) -> DensePosition | None:
+    def close(self, t: Time, q: np.ndarray) -> DensePosition | None:
         """Return a closed position near q, or None."""
         q = close_position(self, t, q, np)
         psi, _, D = self.at(t, q)

@@ -1,4 +1,4 @@
-"""What one element says, a constraint or a force, as scalars of a graph: traced once for all elements of the same structure.
+"""One element, a constraint or a force, as scalars of a graph: traced once for all elements of the same structure.
 
 For a constraint with residual Psi(t, q) the graph gets, all by forward differentiation of the residual alone, along (1, v):
 
@@ -8,38 +8,35 @@ For a constraint with residual Psi(t, q) the graph gets, all by forward differen
 and Psi_q one column at a time, each along a unit vector whose zeros the graph folds away: a row is {column: scalar}.
 """
 
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from udkjax.equations.structure import ElementStructure
+from udkjax.equations.structure import Element, ElementStructure, NumericArray, Shapes, TreeDef
 from udkjax.expressions import Differential, Graph, Scalar, operations, trace
-from udkjax.scene.bodies import Frame
+from udkjax.expressions.differential import Row
+from udkjax.scene.bodies import GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Constraint
 
-Row = dict[int, Scalar]
+Reader = Callable[..., list[np.ndarray]]  # of a traced function into a graph (`trace`)
 
 
-def as_scalar(array: Any) -> Scalar:
+def as_scalar(array: NumericArray) -> Scalar:
     """The scalar that an array of shape () holds."""
     return np.asarray(array, object).item()
 
 
-def _scalars(outputs: list[np.ndarray]) -> list[list[Scalar]]:
-    """Split the outputs of a traced function, given as one array each of the same length."""
-    return [list(o) for o in outputs]
-
-
-def _frames(ground: tuple[bool, ...], q: Any, v: Any = None) -> list[Frame]:
-    """Make the frames that an element sees; the sine and cosine of a body are the same expressions for every element."""
+def _frames(ground: tuple[bool, ...], q: Sequence[Array], v: Sequence[Array] | None = None) -> list[Frame]:
+    """Make the frames of an element; the sine and cosine of a body are the same expressions for every element."""
     frames, k = [], 0
     for fixed in ground:
         if fixed:
-            frames.append(Frame(0.0, 0.0, 0.0, 1.0, 0.0, *(() if v is None else (0.0, 0.0, 0.0))))
+            frames.append(GROUND_FRAME if v is None else GROUND_FRAME_AT_REST)
         else:
             x, y, angle = q[k : k + 3]
             frames.append(Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), *(() if v is None else v[k : k + 3])))
@@ -49,13 +46,13 @@ def _frames(ground: tuple[bool, ...], q: Any, v: Any = None) -> list[Frame]:
 
 def differentiate_constraint(
     graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]
-):
-    """Psi, the rows of Psi_q over the columns of q, Psi_dot and gamma of a constraint on scalars."""
+) -> tuple[list[Scalar], list[Row], list[Scalar], list[Scalar]]:
+    """Return Psi, the rows of Psi_q over the columns of q, Psi_dot and gamma of a constraint on scalars."""
     first_derivative, second_derivative = _trace_residual(*kind)
     one, zero = graph.constant(1.0), graph.constant(0.0)
 
-    def derivative(program, dt, dq) -> list[list[Scalar]]:
-        return _scalars(program(graph, leaves, [np.asarray(s, object) for s in (t, *q, dt, *dq)]))
+    def derivative(program: Reader, dt: Scalar, dq: list[Scalar]) -> list[list[Scalar]]:
+        return [list(o) for o in program(graph, leaves, [np.asarray(s, object) for s in (t, *q, dt, *dq)])]
 
     value, rate = derivative(first_derivative, one, v)
     (acceleration,) = derivative(second_derivative, one, v)
@@ -88,36 +85,38 @@ def _gamma_by_entries(graph: Graph, rows: list[Row], q: list[Scalar], v: list[Sc
 
 
 def _choose_shorter(graph: Graph, known: list[Row], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
-    """The one of two ways to write the same that takes fewer operations, with the entries of the rows known."""
+    """Return the one of two expressions of the same that takes fewer operations once the entries of the rows are known."""
     if other is None:
         return one
     given = [entry for row in known for entry in row.values()]
     return other if operations(graph, given, other) < operations(graph, given, one) else one
 
 
-def trace_force(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]):
-    """The generalized loads of a force element over the columns of q, and its potential, on scalars."""
+def trace_force(
+    graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]
+) -> tuple[list[Scalar], Scalar]:
+    """Return the generalized loads of a force element over the columns of q, and its potential, on scalars."""
     loads, energy = _trace_loads(*kind)
     numbers = [np.asarray(s, object) for s in (t, *q, *v)]
     (stored,) = energy(graph, leaves, numbers)
     return [as_scalar(s) for s in loads(graph, leaves, numbers)], as_scalar(stored)
 
 
-def has_pieces(element: Any) -> bool:
-    """Whether an element is smooth in pieces of the state, and says which it is in."""
+def has_pieces(element: Element) -> bool:
+    """Whether an element is smooth in pieces of the state, with a method `piece` of its own."""
     return type(element).piece not in (Constraint.piece, ForceElement.piece)
 
 
 def trace_piece(
     graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]
 ) -> Scalar:
-    """Which of its smooth pieces an element is in, on scalars."""
+    """Return the number of the smooth piece in which an element is, on scalars."""
     (found,) = _trace_piece_number(*kind)(graph, leaves, [np.asarray(s, object) for s in (t, *q, *v)])
     return as_scalar(found)
 
 
 @lru_cache(maxsize=256)
-def _trace_piece_number(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> Any:
+def _trace_piece_number(tree: TreeDef, shapes: Shapes, ground: tuple[bool, ...]) -> Reader:
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
@@ -130,14 +129,14 @@ def _trace_piece_number(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> A
     return trace(found, leaves, [number] * (1 + 2 * n))
 
 
-def _residual(element: Any, ground: tuple[bool, ...], t: Any, q: Any) -> jax.Array:
+def _residual(element: Constraint, ground: tuple[bool, ...], t: Array, q: Sequence[Array]) -> Array:
     rows = element.residual(t, *_frames(ground, q))
-    rows = rows if isinstance(rows, list | tuple) else list(jnp.atleast_1d(rows))
+    rows = rows if isinstance(rows, list | tuple) else list(jnp.atleast_1d(jnp.asarray(rows)))
     return jnp.stack([jnp.asarray(r, jnp.result_type(float)) for r in rows])
 
 
 @lru_cache(maxsize=256)
-def _trace_residual(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
+def _trace_residual(tree: TreeDef, shapes: Shapes, ground: tuple[bool, ...]) -> tuple[Reader, Reader]:
     """Trace a residual's first and second derivative along (dt, dq)."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
@@ -158,7 +157,7 @@ def _trace_residual(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple
 
 
 @lru_cache(maxsize=256)
-def _trace_loads(tree: Any, shapes: tuple, ground: tuple[bool, ...]) -> tuple[Any, Any]:
+def _trace_loads(tree: TreeDef, shapes: Shapes, ground: tuple[bool, ...]) -> tuple[Reader, Reader]:
     """Trace a force element's generalized loads, -dV/dq of its potential plus what it states itself, and its potential."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]

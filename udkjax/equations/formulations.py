@@ -1,4 +1,4 @@
-"""Other ways to the accelerations (de Falco, Pennestri, Vita 2005, section 7), to be compared with the Udwadia-Kalaba equation.
+"""Other formulations of the equations of motion (de Falco, Pennestri, Vita 2005, section 7), to compare with Udwadia-Kalaba.
 
 All of them solve, with A = Psi_q and c = gamma - 2 alpha Psi_dot - beta^2 Psi,
 
@@ -9,7 +9,6 @@ differ in what they need to get by, and in whether they do.
 """
 
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +16,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from udkjax.deprecation import renamed_attributes, renamed_methods
-from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Vector
+from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
@@ -26,18 +25,18 @@ from udkjax.scene.fields import number
 
 
 class Formulation(eqx.Module):
-    """A way to the accelerations of a system. Given to `simulate(..., formulation=...)`."""
+    """A method to find the accelerations of a system, for `simulate(..., formulation=...)`."""
 
     __getattr__ = renamed_attributes("Formulation", of="formulate")
     __init_subclass__ = renamed_methods(of="formulate")
 
     @abstractmethod
     def formulate(self, equations: AbstractSystem) -> AbstractSystem:
-        """The equations of a system, solved in this way."""
+        """Return the equations of a system, solved by this formulation."""
 
 
 class PointwiseFormulation(Formulation):
-    """A formulation that is a way to solve for a at a given state, and nothing else."""
+    """A formulation that solves for a at a given state, and changes nothing else."""
 
     def formulate(self, equations: AbstractSystem) -> "FormulatedSystem":
         return FormulatedSystem(equations, self)
@@ -142,24 +141,24 @@ class WrappedSystem(AbstractSystem):
     At constant rank they are the same function, so their derivatives are those of the equations inside.
     """
 
-    equations: eqx.AbstractVar[Any]
+    equations: eqx.AbstractVar[AbstractSystem]
 
-    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
+    def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
         return self.equations.multipliers(t, q, v)
 
-    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
+    def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
         return self.equations.matrices(t, q, v)
 
-    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+    def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         return self.equations.violation(t, q, v)
 
-    def size(self, dq: Vector) -> Any:
+    def size(self, dq: Vector) -> Float[Array, ""]:
         return self.equations.size(dq)
 
-    def violation_size(self, psi: Vector) -> Any:
+    def violation_size(self, psi: Vector) -> Float[Array, ""]:
         return self.equations.violation_size(psi)
 
-    def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
+    def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
 
     @property
@@ -173,18 +172,18 @@ class FormulatedSystem(WrappedSystem):
     equations: AbstractSystem
     formulation: PointwiseFormulation
 
-    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+    def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         return _accelerations(self, t, q, v)
 
-    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         return self.equations.project(t, q, v)
 
-    def tangent_part(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
+    def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         return self.equations.tangent_part(t, q, v, dq, dv)
 
 
 @eqx.filter_custom_jvp
-def _accelerations(formulated: FormulatedSystem, t: Any, q: Vector, v: Vector) -> Vector:
+def _accelerations(formulated: FormulatedSystem, t: Time, q: Vector, v: Vector) -> Vector:
     """In the scene's own units, in which coordinates, rows and masses are of order one: thresholds of the rank are relative."""
     M, F, A, c = formulated.matrices(t, q, v)
     scales = getattr(formulated.equations, "scales", None)

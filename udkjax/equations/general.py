@@ -1,14 +1,13 @@
 """A constrained system of the user's own, by the same equation: any coordinates and masses, nonholonomic rows too."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Vector
+from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
@@ -24,10 +23,10 @@ class ConstrainedSystem(eqx.Module):
     `breakpoints` are the times (s) where force or constraints are not smooth. Simulate it from a `State` with q and v (n,).
     """
 
-    mass: Callable[[Any], Any]
-    force: Callable[[Any, Any, Any], Any]
-    constraint: Callable[[Any, Any], Any] | None = None
-    velocity_constraint: Callable[[Any, Any, Any], Any] | None = None
+    mass: Callable[[Vector], Float[ArrayLike, "n n"]]
+    force: Callable[[Time, Vector, Vector], Float[ArrayLike, "n"]]
+    constraint: Callable[[Time, Vector], Float[ArrayLike, "m"]] | None = None
+    velocity_constraint: Callable[[Time, Vector, Vector], Float[ArrayLike, "k"]] | None = None
     breakpoints: Float[Array, "k"] | None = eqx.field(converter=optional_number, default=None)
 
 
@@ -42,15 +41,15 @@ class GeneralEquations(AbstractSystem):
     method: Pseudoinverse
     baumgarte: Baumgarte | None
 
-    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+    def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         free, weight, plus, b = self._equation(t, q, v)
         return free if plus is None else free + weight(plus @ b)
 
-    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
+    def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
         _, _, plus, b = self._equation(t, q, v)
         return jnp.zeros(0) if plus is None else -(plus.T @ (plus @ b))
 
-    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Two Newton steps in position and two in velocity, where phi need not be linear."""
         for _ in range(2 if self.system.constraint is not None else 0):
             plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
@@ -60,7 +59,7 @@ class GeneralEquations(AbstractSystem):
             v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
         return q, v
 
-    def tangent_part(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
+    def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """(I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq."""
         if self.system.constraint is not None:
             slopes = jax.jacfwd(self._psi, 1)(t, q)
@@ -72,21 +71,21 @@ class GeneralEquations(AbstractSystem):
             dv = dv - weight(plus @ (slopes @ dv))
         return TangentPart(dq, dv)
 
-    def is_finite(self, t: Any, q: Vector, v: Vector) -> Any:
+    def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
 
-    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+    def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         return self._psi(t, q), jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)])
 
     @property
     def constrained(self) -> bool:
         return self.system.constraint is not None or self.system.velocity_constraint is not None
 
-    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
+    def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
         mass, force = (jnp.asarray(x) for x in (self.system.mass(q), self.system.force(t, q, v)))
         return mass, force, *self._rows(t, q, v)
 
-    def _rows(self, t: Any, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"]]:
+    def _rows(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"]]:
         """A and c of A a = c."""
         rate = lambda t, q: self._psi_dot(t, q, v)  # noqa: E731
         gamma = -jax.jvp(rate, (t, q), (jnp.ones_like(t), v))[1]
@@ -99,10 +98,12 @@ class GeneralEquations(AbstractSystem):
             c = c.at[: len(psi)].add(-(beta**2) * psi)
         return self._slopes(t, q, v), c
 
-    def _equation(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Any, Plus | None, Any]:
+    def _equation(
+        self, t: Time, q: Vector, v: Vector
+    ) -> tuple[Vector, Callable[[Vector], Vector], Plus | None, Float[Array, "m"]]:
         free = self._free(t, q, v)
         if not self.constrained:
-            return free, None, None, None
+            return free, lambda x: x, None, jnp.zeros(0)
         slopes, c = self._rows(t, q, v)
         plus, weight = self._plus(q, slopes)
         return free, weight, plus, c - slopes @ free
@@ -113,21 +114,21 @@ class GeneralEquations(AbstractSystem):
         D = jax.scipy.linalg.solve_triangular(L, slopes.T, lower=True).T
         return self.method.plus(D), lambda x: jax.scipy.linalg.solve_triangular(L, x, lower=True, trans=1)
 
-    def _free(self, t: Any, q: Vector, v: Vector) -> Vector:
+    def _free(self, t: Time, q: Vector, v: Vector) -> Vector:
         factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.system.mass(q)), lower=True)
         return jax.scipy.linalg.cho_solve(factor, jnp.asarray(self.system.force(t, q, v)))
 
-    def _slopes(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m n"]:
+    def _slopes(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m n"]:
         return jnp.concatenate([jax.jacfwd(self._psi, 1)(t, q), jax.jacfwd(self._phi, 2)(t, q, v)])
 
-    def _psi(self, t: Any, q: Vector) -> Array:
+    def _psi(self, t: Time, q: Vector) -> Array:
         return jnp.zeros(0) if self.system.constraint is None else jnp.atleast_1d(jnp.asarray(self.system.constraint(t, q)))
 
-    def _phi(self, t: Any, q: Vector, v: Vector) -> Array:
+    def _phi(self, t: Time, q: Vector, v: Vector) -> Array:
         constraint = self.system.velocity_constraint
         return jnp.zeros(0) if constraint is None else jnp.atleast_1d(jnp.asarray(constraint(t, q, v)))
 
-    def _psi_dot(self, t: Any, q: Vector, v: Vector) -> Array:
+    def _psi_dot(self, t: Time, q: Vector, v: Vector) -> Array:
         return jax.jvp(self._psi, (t, q), (jnp.ones_like(t), v))[1]
 
 

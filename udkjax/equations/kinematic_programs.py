@@ -1,11 +1,10 @@
 """The programs of a driven mechanism that its positions alone need: a Newton step, and derivatives by the driver's value."""
 
 from functools import cached_property, lru_cache
-from typing import Any
 
 from udkjax.equations.scalar_equations import scalar_equations
 from udkjax.equations.scene_programs import EliminationPrograms
-from udkjax.equations.structure import structure
+from udkjax.equations.structure import Shapes, TreeDef, structure
 from udkjax.expressions import ScalarProgram
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
@@ -31,7 +30,7 @@ class KinematicPrograms(EliminationPrograms):
 
 
 @lru_cache(maxsize=64)
-def _kinematic_programs(tree: Any, shapes: tuple, redundant_rows: tuple[int, ...]) -> KinematicPrograms:
+def _kinematic_programs(tree: TreeDef, shapes: Shapes, redundant_rows: tuple[int, ...]) -> KinematicPrograms:
     return KinematicPrograms(scalar_equations(tree, shapes), redundant_rows, False, RankPolicy.DROP)
 
 

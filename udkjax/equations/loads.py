@@ -1,9 +1,10 @@
 """Masses, loads and energies of a mechanism: M, F, T and V (de Falco, Pennestri, Vita 2005, section 3).
 
-As it reads, on arrays, by JAX's derivatives of what each force element says of itself. t, q and v are those of constraints.py.
+The functions are written as the paper has them, on arrays; JAX differentiates the potential energies of the force elements.
+t, q and v are those of constraints.py.
 """
 
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.constraints import State, bodies, vector
-from udkjax.equations.structure import evaluate_by_kind
+from udkjax.equations.structure import ElementKind, evaluate_by_kind
+from udkjax.scene.bodies import Frame
+from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -21,7 +24,7 @@ def mass(mechanism: Mechanism) -> Float[Array, "n"]:
 
 
 def force(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
-    """F = -V_q + the loads that force elements state: force x, force y (N) and torque (N m) on each body."""
+    """F = -V_q + the loads of force elements: force x, force y (N) and torque (N m) on each body."""
     return element_loads(mechanism, t, q, v) - jax.grad(lambda q: potential_energy(mechanism, t, q, v))(vector(q))
 
 
@@ -38,11 +41,13 @@ def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> 
 
 
 def element_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
-    """The loads of the force elements that state them: all that does not come from a potential."""
+    """The sum of the loads that force elements return by their method `loads`, without those of potentials."""
 
-    def loads(element: Any, *frames: Any) -> Any:
-        stated = element.loads(t, *frames)
-        return None if stated is None else jnp.stack([vector(list(load)) for load in stated])
+    time = jnp.asarray(t, jnp.result_type(float))
+
+    def loads(element: ForceElement, *frames: Frame) -> Float[Array, "frames 3"] | None:
+        found = element.loads(time, *frames)
+        return None if found is None else jnp.stack([vector(list(load)) for load in found])
 
     total = jnp.zeros((len(mechanism.body_names), 3))
     for kind, found in _evaluate_forces(loads, mechanism, q, v):
@@ -51,5 +56,7 @@ def element_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Flo
     return total.ravel()
 
 
-def _evaluate_forces(function: Any, mechanism: Mechanism, q: State, v: State) -> Any:
+def _evaluate_forces(
+    function: Callable[..., Array | None], mechanism: Mechanism, q: State, v: State
+) -> list[tuple[ElementKind, Array | None]]:
     return evaluate_by_kind(function, mechanism, [*mechanism.forces.values()], bodies(q), bodies(v))

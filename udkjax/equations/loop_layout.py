@@ -4,10 +4,10 @@ A loop runs one kernel for every element of a group, or for every body. Its tabl
 the arrays at which begins what belongs to it: its coordinates, its constants, its rows of Psi, its entries of D.
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -19,7 +19,7 @@ from udkjax.equations.element_programs import (
     constraint_programs,
     force_programs,
 )
-from udkjax.equations.structure import ElementKind, element_kinds
+from udkjax.equations.structure import ElementKind, Shapes, TreeDef, element_kinds
 from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import KernelWriter
 from udkjax.scene.mechanism import Mechanism
@@ -33,6 +33,8 @@ OWN_CONSTANTS, ENTRIES, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
 DROP_TOL, SAFE_TOL, GAINS = 0, 1, 2
 ROOT, COMPLIANCE, WEIGHT, PER_BODY = 0, 2, 4, 6
 MASS_OR_INERTIA = (0, 0, 1)  # which of the two, of x, y and the angle
+
+AnyIndex = TypeVar("AnyIndex", int, np.ndarray)
 
 SOLVES = 4  # linear systems in one program, at most
 # Arrays of each: D D^T x = right, and jt_x = D^T x; y = right - sum, where L y = right.
@@ -108,7 +110,7 @@ class LoopLayout:
         self.eliminated = [group for group in self.constraints if group.rows]
         self.body_table = np.array([[3 * b, 2 * b, self.of_body(b)] for b in range(self.body_count)]).reshape(-1, 3)
 
-    def _kinds(self, labels: Sequence[Any] | None = None) -> list[ElementKind]:
+    def _kinds(self, labels: Sequence[Hashable] | None = None) -> list[ElementKind]:
         return element_kinds(self._mechanism, list(self._mechanism.constraints.values()), labels)
 
     def _programs(self, kind: ElementKind) -> ConstraintPrograms:
@@ -150,12 +152,12 @@ class LoopLayout:
         self.constant_count += len(programs.constants) * size
         return self.constant_count - len(programs.constants) * size
 
-    def _table(self, kind: ElementKind, columns: Sequence[Any]) -> np.ndarray:
+    def _table(self, kind: ElementKind, columns: Sequence[np.ndarray | int]) -> np.ndarray:
         of_bodies = [column for b in kind.bodies for column in (3 * b, 2 * b, self.of_body(b))]
         return np.stack([np.broadcast_to(c, (len(kind.members),)) for c in (*columns, *of_bodies)], 1)
 
-    def of_body(self, body: Any) -> Any:
-        """Where the constants of a body begin."""
+    def of_body(self, body: AnyIndex) -> AnyIndex:
+        """Return the place at which the constants of a body begin, or of several bodies."""
         return self.first_body + PER_BODY * body
 
     def reserve(self, name: str, count: int) -> int:
@@ -187,6 +189,6 @@ class LoopLayout:
         return row.astype(int), column.astype(int), place.astype(int), factor
 
 
-def abstract_mechanism(tree: Any, shapes: tuple) -> Mechanism:
+def abstract_mechanism(tree: TreeDef, shapes: Shapes) -> Mechanism:
     """Return the mechanism of a structure, with shapes in place of its numbers."""
     return jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes])

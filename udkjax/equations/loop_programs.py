@@ -6,7 +6,7 @@ Terms come from loops over elements of the same structure (loop_terms.py), linea
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,14 @@ from udkjax.equations.loop_elimination import BlockElimination
 from udkjax.equations.loop_layout import BODY_COORDINATES, DROP_TOL, LoopLayout, abstract_mechanism
 from udkjax.equations.loop_prologue import write_prologue
 from udkjax.equations.loop_terms import LoopTerms, Parts
-from udkjax.equations.structure import structure
+from udkjax.equations.structure import AnyArray, ArrayLibrary, Shapes, Time, TreeDef, structure
 from udkjax.expressions.loop_derivative import LoopDerivative
 from udkjax.expressions.loop_program import Kernel, KernelLoop, KernelWriter, LoopProgram, Reset, evaluate_loops
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
+
+Result = TypeVar("Result")
+StateFunction = Callable[[Time, AnyArray, AnyArray], Result]  # of t, q and v
 
 NOT_DIFFERENTIATED = ("t", "gram", "factors", "ratio")  # arrays
 
@@ -57,8 +60,8 @@ class LoopPrograms:
 
     def __init__(
         self,
-        tree: Any,
-        shapes: tuple,
+        tree: TreeDef,
+        shapes: Shapes,
         redundant_rows: tuple[int, ...],
         baumgarte: bool,
         policy: RankPolicy,
@@ -259,27 +262,27 @@ class LoopPrograms:
         """The constants as a function of the numbers of the scene and the gains."""
         return self._constants_by_arrays(numbers, jnp)
 
-    def _constants_by_arrays(self, numbers: Any, xp: Any) -> Any:
+    def _constants_by_arrays(self, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
         arrays = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(self.constants))}
         return evaluate_loops(self.prologue, arrays, xp)["constants"]
 
-    def geometry(self, numbers: Any, xp: Any) -> Callable[[Any, Any, Any], tuple[Any, Any, Any]]:
+    def geometry(self, numbers: AnyArray, xp: ArrayLibrary) -> StateFunction[AnyArray, tuple[AnyArray, AnyArray, AnyArray]]:
         """Return a function of t, q and v, of the numbers of the scene: Psi, Psi_dot and the entries of D at `d_entries`."""
         run = self._run_by_arrays(self._geometry, numbers, xp)
         _, _, places, factors = self.d_entries
 
-        def evaluate(t: Any, q: Any, v: Any) -> tuple[Any, Any, Any]:
+        def evaluate(t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
             found = run(t, q, v)
             return found["psi"], found["psi_dot"], xp.append(found["D"], 1.0)[places] * factors
 
         return evaluate
 
-    def loads(self, numbers: Any, xp: Any) -> Callable[[Any, Any, Any], tuple[Any, Any]]:
+    def loads(self, numbers: AnyArray, xp: ArrayLibrary) -> StateFunction[AnyArray, tuple[AnyArray, AnyArray]]:
         """Return a function of t, q and v, of the numbers of the scene: a_F, and b of all rows."""
         run, n = self._run_by_arrays(self.equation_terms, numbers, xp), self.coordinate_count
-        gravity = xp.tile(xp.append(numbers[np.ravel(self._places.gravity)], 0.0), n // 3)
+        gravity: AnyArray = xp.tile(xp.append(numbers[np.ravel(self._places.gravity)], 0.0), n // 3)
 
-        def evaluate(t: Any, q: Any, v: Any) -> tuple[Any, Any]:
+        def evaluate(t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
             terms = run(t, q, v)["terms"]
             return terms[:n] if self._layout.forces else gravity, terms[n:]
 
@@ -291,14 +294,16 @@ class LoopPrograms:
         rows = [*terms.row_terms("psi", "psi"), *terms.row_terms("psi_dot", "psi_dot")]
         return _program([terms.sincos(), *terms.element_terms(("D",))], rows)
 
-    def _run_by_arrays(self, program: LoopProgram, numbers: Any, xp: Any) -> Callable[[Any, Any, Any], dict[str, Any]]:
+    def _run_by_arrays(
+        self, program: LoopProgram, numbers: AnyArray, xp: ArrayLibrary
+    ) -> StateFunction[AnyArray, dict[str, AnyArray]]:
         """Run a program in which no round of a loop takes anything from another, by NumPy or JAX."""
         constants = self._constants_by_arrays(numbers, xp)
         sizes = self.scratch | {"psi": self.row_count, "psi_dot": self.row_count, "terms": self.term_count}
         results = {"psi", "psi_dot", "terms", "D"}
         blank = {x: xp.zeros(size) for x, size in sizes.items() if x in program.arrays | results}
 
-        def run(t: Any, q: Any, v: Any) -> dict[str, Any]:
+        def run(t: Time, q: AnyArray, v: AnyArray) -> dict[str, AnyArray]:
             given = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v}
             return evaluate_loops(program, blank | given, xp)
 
@@ -311,7 +316,7 @@ def _program(*parts: Iterable[KernelLoop | Reset]) -> LoopProgram:
 
 @lru_cache(maxsize=16)
 def _loop_programs(
-    tree: Any, shapes: tuple, redundant_rows: tuple[int, ...], baumgarte: bool, policy: RankPolicy
+    tree: TreeDef, shapes: Shapes, redundant_rows: tuple[int, ...], baumgarte: bool, policy: RankPolicy
 ) -> LoopPrograms:
     return LoopPrograms(tree, shapes, redundant_rows, baumgarte, policy)
 

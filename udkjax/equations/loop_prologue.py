@@ -1,7 +1,6 @@
 """The prologue of a large scene: what depends on the numbers of the scene alone, computed once a run."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -20,6 +19,7 @@ from udkjax.equations.loop_layout import (
     ElementGroup,
     LoopLayout,
 )
+from udkjax.equations.structure import Element
 from udkjax.expressions.loop_program import KernelLoop, KernelWriter, LoopProgram
 from udkjax.scene.mechanism import Mechanism
 
@@ -55,7 +55,7 @@ def write_prologue(layout: LoopLayout, places: Mechanism, number_count: int) -> 
     return LoopProgram(parts)
 
 
-def _group_constants(layout: LoopLayout, group: ElementGroup, elements: Sequence[Any]) -> KernelLoop:
+def _group_constants(layout: LoopLayout, group: ElementGroup, elements: Sequence[Element]) -> KernelLoop:
     programs, table = group.programs, group.table
     members = [jax.tree.leaves(elements[i]) for i in group.members]
     starts = np.array([[np.ravel(x)[0] if np.size(x) else 0 for x in leaves] for leaves in members], int)

@@ -9,14 +9,12 @@ and the equations of motion are those along the columns of N, one for each indep
 makes when this one moves with rate one and the other independent ones stay.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, Vector
+from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, Time, Vector
 from udkjax.equations.formulations import Formulation, WrappedSystem, null_space_accelerations
 from udkjax.equations.position_closure import STRIDE
 from udkjax.equations.scales import RANK_TOL
@@ -64,13 +62,13 @@ class PartitionedSystem(WrappedSystem):
 
     equations: MechanismSystem
     formulation: CoordinatePartitioning
-    dependent: Any = None  # which coordinates are, (n,), if that is held
+    dependent: Bool[Array, "n"] | None = None  # which coordinates are dependent, where the partition is fixed
 
-    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+    def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """a = a_p + N z at the state as it is."""
         return _accelerations(self.fix_partition(t, q, v), t, q, v)
 
-    def rates(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """v and a at the state that the independent coordinates and velocities determine."""
         fixed = self.fix_partition(t, q, v)
         closed, v = _solve_dependent(fixed, t, q, v)
@@ -78,12 +76,12 @@ class PartitionedSystem(WrappedSystem):
         near = self.equations.size(closed - q) <= STRIDE
         return jnp.where(near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
-    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Solve the constraints for what is dependent."""
         return _solve_dependent(self.fix_partition(t, q, v), t, q, v)
 
-    def fix_partition(self, t: Any, q: Vector, v: Vector) -> "PartitionedSystem":
-        """With the partition that pivoting chooses here."""
+    def fix_partition(self, t: Time, q: Vector, v: Vector) -> "PartitionedSystem":
+        """The same equations with the partition that pivoting chooses at this state."""
         if self.dependent is not None:
             return self
         D = self.equations.weighted_rows(t, q)[0]
@@ -94,12 +92,19 @@ class PartitionedSystem(WrappedSystem):
         return PartitionedSystem(self.equations, self.formulation, jax.lax.stop_gradient(dependent))
 
     @property
-    def independent(self) -> Any:
+    def independent(self) -> Bool[Array, "n"] | None:
         return None if self.dependent is None else ~self.dependent
+
+    @property
+    def dependent_columns(self) -> Bool[Array, "n"]:
+        """The partition; only for equations that have one (`fix_partition`)."""
+        if self.dependent is None:
+            raise ValueError("no partition is fixed: call fix_partition first")
+        return self.dependent
 
     def _plus(self, D: Float[Array, "m n"]) -> Plus:
         """D^+ of the dependent columns: zero for the others."""
-        return SVD(self.formulation.rank_tol).plus(jnp.where(self.dependent, D, 0))
+        return SVD(self.formulation.rank_tol).plus(jnp.where(self.dependent_columns, D, 0))
 
 
 # Derivatives. Where the partition is fixed, Psi(t, q_d, q_i) = 0 makes q_d a function of the rest. One Newton step from a state
@@ -107,7 +112,7 @@ class PartitionedSystem(WrappedSystem):
 
 
 @jax.custom_jvp
-def _solve_dependent(fixed: PartitionedSystem, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+def _solve_dependent(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     if not fixed.constrained:
         return q, v
     tol = jnp.sqrt(jnp.finfo(q.dtype).eps)  # Newton's method squares it in the step that it does not take any more
@@ -132,33 +137,33 @@ def _(primals, tangents):
     closed, rate = _solve_dependent(fixed, t, q, v)
 
     def correct(fixed, t, q, v):
-        start = jnp.where(fixed.dependent, jax.lax.stop_gradient(closed), q)
+        start = jnp.where(fixed.dependent_columns, jax.lax.stop_gradient(closed), q)
         q = _newton(fixed, t, start)
-        return q, _velocity(fixed, t, q, jnp.where(fixed.dependent, jax.lax.stop_gradient(rate), v))
+        return q, _velocity(fixed, t, q, jnp.where(fixed.dependent_columns, jax.lax.stop_gradient(rate), v))
 
     return (closed, rate), jax.jvp(correct, (fixed, t, q, v), tangents)[1]
 
 
-def _newton(fixed: PartitionedSystem, t: Any, q: Vector) -> Vector:
+def _newton(fixed: PartitionedSystem, t: Time, q: Vector) -> Vector:
     D, psi, root = fixed.equations.weighted_rows(t, q)
-    return jnp.where(fixed.dependent, q - root * (fixed._plus(D) @ psi), q)  # the rest stays to the bit
+    return jnp.where(fixed.dependent_columns, q - root * (fixed._plus(D) @ psi), q)  # the rest stays to the bit
 
 
-def _velocity(fixed: PartitionedSystem, t: Any, q: Vector, v: Vector) -> Vector:
+def _velocity(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> Vector:
     D, _, root = fixed.equations.weighted_rows(t, q)
     rate = fixed.equations.scales.weights * fixed.violation(t, q, v)[1]
-    return jnp.where(fixed.dependent, v - root * (fixed._plus(D) @ rate), v)
+    return jnp.where(fixed.dependent_columns, v - root * (fixed._plus(D) @ rate), v)
 
 
 @jax.custom_jvp
-def _accelerations(fixed: PartitionedSystem, t: Any, q: Vector, v: Vector) -> Vector:
+def _accelerations(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> Vector:
     M, F, A, c = fixed.matrices(t, q, v)
     if not len(A):
         return F / jnp.diag(M)
     root, w = 1 / jnp.sqrt(jnp.diag(M)), fixed.equations.scales.weights
     A, c = w[:, None] * A, w * c
     plus = fixed._plus(A * root)
-    free = jnp.diag(jnp.where(fixed.dependent, 0.0, 1.0))
+    free = jnp.diag(jnp.where(fixed.dependent_columns, 0.0, 1.0))
     return null_space_accelerations(M, F, free - root[:, None] * (plus @ (A @ free)), root * (plus @ c))
 
 

@@ -8,13 +8,16 @@ are known are closed by NumPy: nothing is compiled for it. Numbers that are trac
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike
 
+from udkjax.equations.abstract_system import MechanismSystem, Time
 from udkjax.equations.scales import Scales
+from udkjax.equations.structure import AnyArray, ArrayLibrary
 
 # Of the scene's scales: what counts as closed. Rounding leaves 1e-15; a scene that cannot be closed leaves what its lengths are
 # wrong by.
@@ -25,56 +28,64 @@ ITERATIONS = 40
 HALVINGS = 12
 
 
-class Rows(Protocol):
-    """What closing asks of the rows of Psi."""
+State = TypeVar("State")
+Assembly = tuple[AnyArray, AnyArray, AnyArray, AnyArray, ArrayLike]  # q, v, Psi, Psi_dot and the rank of D
+
+
+class Rows(Protocol[AnyArray]):
+    """The rows of Psi, as the loop that closes a mechanism evaluates them."""
 
     @property
     def scales(self) -> Scales:
-        """The scene's."""
+        """The scales of the scene."""
         ...
 
-    def residual(self, t: Any, q: Any) -> Any:
+    def residual(self, t: Time, q: AnyArray) -> AnyArray:
         """Psi, each row over its scale."""
         ...
 
-    def correction(self, t: Any, q: Any) -> Any:
+    def correction(self, t: Time, q: AnyArray) -> AnyArray:
         """-W D^+ Psi."""
         ...
 
 
-def rounding(scales: Scales, q: Any, xp: Any) -> Any:
-    """What rounding errors of the coordinates leave of a residual."""
+def rounding(scales: Scales, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
+    """Return the residual that rounding errors of the coordinates leave."""
     return ROUNDING * float(jnp.finfo(q.dtype).eps) * xp.maximum(1.0, scales.size(q, xp))
 
 
-def is_closed(scales: Scales, q: Any, v: Any, psi: Any, psi_dot: Any, xp: Any) -> Any:
-    """Whether what is left of Psi and Psi_dot is within `CLOSED` of the scene's scales, or rounding."""
+def is_closed(scales: Scales, q: AnyArray, v: AnyArray, psi: AnyArray, psi_dot: AnyArray, xp: ArrayLibrary) -> AnyArray:
+    """Whether Psi and Psi_dot are within `CLOSED` of the scene's scales, or rounding."""
     open_by = xp.maximum(CLOSED, rounding(scales, q, xp))
     rate = xp.maximum(scales.rate, scales.size(v, xp))
     return (scales.violation(psi, xp) <= open_by) & (scales.violation(psi_dot, xp) <= open_by * rate)
 
 
-def limited_step(rows: Rows, t: Any, q: Any, xp: Any) -> Any:
+def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
     """A Gauss-Newton step, shortened so that no coordinate changes by more than `STRIDE`."""
     step = rows.correction(t, q)
     longest = rows.scales.size(step, xp)
     return step * xp.where(longest > STRIDE, STRIDE / xp.where(longest > STRIDE, longest, 1.0), 1.0)
 
 
-def _python_loop(condition: Callable[[Any], Any], body: Callable[[Any], Any], state: Any) -> Any:
+def _python_loop(condition: Callable[[State], ArrayLike], body: Callable[[State], State], state: State) -> State:
     while condition(state):
         state = body(state)
     return state
 
 
-def damped_step(rows: Rows, t: Any, q: Any, xp: Any = jnp) -> tuple[Any, Any]:
-    """One step, halved until the residual falls, and whether it does; no step where the residual is rounding."""
-    loop, stop = (_python_loop, lambda x: x) if xp is np else (jax.lax.while_loop, jax.lax.stop_gradient)
+def _identity(x: State) -> State:
+    return x
+
+
+def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> tuple[AnyArray, Any]:
+    """Take one step, halved until the residual falls; return whether it does. A residual of rounding takes no step."""
+    loop, stop = (_python_loop, _identity) if xp is np else (jax.lax.while_loop, jax.lax.stop_gradient)
     step = limited_step(rows, t, q, xp)
-    fixed, current, fixed_step = stop((rows, q, step))
+    fixed, current, fixed_step = stop(rows), stop(q), stop(step)
     size = xp.linalg.norm(fixed.residual(t, current))
 
-    def is_worse(trial: Any) -> Any:
+    def is_worse(trial: tuple[AnyArray, Any]) -> ArrayLike:
         scale, k = trial
         return (k < HALVINGS) & ~(xp.linalg.norm(fixed.residual(t, current + scale * fixed_step)) < size)
 
@@ -83,11 +94,11 @@ def damped_step(rows: Rows, t: Any, q: Any, xp: Any = jnp) -> tuple[Any, Any]:
     return xp.where(improves, q + scale * step, q), improves
 
 
-def close_position(rows: Rows, t: Any, q: Any, xp: Any = jnp) -> Any:
-    """Steps until the residual is rounding, or none makes it smaller."""
+def close_position(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
+    """Take steps until the residual is rounding, or no step makes it smaller."""
     loop = _python_loop if xp is np else jax.lax.while_loop
 
-    def goes_on(state: Any) -> Any:
+    def goes_on(state: tuple[AnyArray, Any, int]) -> ArrayLike:
         _, improves, k = state
         return improves & (k < ITERATIONS)
 
@@ -102,20 +113,20 @@ def driver_time_step(scales: Scales) -> float:
 class TracedRows(NamedTuple):
     """The rows of the equations of motion of a mechanism with traced numbers."""
 
-    equations: Any
+    equations: MechanismSystem
 
     @property
     def scales(self) -> Scales:
         return self.equations.scales
 
-    def residual(self, t: Any, q: Any) -> Any:
+    def residual(self, t: Time, q: Array) -> Array:
         return self.equations.violation(t, q, q)[0] / self.scales.rows
 
-    def correction(self, t: Any, q: Any) -> Any:
+    def correction(self, t: Time, q: Array) -> Array:
         plus, psi, root = self.equations.linearized_position(t, q)
         return -root * (plus @ psi)
 
-    def assemble(self, close: Callable[[Any, Any, Any], Any], t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def assemble(self, close: Callable[["TracedRows", Time, Array], Array], t: Time, q: Array, v: Array) -> Assembly[Array]:
         """Return q closed by `close`, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
         if not self.equations.constrained:
             return q, v, *self.equations.violation(t, q, v), 0

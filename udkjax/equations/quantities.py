@@ -1,14 +1,14 @@
-"""What one asks of a motion: accelerations, multipliers, energies, violations."""
+"""Quantities of a motion: accelerations, multipliers, energies and violations of the constraints."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.equations.abstract_system import AbstractSystem
+from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, StateHistory, Vector
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, prepare_general
@@ -16,6 +16,8 @@ from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
+
+Result = TypeVar("Result")
 
 
 class Energy(NamedTuple):
@@ -36,7 +38,7 @@ def equations_of(
     formulation: Formulation | None = None,
     analysis: Analysis | None = None,
 ) -> AbstractSystem:
-    """Prepare the equations of motion of whatever has some, by the Udwadia-Kalaba equation or another formulation."""
+    """Prepare the equations of motion of a mechanism or a system, by the Udwadia-Kalaba equation or another formulation."""
     if isinstance(system, ConstrainedSystem):
         equations: AbstractSystem = prepare_general(system, method, baumgarte)
     else:
@@ -54,7 +56,7 @@ def accelerations(
     multipliers: bool = False,
     formulation: Formulation | None = None,
     analysis: Analysis | None = None,
-) -> Any:
+) -> Float[Array, "bodies 3"] | tuple[Float[Array, "bodies 3"], Float[Array, "m"]]:
     """Return a (bodies, 3) at time t (s), coordinates q and velocities v; with `multipliers` also lambda, one a row of Psi.
 
     a = a_F + M^(-1/2) D^+ b and lambda = -(D^+)^T D^+ b, of minimum norm where constraints are redundant (m/s^2, rad/s^2; N, N m,
@@ -68,7 +70,7 @@ def accelerations(
     return _accelerations(mechanism, analysis, t, q, v, method, stabilization, formulation, multipliers)
 
 
-def violation(mechanism: Mechanism | ConstrainedSystem, solution: Any) -> Float[Array, "T m"]:
+def violation(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory) -> Float[Array, "T m"]:
     """Return Psi (m, rad) at each output time, one column a row: joints in their order, then drivers.
 
     `solution` is anything with ts (T,), q and v (T, bodies, 3).
@@ -76,7 +78,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Any) -> Float[
     return _evaluate_along(mechanism, solution, _psi)
 
 
-def energy(mechanism: Mechanism, solution: Any) -> Energy:
+def energy(mechanism: Mechanism, solution: StateHistory) -> Energy:
     """Return kinetic energy v^T M v / 2 and potential energy (J) at each output time."""
     return _evaluate_along(mechanism, solution, _energy)
 
@@ -91,23 +93,23 @@ def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation,
     return (a, equations.multipliers(t, *flat)) if multipliers else a
 
 
-def _psi(equations: Any, t: Any, q: Any, v: Any) -> Array:
+def _psi(equations: AbstractSystem, t: Array, q: Vector, v: Vector) -> Array:
     return equations.violation(t, q, v)[0]
 
 
-def _energy(equations: Any, t: Any, q: Any, v: Any) -> Energy:
+def _energy(equations: MechanismSystem, t: Array, q: Vector, v: Vector) -> Energy:
     return Energy(*equations.energy(t, q, v))
 
 
-def _evaluate_along(mechanism: Any, solution: Any, quantity: Callable, method: Any = None, baumgarte: Any = None) -> Any:
-    analysis, method = None, SVD() if method is None else method
+def _evaluate_along(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory, quantity: Callable[..., Result]) -> Result:
+    analysis = None
     if isinstance(mechanism, Mechanism):
         analysis, mechanism = analyse(mechanism), mechanism.without_origin
-    return _evaluate(mechanism, analysis, solution.ts, solution.q, solution.v, quantity, method, baumgarte)
+    return _evaluate(mechanism, analysis, solution.ts, solution.q, solution.v, quantity)
 
 
 @eqx.filter_jit
-def _evaluate(mechanism, analysis, ts, q, v, quantity, method, baumgarte):
-    equations = equations_of(mechanism, method, baumgarte, analysis=analysis)
+def _evaluate(mechanism, analysis, ts, q, v, quantity):
+    equations = equations_of(mechanism, SVD(), analysis=analysis)
     ts, q, v = jnp.asarray(ts), jnp.asarray(q).reshape(len(ts), -1), jnp.asarray(v).reshape(len(ts), -1)
     return jax.vmap(lambda t, q, v: quantity(equations, t, q, v))(ts, q, v)

@@ -1,4 +1,4 @@
-"""What joints do to the bodies that they hold: -Psi_q^T lambda, in the axes, about the point and by the split that one asks for.
+"""Loads of joints on their bodies, -Psi_q^T lambda: in chosen axes, about a chosen point, by a chosen split.
 
 Of redundant constraints only some components are decided by equilibrium (determinacy.py). How the others are shared takes an
 assumption: by default the least norm, each row in units of its scale; or, with the compliances c of joints (m/N, rad/(N m)),
@@ -11,8 +11,8 @@ null space of D^T, and K = diag(w c w), the minimum over mu + P z is at z = -(P 
 the others leave; what is still open among these alone is shared by the least norm.
 """
 
-from collections.abc import Mapping
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -22,21 +22,23 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.abstract_system import StateHistory, Time
 from udkjax.equations.analysis import analyse
 from udkjax.equations.constraints import psi_q
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
-from udkjax.scene.bodies import GROUND, Frame, Point, between
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, Point, between
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.drivers import Driver
+from udkjax.scene.fields import Number
 from udkjax.scene.joints import Constraint, Distance, Prismatic, Rack, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 
 Axes = Literal["ground", "body", "joint"]
 About = Literal["centre", "joint"]
-ByBody = dict[str, dict[str, Any]]  # of a joint or driver, of a body
+ByBody = dict[str, dict[str, Array]]  # of a joint or driver, of a body
 
 # Of P K P relative to its largest eigenvalue: joints that are stiffer than the softest by more count as rigid.
 COMPLIANCE_TOL = 1e-10
@@ -44,14 +46,14 @@ COMPLIANCE_TOL = 1e-10
 
 def reactions(
     mechanism: Mechanism,
-    solution: Any,
+    solution: StateHistory,
     method: Pseudoinverse | None = None,
     stabilization: Baumgarte | None = None,
     frame: Axes = "ground",
     about: About = "centre",
     compliances: Mapping[str, ArrayLike] | None = None,
 ) -> dict[str, dict[str, Float[Array, "T 3"]]]:
-    """Return what each joint and driver does to each body that it holds, by their names: `reactions(mech, sol)["A"]["link1"]`.
+    """Return the load -Psi_q^T lambda of each joint and driver on each of its bodies: `reactions(mech, sol)["A"]["link1"]`.
 
     Args:
         mechanism: the mechanism.
@@ -79,7 +81,11 @@ def reactions(
 
 
 def unique_reactions(
-    mechanism: Mechanism, solution: Any, frame: Axes = "ground", about: About = "centre", rank_tol: ArrayLike = STATIC_RANK_TOL
+    mechanism: Mechanism,
+    solution: StateHistory,
+    frame: Axes = "ground",
+    about: About = "centre",
+    rank_tol: ArrayLike = STATIC_RANK_TOL,
 ) -> dict[str, dict[str, Bool[Array, "T 3"]]]:
     """Tell which components of `reactions` equilibrium alone decides, whatever their split.
 
@@ -104,13 +110,13 @@ def unique_reactions(
 
 
 def _split_by_body(
-    mechanism: Mechanism, q: Array, by_row: Float[Array, "T m n"], total: Any, frame: Axes, about: About
+    mechanism: Mechanism, q: Array, by_row: Float[Array, "T m n"], total: Callable[[Array], Array], frame: Axes, about: About
 ) -> ByBody:
     """Split what rows do to coordinates by joints and bodies, (rows, T, 3) each, in other axes and about another point."""
     if frame not in ("ground", "body", "joint") or about not in ("centre", "joint"):
         raise ValueError(f'frame is "ground", "body" or "joint", not {frame!r}; about is "centre" or "joint", not {about!r}')
     places = {name: k for k, name in enumerate(mechanism.body_names)}
-    seen = {name: _frame(q, place) for name, place in places.items()} | {GROUND: Frame(0.0, 0.0, 0.0, 1.0, 0.0)}
+    seen = {name: _frame(q, place) for name, place in places.items()} | {GROUND: GROUND_FRAME}
     row_names, found = [name for name, _ in analyse(mechanism).row_names], {}
     for name, element in mechanism.constraints.items():
         own = np.array([k for k, owner in enumerate(row_names) if owner == name])
@@ -128,7 +134,7 @@ def _split_by_body(
     return found
 
 
-def _transform_load(load: Float[Array, "... 3"], body: Frame, point: Point | None, angle: Any) -> Float[Array, "... 3"]:
+def _transform_load(load: Float[Array, "... 3"], body: Frame, point: Point | None, angle: Number) -> Float[Array, "... 3"]:
     """A load about a centre of mass, in ground axes, about another point and in axes at an `angle` (rad) to these."""
     fx, fy, torque = load[..., 0], load[..., 1], load[..., 2]
     if point is not None:
@@ -142,7 +148,7 @@ def _frame(q: Float[Array, "T n"], place: int) -> Frame:
     return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle))
 
 
-def _joint_angle(element: Constraint, frames: list[Frame]) -> Any:
+def _joint_angle(element: Constraint, frames: list[Frame]) -> Number:
     """The angle (rad) of a joint's own axes to the ground."""
     if isinstance(element, Prismatic | Slot | Rack):
         return frames[0].angle + element.axis
@@ -154,14 +160,14 @@ def _joint_angle(element: Constraint, frames: list[Frame]) -> Any:
     return frames[-1].angle
 
 
-def _joint_point(element: Any, k: int, frames: list[Frame]) -> Point | None:
+def _joint_point(element: Constraint, k: int, frames: list[Frame]) -> Point | None:
     """Where a joint acts on its body k, in ground coordinates; None where it has no points."""
     points = getattr(element, "points", None)
     if points is None or (isinstance(element, Driver) and element.coordinate == "angle"):
         return None
-    apart = isinstance(element, Distance) or (isinstance(element, Driver) and element.coordinate == "distance")
-    held = k if apart else len(points) - 1  # of a slot, the pin
-    return frames[held].point(points[held])
+    has_two_points = isinstance(element, Distance) or (isinstance(element, Driver) and element.coordinate == "distance")
+    holder = k if has_two_points else len(points) - 1  # of a slot, the pin
+    return frames[holder].point(points[holder])
 
 
 def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, ArrayLike]) -> Float[Array, "m"]:
@@ -180,13 +186,13 @@ def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, ArrayLike])
     return jnp.concatenate(rows) if rows else jnp.zeros(0)
 
 
-def _states(solution: Any) -> tuple[Array, Array, Array]:
+def _states(solution: StateHistory) -> tuple[Array, Array, Array]:
     ts = jnp.asarray(solution.ts)
     return ts, jnp.asarray(solution.q).reshape(len(ts), -1), jnp.asarray(solution.v).reshape(len(ts), -1)
 
 
 def split_by_compliance(
-    mechanism: Mechanism, t: Any, q: Array, multipliers: Float[Array, "m"], soft: Float[Array, "m"], w: Float[Array, "m"]
+    mechanism: Mechanism, t: Time, q: Array, multipliers: Float[Array, "m"], soft: Float[Array, "m"], w: Float[Array, "m"]
 ) -> Float[Array, "m"]:
     """Return the multipliers of the least elastic energy among all that do the same; `w` are the weights of rows."""
     if not len(soft):

@@ -1,4 +1,4 @@
-"""Which rows of Psi are redundant: found once, by `analyse`, so that no run computes them.
+"""Redundant rows of Psi, which `analyse` finds once, so that no run computes them.
 
 Redundancy is a matter of numbers (three equal cranks), not of topology alone, and a single position does not show it: at a
 singular configuration more rows are dependent than elsewhere. So the mechanism is closed and led along a random motion, and rows
@@ -8,12 +8,15 @@ the right choice where the other vanishes, and the motion tells which. All of it
 compiled for it.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import NEGLIGIBLE, KinematicRows
 from udkjax.equations.position_closure import STRIDE
+from udkjax.equations.scales import Scales
 from udkjax.equations.structure import is_large
 from udkjax.scene.mechanism import Mechanism
 
@@ -23,7 +26,52 @@ WANDER = 0.3  # of the direction of the random motion: how much of it is new at 
 ORDINARY = 0.05  # a position counts as ordinary if its smallest singular value is this part of the largest
 
 
-@np.errstate(all="ignore")  # what is not finite does not close
+class ClosedPosition(Protocol):
+    """A closed position, with the rank of D there: a `DensePosition` or a `SparsePosition`."""
+
+    @property
+    def q(self) -> np.ndarray:
+        """The coordinates (n,)."""
+        ...
+
+    @property
+    def rank(self) -> int:
+        """The rank of D."""
+        ...
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the rank is beyond doubt."""
+        ...
+
+    def tangent_part(self, heading: np.ndarray) -> np.ndarray:
+        """The part of a displacement that the constraints allow."""
+        ...
+
+
+Position = TypeVar("Position", bound=ClosedPosition)
+
+
+class PositionRows(Protocol[Position]):
+    """Psi and D of a mechanism with known numbers: `KinematicRows` or `SparseRows`."""
+
+    count: int
+    size: int
+    names: list[tuple[str, int]]
+    scales: Scales
+    metric: np.ndarray
+    driver_time_step: float
+
+    def close(self, t: Time, q: np.ndarray) -> Position | None:
+        """Return a closed position near q, or None."""
+        ...
+
+    def split_rows(self, positions: list[Position]) -> Sequence[tuple[np.ndarray, Sequence[Any]]]:
+        """Sets of rows that depend on each other; of each set at each position `smallest`, a singular value, and `null_space`."""
+        ...
+
+
+@np.errstate(all="ignore")  # coordinates that are not finite do not close
 def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     """Return the rows of Psi to leave out, or None: the guess cannot be closed or moved. All numbers are known."""
     rows = kinematic_rows(mechanism)
@@ -34,7 +82,7 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
 
 
 @np.errstate(all="ignore")
-def sample_positions(rows: Any, q: np.ndarray) -> list[Any]:
+def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Position]:
     """Closed positions of the highest rank along a random motion from a guess q: one is enough where no row is redundant.
 
     None at all where the guess cannot be closed or moved.
@@ -66,7 +114,7 @@ def sample_positions(rows: Any, q: np.ndarray) -> list[Any]:
     return [p for p in found if p.rank == rank]
 
 
-def choose_redundant_rows(rows: Any, positions: list[Any]) -> tuple[int, ...]:
+def choose_redundant_rows(rows: PositionRows[Position], positions: list[Position]) -> tuple[int, ...]:
     """The rows to leave out, of positions of ordinary rank: those whose absence never makes the others dependent."""
     if positions[0].rank == rows.count:
         return ()
@@ -88,7 +136,7 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
     return tuple(dict.fromkeys(names))
 
 
-def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> Any:
+def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> PositionRows:
     """Psi and D of a mechanism with known numbers: `KinematicRows`, or for large scenes `SparseRows`."""
     if not (is_large(mechanism) if large is None else large):
         return KinematicRows(mechanism)

@@ -5,21 +5,22 @@ the programs taken from it (expressions/scalar_program.py) compute only the outp
 """
 
 from functools import cached_property, lru_cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.elements import Row, as_scalar, differentiate_constraint, has_pieces, trace_force, trace_piece
-from udkjax.equations.structure import ElementStructure, element_structure
+from udkjax.equations.elements import as_scalar, differentiate_constraint, has_pieces, trace_force, trace_piece
+from udkjax.equations.structure import Element, ElementStructure, Shapes, TreeDef, element_structure
 from udkjax.expressions import Graph, Scalar
+from udkjax.expressions.differential import Row
 from udkjax.scene.bodies import GROUND
+from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 
 
 @lru_cache(maxsize=64)
-def scalar_equations(tree: Any, shapes: tuple) -> "ScalarEquations":
+def scalar_equations(tree: TreeDef, shapes: Shapes) -> "ScalarEquations":
     """Return the graph of the mechanisms with this tree and with numbers of these shapes and types."""
     return ScalarEquations(jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes]))
 
@@ -73,7 +74,7 @@ class ScalarEquations:
         scene = self.scene.constraints
         return [self._constraint(element, scene[name]) for name, element in self.mechanism.constraints.items()]
 
-    def _constraint(self, element: Any, scalars: Any):
+    def _constraint(self, element: Constraint, scalars: Constraint) -> tuple[list[Scalar], list[Row], list[Scalar], list[Scalar]]:
         places = self._coordinates(element)
         state = [self.t, [self.q[k] for k in places], [self.v[k] for k in places]]
         value, rows, rate, gamma = differentiate_constraint(
@@ -81,10 +82,10 @@ class ScalarEquations:
         )
         return value, [{places[k]: entry for k, entry in row.items()} for row in rows], rate, gamma
 
-    def _structure(self, element: Any) -> ElementStructure:
+    def _structure(self, element: Element) -> ElementStructure:
         return element_structure(element, self.mechanism.frames_of(element))
 
-    def _coordinates(self, element: Any) -> list[int]:
+    def _coordinates(self, element: Element) -> list[int]:
         return [self.start[name] + k for name in self.mechanism.frames_of(element) if name != GROUND for k in range(3)]
 
     # --- masses and loads
@@ -106,7 +107,7 @@ class ScalarEquations:
 
     @cached_property
     def gravity(self) -> list[Scalar]:
-        """The acceleration of free fall, coordinate by coordinate."""
+        """The acceleration of free fall of each coordinate."""
         x, y = self.scene.gravity
         return [as_scalar(x), as_scalar(y), self.graph.constant(0.0)] * len(self.mechanism.body_names)
 
@@ -129,14 +130,14 @@ class ScalarEquations:
         stored = (self._force(e, self.scene.forces[n])[1] for n, e in self.mechanism.forces.items())
         return sum(stored, self.graph.constant(0.0)) - sum(weights, self.graph.constant(0.0))
 
-    def _force(self, element: Any, scalars: Any) -> tuple[list[Scalar], Scalar]:
+    def _force(self, element: Element, scalars: Element) -> tuple[list[Scalar], Scalar]:
         places = self._coordinates(element)
         state = [self.t, [self.q[k] for k in places], [self.v[k] for k in places]]
         return trace_force(self.graph, self._structure(element), jax.tree.leaves(scalars), *state)
 
     @cached_property
     def pieces(self) -> list[Scalar]:
-        """In which of its pieces each element is that is smooth in pieces of the state."""
+        """The number of the smooth piece of each element that has several."""
         m, scene = self.mechanism, self.scene
         pairs = [(e, scene.constraints[name]) for name, e in m.constraints.items()]
         pairs += [(e, scene.forces[name]) for name, e in m.forces.items()]
@@ -149,7 +150,7 @@ class ScalarEquations:
         return found
 
 
-def _inputs(graph: Graph, name: str, group: str, leaf: Any) -> np.ndarray:
+def _inputs(graph: Graph, name: str, group: str, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
     array = np.empty(leaf.shape, object)
     for place in np.ndindex(*leaf.shape):
         array[place] = graph.input((name, place), group, leaf.dtype)

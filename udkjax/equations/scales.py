@@ -1,10 +1,10 @@
-"""The characteristic length, rate and mass of a mechanism, which every threshold is relative to, and what rests on them alone.
+"""The characteristic length, rate and mass of a mechanism, the units of every threshold.
 
 See analysis.py for what they mean. They are computed alike by NumPy, where all numbers are known, and by JAX in a trace.
 """
 
 from functools import reduce
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import is_large, leaves_as_scalars, leaves_as_vector
+from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, is_large, leaves_as_scalars, leaves_as_vector
 from udkjax.expressions import ScalarProgram
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -26,8 +26,19 @@ RANK_TOL = 1e-4
 ORDINARY_MASS_RATIO = 100.0  # up to which that holds: see `rank_tolerance`
 
 
+class GuessTerms(NamedTuple):
+    """The terms of the equations at the initial guess that the scales are made of; Psi_q by its entries."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+    psi_q: NumericArray
+    free: NumericArray  # a_F
+    psi_t: NumericArray
+    gamma: NumericArray
+
+
 class Scales(eqx.Module):
-    """What to measure lengths, rates, masses and rows of Psi by; arrays without derivatives."""
+    """The units of lengths, rates, masses and rows of Psi; arrays without derivatives."""
 
     length: Float[Array, ""]  # m
     arm: Float[Array, ""]  # m; the longest of a constraint, masses aside; `length` where there is none
@@ -37,19 +48,19 @@ class Scales(eqx.Module):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        """What rows of D are multiplied by so that one rank threshold serves them all: 1 for rows in metres, L for radians."""
+        """The weights of the rows of D with which one rank threshold serves them all: 1 for rows in metres, L for radians."""
         return self.length / self.rows
 
     def coordinates(self, n: int) -> Float[Array, "n"]:
-        """What coordinates are measured by: L, L and one radian for each body."""
+        """The units of coordinates: L, L and one radian for each body."""
         return jnp.tile(jnp.stack([self.length, self.length, jnp.ones_like(self.length)]), n // 3)
 
-    def size(self, q: Any, xp: Any = jnp) -> Any:
+    def size(self, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
         """The largest of a change of coordinates (n,): lengths over L, angles in rad."""
         x = xp.abs(q.reshape(-1, 3))
         return xp.maximum(xp.max(x[:, :2], initial=0.0) / self.length, xp.max(x[:, 2], initial=0.0))
 
-    def violation(self, psi: Any, xp: Any = jnp) -> Any:
+    def violation(self, psi: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
         """The largest of a violation (m,) of the rows of Psi, each over its scale."""
         return xp.max(xp.abs(psi) / self.rows, initial=0.0)
 
@@ -72,35 +83,35 @@ def traced_scales(mechanism: Mechanism) -> Scales:
     )
 
 
-def _small_scene_terms(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
-    """Where Psi_q has entries, their values, a_F, Psi_t and gamma at the initial guess, by the scene's programs."""
+def _small_scene_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, xp: ArrayLibrary) -> GuessTerms:
+    """Return the terms of a small scene at the initial guess, by its programs."""
     programs = scene_programs(mechanism)
     rows, columns = programs.pattern.shape
     given = [*leaves_as_scalars(jax.tree.leaves(mechanism)), 0.0, 0.0]
     constants = programs.prologue([*map(float, given)] if xp is np else given)
 
-    def run(program: ScalarProgram, v: Any) -> Any:
+    def run(program: ScalarProgram, v: NumericArray) -> NumericArray:
         state = [0.0, *leaves_as_scalars([q]), *leaves_as_scalars([v])] if xp is jnp else [0.0, *q.tolist(), *v.tolist()]
         return xp.stack([xp.asarray(x, float) for x in program([*constants, *state])])
 
     if not rows:
         free, root = xp.split(run(programs.equation_terms, v), 2)
         none = xp.zeros(0)
-        return (np.zeros(0, int), np.zeros(0, int)), none, free, none, none
+        return GuessTerms(np.zeros(0, int), np.zeros(0, int), none, free, none, none)
     value_count = programs.pattern.value_count
     values, b, free, root = xp.split(
         run(programs.equation_terms, v), [value_count, value_count + rows, value_count + rows + columns]
     )
     psi_q = programs.pattern.dense(values, xp) / root
-    places = np.nonzero(programs.pattern.dense(np.ones(value_count), np))
-    return places, psi_q[places], free, run(programs.psi_dot, 0 * v), b + psi_q @ free
+    rows, columns = np.nonzero(programs.pattern.dense(np.ones(value_count), np))
+    return GuessTerms(rows, columns, psi_q[rows, columns], free, run(programs.psi_dot, 0 * v), b + psi_q @ free)
 
 
-def _large_scene_terms(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[Any, ...]:
-    """The same of a large scene, by its loops."""
+def _large_scene_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, xp: ArrayLibrary) -> GuessTerms:
+    """Return the terms of a large scene at the initial guess, by its loops."""
     programs = loop_programs(mechanism)
     row, column, *_ = programs.d_entries
-    numbers = leaves_as_vector(jax.tree.leaves(mechanism))
+    numbers = xp.asarray(leaves_as_vector(jax.tree.leaves(mechanism)))
     _, rate, values = programs.geometry(numbers, xp)(0.0, q, 0 * v)
     psi_q = values * xp.sqrt(mass_of(mechanism, xp))[column]
     free, b = programs.loads(numbers, xp)(0.0, q, v)
@@ -109,25 +120,25 @@ def _large_scene_terms(mechanism: Mechanism, q: Any, v: Any, xp: Any) -> tuple[A
         if xp is np
         else jnp.zeros(programs.row_count).at[row].add(psi_q * free[column])
     )
-    return (row, column), psi_q, free, rate, b + gamma
+    return GuessTerms(row, column, psi_q, free, rate, b + gamma)
 
 
-def mass_of(mechanism: Mechanism, xp: Any) -> Any:
+def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
     """The diagonal of the mass matrix, by NumPy or JAX."""
     bodies = mechanism.bodies.values()
     mass, inertia = (xp.stack([xp.asarray(getattr(body, name), float) for body in bodies]) for name in ("mass", "inertia"))
     return xp.ravel(xp.stack([mass, mass, inertia], 1))
 
 
-def _scales(mechanism: Mechanism, guess: tuple[Any, ...], xp: Any) -> Scales:
-    (rows, columns), psi_q, free, psi_t, gamma = guess
+def _scales(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> Scales:
+    rows, columns, psi_q, free, psi_t, gamma = guess
     bodies = mechanism.bodies.values()
     inertia, mass = (xp.stack([xp.asarray(getattr(body, name)) for body in bodies]) for name in ("inertia", "mass"))
     length = arm = xp.max(xp.sqrt(inertia / mass))
     pair, of_entry = np.unique(rows * len(mass) + columns // 3, return_inverse=True)  # of a row and a body
     turns = columns % 3 == 2
 
-    def sum_by_pair(values: Any) -> Any:
+    def sum_by_pair(values: NumericArray) -> NumericArray:
         if xp is np:
             return np.bincount(of_entry, values, len(pair))
         return jnp.zeros(len(pair)).at[of_entry].add(values)
@@ -149,7 +160,7 @@ def _scales(mechanism: Mechanism, guess: tuple[Any, ...], xp: Any) -> Scales:
         scale = jnp.zeros(count).at[row].max(change)
     scale = xp.where(xp.isfinite(scale) & (scale > 0.0), scale, length)  # a row that nothing moves here: as if in metres
 
-    def largest(x: Any) -> Any:
+    def largest(x: NumericArray) -> NumericArray:
         return xp.max(xp.where(xp.isfinite(x), xp.abs(x), 0.0), initial=0.0)
 
     unit = xp.tile(xp.stack([length, length, xp.ones_like(length)]), len(mass))
@@ -168,7 +179,7 @@ def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:
     """
     masses = [body.mass for body in mechanism.bodies.values()]
     known = not any(isinstance(mass, Tracer) for mass in masses)
-    xp: Any = np if known else jnp  # while something else is traced, jnp would trace what is known, too
+    xp: ArrayLibrary = np if known else jnp  # while something else is traced, jnp would trace what is known, too
     masses = [xp.asarray(mass) for mass in masses]
     ratio = reduce(xp.minimum, masses) / reduce(xp.maximum, masses)
     return jax.lax.stop_gradient(number(RANK_TOL * xp.minimum(1.0, xp.sqrt(ORDINARY_MASS_RATIO * ratio))))

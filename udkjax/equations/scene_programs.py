@@ -2,10 +2,9 @@
 
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
-from typing import Any
 
 from udkjax.equations.scalar_equations import ScalarEquations, scalar_equations
-from udkjax.equations.structure import structure
+from udkjax.equations.structure import Shapes, TreeDef, structure
 from udkjax.expressions import Scalar, ScalarProgram, frontier
 from udkjax.expressions.selection import all_of
 from udkjax.pinv.rank_policy import RankPolicy
@@ -227,13 +226,13 @@ class EliminationPrograms(ScenePrograms):
 
 
 @lru_cache(maxsize=64)
-def _scene_programs(tree: Any, shapes: tuple) -> ScenePrograms:
+def _scene_programs(tree: TreeDef, shapes: Shapes) -> ScenePrograms:
     return ScenePrograms(scalar_equations(tree, shapes), baumgarte=False)
 
 
 @lru_cache(maxsize=64)
 def _elimination_programs(
-    tree: Any, shapes: tuple, redundant_rows: tuple[int, ...], baumgarte: bool, policy: RankPolicy
+    tree: TreeDef, shapes: Shapes, redundant_rows: tuple[int, ...], baumgarte: bool, policy: RankPolicy
 ) -> EliminationPrograms:
     return EliminationPrograms(scalar_equations(tree, shapes), redundant_rows, baumgarte, policy)
 

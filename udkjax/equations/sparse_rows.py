@@ -7,8 +7,9 @@ sparse. Rows that share none of them have nothing to do with each other: each se
 dozen in most scenes, is decided about by itself, by singular values.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
@@ -16,9 +17,10 @@ from scipy.sparse import coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
+from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import CLEAR, NEGLIGIBLE
 from udkjax.equations.loop_programs import loop_programs
-from udkjax.equations.position_closure import close_position, driver_time_step, is_closed
+from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
 from udkjax.equations.structure import leaves_as_vector
 from udkjax.pinv.elimination_order import minimum_degree
@@ -30,12 +32,15 @@ DAMPING = RANK_TOL**2  # of D D^T in closing: what truncation at `RANK_TOL` is t
 COLUMNS = 64  # of a null space that are solved for at a time, which bounds the memory of their dense form
 
 
+SparseMatrix: TypeAlias = Any  # of SciPy, whose annotations leave the shape open
+
+
 class SparsePosition(NamedTuple):
     """A closed position, with the elimination of its rows."""
 
-    t: float
+    t: Time
     q: np.ndarray
-    D: Any  # sparse
+    D: SparseMatrix
     pivots: np.ndarray  # of the rows, in their own order
     independent: np.ndarray  # rows with a pivot
     dependent: np.ndarray  # rows without one
@@ -62,14 +67,14 @@ class SparsePosition(NamedTuple):
         return heading
 
     @property
-    def null_space(self) -> Any:
+    def null_space(self) -> SparseMatrix:
         """The left null space of D: combinations of rows that vanish, (rows, redundant)."""
         rows, count = self.D.shape[0], len(self.dependent)
         if not count:
             return csc_array((rows, 0))
         independent = self.D[self.independent]
         solve = splu(csc_array(independent @ independent.T), **_SYMMETRIC).solve
-        split_dependent_rows = []
+        blocks = []
         for start in range(0, count, COLUMNS):
             dependent = self.dependent[start : start + COLUMNS]
             right = (independent @ self.D[dependent].T).toarray()
@@ -77,20 +82,20 @@ class SparsePosition(NamedTuple):
             found[self.independent] = -solve(right)
             found[dependent, np.arange(len(dependent))] = 1.0
             found[np.abs(found) < NEGLIGIBLE] = 0.0
-            split_dependent_rows.append(coo_array(found))
-        return csc_array(_stack_columns(split_dependent_rows, rows))
+            blocks.append(coo_array(found))
+        return csc_array(_stack_columns(blocks, rows))
 
 
 _SYMMETRIC: dict[str, Any] = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}, "diag_pivot_thresh": 0.0}
 
 
-def _stack_columns(split_dependent_rows: list[Any], rows: int) -> Any:
-    shift = np.cumsum([0, *(p.shape[1] for p in split_dependent_rows)])
+def _stack_columns(blocks: list[SparseMatrix], rows: int) -> SparseMatrix:
+    shift = np.cumsum([0, *(p.shape[1] for p in blocks)])
     place = (
-        np.concatenate([p.row for p in split_dependent_rows]),
-        np.concatenate([p.col + s for p, s in zip(split_dependent_rows, shift, strict=False)]),
+        np.concatenate([p.row for p in blocks]),
+        np.concatenate([p.col + s for p, s in zip(blocks, shift, strict=False)]),
     )
-    return coo_array((np.concatenate([p.data for p in split_dependent_rows]), place), shape=(rows, shift[-1]))
+    return coo_array((np.concatenate([p.data for p in blocks]), place), shape=(rows, shift[-1]))
 
 
 class SparseRows:
@@ -109,7 +114,7 @@ class SparseRows:
         self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
         self._stretch = self.metric / root
         self.driver_time_step = driver_time_step(self.scales)
-        self._evaluate = programs.geometry(leaves_as_vector(jax.tree.leaves(mechanism)), np)
+        self._evaluate = programs.geometry(np.asarray(leaves_as_vector(jax.tree.leaves(mechanism))), np)
 
     @cached_property
     def _order(self) -> list[int]:
@@ -118,34 +123,34 @@ class SparseRows:
             rows[i].add(k // 3)
         return minimum_degree(rows)
 
-    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
+    def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, SparseMatrix]:
         """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
         psi, _, values = self._evaluate(t, q, q)
         D, length = self._normalize_rows(values)
         return psi, length, D
 
-    def _normalize_rows(self, values: np.ndarray) -> tuple[Any, np.ndarray]:
+    def _normalize_rows(self, values: np.ndarray) -> tuple[SparseMatrix, np.ndarray]:
         row, column, *_ = self._programs.d_entries
         D = csr_array((values * self._stretch[column], (row, column)), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
         length[length == 0.0] = 1.0
         return csr_array(D.multiply(1 / length[:, None])), length
 
-    def residual(self, t: float, q: np.ndarray) -> np.ndarray:
+    def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
         return self._evaluate(t, q, q)[0] / self.scales.rows
 
-    def correction(self, t: float, q: np.ndarray) -> np.ndarray:
+    def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
         psi, length, D = self.at(t, q)
         return self._solve(D, psi / length)
 
-    def _solve(self, D: Any, residual: np.ndarray) -> np.ndarray:
+    def _solve(self, D: SparseMatrix, residual: np.ndarray) -> np.ndarray:
         """-W D^T (D D^T + damping)^(-1) of a residual."""
         if not np.all(np.isfinite(D.data)):
             return np.full(self.size, np.nan)
         system = csc_array(D @ D.T + DAMPING * eye_array(self.count))
         return -self.metric * (D.T @ splu(system, **_SYMMETRIC).solve(residual))
 
-    def close(self, t: float, q: np.ndarray) -> SparsePosition | None:
+    def close(self, t: Time, q: np.ndarray) -> SparsePosition | None:
         """Return a closed position near q, or None."""
         q = close_position(self, t, q, np)
         psi, _, D = self.at(t, q)
@@ -153,7 +158,7 @@ class SparseRows:
             return None
         return self._position(t, q, D)
 
-    def assemble(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[Any, Any, Any, Any, int]:
+    def assemble(self, t: Time, q: np.ndarray, v: np.ndarray) -> Assembly[np.ndarray]:
         """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
         if not self.count:
             return q, v, np.zeros(0), np.zeros(0), 0
@@ -166,17 +171,17 @@ class SparseRows:
             v = v + self._solve(D, self._evaluate(t, q, v)[1] / length)
         return q, v, psi, self._evaluate(t, q, v)[1], rank
 
-    def split_rows(self, positions: list[SparsePosition]) -> list[tuple[np.ndarray, list["RowSubset"]]]:
+    def split_rows(self, positions: list[SparsePosition]) -> Sequence[tuple[np.ndarray, Sequence["RowSubset"]]]:
         """Sets of rows that depend on each other, and how each stands in the positions."""
         return split_dependent_rows(positions)
 
-    def _position(self, t: float, q: np.ndarray, D: csr_array) -> SparsePosition:
+    def _position(self, t: Time, q: np.ndarray, D: SparseMatrix) -> SparsePosition:
         pivots = find_pivots(csr_array(D @ D.T), self._order)
         has_pivot = pivots > NO_PIVOT
         return SparsePosition(t, q, D, pivots, np.flatnonzero(has_pivot), np.flatnonzero(~has_pivot))
 
 
-def find_pivots(gram: csr_array, order: list[int]) -> np.ndarray:
+def find_pivots(gram: SparseMatrix, order: list[int]) -> np.ndarray:
     """The pivots of D D^T in the order of elimination, for rows of length one; dependent rows are passed over."""
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))
@@ -203,7 +208,7 @@ def find_pivots(gram: csr_array, order: list[int]) -> np.ndarray:
 class RowSubset(NamedTuple):
     """Some rows at one position, by themselves: an orthonormal basis of their left null space."""
 
-    smallest: float  # singular value that counts, relative to the largest
+    smallest: Time  # singular value that counts, relative to the largest
     null_space: np.ndarray
 
 

@@ -4,15 +4,19 @@ Elements of the same structure, such as all revolute joints, are traced once and
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Sequence
+from types import ModuleType
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from udkjax.scene.bodies import GROUND, Frame
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism, attached_bodies
 
 # Bodies, constraints and force elements beyond which the programs are loops over elements of the same structure. Straight-line
@@ -26,25 +30,35 @@ def is_large(mechanism: Mechanism) -> bool:
     return len(mechanism.body_names) + len(mechanism.constraints) + len(mechanism.force_names) > LARGE_SCENE
 
 
-def structure(mechanism: Mechanism) -> tuple[Any, tuple]:
+Time: TypeAlias = Float[ArrayLike, ""]  # s
+TreeDef: TypeAlias = Hashable  # JAX's description of a tree without its leaves
+Shapes: TypeAlias = tuple[tuple[tuple[int, ...], np.dtype], ...]  # the shape and the type of each number of a tree
+ArrayLibrary: TypeAlias = ModuleType  # numpy or jax.numpy
+NumericArray: TypeAlias = Array | np.ndarray  # of JAX, perhaps traced, or of NumPy where it is known
+AnyArray = TypeVar("AnyArray", Array, np.ndarray)  # of the one library or of the other
+Element: TypeAlias = Constraint | ForceElement
+Result = TypeVar("Result")
+
+
+def structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
     """Return the tree of a mechanism, and the shape and the type of each of its numbers."""
     leaves, tree = jax.tree.flatten(mechanism.without_origin)
     return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
 
 
-def leaves_as_vector(leaves: Sequence[Any]) -> Any:
+def leaves_as_vector(leaves: Sequence[NumericArray]) -> NumericArray:
     """All numbers of some arrays as one vector, in order; by NumPy where they are known."""
     known = not any(isinstance(x, Tracer) for x in leaves)
     parts = [np.ravel(np.asarray(x, float)) if known else jnp.ravel(jnp.asarray(x, float)) for x in leaves]
     return np.concatenate(parts) if known else jnp.concatenate(parts)
 
 
-def leaves_as_scalars(leaves: Sequence[Any]) -> list[Any]:
+def leaves_as_scalars(leaves: Sequence[NumericArray]) -> list[NumericArray]:
     """All numbers of some arrays one by one, in the order in which the graph of a scene counts them."""
     return [x for leaf in leaves for x in _scalars(leaf)]
 
 
-def _scalars(leaf: Any) -> list[Any]:
+def _scalars(leaf: NumericArray) -> list[NumericArray]:
     if not np.shape(leaf):
         return [leaf[()] if isinstance(leaf, np.ndarray) else leaf]
     if not isinstance(leaf, Tracer):
@@ -56,9 +70,9 @@ def _scalars(leaf: Any) -> list[Any]:
 class ElementStructure(NamedTuple):
     """What is traced once for many elements: all of them but the names of their bodies and the values of their numbers."""
 
-    tree: Any
-    shapes: tuple
-    ground: tuple[bool, ...]  # which of its frames are the ground's
+    tree: TreeDef
+    shapes: Shapes
+    ground: tuple[bool, ...]  # of each of its frames: whether it is the ground's
 
     @property
     def body_count(self) -> int:
@@ -66,7 +80,7 @@ class ElementStructure(NamedTuple):
         return len(self.ground) - sum(self.ground)
 
 
-def element_structure(element: Any, frames: Sequence[str]) -> ElementStructure:
+def element_structure(element: Element, frames: Sequence[str]) -> ElementStructure:
     """Return the structure of a constraint or force element that is attached to `frames`, names of bodies or the ground."""
     numbers = {name: GROUND if name == GROUND else str(k) for k, name in enumerate(frames)}
     nameless = object.__new__(type(element))
@@ -86,14 +100,16 @@ class ElementKind(NamedTuple):
     """All elements of one structure."""
 
     structure: ElementStructure
-    members: np.ndarray  # (elements,) their indices among those given
-    bodies: np.ndarray  # (bodies of each, elements)
+    members: Int[np.ndarray, "elements"]  # their indices among the elements that were sorted
+    bodies: Int[np.ndarray, "bodies_of_each elements"]  # indices of their bodies
 
 
-def element_kinds(mechanism: Mechanism, elements: Sequence[Any], labels: Sequence[Any] | None = None) -> list[ElementKind]:
+def element_kinds(
+    mechanism: Mechanism, elements: Sequence[Element], labels: Sequence[Hashable] | None = None
+) -> list[ElementKind]:
     """Sort elements by their structure, and by their `labels` where there are any."""
     body_index, joints = {name: k for k, name in enumerate(mechanism.body_names)}, mechanism.joints
-    found: dict[Any, list[tuple[int, list[int]]]] = {}
+    found: dict[tuple[ElementStructure, Hashable], list[tuple[int, list[int]]]] = {}
     for i, element in enumerate(elements):
         frames = attached_bodies(element, joints)  # a method of a large module takes a look at all of its leaves
         key = element_structure(element, frames), labels[i] if labels else None
@@ -106,8 +122,8 @@ def element_kinds(mechanism: Mechanism, elements: Sequence[Any], labels: Sequenc
 
 
 def evaluate_by_kind(
-    function: Callable[..., Any], mechanism: Mechanism, elements: Sequence[Any], *states: Any
-) -> list[tuple[ElementKind, Any]]:
+    function: Callable[..., Result], mechanism: Mechanism, elements: Sequence[Element], *states: Float[Array, "bodies 3"]
+) -> list[tuple[ElementKind, Result]]:
     """Evaluate `function(element, *frames)` for elements of each kind together.
 
     Args:
@@ -120,15 +136,15 @@ def evaluate_by_kind(
         The kinds, each with the results, the elements first.
     """
     q, found = states[0], []
-    turned = jnp.cos(q[:, 2:]), jnp.sin(q[:, 2:])
-    frames = jnp.concatenate([q, *turned, *states[1:]], axis=1)  # the fields of `Frame` of each body
-    ground = (0.0, 0.0, 0.0, 1.0, 0.0, *(0.0 for _ in states[1:] for _ in range(3)))
+    cos, sin = jnp.cos(q[:, 2:]), jnp.sin(q[:, 2:])
+    frames = jnp.concatenate([q, cos, sin, *states[1:]], axis=1)  # the fields of `Frame` of each body
+    ground = GROUND_FRAME if len(states) == 1 else GROUND_FRAME_AT_REST
     for kind in element_kinds(mechanism, elements):
 
-        def evaluate(leaves: Sequence[Any], of_bodies: Any, kind: ElementStructure = kind.structure) -> Any:
-            rest = iter(of_bodies)
+        def evaluate(leaves: Sequence[Array], body_frames: Array, kind: ElementStructure = kind.structure) -> Result:
+            rest = iter(body_frames)
             element = jax.tree.unflatten(kind.tree, leaves)
-            return function(element, *(Frame(*(ground if fixed else next(rest))) for fixed in kind.ground))
+            return function(element, *(ground if fixed else Frame(*next(rest)) for fixed in kind.ground))
 
         columns = zip(*(jax.tree.leaves(elements[i]) for i in kind.members), strict=True)
         leaves = [jnp.stack([jnp.asarray(x) for x in column]) for column in columns]

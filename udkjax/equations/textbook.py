@@ -1,7 +1,5 @@
 """The equations of motion of a mechanism by the textbook (udwadia_kalaba.py): any pseudoinverse, derivatives of any order."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.abstract_system import MechanismSystem, TangentPart, Vector
+from udkjax.equations.abstract_system import MechanismSystem, PseudoinverseOperator, TangentPart, Time, Vector
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -31,56 +29,56 @@ class TextbookEquations(MechanismSystem):
     scales: Scales
     redundant: tuple[int, ...] | None = eqx.field(static=True)  # rows that elimination leaves out; None: they are not known
 
-    def accelerations(self, t: Any, q: Vector, v: Vector) -> Vector:
+    def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """a = a_F + M^(-1/2) D^+ b."""
         return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.weights)
 
-    def multipliers(self, t: Any, q: Vector, v: Vector) -> Float[Array, "m"]:
+    def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
         """lambda = -(D^+)^T D^+ b."""
         return uk.multipliers(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
 
-    def project(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric: see `correct`."""
         return _project(self, t, q, v)
 
-    def correct(self, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def correct(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """One Newton step in position and one in velocity: at a state on the manifold it has the tangents of a projection."""
         return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
-    def tangent_part(self, t: Any, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
+    def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
         mechanism, w = self.mechanism, self.weights
         of = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
         return TangentPart(*of(jnp.stack([dq, dv])))
 
-    def violation(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+    def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Psi and Psi_dot, of all rows."""
         return constraints.psi(self.mechanism, t, q), constraints.psi_dot(self.mechanism, t, q, v)
 
-    def is_finite(self, t: Any, q: Vector, v: Vector) -> Bool[Array, ""]:
+    def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         """Whether everything that the equation is made of is a number."""
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in self.matrices(t, q, v)]))
 
-    def matrices(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
+    def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
         """M, F, Psi_q and gamma - 2 alpha Psi_dot - beta^2 Psi, of all rows."""
         mechanism, A = self.mechanism, constraints.psi_q(self.mechanism, t, q)
         c = uk.b(mechanism, t, q, v, self.baumgarte) + A @ uk.a_F(mechanism, t, q, v)
         return jnp.diag(loads.mass(mechanism)), loads.force(mechanism, t, q, v), A, c
 
-    def jacobian(self, t: Any, q: Vector) -> Float[Array, "m n"]:
+    def jacobian(self, t: Time, q: Vector) -> Float[Array, "m n"]:
         """Psi_q of all rows."""
         return constraints.psi_q(self.mechanism, t, q)
 
-    def weighted_rows(self, t: Any, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+    def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """D and Psi, their rows weighted, and M^(-1/2), of all rows."""
         w = self.scales.weights
         return uk.D(self.mechanism, t, q, w), w * constraints.psi(self.mechanism, t, q), uk.inverse_sqrt_mass(self.mechanism)
 
-    def energy(self, t: Any, q: Vector, v: Vector) -> tuple[Array, Array]:
+    def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Kinetic and potential energy (J)."""
         return loads.kinetic_energy(self.mechanism, v), loads.potential_energy(self.mechanism, t, q, v)
 
-    def linearized_position(self, t: Any, q: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
+    def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
         mechanism, w = self.mechanism, self.weights
         return (
             uk.pseudoinverse(self.method, uk.D(mechanism, t, q, w)),
@@ -88,7 +86,7 @@ class TextbookEquations(MechanismSystem):
             uk.inverse_sqrt_mass(mechanism),
         )
 
-    def linearized_velocity(self, t: Any, q: Vector, v: Vector) -> tuple[Any, Float[Array, "m"], Vector]:
+    def linearized_velocity(self, t: Time, q: Vector, v: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
         mechanism, w = self.mechanism, self.weights
         rate = uk.weigh(w, constraints.psi_dot(mechanism, t, q, v))
         return uk.pseudoinverse(self.method, uk.D(mechanism, t, q, w)), rate, uk.inverse_sqrt_mass(mechanism)
@@ -125,7 +123,7 @@ def prepare(
     """
     analysis = analyse(mechanism) if analysis is None else analysis
     mechanism = mechanism.without_origin
-    chosen: Any = Auto() if method is None else method
+    chosen = Auto() if method is None else method
     tol = rank_tolerance(mechanism) if chosen.rank_tol is None else chosen.rank_tol
     chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)
     if isinstance(chosen, Elimination) and not chosen.relative:
@@ -139,7 +137,7 @@ def prepare(
 
 
 @jax.custom_jvp
-def _project(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+def _project(equations: TextbookEquations, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     return uk.project(equations.mechanism, t, q, v, equations.method, equations.weights)
 
 
@@ -150,7 +148,7 @@ def _(primals, tangents):
 
 
 @jax.custom_jvp
-def _at_projection(equations: TextbookEquations, t: Any, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+def _at_projection(equations: TextbookEquations, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     """A state on the manifold, with the derivatives that `project` has where it returns it."""
     del equations, t
     return q, v

@@ -16,16 +16,14 @@ for diag(w) D and diag(w) b, which changes no solution of consistent rows, and l
 its row out.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.equations import constraints, loads
 from udkjax.equations.constraints import State, vector
-from udkjax.pinv import Pseudoinverse
+from udkjax.pinv import Plus, Pseudoinverse
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -102,7 +100,7 @@ def project(
     By so many Newton steps q - M^(-1/2) D^+ Psi, then v - M^(-1/2) D^+ Psi_dot, in which Psi_dot is linear.
     """
 
-    def newton(_: Any, q: Any) -> Any:
+    def newton(_: int, q: Array) -> Array:
         return q - inverse_sqrt_mass(mechanism) * (
             pseudoinverse(method, D(mechanism, t, q, w)) @ weigh(w, constraints.psi(mechanism, t, q))
         )
@@ -132,19 +130,23 @@ def weigh(w: Weights, rows: Array) -> Array:
     return rows if w is None else (rows.T * jnp.asarray(w)).T
 
 
-def pseudoinverse(method: Pseudoinverse, D: Float[Array, "m n"]) -> Any:
+def pseudoinverse(method: Pseudoinverse, D: Float[Array, "m n"]) -> "Plus | ZeroPseudoinverse":
     """D^+ as an operator, `D_plus @ b` and `D_plus.T @ x`; of no rows at all it is zero."""
-    return method.plus(D) if len(D) else _Zero(D.shape)
+    return method.plus(D) if len(D) else ZeroPseudoinverse(D.shape)
 
 
-class _Zero(eqx.Module):
+class ZeroPseudoinverse(eqx.Module):
     """D^+ of a matrix without rows."""
 
     shape: tuple[int, ...] = eqx.field(static=True)
 
     @property
-    def T(self) -> "_Zero":
-        return _Zero(self.shape[::-1])
+    def T(self) -> "ZeroPseudoinverse":
+        return ZeroPseudoinverse(self.shape[::-1])
+
+    @property
+    def rank(self) -> Int[Array, ""]:
+        return jnp.zeros((), int)
 
     def __matmul__(self, b: Array) -> Array:
         return jnp.zeros(self.shape[1])

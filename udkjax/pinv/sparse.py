@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from udkjax.expressions import Graph, Scalar
+from udkjax.expressions.differential import Row
 from udkjax.expressions.selection import absolute, greater, maximum, where
 from udkjax.pinv.elimination_order import minimum_degree
-
-Row = dict[int, Scalar]
 
 
 class PatternEntry(NamedTuple):
