@@ -8,15 +8,14 @@ What an opaque node (an array primitive, `call`) returns counts as further input
 follow from those of its arguments by JAX's own rule for the primitive, forward or transposed.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any
 
 import jax
 import numpy as np
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
-from udkjax.expressions.jaxpr_reader import read_jaxpr
+from udkjax.expressions.jaxpr_reader import ClosedJaxpr, read_jaxpr
 
 Row = dict[int, Scalar]  # partial derivatives, by the index of the node with respect to which they are taken
 
@@ -167,7 +166,7 @@ def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
 
 
 @lru_cache(maxsize=256)
-def _slope(detail: BoundPrimitive, dtypes: tuple, k: int) -> Any:
+def _slope(detail: BoundPrimitive, dtypes: tuple[np.dtype, ...], k: int) -> ClosedJaxpr:
     """The derivative of a primitive on scalars with respect to its k-th argument, as a jaxpr."""
 
     def slope(*scalars):
@@ -215,7 +214,9 @@ def _pull_back(graph: Graph, call: int, seeds: Row, flags: Sequence[bool]) -> li
     return [s for array in result for s in array.flat]
 
 
-def _restrict(detail: BoundPrimitive, arrays: Sequence[Any], active: Sequence[int], wanted: Sequence[int]) -> Any:
+def _restrict(
+    detail: BoundPrimitive, arrays: Sequence[jax.Array], active: Sequence[int], wanted: Sequence[int]
+) -> Callable[..., list[jax.Array]]:
     """An array primitive as a function of some of its arguments, with some of its results."""
 
     def function(*some):
@@ -238,7 +239,7 @@ def _pick(graph: Graph, k: int, found: Mapping[int, np.ndarray]) -> Scalar:
     return found[output].flat[flat]  # pyright: ignore[reportReturnType]
 
 
-def _arrays(node: Node, scalars: Sequence[Any]) -> list[np.ndarray]:
+def _arrays(node: Node, scalars: Sequence[object]) -> list[np.ndarray]:
     arrays, start = [], 0
     for shape in node.detail.shapes:
         size = int(np.prod(shape))

@@ -6,10 +6,12 @@ never emitted (scalar_program.py), so a caller builds freely and chooses later.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax.extend.core import Primitive
+from numpy.typing import DTypeLike
 
 
 class Node(NamedTuple):
@@ -89,36 +91,40 @@ class Scalar:
 class Graph:
     """Nodes in an order in which every argument comes before its use."""
 
-    def __init__(self, dtype: Any = np.float64):
+    def __init__(self, dtype: DTypeLike = np.float64):
         self.dtype = np.dtype(dtype)
         self.nodes: list[Node] = []
-        self._known: dict[Any, int] = {}
+        self._known: dict[Hashable, int] = {}
 
     # --- leaves
 
-    def input(self, name: Any, group: str, dtype=None) -> Scalar:
+    def input(self, name: Hashable, group: str, dtype: DTypeLike | None = None) -> Scalar:
         """Add an input, identified by its group and its name.
 
         The group says what kind of quantity it is, so that a program can be split by what depends on it.
         """
         return Scalar(self, self._node("input", (), (group, name), np.dtype(dtype or self.dtype), frozenset([group])))
 
-    def constant(self, value: Any, dtype=None) -> Scalar:
+    def constant(self, value: Any, dtype: DTypeLike | None = None) -> Scalar:
+        """Add a known value."""
         dtype = np.dtype(dtype or self.dtype)
         value = dtype.type(value).item()
         if np.issubdtype(dtype, np.floating) and math.copysign(1.0, value) < 0:
             return Scalar(self, self._node("constant", (), -value, dtype, frozenset()), -1 if value != 0 else 1)
         return Scalar(self, self._node("constant", (), value, dtype, frozenset()))
 
-    def scalar(self, value: Any) -> Scalar:
+    def scalar(self, value: "Scalar | float") -> Scalar:
+        """Return a scalar of this graph: `value` itself, or the constant."""
         return value if isinstance(value, Scalar) else self.constant(value)
 
     # --- arithmetic
 
     def negate(self, a: Scalar) -> Scalar:
+        """-a."""
         return a if a.is_zero else Scalar(self, a.index, -a.sign)
 
     def add(self, a: Scalar, b: Scalar) -> Scalar:
+        """A + b."""
         if a.is_zero:
             return b
         if b.is_zero:
@@ -133,6 +139,7 @@ class Graph:
         return Scalar(self, self._operation(kind, (Scalar(self, a.index), Scalar(self, b.index))), a.sign)
 
     def multiply(self, a: Scalar, b: Scalar) -> Scalar:
+        """A * b."""
         if a.constant is not None and b.constant is not None:
             return self.constant(a.constant * b.constant, a.node.dtype)
         for one, other in ((a, b), (b, a)):
@@ -145,6 +152,7 @@ class Graph:
         return Scalar(self, self._operation("mul", (Scalar(self, a.index), Scalar(self, b.index))), a.sign * b.sign)
 
     def divide(self, a: Scalar, b: Scalar) -> Scalar:
+        """A / b."""
         if a.is_zero:
             return a
         if b.constant in (1.0, -1.0):
@@ -156,23 +164,37 @@ class Graph:
         return Scalar(self, self._operation("div", (Scalar(self, a.index), Scalar(self, b.index))), a.sign * b.sign)
 
     def sqrt(self, a: Scalar) -> Scalar:
+        """The square root."""
         if a.constant is not None:
             return self.constant(math.sqrt(a.constant), a.node.dtype)
         return Scalar(self, self._operation("sqrt", (a,)))
 
     # --- everything else
 
-    def apply(self, primitive: Any, parameters: dict, arguments: tuple[Scalar, ...], dtype: Any, fold: Callable) -> Scalar:
-        """A JAX primitive on scalars; `fold` computes it where all arguments are known."""
+    def apply(
+        self, primitive: Primitive, parameters: dict, arguments: tuple[Scalar, ...], dtype: DTypeLike, fold: Callable
+    ) -> Scalar:
+        """Apply a JAX primitive to scalars.
+
+        Args:
+            primitive: The primitive.
+            parameters: Its parameters, as in a jaxpr.
+            arguments: The scalars.
+            dtype: The type of the result.
+            fold: A function of arrays that computes the result where all arguments are known.
+
+        Returns:
+            The result; a constant where all arguments are.
+        """
         if all(a.constant is not None for a in arguments):
             return self.constant(np.asarray(fold(*(np.asarray(a.constant, a.node.dtype) for a in arguments))).item(), dtype)
         detail = BoundPrimitive(primitive, parameters)
         return Scalar(self, self._operation("apply", tuple(arguments), detail, np.dtype(dtype)))
 
     def call(
-        self, detail: "BoundPrimitive", arguments: tuple[Scalar, ...], outputs: list[tuple[tuple[int, ...], Any]]
+        self, detail: "BoundPrimitive", arguments: tuple[Scalar, ...], outputs: list[tuple[tuple[int, ...], DTypeLike]]
     ) -> list[np.ndarray]:
-        """A JAX primitive on whole arrays: an opaque node, and a pick for each element of what it returns."""
+        """Apply a JAX primitive to whole arrays: one opaque node, and a pick for each element of its results."""
         index = self._operation("call", arguments, detail, np.dtype(object))
         arrays = []
         for k, (shape, dtype) in enumerate(outputs):
@@ -184,7 +206,7 @@ class Graph:
         return arrays
 
     def dependencies(self, wanted: Iterable[int], given: Collection[int] = ()) -> list[int]:
-        """The nodes that some nodes take, with themselves, in an order in which they can be evaluated; without those given."""
+        """Return the nodes on which some nodes depend, in an order of evaluation, but not `given` and its dependencies."""
         found, stack = set(), list(wanted)
         while stack:
             index = stack.pop()
@@ -194,7 +216,7 @@ class Graph:
         return sorted(found)
 
     def substitute(self, wanted: Sequence[Scalar], others: Mapping[int, Scalar]) -> list[Scalar]:
-        """The same expressions, of others in place of some nodes."""
+        """Return expressions with other scalars in place of some nodes, by their index."""
         found = dict(others)
 
         def other(a: Scalar) -> Scalar:
@@ -231,7 +253,7 @@ class Graph:
 class BoundPrimitive:
     """A primitive with its parameters, and for arrays the shapes of its arguments; equal where the computation is."""
 
-    def __init__(self, primitive: Any, parameters: dict, shapes: tuple = ()):
+    def __init__(self, primitive: Primitive, parameters: dict, shapes: tuple = ()):
         self.primitive, self.parameters, self.shapes = primitive, parameters, shapes
         self._key = (primitive.name, shapes, tuple(sorted((k, str(v)) for k, v in parameters.items())))
 

@@ -7,13 +7,19 @@ node with the arrays it needs: anything that JAX can trace can be read.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
 from jax.extend import core
+from jax.typing import ArrayLike
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Scalar
+
+ClosedJaxpr: TypeAlias = Any  # JAX exports the class, but not to type checkers
+Equation: TypeAlias = Any  # a `JaxprEqn`, whose annotations leave the shapes of its variables out
+Dimensions = tuple[Sequence[int], Sequence[int]]
+DimensionNumbers = tuple[Dimensions, Dimensions]  # of `dot_general`: those contracted, those of the batch, of each operand
 
 _INLINED = (
     "jit",
@@ -35,7 +41,7 @@ _ELEMENTWISE = frozenset(
 )  # fmt: skip
 
 
-def trace(function: Callable, *examples: Any) -> Callable[..., list[np.ndarray]]:
+def trace(function: Callable, *examples: object) -> Callable[..., list[np.ndarray]]:
     """Trace a function once; the result reads it into a graph, for arguments given as arrays of Scalars, as often as wanted."""
     jaxpr = jax.make_jaxpr(function)(*examples)
     return lambda graph, *arguments: read_jaxpr(
@@ -43,13 +49,13 @@ def trace(function: Callable, *examples: Any) -> Callable[..., list[np.ndarray]]
     )
 
 
-def read_jaxpr(graph: Graph, closed: Any, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+def read_jaxpr(graph: Graph, closed: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the outputs of a closed jaxpr as arrays of Scalars."""
     constants = [_constants(graph, c) for c in closed.consts]
     return _read(graph, closed.jaxpr, constants, arguments)
 
 
-def _constants(graph: Graph, value: Any) -> np.ndarray:
+def _constants(graph: Graph, value: ArrayLike) -> np.ndarray:
     value = np.asarray(value)
     array = np.empty(value.shape, object)
     for place in np.ndindex(*value.shape):
@@ -57,8 +63,8 @@ def _constants(graph: Graph, value: Any) -> np.ndarray:
     return array
 
 
-def _read(graph: Graph, jaxpr: Any, constants: Sequence[np.ndarray], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
-    known: dict[Any, np.ndarray] = {}
+def _read(graph: Graph, jaxpr: core.Jaxpr, constants: Sequence[np.ndarray], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+    known: dict[core.Var, np.ndarray] = {}
     for variables, values in ((jaxpr.constvars, constants), (jaxpr.invars, arguments)):
         known.update(zip(variables, (np.asarray(v, object) for v in values), strict=True))
 
@@ -71,7 +77,7 @@ def _read(graph: Graph, jaxpr: Any, constants: Sequence[np.ndarray], arguments: 
     return [value(a) for a in jaxpr.outvars]
 
 
-def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
     name, parameters = equation.primitive.name, equation.params
     if name in _INLINED:
         inner = next(parameters[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in parameters)
@@ -108,11 +114,11 @@ def _equation(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.
     return graph.call(details, scalars, [(v.aval.shape, v.aval.dtype) for v in equation.outvars])
 
 
-def _read_inner(graph: Graph, jaxpr: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _read_inner(graph: Graph, jaxpr: core.Jaxpr | ClosedJaxpr, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     return read_jaxpr(graph, jaxpr, inputs) if hasattr(jaxpr, "consts") else _read(graph, jaxpr, [], inputs)
 
 
-def _unroll(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _unroll(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """A loop of known length, round by round."""
     body, order = equation.params["jaxpr"], range(equation.params["length"])
     inner = getattr(body, "jaxpr", body)
@@ -137,7 +143,7 @@ def _elementwise(operation: Callable[..., Scalar], shape: tuple[int, ...], input
     return result
 
 
-def _apply(graph: Graph, equation: Any, dtype: np.dtype, *scalars: Scalar) -> Scalar:
+def _apply(graph: Graph, equation: Equation, dtype: np.dtype, *scalars: Scalar) -> Scalar:
     primitive, parameters = equation.primitive, equation.params
     if primitive.name == "select_n" and scalars[0].constant is not None:
         return scalars[1 + int(scalars[0].constant)]
@@ -146,12 +152,12 @@ def _apply(graph: Graph, equation: Any, dtype: np.dtype, *scalars: Scalar) -> Sc
     return graph.apply(primitive, parameters, scalars, dtype, lambda *values: _fold(primitive, parameters, values))
 
 
-def _fold(primitive: Any, parameters: dict, values: Sequence[Any]) -> Any:
+def _fold(primitive: core.Primitive, parameters: dict, values: Sequence[ArrayLike]) -> np.ndarray:
     with jax.ensure_compile_time_eval():
         return np.asarray(primitive.bind(*map(jax.numpy.asarray, values), **parameters))
 
 
-def _evaluate_constants(graph: Graph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+def _evaluate_constants(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """What a primitive gives for known values, such as indices."""
     values = [_values(i).astype(v.aval.dtype) for i, v in zip(inputs, equation.invars, strict=True)]  # an empty one has no type
     with jax.ensure_compile_time_eval():
@@ -164,7 +170,7 @@ def _values(array: np.ndarray) -> np.ndarray:
     return np.array([s.constant for s in array.flat], dtype).reshape(array.shape)
 
 
-def _select(equation: Any, inputs: list[np.ndarray]) -> np.ndarray:
+def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
     """Which elements an indexing with known indices takes: let JAX take them from an array of their places."""
     array, *indices = inputs
     places, outside = np.arange(array.size).reshape(array.shape), array.size  # what stands for an index beyond the end
@@ -185,7 +191,7 @@ def _integer_power(x: Scalar, y: int) -> Scalar:
     return result
 
 
-def _dot(graph: Graph, a: np.ndarray, b: np.ndarray, numbers: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _dot(graph: Graph, a: np.ndarray, b: np.ndarray, numbers: DimensionNumbers, shape: tuple[int, ...]) -> np.ndarray:
     (contract_a, contract_b), (batch_a, batch_b) = numbers
     free_a = [k for k in range(a.ndim) if k not in (*contract_a, *batch_a)]
     free_b = [k for k in range(b.ndim) if k not in (*contract_b, *batch_b)]
@@ -221,7 +227,7 @@ _ARITHMETIC: dict[str, Callable[..., Scalar]] = {
     "sqrt": lambda a, **_: a.graph.sqrt(a),
     "integer_pow": lambda a, y, **_: _integer_power(a, y),
 }
-_SHAPES: dict[str, Callable[..., Any]] = {
+_SHAPES: dict[str, Callable[..., np.ndarray]] = {
     "reshape": lambda a, new_sizes, **_: a.reshape(new_sizes),
     "squeeze": lambda a, dimensions: np.squeeze(a, tuple(dimensions)),
     "expand_dims": lambda a, dimensions: np.expand_dims(a, dimensions),

@@ -4,8 +4,9 @@ A `Kernel` is the program with the addresses of its inputs and outputs, relative
 row of a table of bases, in order. The code grows with the number of kinds of elements, the tables with the number of elements.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -13,11 +14,12 @@ import numpy as np
 from udkjax.expressions.graph import Graph, Scalar
 from udkjax.expressions.scalar_program import ScalarProgram
 
+AnyArray = TypeVar("AnyArray", jax.Array, np.ndarray)
 SET, ADD, MINIMUM = "set", "add", "least"  # an output replaces what is there, is added to it, or the smaller of both stays
 
 
 class Address(NamedTuple):
-    """Where a number lies: so many behind a base in an array. `base` is a column of the table, or None: the array's start."""
+    """The address of a number: `offset` places behind a base in an array, a column of the table (None: the array's start)."""
 
     array: str
     base: int | None
@@ -26,7 +28,7 @@ class Address(NamedTuple):
 
 
 class Kernel:
-    """A straight-line program of one thing among many that are alike."""
+    """A straight-line program of one element among many that are alike."""
 
     def __init__(self, program: ScalarProgram, inputs: Sequence[Address], outputs: Sequence[Address]):
         self.program, self.inputs, self.outputs = program, list(inputs), list(outputs)
@@ -35,7 +37,7 @@ class Kernel:
 
 
 class KernelWriter:
-    """Writes a kernel: what it reads, what it computes in `graph`, and where it writes that to."""
+    """Writes a kernel: its inputs, the graph that computes its outputs, and the addresses of both."""
 
     def __init__(self, graph: Graph | None = None):
         self.graph = Graph() if graph is None else graph
@@ -67,15 +69,15 @@ class KernelLoop(NamedTuple):
 
     kernel: Kernel
     table: np.ndarray
-    names: Mapping[str, str] = {}  # of the kernel's arrays: which they are here, if another
+    names: Mapping[str, str] = {}  # from the kernel's names of arrays to the program's, where they differ
 
     def array(self, name: str) -> str:
-        """Which array one of the kernel's is."""
+        """Return the program's name of one of the kernel's arrays."""
         return self.names.get(name, name)
 
 
 class Reset(NamedTuple):
-    """Some numbers of an array become a constant."""
+    """Sets some numbers of an array to a constant."""
 
     array: str
     start: int
@@ -90,13 +92,13 @@ class LoopProgram(NamedTuple):
 
     @property
     def arrays(self) -> set[str]:
-        """All arrays that it reads or writes."""
+        """The names of all arrays that the program reads or writes."""
         found = {part.array for part in self.parts if isinstance(part, Reset)}
         return found.union(*({part.array(x) for x in part.kernel.arrays} for part in self.parts if isinstance(part, KernelLoop)))
 
 
-def evaluate_loops(program: LoopProgram, arrays: dict[str, Any], xp: Any) -> dict[str, Any]:
-    """The arrays as a program leaves them, all rows of a loop at once, by NumPy or JAX: none may take anything from another."""
+def evaluate_loops(program: LoopProgram, arrays: dict[str, AnyArray], xp: ModuleType) -> dict[str, AnyArray]:
+    """Return the arrays as a program leaves them, by NumPy or JAX; no row of a loop may read what another writes."""
     found = dict(arrays)
     for part in program.parts:
         if isinstance(part, Reset):
@@ -112,15 +114,15 @@ def evaluate_loops(program: LoopProgram, arrays: dict[str, Any], xp: Any) -> dic
 
         pairs = list(zip(kernel.program.inputs, kernel.inputs, strict=True))
         values = [found[part.array(x.array)][places(x)] if kernel.program.uses(s) else np.zeros(len(table)) for s, x in pairs]
-        run = kernel.program.by_numpy if xp is np or not values else jax.vmap(kernel.program)
+        run: Callable = kernel.program.by_numpy if xp is np or not values else jax.vmap(kernel.program)
         for x, address in zip(run(values), kernel.outputs, strict=True):
             name = part.array(address.array)
             found[name] = _update(found[name], places(address), x, address.update, xp)
     return found
 
 
-def _update(array: Any, places: np.ndarray, x: Any, update: str, xp: Any) -> Any:
-    if xp is not np:
+def _update(array: AnyArray, places: np.ndarray, x: AnyArray, update: str, xp: ModuleType) -> AnyArray:
+    if not isinstance(array, np.ndarray):
         return array.at[places].add(x) if update == ADD else array.at[places].set(x)
     array = array.copy()
     (np.add.at if update == ADD else np.ndarray.__setitem__)(array, places, x)

@@ -1,4 +1,4 @@
-"""Emit a graph as a program: a function of scalars that computes the outputs asked for, and nothing else.
+"""Scalar programs: functions of scalars that compute some outputs of a graph, and nothing else.
 
 On JAX scalars it is traced (under vmap each scalar becomes one vector over the batch, the layout that vectorizes); on Python
 floats it is evaluated at once, which is how a scene is analysed without compiling anything.
@@ -7,13 +7,16 @@ floats it is evaluated at once, which is how a scene is analysed without compili
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
+
+Value: TypeAlias = Any  # a number of Python, NumPy or JAX, or an array: each has its own operators
 
 _SINE_AND_COSINE = ("sin", "cos")
 _LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # of these names math and NumPy have functions, too
@@ -55,10 +58,10 @@ class ScalarProgram:
         self._traced = jax.jit(self._run)  # traced once, wherever and however often it is called and differentiated
 
     def uses(self, scalar: Scalar) -> bool:
-        """Whether the program needs this input at all."""
+        """Whether the program uses an input."""
         return scalar.index in self.last_use
 
-    def __call__(self, values: Sequence[Any]) -> list[Any]:
+    def __call__(self, values: Sequence[Value]) -> list[Value]:
         if all(isinstance(v, float | int) for v in values):
             try:
                 return self._run(values)
@@ -68,7 +71,7 @@ class ScalarProgram:
         return self._traced(self._typed(values))
 
     def by_numpy(self, values: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The same of arrays (rows,), element by element, without compiling anything."""
+        """Evaluate the program on arrays (rows,), element by element, without compiling anything."""
         rows = len(values[0]) if values else 1
         with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
             if any(self.graph.nodes[i].kind == "call" for i in self.order):  # of an array primitive: one row after the other
@@ -77,25 +80,25 @@ class ScalarProgram:
             return [np.broadcast_to(np.asarray(x), (rows,)) for x in self._run(values)]
 
     def depends_on(self, flags: Sequence[bool]) -> tuple[bool, ...]:
-        """Which outputs depend on any of the inputs that are marked."""
+        """Return for each output whether it depends on any of the inputs that are flagged."""
         reached = {s.index for s, m in zip(self.inputs, flags, strict=True) if m}
         for index in self.order:
             if any(a.index in reached for a in self.graph.nodes[index].arguments):
                 reached.add(index)
         return tuple(s.index in reached for s in self.outputs)
 
-    def _typed(self, values: Sequence[Any]) -> list[Any]:
+    def _typed(self, values: Sequence[Value]) -> list[Value]:
         given = zip(values, (s.node.dtype for s in self.inputs), strict=True)
         return [v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in given]
 
-    def _run(self, values: Sequence[Any]) -> list[Any]:
-        known: dict[int, Any] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
+    def _run(self, values: Sequence[Value]) -> list[Value]:
+        known: dict[int, Value] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
         for index in self.order:
             known[index] = _evaluate(self.graph.nodes[index], known)
         return [_signed(known, s) for s in self.outputs]
 
     def count(self) -> dict[str, int]:
-        """How many operations of each kind the program holds; the sine and cosine of one angle are one."""
+        """Count the operations of each kind; the sine and cosine of one angle are one."""
         counts: dict[str, int] = {}
         for index in self.order:
             node = self.graph.nodes[index]
@@ -106,7 +109,7 @@ class ScalarProgram:
 
 
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:
-    """Return what an early program must hand to a later one: the early nodes that the outputs or later nodes use.
+    """Return the nodes that an early program must hand to a later one: the early nodes that outputs or later nodes use.
 
     Where early is what depends on parameters alone, that program runs once, the later one whenever the state changes.
     """
@@ -118,7 +121,7 @@ def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bo
 
 
 def operations(graph: Graph, given: Sequence[Scalar], outputs: Sequence[Scalar]) -> int:
-    """How many nodes outputs take, once `given` and whatever that is made of are known."""
+    """Count the nodes that outputs take once `given`, with its dependencies, is known."""
     return len({*graph.dependencies(s.index for s in outputs)}.difference(graph.dependencies(s.index for s in given)))
 
 
@@ -130,16 +133,16 @@ def _needed(graph: Graph, given: set[int], wanted: Sequence[int]) -> list[int]:
     return needed
 
 
-def _signed(known: dict[int, Any], scalar: Scalar) -> Any:
+def _signed(known: dict[int, Value], scalar: Scalar) -> Value:
     value = known[scalar.index]
     return value if scalar.sign > 0 else _negative(value)
 
 
-def _negative(value: Any) -> Any:
+def _negative(value: Value) -> Value:
     return jax.lax.neg(value) if isinstance(value, jax.Array) else -value
 
 
-def _evaluate(node: Node, known: dict[int, Any]) -> Any:
+def _evaluate(node: Node, known: dict[int, Value]) -> Value:
     if node.kind == "constant":
         return node.detail
     if node.kind == "pick":
@@ -163,11 +166,11 @@ def _evaluate(node: Node, known: dict[int, Any]) -> Any:
     raise AssertionError(node.kind)
 
 
-def _library(x: Any) -> Any:
+def _library(x: Value) -> ModuleType:
     return np if isinstance(x, np.floating | np.ndarray) else math
 
 
-def _apply(node: Node, values: list[Any]) -> Any:
+def _apply(node: Node, values: list[Value]) -> Value:
     name = node.detail.primitive.name
     if name in _LIBRARY_FUNCTIONS and isinstance(values[0], float | np.ndarray):
         return getattr(_library(values[0]), name)(values[0])
@@ -185,7 +188,7 @@ def _apply(node: Node, values: list[Any]) -> Any:
         return found[()] if any(isinstance(v, np.generic) for v in values) else found.item()  # Python's floats raise where 1/0 is
 
 
-def _call(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Any]) -> list[Any]:
+def _call(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Value]) -> list[Value]:
     primitive, parameters = details.primitive, details.parameters
     if not all(isinstance(v, float | int | bool | np.generic) for v in values):
         result = primitive.bind(*_arrays(details, arguments, values), **parameters)
@@ -195,7 +198,7 @@ def _call(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Any
         return [np.asarray(r) for r in (result if primitive.multiple_results else [result])]
 
 
-def _arrays(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Any]) -> list[Any]:
+def _arrays(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Value]) -> list[Value]:
     arrays, start = [], 0
     for shape in details.shapes:
         size = int(np.prod(shape))

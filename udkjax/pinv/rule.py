@@ -6,7 +6,7 @@ and every derivative, forward or reverse and of any order, follow from here. No 
 
 from abc import abstractmethod
 from functools import partial
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Protocol, Self, TypeAlias
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -15,10 +15,20 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 # Accelerators round float32 products to ten bits unless told otherwise.
 dot = partial(jnp.matmul, precision="highest")
+
+
+Operator: TypeAlias = PyTree[Array]  # a matrix, or what stands for one in a method
+
+
+class Factors(Protocol):
+    """The factors of an operator: a pytree of arrays, with the rank that the method decided."""
+
+    @property
+    def rank(self) -> Int[Array, ""]: ...
 
 
 class LeastSquaresSolution(NamedTuple):
@@ -37,11 +47,11 @@ def number(value: ArrayLike | None) -> Float[Array, ""] | None:
 
 
 class Pseudoinverse(eqx.Module):
-    """A way to apply the Moore-Penrose pseudoinverse D^+ of an (m, n) operator D, truncated at a numerical rank.
+    """A method to apply the Moore-Penrose pseudoinverse D^+ of an (m, n) operator D, truncated at a numerical rank.
 
-    What counts as zero: with `relative=True` whatever is at most `rank_tol` times the method's scale of D (the largest singular
-    value, or its stand-in: the largest norm of a column or row); with `relative=False` whatever is at most `rank_tol`, in the
-    units of D. `rank_tol=None` stands for max(m, n) eps, eps the rounding unit of D: right for data that is exact up to rounding.
+    With `relative=True` a number counts as zero if it is at most `rank_tol` times the method's scale of D (the largest singular
+    value, or the largest norm of a column or row in its place); with `relative=False` if it is at most `rank_tol`, in the units
+    of D. `rank_tol=None` stands for max(m, n) eps, eps the rounding unit of D: right for data that is exact up to rounding.
     (For Greville it is eps^(1/3).) `rank_tol` is an array leaf: it may be traced and batched; its derivative is zero.
 
     Methods for any operator: the matrix as a pytree, everything else as the seven functions below. Derivatives assume that the
@@ -56,31 +66,31 @@ class Pseudoinverse(eqx.Module):
             raise ValueError("an absolute rank threshold has no default: give rank_tol, in the units of the matrix")
 
     @classmethod
-    def absolute(cls, rank_tol: ArrayLike, **choices: Any) -> Self:
+    def absolute(cls, rank_tol: ArrayLike, **choices: object) -> Self:
         """Threshold in the units of D, whatever its size. The paper's own rule takes the tolerance of the integration."""
         return cls(rank_tol=rank_tol, relative=False, **choices)
 
-    # What a method writes. All functions of b, x, c and y are linear in them, in ordinary jax.numpy.
+    # The functions of a method. They are linear in b, x, c and y, and written in ordinary jax.numpy.
 
     @abstractmethod
-    def admit(self, D: Any) -> Any:
-        """Check the operator at the door, by name; convert what is convertible."""
+    def admit(self, D: Operator) -> Operator:
+        """Return the operator as arrays; raise an error that names the method where it is not one."""
 
     @abstractmethod
-    def shape(self, D: Any) -> tuple[int, int]:
+    def shape(self, D: Operator) -> tuple[int, int]:
         """(m, n)."""
 
     @abstractmethod
-    def matvec(self, D: Any, x: Float[Array, "n"]) -> Float[Array, "m"]:
+    def matvec(self, D: Operator, x: Float[Array, "n"]) -> Float[Array, "m"]:
         """D x, bilinear in D and x."""
 
     @abstractmethod
-    def rmatvec(self, D: Any, y: Float[Array, "m"]) -> Float[Array, "n"]:
+    def rmatvec(self, D: Operator, y: Float[Array, "m"]) -> Float[Array, "n"]:
         """D^T y, bilinear in D and y."""
 
     @abstractmethod
-    def factor(self, D: Any) -> Any:
-        """Whatever `apply` needs: a pytree with an integer leaf `.rank`. Never differentiated."""
+    def factor(self, D: Operator) -> Factors:
+        """Return the factors that `apply` takes: a pytree with an integer leaf `.rank`. It is never differentiated."""
 
     @abstractmethod
     def apply(self, factors: Any, b: Float[Array, "m"]) -> Float[Array, "n"]:
@@ -90,24 +100,24 @@ class Pseudoinverse(eqx.Module):
     def apply_transpose(self, factors: Any, c: Float[Array, "n"]) -> Float[Array, "m"]:
         """(D^+)^T c."""
 
-    # What it gets for it.
+    # The functions that all methods share.
 
-    def plus(self, D: Any) -> "Plus":
+    def plus(self, D: Operator) -> "Plus":
         """D^+ as an operator, factorized once: `plus @ b`, `plus.T @ x`, `plus.rank`."""
         D = self.admit(D)
         method = jax.lax.stop_gradient(self)
         return Plus(method, jax.lax.stop_gradient(method.factor(jax.lax.stop_gradient(D))), D)
 
-    def solve(self, D: Any, b: Float[ArrayLike, "m *k"]) -> LeastSquaresSolution:
+    def solve(self, D: Operator, b: Float[ArrayLike, "m *k"]) -> LeastSquaresSolution:
         """Minimum-norm least-squares solution x = D^+ b of D x = b, for one b (m,) or the columns of one (m, k); and rank(D)."""
         plus = self.plus(D)
         return LeastSquaresSolution(plus @ jnp.asarray(b), plus.rank)
 
-    def rank(self, D: Any) -> Int[Array, ""]:
+    def rank(self, D: Operator) -> Int[Array, ""]:
         """The numerical rank: how many directions lie above the threshold."""
         return self.plus(D).rank
 
-    def __call__(self, D: Any) -> Float[Array, "n m"]:
+    def __call__(self, D: Operator) -> Float[Array, "n m"]:
         """D^+ itself, as a matrix."""
         plus = self.plus(D)
         rows, _ = self.shape(plus.matrix)
@@ -157,8 +167,8 @@ class Plus(eqx.Module):
     """D^+, or its transpose, as an operator: `plus @ b` for b (m,) or (m, k)."""
 
     method: Pseudoinverse
-    factors: Any
-    matrix: Any
+    factors: Factors
+    matrix: Operator
     transposed: bool = eqx.field(static=True, default=False)
 
     @property

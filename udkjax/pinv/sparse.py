@@ -7,14 +7,18 @@ says that the row depends on them; it is dropped, and counted out of the rank.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 from udkjax.expressions import Graph, Scalar
 from udkjax.expressions.differential import Row
 from udkjax.expressions.selection import absolute, greater, maximum, where
 from udkjax.pinv.elimination_order import minimum_degree
+
+AnyArray = TypeVar("AnyArray", jax.Array, np.ndarray)
 
 
 class PatternEntry(NamedTuple):
@@ -36,7 +40,7 @@ class Pattern(NamedTuple):
     def value_count(self) -> int:
         return 1 + max((e.value for e in self.entries), default=-1)
 
-    def dense(self, values: Any, numpy: Any) -> Any:
+    def dense(self, values: AnyArray, numpy: ModuleType) -> AnyArray:
         """Return the matrix of the given values (value_count,)."""
         place, sign = np.full(self.shape, self.value_count), np.zeros(self.shape)
         for e in self.entries:
