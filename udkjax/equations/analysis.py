@@ -72,14 +72,19 @@ class Analysis(eqx.Module):
 
 
 def analyse(mechanism: Mechanism) -> Analysis:
-    """Find the rank, the redundant rows and the scales of a mechanism; cached by structure and numbers.
+    """Find the rank, the redundant rows and the scales of a mechanism; results are cached by structure and numbers.
 
     Which rows are redundant depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of
-    the known one that it was made from by `with_parameters`: rows that are left out are watched, and a run whose numbers made one
-    of them independent says so. Masses and loads decide nothing about rows: they may be traced. One whose geometry is traced and
-    that was made anew has no origin: its redundant rows stay unknown, and `Auto` then takes singular values throughout, by
-    diffrax: right, and a hundred times slower. Analyse before the trace, and hand it on: `simulate(mechanism, ts,
-    analysis=analysis)`.
+    the known one that it was made from by `with_parameters`: a run watches the rows that are left out, and says so where
+    numbers made one of them independent. A mechanism whose geometry is traced as an argument of a function under `jit` has no
+    origin: its redundant rows stay unknown, and `Auto` then takes singular values throughout, by diffrax: right, and a hundred
+    times slower. Analyse it before the trace, and hand the analysis on: `simulate(mechanism, ts, analysis=analysis)`.
+
+    Args:
+        mechanism: The scene; its numbers may be traced.
+
+    Returns:
+        The `Analysis`; `rank` and `redundant_rows` are None where they are not known.
     """
     if not mechanism.is_concrete:
         if mechanism.origin is not None:

@@ -24,7 +24,16 @@ State = Float[ArrayLike, "n"] | Float[ArrayLike, "n/3 3"]
 
 
 def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
-    """Psi(t, q), which is zero where all joints are closed (m, rad)."""
+    """Psi(t, q), the residuals of all constraints, which are zero where all joints are closed.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+
+    Returns:
+        Psi (m,), in m or rad.
+    """
     found = evaluate_by_kind(
         lambda c, *frames: vector(c.residual(t, *frames)), mechanism, [*mechanism.constraints.values()], bodies(q)
     )
@@ -32,19 +41,47 @@ def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
 
 
 def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
-    """Psi_q = dPsi/dq, the Jacobian."""
+    """Psi_q = dPsi/dq, the Jacobian of the constraints.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+
+    Returns:
+        Psi_q (m, n).
+    """
     return jax.jacfwd(lambda q: psi(mechanism, t, q))(vector(q))
 
 
 def psi_dot(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
-    """Psi_dot = Psi_q v + Psi_t, the rate of Psi along a motion (m/s, rad/s)."""
+    """Psi_dot = Psi_q v + Psi_t, the rate of Psi along a motion.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+
+    Returns:
+        Psi_dot (m,), in m/s or rad/s.
+    """
     return rate_along_motion(lambda t, q: psi(mechanism, t, q), t, q, v)
 
 
 def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
-    """gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt, with which Psi_ddot = Psi_q a - gamma (m/s^2, rad/s^2).
+    """gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt, with which Psi_ddot = Psi_q a - gamma.
 
     It is minus the rate of Psi_dot along the motion of constant v.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+
+    Returns:
+        gamma (m,), in m/s^2 or rad/s^2.
     """
     return -rate_along_motion(lambda t, q: psi_dot(mechanism, t, q, v), t, q, v)
 

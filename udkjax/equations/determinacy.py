@@ -44,13 +44,33 @@ class LeftNullSpace(NamedTuple):
 
 
 def scaled_jacobian(mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None) -> Float[Array, "m n"]:
-    """Return J = diag(1 / rows) Psi_q diag(L, L, 1, ...), without a unit, at time t (s) and coordinates q."""
+    """J = diag(1 / rows) Psi_q diag(L, L, 1, ...), without a unit.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        analysis: That of `analyse`, for its scales; by default made here.
+
+    Returns:
+        J (m, n).
+    """
     scales = _scales(mechanism, analysis)
     return constraints.psi_q(mechanism, t, q) * scales.coordinates(3 * len(mechanism.body_names)) / scales.rows[:, None]
 
 
 def singular_values(mechanism: Mechanism, t: ArrayLike, q: State, analysis: Analysis | None = None) -> Float[Array, "k"]:
-    """Return the singular values of J, largest first: min(m, n) numbers."""
+    """Singular values of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...), largest first.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        analysis: That of `analyse`, for its scales; by default made here.
+
+    Returns:
+        min(m, n) singular values, without a unit.
+    """
     J = scaled_jacobian(mechanism, t, q, analysis)
     return jnp.linalg.svd(J, compute_uv=False) if J.size else jnp.zeros(0)
 

@@ -19,22 +19,57 @@ from udkjax.scene.mechanism import Mechanism
 
 
 def mass(mechanism: Mechanism) -> Float[Array, "n"]:
-    """The diagonal of M: m, m (kg) and I (kg m^2) of each body. Origins are centres of mass, so M is diagonal and constant."""
+    """The diagonal of M. Origins are centres of mass, so M is diagonal and constant.
+
+    Args:
+        mechanism: The scene.
+
+    Returns:
+        m, m (kg) and I (kg m^2) of each body (n,).
+    """
     return vector([m for body in mechanism.bodies.values() for m in (body.mass, body.mass, body.inertia)])
 
 
 def force(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
-    """F = -V_q + the loads of force elements: force x, force y (N) and torque (N m) on each body."""
+    """F = -V_q + the loads of force elements.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+
+    Returns:
+        Force x, force y (N) and torque (N m) on each body (n,).
+    """
     return element_loads(mechanism, t, q, v) - jax.grad(lambda q: potential_energy(mechanism, t, q, v))(vector(q))
 
 
 def kinetic_energy(mechanism: Mechanism, v: State) -> Float[Array, ""]:
-    """T = v^T M v / 2 (J)."""
+    """T = v^T M v / 2.
+
+    Args:
+        mechanism: The scene.
+        v: Velocities (m/s, rad/s), (n,) or (bodies, 3).
+
+    Returns:
+        T (J).
+    """
     return mass(mechanism) @ vector(v) ** 2 / 2
 
 
 def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, ""]:
-    """V (J): of gravity, zero at the origin, and of the force elements that have one. It does not depend on v."""
+    """V = the potential energy of gravity, zero at the origin, and of the force elements that have one.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities, which the frames of force elements hold; V does not depend on them.
+
+    Returns:
+        V (J).
+    """
     gravity = jnp.tile(jnp.append(mechanism.gravity, 0.0), len(mechanism.body_names))
     found = _evaluate_forces(lambda e, *frames: e.potential(t, *frames), mechanism, q, v)
     return sum((jnp.sum(V) for _, V in found if V is not None), -(mass(mechanism) * gravity) @ vector(q))

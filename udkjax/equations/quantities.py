@@ -38,7 +38,18 @@ def equations_of(
     formulation: Formulation | None = None,
     analysis: Analysis | None = None,
 ) -> AbstractSystem:
-    """Prepare the equations of motion of a mechanism or a system, by the Udwadia-Kalaba equation or another formulation."""
+    """Prepare the equations of motion of a mechanism or a system, by the Udwadia-Kalaba equation or another formulation.
+
+    Args:
+        system: The mechanism, or the `ConstrainedSystem`.
+        method: The pseudoinverse; by default `Auto`.
+        baumgarte: Gains to feed violations back; None: no stabilization.
+        formulation: Another formulation; None: the Udwadia-Kalaba equation.
+        analysis: That of `analyse`; by default made here.
+
+    Returns:
+        The equations, ready to be evaluated at states (n,).
+    """
     if isinstance(system, ConstrainedSystem):
         equations: AbstractSystem = prepare_general(system, method, baumgarte)
     else:
@@ -57,12 +68,22 @@ def accelerations(
     formulation: Formulation | None = None,
     analysis: Analysis | None = None,
 ) -> Float[Array, "bodies 3"] | tuple[Float[Array, "bodies 3"], Float[Array, "m"]]:
-    """Return a (bodies, 3) at time t (s), coordinates q and velocities v; with `multipliers` also lambda, one a row of Psi.
+    """a = a_F + M^(-1/2) D^+ b, and lambda = -(D^+)^T D^+ b where asked for. The state need not be closed.
 
-    a = a_F + M^(-1/2) D^+ b and lambda = -(D^+)^T D^+ b, of minimum norm where constraints are redundant (m/s^2, rad/s^2; N, N m,
-    in the rows' order and with the sign of M a + Psi_q^T lambda = F). The state need not be closed. `Auto` takes singular values.
-    A `formulation` finds a in another way, but not lambda. `analysis` is that of `analyse`. For a `ConstrainedSystem` q, v and a
-    are (n,).
+    Args:
+        mechanism: The mechanism, or a `ConstrainedSystem`.
+        t: Time (s).
+        q: Coordinates (m, rad), (bodies, 3); of a `ConstrainedSystem` (n,), and so are v and a.
+        v: Velocities (m/s, rad/s), in the shape of q.
+        method: The pseudoinverse; `Auto`, the default, takes singular values.
+        stabilization: `Baumgarte`, or None.
+        multipliers: Whether to return lambda, too.
+        formulation: Another formulation, which finds a but not lambda; None: the Udwadia-Kalaba equation.
+        analysis: That of `analyse`; by default made here.
+
+    Returns:
+        a (m/s^2, rad/s^2) in the shape of q; with `multipliers` also lambda (m,) in N and N m, in the order of the rows, with
+        the sign of M a + Psi_q^T lambda = F, and of minimum norm where constraints are redundant.
     """
     if isinstance(mechanism, Mechanism):
         analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.without_origin
@@ -71,15 +92,28 @@ def accelerations(
 
 
 def violation(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory) -> Float[Array, "T m"]:
-    """Return Psi (m, rad) at each output time, one column a row: joints in their order, then drivers.
+    """Psi at each time of a solution.
 
-    `solution` is anything with ts (T,), q and v (T, bodies, 3).
+    Args:
+        mechanism: The mechanism, or a `ConstrainedSystem`.
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
+
+    Returns:
+        Psi (T, m), in m or rad: the rows of the joints in their order, then those of the drivers.
     """
     return _evaluate_along(mechanism, solution, _psi)
 
 
 def energy(mechanism: Mechanism, solution: StateHistory) -> Energy:
-    """Return kinetic energy v^T M v / 2 and potential energy (J) at each output time."""
+    """T = v^T M v / 2 and V at each time of a solution.
+
+    Args:
+        mechanism: The scene.
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
+
+    Returns:
+        The `Energy`, kinetic and potential (T,), in J.
+    """
     return _evaluate_along(mechanism, solution, _energy)
 
 

@@ -87,10 +87,20 @@ def unique_reactions(
     about: About = "centre",
     rank_tol: ArrayLike = STATIC_RANK_TOL,
 ) -> dict[str, dict[str, Bool[Array, "T 3"]]]:
-    """Tell which components of `reactions` equilibrium alone decides, whatever their split.
+    """Decide which components of `reactions` equilibrium alone determines: those with c^T N = 0.
 
-    A component is c^T lambda; it is unique if c^T N = 0, N the null space of Psi_q^T. Arguments are those of `reactions`;
-    `rank_tol` is that of `uniqueness`.
+    A component is c^T lambda, and N the null space of Psi_q^T: a unique component does not depend on how redundant forces are
+    shared.
+
+    Args:
+        mechanism: The scene.
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
+        frame: The axes of the force, as in `reactions`.
+        about: The point of the torque, as in `reactions`.
+        rank_tol: Singular values up to so much of the largest count as zero, as in `uniqueness`.
+
+    Returns:
+        For each joint and driver, and each of its bodies, booleans (T, 3) for force x, force y and torque.
     """
     analysis, (ts, q, _) = analyse(mechanism), _states(solution)
     Psi_q, N = _null_spaces(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol))

@@ -117,9 +117,19 @@ def prepare(
     baumgarte: Baumgarte | None = None,
     analysis: Analysis | None = None,
 ) -> TextbookEquations:
-    """Prepare a mechanism for a method (default `Auto`). Its numbers may be traced.
+    """Prepare the equations of motion of a mechanism by a pseudoinverse.
 
-    A method without a `rank_tol` gets `rank_tolerance`. `analysis` is that of `analyse`, by default made here.
+    Args:
+        mechanism: The scene; its numbers may be traced.
+        method: The pseudoinverse, by default `Auto`; without a `rank_tol` it gets `rank_tolerance`.
+        baumgarte: Gains to feed violations back; None: no stabilization.
+        analysis: That of `analyse`; by default made here.
+
+    Returns:
+        The equations, ready to be evaluated at states (n,).
+
+    Raises:
+        ValueError: `Elimination` with an absolute threshold.
     """
     analysis = analyse(mechanism) if analysis is None else analysis
     mechanism = mechanism.without_origin

@@ -44,19 +44,51 @@ class Baumgarte(eqx.Module):
 
 
 def D(mechanism: Mechanism, t: ArrayLike, q: State, w: Weights = None) -> Float[Array, "m n"]:
-    """D = Psi_q M^(-1/2)."""
+    """D = Psi_q M^(-1/2).
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        w: Weights of the rows (m,); None: all one.
+
+    Returns:
+        D (m, n), its rows weighted.
+    """
     return weigh(w, constraints.psi_q(mechanism, t, q) * inverse_sqrt_mass(mechanism))
 
 
 def a_F(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
-    """a_F = M^(-1) F: the accelerations without constraints (m/s^2, rad/s^2)."""
+    """a_F = M^(-1) F: the accelerations without constraints.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+
+    Returns:
+        a_F (n,), in m/s^2 and rad/s^2.
+    """
     return loads.force(mechanism, t, q, v) / loads.mass(mechanism)
 
 
 def b(
     mechanism: Mechanism, t: ArrayLike, q: State, v: State, baumgarte: Baumgarte | None = None, w: Weights = None
 ) -> Float[Array, "m"]:
-    """b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: what the constraints still ask of the accelerations a_F."""
+    """b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+        baumgarte: Gains alpha and beta; None: no stabilization.
+        w: Weights of the rows (m,); None: all one.
+
+    Returns:
+        b (m,), its rows weighted.
+    """
     b = constraints.gamma(mechanism, t, q, v) - constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v)
     if baumgarte is not None:
         b = b - 2 * baumgarte.alpha * constraints.psi_dot(mechanism, t, q, v)
@@ -73,7 +105,20 @@ def accelerations(
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
 ) -> Float[Array, "n"]:
-    """a = a_F + M^(-1/2) D^+ b (m/s^2, rad/s^2)."""
+    """a = a_F + M^(-1/2) D^+ b.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+        method: The pseudoinverse.
+        baumgarte: Gains alpha and beta; None: no stabilization.
+        w: Weights of the rows (m,); None: all one.
+
+    Returns:
+        a (n,), in m/s^2 and rad/s^2.
+    """
     x = pseudoinverse(method, D(mechanism, t, q, w)) @ b(mechanism, t, q, v, baumgarte, w)
     return a_F(mechanism, t, q, v) + inverse_sqrt_mass(mechanism) * x
 
@@ -87,7 +132,20 @@ def multipliers(
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
 ) -> Float[Array, "m"]:
-    """lambda = -(D^+)^T D^+ b (N, N m): of all that keep M a + Psi_q^T lambda = F those of least norm, where w is None."""
+    """lambda = -(D^+)^T D^+ b: of all that keep M a + Psi_q^T lambda = F those of least norm, where w is None.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+        method: The pseudoinverse.
+        baumgarte: Gains alpha and beta; None: no stabilization.
+        w: Weights of the rows (m,); None: all one.
+
+    Returns:
+        lambda (m,), in N for rows in metres and N m for rows in radians.
+    """
     D_plus = pseudoinverse(method, D(mechanism, t, q, w))
     return weigh(w, -(D_plus.T @ (D_plus @ b(mechanism, t, q, v, baumgarte, w))))
 
@@ -97,7 +155,19 @@ def project(
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """Return a state to the manifold Psi = 0, Psi_dot = 0 by the smallest change in the metric of M.
 
-    By so many Newton steps q - M^(-1/2) D^+ Psi, then v - M^(-1/2) D^+ Psi_dot, in which Psi_dot is linear.
+    Newton steps q - M^(-1/2) D^+ Psi are followed by one step v - M^(-1/2) D^+ Psi_dot, in which Psi_dot is linear.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+        method: The pseudoinverse.
+        w: Weights of the rows (m,); None: all one.
+        steps: The number of Newton steps of q.
+
+    Returns:
+        q and v (n,).
     """
 
     def newton(_: int, q: Array) -> Array:
@@ -113,7 +183,19 @@ def project(
 def tangent_part(
     mechanism: Mechanism, t: ArrayLike, q: State, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
 ) -> Float[Array, "n"]:
-    """(I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: the part of it within the manifold, which projection leaves."""
+    """(I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: its part within the manifold, which a projection leaves.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        change: The change (n,).
+        method: The pseudoinverse.
+        w: Weights of the rows (m,); None: all one.
+
+    Returns:
+        The part of the change within the manifold (n,).
+    """
     matrix = D(mechanism, t, q, w)
     return change - inverse_sqrt_mass(mechanism) * (
         pseudoinverse(method, matrix) @ (matrix @ (change / inverse_sqrt_mass(mechanism)))
@@ -126,7 +208,7 @@ def inverse_sqrt_mass(mechanism: Mechanism) -> Float[Array, "n"]:
 
 
 def weigh(w: Weights, rows: Array) -> Array:
-    """Rows, or one number of each, times their weights."""
+    """diag(w) times some rows, or times one number for each row; `rows` as they are where w is None."""
     return rows if w is None else (rows.T * jnp.asarray(w)).T
 
 

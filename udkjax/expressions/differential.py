@@ -90,14 +90,33 @@ class Differential:
 
 
 def tangents(graph: Graph, outputs: Sequence[Scalar], seeds: Mapping[Scalar, Scalar]) -> list[Scalar]:
-    """The directional derivatives of outputs, `seeds` being the tangents of inputs. What has no seed does not move."""
+    """Differentiate outputs along tangents of inputs: the directional derivatives sum (df/dx) dx.
+
+    Args:
+        graph: The graph of all scalars.
+        outputs: The functions f.
+        seeds: The tangents dx by input; an input without one is constant.
+
+    Returns:
+        The tangent of each output.
+    """
     differential = Differential(graph, outputs, list(seeds))
     known = differential.forward({s.index: t if s.sign > 0 else -t for s, t in seeds.items()})
     return [product(differential.row(s), known, graph) for s in outputs]
 
 
 def cotangents(graph: Graph, outputs: Sequence[Scalar], seeds: Sequence[Scalar], inputs: Sequence[Scalar]) -> list[Scalar]:
-    """The derivatives of sum(seeds * outputs) with respect to inputs."""
+    """Differentiate sum(seeds * outputs) with respect to inputs.
+
+    Args:
+        graph: The graph of all scalars.
+        outputs: The functions.
+        seeds: The cotangent of each output.
+        inputs: The variables.
+
+    Returns:
+        The cotangent of each input.
+    """
     differential, found = Differential(graph, outputs, inputs), {}
     for output, seed in zip(outputs, seeds, strict=True):
         accumulate(found, differential.row(output), seed)

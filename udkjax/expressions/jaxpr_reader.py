@@ -42,7 +42,15 @@ _ELEMENTWISE = frozenset(
 
 
 def trace(function: Callable, *examples: object) -> Callable[..., list[np.ndarray]]:
-    """Trace a function once; the result reads it into a graph, for arguments given as arrays of Scalars, as often as wanted."""
+    """Trace a function once, to read it into graphs as often as wanted.
+
+    Args:
+        function: A function of arrays.
+        examples: Arrays or shapes of its arguments, as `jax.make_jaxpr` takes them.
+
+    Returns:
+        A function of a graph and of arguments, given as arrays of Scalars, that returns the outputs as arrays of Scalars.
+    """
     jaxpr = jax.make_jaxpr(function)(*examples)
     return lambda graph, *arguments: read_jaxpr(
         graph, jaxpr, jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, np.ndarray))
@@ -50,7 +58,16 @@ def trace(function: Callable, *examples: object) -> Callable[..., list[np.ndarra
 
 
 def read_jaxpr(graph: Graph, closed: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the outputs of a closed jaxpr as arrays of Scalars."""
+    """Read a closed jaxpr into a graph.
+
+    Args:
+        graph: The graph.
+        closed: The jaxpr, with its constants.
+        arguments: Its arguments as arrays of Scalars.
+
+    Returns:
+        Its outputs as arrays of Scalars.
+    """
     constants = [_constants(graph, c) for c in closed.consts]
     return _read(graph, closed.jaxpr, constants, arguments)
 

@@ -111,7 +111,16 @@ class ScalarProgram:
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:
     """Return the nodes that an early program must hand to a later one: the early nodes that outputs or later nodes use.
 
-    Where early is what depends on parameters alone, that program runs once, the later one whenever the state changes.
+    Where the early nodes are those that depend on parameters alone, the early program runs once, the later one whenever the
+    state changes.
+
+    Args:
+        graph: The graph.
+        outputs: The outputs of the later program.
+        early: Whether a node belongs to the early program.
+
+    Returns:
+        The nodes, in the order of the graph.
     """
     order = _needed(graph, {i for i, n in enumerate(graph.nodes) if n.kind == "input"}, [s.index for s in outputs])
     used = {s.index for s in outputs}
@@ -121,7 +130,16 @@ def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bo
 
 
 def operations(graph: Graph, given: Sequence[Scalar], outputs: Sequence[Scalar]) -> int:
-    """Count the nodes that outputs take once `given`, with its dependencies, is known."""
+    """Count the nodes that outputs take once `given`, with its dependencies, is known.
+
+    Args:
+        graph: The graph.
+        given: Scalars that are known.
+        outputs: Scalars that are wanted.
+
+    Returns:
+        The number of nodes.
+    """
     return len({*graph.dependencies(s.index for s in outputs)}.difference(graph.dependencies(s.index for s in given)))
 
 

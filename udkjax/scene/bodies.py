@@ -88,6 +88,15 @@ GROUND_FRAME_AT_REST = Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # as force
 
 
 def between(points: Float[Array, "2 2"] | Sequence[Vector], one: Frame, two: Frame) -> Point:
-    """Return the vector from `points[0]` of body 1 to `points[1]` of body 2, in ground coordinates (m)."""
+    """The vector from `points[0]` of body 1 to `points[1]` of body 2.
+
+    Args:
+        points: The two points, each in its body's own frame (m).
+        one: The frame of body 1.
+        two: The frame of body 2.
+
+    Returns:
+        The vector in ground coordinates (m).
+    """
     p, q = one.point(points[0]), two.point(points[1])
     return Point(q.x - p.x, q.y - p.y)

@@ -20,12 +20,24 @@ PINS = (Revolute, Weld)  # joints that hold two points together
 
 
 def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: ArrayLike, as_rod: bool = False) -> Mechanism:
-    """Return the mechanism with bodies of another length (m): the largest distance between two points where a body is attached.
+    """Return the mechanism with another length of some bodies: the largest distance between two points where a body is attached.
 
-    All attachments of these bodies, to joints, drivers and forces, are scaled about their centres of mass, so that these stay in
-    their places between them. Mass and inertia stay; with `as_rod` they become those of a rod of the same mass per metre, in
-    proportion to the length and to its third power. Angles stay, and positions and velocities of the initial guess follow along
-    the pins. Pure and differentiable; the length may be traced. Raises `SceneError`.
+    All attachments of these bodies, to joints, drivers and forces, are scaled about their centres of mass, so that these stay
+    in their places between them. Angles stay, and positions and velocities of the initial guess follow along the pins. The
+    function is pure and differentiable.
+
+    Args:
+        mechanism: The scene.
+        bodies: The name of a body, or several.
+        length: The length (m); it may be traced.
+        as_rod: Change mass and inertia to those of a rod of the same mass per metre, in proportion to the length and to its third
+            power; by default they stay.
+
+    Returns:
+        The mechanism; the one that was given does not change.
+
+    Raises:
+        SceneError: A name is not that of a body, or a body is attached at fewer than two points.
     """
     names = _check_names(mechanism, bodies)
     values: dict[str, Numbers] = {}
@@ -53,10 +65,22 @@ def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
 def with_angle(
     mechanism: Mechanism, bodies: Sequence[str] | str, angle: ArrayLike, angular_velocity: ArrayLike | None = None
 ) -> Mechanism:
-    """Return the mechanism with another initial angle (rad), and angular velocity (rad/s), of all of some bodies.
+    """Return the mechanism with another initial angle, and angular velocity, of some bodies.
 
     Positions and velocities of the initial guess follow along the pins: a parallelogram stays closed where all links are given.
-    Pure and differentiable; the angle may be traced. Raises `SceneError`.
+    The function is pure and differentiable.
+
+    Args:
+        mechanism: The scene.
+        bodies: The name of a body, or several.
+        angle: The angle (rad); it may be traced.
+        angular_velocity: The angular velocity (rad/s); None: as it is.
+
+    Returns:
+        The mechanism; the one that was given does not change.
+
+    Raises:
+        SceneError: A name is not that of a body.
     """
     names = _check_names(mechanism, bodies)
     values: dict[str, Numbers] = {f"body.{body}.angle": angle for body in names}

@@ -21,7 +21,18 @@ FORMAT = 1
 
 
 def load(path: str | os.PathLike[str]) -> Mechanism:
-    """Read a mechanism from a TOML file. Raises `SceneError`, which lists every mistake in it, or `OSError`."""
+    """Read a mechanism from a TOML file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The mechanism.
+
+    Raises:
+        SceneError: The scene is wrong; the error lists every mistake in it.
+        OSError: The file cannot be read.
+    """
     try:
         return _read(Path(path).read_text(encoding="utf-8"), os.fspath(path))
     except UnicodeDecodeError as error:
@@ -29,12 +40,31 @@ def load(path: str | os.PathLike[str]) -> Mechanism:
 
 
 def loads(text: str) -> Mechanism:
-    """Read a mechanism from the text of a TOML file, as `load` does."""
+    """Read a mechanism from the text of a TOML file, as `load` does.
+
+    Args:
+        text: The text.
+
+    Returns:
+        The mechanism.
+
+    Raises:
+        SceneError: The scene is wrong; the error lists every mistake in it.
+    """
     return _read(text, "")
 
 
 def save(mechanism: Mechanism, path: str | os.PathLike[str]) -> None:
-    """Write a mechanism to a TOML file, whole or not at all. Raises `SceneError` if the format cannot hold it (see `dumps`)."""
+    """Write a mechanism to a TOML file, whole or not at all.
+
+    Args:
+        mechanism: The scene.
+        path: The file; an older one is replaced.
+
+    Raises:
+        SceneError: The format cannot hold the mechanism, as in `dumps`.
+        OSError: The file cannot be written.
+    """
     text, path = dumps(mechanism), Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -45,9 +75,16 @@ def save(mechanism: Mechanism, path: str | os.PathLike[str]) -> None:
 
 
 def dumps(mechanism: Mechanism) -> str:
-    """Return the mechanism as the text of a TOML file.
+    """Return the mechanism as the text of a TOML file; reading it gives the same numbers back, bit by bit.
 
-    Raises `SceneError` for what the format cannot hold: classes of the user's own, traced numbers, batches of numbers.
+    Args:
+        mechanism: The scene.
+
+    Returns:
+        The text.
+
+    Raises:
+        SceneError: The format cannot hold the mechanism: classes of the user's own, traced numbers, batches of numbers.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(mechanism)):
         raise SceneError(["its numbers are traced: write it outside of jit, vmap and grad"], mechanism.name)

@@ -24,7 +24,7 @@ TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
 class SweepError(Mistakes):
     """A sweep cannot be what it says. `problems` lists every mistake."""
 
-    of = "sweep"
+    subject = "sweep"
 
 
 def lay_out(mechanism: Mechanism, axes: Mapping[str, Any], design: Design | None = None) -> tuple[Dimension, ...]:
