@@ -15,7 +15,7 @@ from scipy.integrate import ode, solve_ivp
 import udkjax as udk
 from benchmarks.common import Compiled, Work, machine, report
 from benchmarks.problems import PROBLEMS, STIFF, Problem
-from udkjax.integrate.counting import count_evaluations, evaluations
+from udkjax.integrate.solvers.counting import count_evaluations, evaluations
 
 Run = Callable[[float], tuple[float, ...]]  # from a tolerance to an error and counts
 FIRST = 1e-6  # step that is tried

@@ -161,7 +161,7 @@ def test_asking_for_identify_loads_no_optimizer():
     assert python(f"import sys, udkjax; udkjax.identify; {loaded}") == "set()"
 
 
-OPTIONAL = ("anywidget", "dask", "distributed", "h5netcdf", "h5py", "matplotlib", "optax", "pandas", "tyro", "xarray")
+OPTIONAL = sorted(EXTRAS)
 CORE = f"""
 import sys
 for name in {OPTIONAL}:
@@ -172,8 +172,10 @@ mech = udk.loads(udk.dumps(udk.library.parallelogram()))
 for solver in (None, diffrax.Tsit5()):
     sol = udk.simulate(mech, np.linspace(0.0, 0.5, 6), solver=solver)
     assert abs(udk.violation(mech, sol)).max() < 1e-12
+assert "</html>" in udk.animate(mech, sol).html()
 missing = []
-for use in ("sol.to_xarray(mech)", "from udkjax.show.plots import trajectory", "from udkjax.cli import main; main(['--help'])"):
+png, cli = "udk.animate(mech, sol).save('a.png')", "from udkjax.cli import main; main(['--help'])"
+for use in ("sol.to_xarray(mech)", png, "import udkjax.show.plots", cli):
     try:
         exec(use)
     except ImportError as error:
@@ -188,7 +190,7 @@ def test_the_core_needs_no_extra_and_a_missing_one_is_named():
     shown = python(CORE, UDKJAX_CACHE=os.environ["UDKJAX_CACHE"])
     cures = [
         f"{package} is not installed: pip install 'udkjax[{extra}]'"
-        for package, extra in (("xarray", "io"), ("matplotlib", "plot"))
+        for package, extra in (("xarray", "io"), ("PIL", "plot"), ("matplotlib", "plot"))
     ]
     assert shown == str([*cures, 2])
 

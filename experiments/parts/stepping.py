@@ -12,11 +12,11 @@ import optimistix as optx
 
 import udkjax as udk
 from udkjax.equations import prepare
-from udkjax.integrate.bdf import BDF
 from udkjax.integrate.constrained import Constrained
-from udkjax.integrate.counting import Counting, evaluations
 from udkjax.integrate.diffrax_engine import derivative
-from udkjax.integrate.multistep import Multistep, Tolerances
+from udkjax.integrate.solvers.bdf import BDF
+from udkjax.integrate.solvers.counting import CountingController, evaluations
+from udkjax.integrate.solvers.multistep import Multistep, Tolerances
 
 GROWTH = 1.1  # of the steps of the start; beyond 1.127 the formula of order five is unstable
 # The first step, relative to the steps to come: with order one it errs by 1e-12 of what a step of that size does.
@@ -109,7 +109,7 @@ def by_tolerance(
             y0,
             equations,
             saveat=diffrax.SaveAt(subs=saved, controller_state=True),
-            stepsize_controller=Counting(diffrax.PIDController(rtol=tol, atol=tol, norm=optx.max_norm)),
+            stepsize_controller=CountingController(diffrax.PIDController(rtol=tol, atol=tol, norm=optx.max_norm)),
             max_steps=max_steps,
             throw=False,
         )

@@ -9,12 +9,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, P
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations.scene_programs import elimination_programs, scene_programs
 from udkjax.equations.structure import leaves_as_scalars
 from udkjax.pinv.rank_policy import RankPolicy
-
-P = [[0.2, -0.1], [-0.3, 0.15]]
 
 
 class Ellipse(udk.Joint):
@@ -101,45 +100,26 @@ class Drag(udk.ForceElement):
 def mech():
     """One of each, far from closed; it is not meant to move."""
     return udk.Mechanism(
-        bodies={
-            "b": udk.Body(1.0, 0.1, [0.3, -0.2], 0.4, [0.1, 0.2], -0.3),
-            "a": udk.Body(2.0, 0.2, [1.0, 0.5], -1.1),
-            "c": udk.Body(0.7, 1.9, [-0.4, 0.1], 2.0),
-        },
+        bodies=BODIES,
         joints={
-            "revolute": udk.Revolute(["ground", "b"], P),
+            **JOINTS,
             "revolute of two": udk.Revolute(["c", "b"], P),
             "to ground": udk.Revolute(["a", "ground"], P),
-            "prismatic": udk.Prismatic(["a", "b"], P, axis=0.3),
-            "slot": udk.Slot(["a", "c"], P, axis=0.3),
-            "weld": udk.Weld(["a", "ground"], P),
-            "distance": udk.Distance(["a", "b"], P),
-            "angle": udk.Angle(["c", "b"]),
-            "gear": udk.Gear(["a", "b"], [0.1, 0.2]),
-            "inner gear": udk.Gear(["a", "b"], [0.1, 0.2], internal=True, carrier="c"),
-            "rack": udk.Rack(["a", "b"], radius=0.2, axis=0.1),
-            "cam": udk.Cam(["a", "b"], P, udk.Profile([-1.0, 0.5, 2.0, 4.0], [1.0, 1.1, 1.2, 1.1])),
+            "slot of two": udk.Slot(["a", "c"], P, axis=0.3),
+            "rack of two": udk.Rack(["a", "b"], radius=0.2, axis=0.1),
             "ellipse": Ellipse(["a", "c"], jnp.array([[1.0, 0.2], [0.2, 0.5]]), jnp.array([0.1, 0.3])),
             "ellipse on ground": Ellipse(["ground", "c"], jnp.array([[1.0, 0.2], [0.2, 0.5]]), jnp.array([0.1, 0.3])),
             "table": Table("c", (0.1, 0.4, -0.3, 0.8)),
             "belt": Belt(["a", "ground", "c"], 0.3),
         },
         drivers={
-            "turn": udk.Driver(["ground", "b"], "angle", udk.Polynomial([0.1, 2.0, -0.7, 0.2])),
-            "push": udk.Driver(["ground", "b"], "x", udk.Sine(1.0, 2.0, 0.3, -0.2)),
-            "lift": udk.Driver(["a", "b"], "y", udk.Spline([0.0, 1.0, 3.0], [0.0, 0.5, 0.1]), P),
-            "stretch": udk.Driver(["a", "b"], "distance", udk.Polynomial([1.0]), P),
+            **DRIVERS,
             "chirp": udk.Driver(["c", "ground"], "angle", Chirp(1.7)),
         },
         forces={
-            "damped": udk.Spring(["a", "b"], P, stiffness=10.0, length=0.4, damping=0.3),
-            "undamped": udk.Spring(["ground", "b"], P, stiffness=10.0, length=0.4),
-            "torsion": udk.TorsionSpring(["a", "b"], stiffness=3.0, damping=0.2, angle=0.1),
-            "push": udk.Force("a", [1.0, 2.0], point=[0.1, 0.4]),
-            "follow": udk.Force("c", [1.0, 2.0], point=[-0.3, 0.2], frame="body"),
-            "torque": udk.Torque(["a", "b"], value=0.7),
+            **FORCES,
             "motor": udk.Torque(["ground", "c"], value=0.7),
-            "rub": udk.Friction("revolute of two", torque=0.5, velocity=0.3),
+            "rub of two": udk.Friction("revolute of two", torque=0.5, velocity=0.3),
             "stop": Stop("b", 40.0),
             "drag": Drag(["b", "c"], jnp.array([[0.4, 0.1], [0.0, 0.7]])),
             "gust": Drag(["a", "ground"], jnp.array([[0.4, 0.1], [0.0, 0.7]])),
@@ -209,12 +189,12 @@ def owner(mech):
     return np.array([name for name, _ in prepare(mech).row_names])
 
 
-NAMES = """revolute|revolute of two|to ground|prismatic|slot|weld|distance|angle|gear|inner gear|rack|cam|ellipse
-    |ellipse on ground|table|belt|turn|push|lift|stretch|chirp"""
+OWN_JOINTS = ["revolute of two", "to ground", "slot of two", "rack of two", "ellipse", "ellipse on ground", "table", "belt"]
+NAMES = [*JOINTS, *OWN_JOINTS, *DRIVERS, "chirp"]
 
 
 @pytest.mark.parametrize("term", ["psi", "psi_q", "psi_dot", "gamma"])
-@pytest.mark.parametrize("name", [n.strip() for n in NAMES.split("|")])
+@pytest.mark.parametrize("name", NAMES)
 def test_rows_are_the_derivatives_of_the_residual(terms, expected, owner, name, term):
     rows = owner == name
     assert rows.any()
@@ -222,7 +202,7 @@ def test_rows_are_the_derivatives_of_the_residual(terms, expected, owner, name, 
 
 
 def test_no_element_is_forgotten(mech, owner):
-    assert list(dict.fromkeys(owner)) == list(mech.constraints) == [n.strip() for n in NAMES.split("|")]
+    assert list(dict.fromkeys(owner)) == list(mech.constraints) == NAMES
 
 
 @pytest.mark.parametrize("term", ["mass", "force", "kinetic", "potential"])
@@ -230,11 +210,9 @@ def test_masses_loads_and_energies(terms, expected, term):
     assert_allclose(terms[term], expected[term], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "name", ["damped", "undamped", "torsion", "push", "follow", "torque", "motor", "rub", "stop", "drag", "gust"]
-)
+@pytest.mark.parametrize("name", [*FORCES, "motor", "rub of two", "stop", "drag", "gust"])
 def test_one_force_element_alone(mech, states, name):
-    pin = {"revolute of two": mech.joints["revolute of two"]}
+    pin = {name: mech.joints[name] for name in ("revolute", "revolute of two")}
     alone = udk.Mechanism(mech.bodies, pin, forces={name: mech.forces[name]}, gravity=(0.0, 0.0))
     t, q, v = (s[1] for s in states)
     q = q.at[0].set(-0.5)  # at the stop

@@ -1,7 +1,7 @@
 """Adams methods: order, cost beside VODE, accuracy, and all that a diffrax solver has to do."""
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import diffrax
 import equinox as eqx
@@ -15,9 +15,8 @@ from scipy.special import ellipj, ellipk
 import udkjax as udk
 from benchmarks.integrators import FINER, Work, vode
 from benchmarks.problems import NOT_STIFF, pendulum
-from udkjax.integrate.counting import Counting, count_evaluations, evaluations, tally
-from udkjax.integrate.multistep import Tolerances
-from udkjax.integrate.wrapper import Wrapper
+from udkjax.integrate.solvers.counting import CountingController, Wrapper, count_evaluations, evaluations, tally
+from udkjax.integrate.solvers.multistep import Tolerances
 
 solve_ode: Any = diffrax.diffeqsolve  # whose parts are None where they were not asked for
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
@@ -58,7 +57,7 @@ def program(f, solver, counting=count_evaluations):
 @pytest.fixture(scope="module")
 def swing():
     """The program of the pendulum, by each corrector."""
-    return {corrector: program(pendulum, udk.Adams(corrector)) for corrector in ("pece", "iteration")}
+    return {corrector: program(pendulum, udk.Adams(corrector=corrector)) for corrector in ("pece", "iteration")}
 
 
 @pytest.fixture(scope="module", params=["pece", "iteration"])
@@ -132,7 +131,7 @@ def test_cost_beside_vode(pendulums):
 @pytest.mark.parametrize("corrector", ["pece", "iteration"])
 @pytest.mark.parametrize("name", ["Arenstorf", "Pleiades"])
 def test_cost_beside_vode_in_orbits(name, corrector):
-    found = ratios(NOT_STIFF[name], program(NOT_STIFF[name].f, udk.Adams(corrector)))
+    found = ratios(NOT_STIFF[name], program(NOT_STIFF[name].f, udk.Adams(corrector=corrector)))
     assert len(found) >= 6 and found.max() < 1.5 and found.mean() < 1
 
 
@@ -206,8 +205,8 @@ class TestDerivatives:
     """Of cos(sqrt(a) t) with respect to a and t."""
 
     @staticmethod
-    def end(a, t, adjoint, corrector="pece"):
-        term, solver = diffrax.ODETerm(oscillator), udk.Adams(corrector)
+    def end(a, t, adjoint, corrector: Literal["pece", "iteration"] = "pece"):
+        term, solver = diffrax.ODETerm(oscillator), udk.Adams(corrector=corrector)
         return solve_ode(term, solver, 0.0, t, 1e-3, START, a, stepsize_controller=QUICK, adjoint=adjoint, max_steps=300).ys["y"][
             0
         ]
@@ -295,8 +294,8 @@ class OnCircle(Wrapper):
 @pytest.mark.parametrize("corrector", ["pece", pytest.param("iteration", marks=pytest.mark.slow)])
 def test_projected_states_enter_the_history(corrector):
     """The newest point is replaced, at no more than two calls an attempt, instead of a new start at every step."""
-    on_circle = lambda solver, control: (OnCircle(solver), Counting(control))  # noqa: E731
-    run = program(lambda t, y: jnp.stack([y[1], -y[0]]), udk.Adams(corrector), on_circle)
+    on_circle = lambda solver, control: (OnCircle(solver), CountingController(control))  # noqa: E731
+    run = program(lambda t, y: jnp.stack([y[1], -y[0]]), udk.Adams(corrector=corrector), on_circle)
     found, called, counted = run((1.0, 0.0), np.linspace(0.0, 20.0, 3), 1e-9)
     np.testing.assert_allclose(found.ys, [[1, 0], [np.cos(10), -np.sin(10)], [np.cos(20), -np.sin(20)]], rtol=0, atol=2e-8)
     assert called == counted < 450

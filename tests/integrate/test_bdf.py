@@ -13,8 +13,8 @@ import pytest
 
 import udkjax as udk
 from benchmarks.problems import STIFF
-from udkjax.integrate.counting import count_evaluations, evaluations
-from udkjax.integrate.multistep import Tolerances
+from udkjax.integrate.solvers.counting import count_evaluations, evaluations
+from udkjax.integrate.solvers.multistep import Tolerances
 
 # y(t0), y(t0 - h), ... of Gear's formulas, sum a[j] y[-j] = h y'
 GEAR = {

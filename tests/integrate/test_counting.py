@@ -13,8 +13,8 @@ import pytest
 import udkjax as udk
 from udkjax.equations.abstract_system import TangentPart
 from udkjax.integrate.constrained import Constrained
-from udkjax.integrate.counting import NOT_KNOWN, Counting, count_evaluations, evaluations
-from udkjax.integrate.multistep import Multistep, from_controller
+from udkjax.integrate.solvers.counting import NOT_KNOWN, CountingController, count_evaluations, evaluations
+from udkjax.integrate.solvers.multistep import Multistep, tolerances_from_controller
 
 SAVE = diffrax.SaveAt(t1=True, controller_state=True)
 
@@ -145,7 +145,7 @@ def test_what_forgets_its_last_stage_takes_it_again(calls, projected):
         jnp.array([1.0, 0.0]),
         Oscillator(calls),
         saveat=SAVE,
-        stepsize_controller=Counting(controller(1e-3)),
+        stepsize_controller=CountingController(controller(1e-3)),
     )
     jax.effects_barrier()
     assert evaluations(run.controller_state) == calls.value
@@ -155,7 +155,7 @@ def test_what_forgets_its_last_stage_takes_it_again(calls, projected):
 class Remembers(Multistep):
     """Euler's method, which says what it is told of jumps."""
 
-    root_finder: object = eqx.field(default_factory=from_controller)
+    root_finder: object = eqx.field(default_factory=tolerances_from_controller)
     root_find_max_steps: int = 1
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 

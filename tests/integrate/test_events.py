@@ -10,7 +10,7 @@ import udkjax as udk
 from tests.choices import fast
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.textbook import prepare
-from udkjax.integrate.impact import jump
+from udkjax.integrate.events.jumps import velocity_jump
 
 G = 9.81
 ROOM = 24  # events of a run
@@ -266,7 +266,7 @@ def test_jump_keeps_constraints_and_energy(name):
         by_plus = root * (udk.SVD(1e-4)(appended) @ jnp.zeros(len(appended)).at[-1].set(-(1 + e) * (normal @ v)))
         null = jnp.eye(n) - udk.SVD(1e-4)(D) @ D
         effective = (root * normal) @ null @ (root * normal)
-        return jump(equations, 0.0, q, normal, normal @ v), v, D, root, by_plus, effective
+        return velocity_jump(equations, 0.0, q, normal, normal @ v), v, D, root, by_plus, effective
 
     found, *arrays = hit()
     v, D, root, by_plus, effective = (np.asarray(x) for x in arrays)
@@ -282,7 +282,7 @@ def test_jump_keeps_constraints_and_energy(name):
 def test_an_impact_that_the_constraints_block_says_so():
     equations = prepare(PENDULUM, udk.SVD())
     along = jnp.array([1.0, 0.0, 0.0])  # the pin takes it
-    assert not jax.jit(jump)(equations, 0.0, PENDULUM.q0.ravel(), along, -1.0).free
+    assert not jax.jit(velocity_jump)(equations, 0.0, PENDULUM.q0.ravel(), along, -1.0).free
 
 
 def test_gradients_of_a_bouncing_ball():

@@ -3,7 +3,7 @@
 import diffrax
 import numpy as np
 
-from udkjax.integrate.tableau import is_explicit, method_of
+from udkjax.integrate.solvers import is_explicit, method_of
 
 
 def test_the_default_is_dopri8():

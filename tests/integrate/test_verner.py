@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.integrate.verner import DENSE, TABLEAU
+from udkjax.integrate.solvers.verner import DENSE, TABLEAU
 
 STAGES = len(TABLEAU.b_sol)
 A = np.vstack([np.zeros(STAGES)] + [np.pad(row, (0, STAGES - len(row))) for row in TABLEAU.a_lower])

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 import udkjax.scene as udk
 from udkjax.scene import dumps, loads
+from udkjax.scene.schema import CLASSES_BY_TYPE
 
 HEAD = "format = 1\n"
 BODY = '[[body]]\nname = "link1"\nmass = 1.0\ninertia = 1\n'
@@ -111,7 +112,7 @@ MISTAKES = [
     (HEAD + BODY + JOINT.replace("revolute", "revolut"), WHERE + '.type: no type "revolut"; did you mean "revolute"?'),
     (
         HEAD + BODY + JOINT.replace("revolute", "xyz"),
-        WHERE + '.type: no type "xyz"; one of revolute, prismatic, slot, weld, distance, angle, gear, rack, cam',
+        WHERE + f'.type: no type "xyz"; one of {", ".join(CLASSES_BY_TYPE["joint"])}',
     ),
     (HEAD + BODY + JOINT.replace('type = "revolute"', ""), WHERE + ".type: missing; one of revolute"),
     (HEAD + BODY + JOINT.replace("[0, 0]]", "[0]]"), WHERE + ".points: must be a list of 2 x 2 numbers, is [[0, 0], [0]]"),

@@ -6,11 +6,9 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 
 import udkjax.scene as udk
+from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, ROWS, P
 from udkjax.scene import splines
-
-ROWS = {"revolute": 2, "prismatic": 2, "slot": 1, "weld": 3, "distance": 1, "angle": 1, "gear": 1, "rack": 1, "cam": 1} | {
-    "inner gear": 1
-}
+from udkjax.scene.schema import CLASSES_BY_TYPE
 
 
 def evaluate(mechanism, name, at, q):
@@ -19,9 +17,15 @@ def evaluate(mechanism, name, at, q):
     return jnp.stack([jnp.asarray(r) for r in joint.residual(0.0, *(known[n] for n in mechanism.frames_of(joint)))])
 
 
-@pytest.mark.parametrize(("name", "rows"), ROWS.items())
-def test_rows_as_in_the_format(everything, at, name, rows):
-    assert evaluate(everything, name, at, everything.q0).shape == (rows,)
+def test_each_type_of_the_format_is_tested():
+    tested = {"joint": JOINTS, "force": FORCES, "motion": {name: driver.motion for name, driver in DRIVERS.items()}}
+    for section, types in CLASSES_BY_TYPE.items():
+        assert {type(element) for element in tested[section].values()} == set(types.values())
+
+
+@pytest.mark.parametrize("name", JOINTS)
+def test_rows_as_in_the_format(everything, at, name):
+    assert evaluate(everything, name, at, everything.q0).shape == (ROWS.get(name, 1),)
 
 
 @pytest.mark.parametrize("name", ["prismatic", "slot", "distance", "angle", "inner gear", "cam", "lift", "stretch"])
@@ -41,7 +45,8 @@ def test_what_the_initial_guess_decides_holds_there(everything, at, name):
 
 def test_revolute_is_point_2_minus_point_1(everything, at):
     x, y, angle = everything.q0[0]
-    tip = [x - 0.5 * np.cos(angle) - 0.1 * np.sin(angle), y - 0.5 * np.sin(angle) + 0.1 * np.cos(angle)]
+    (px, py), (rx, ry) = P
+    tip = [x + rx * np.cos(angle) - ry * np.sin(angle) - px, y + rx * np.sin(angle) + ry * np.cos(angle) - py]
     assert_allclose(evaluate(everything, "revolute", at, everything.q0), tip, rtol=1e-14)
 
 
@@ -52,7 +57,8 @@ def test_slot_measures_to_the_left_of_the_line():
 
 
 def test_gradient_of_distance_is_the_unit_vector(everything, at):
-    gradient = jax.jacfwd(lambda q: evaluate(everything, "distance", at, q)[0])(everything.q0)
+    rod = udk.Mechanism(BODIES, {"distance": udk.Distance(["a", "b"], np.zeros((2, 2)))})
+    gradient = jax.jacfwd(lambda q: evaluate(rod, "distance", at, q)[0])(everything.q0)
     d = everything.q0[0, :2] - everything.q0[1, :2]  # bodies = [a, b], and b comes first
     assert_allclose(gradient[0, :2], d / jnp.linalg.norm(d), rtol=1e-14)
     assert_allclose(gradient[1, :2], -d / jnp.linalg.norm(d), rtol=1e-14)

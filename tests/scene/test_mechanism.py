@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
+from tests.elements import P
 
 
 def test_the_order_is_the_users(everything):
@@ -47,8 +48,8 @@ def test_same_numbers_same_mechanism(everything, same):
 
 def test_one_entry_of_an_array(everything):
     new = everything.with_parameters({"joint.revolute.points[1][0]": 7.0, "driver.turn.motion.coefficients[1]": 8.0})
-    assert_allclose(new.joints["revolute"].points, [[0.0, 0.0], [7.0, 0.1]])
-    assert_allclose(new.drivers["turn"].motion.coefficients, [0.0, 8.0])
+    assert_allclose(new.joints["revolute"].points, [P[0], [7.0, P[1][1]]])
+    assert_allclose(new.drivers["turn"].motion.coefficients, [0.1, 8.0, -0.7, 0.2])
     both = everything.with_parameters({"gravity[0]": 1.0, "gravity": [2.0, 3.0]})  # the whole first, then its entry
     assert_allclose(both.gravity, [1.0, 3.0])
 

@@ -1,7 +1,6 @@
 """Trajectories: the only floor that knows diffrax, which it imports where a run asks for it."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from udkjax.integrate.assembly import AssemblyError as AssemblyError
 from udkjax.integrate.assembly import Check as Check
@@ -13,16 +12,17 @@ from udkjax.integrate.simulate import simulate as simulate
 from udkjax.integrate.solution import Result as Result
 from udkjax.integrate.solution import SimulationError as SimulationError
 from udkjax.integrate.solution import Solution as Solution
+from udkjax.integrate.solvers import OWN, own_solver
 
 if TYPE_CHECKING:
-    from udkjax.integrate.adams import Adams as Adams
-    from udkjax.integrate.bdf import BDF as BDF
-    from udkjax.integrate.verner import Verner65 as Verner65
+    import diffrax
 
-SOLVERS = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # our own, each a solver of diffrax, and their modules
+    from udkjax.integrate.solvers.adams import Adams as Adams
+    from udkjax.integrate.solvers.bdf import BDF as BDF
+    from udkjax.integrate.solvers.verner import Verner65 as Verner65
 
 
-def __getattr__(name: str) -> Any:
-    if name not in SOLVERS:
+def __getattr__(name: str) -> "type[diffrax.AbstractSolver]":
+    if name not in OWN:
         raise AttributeError(f"module 'udkjax.integrate' has no attribute {name!r}")
-    return getattr(import_module(f"udkjax.integrate.{SOLVERS[name]}"), name)
+    return own_solver(name)

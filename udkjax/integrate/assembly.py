@@ -11,34 +11,24 @@ one that all pseudoinverses share: gradients of the assembled state are right wh
 """
 
 import weakref
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseRows
-from udkjax.equations.position_closure import (
-    CLOSED,
-    ITERATIONS,
-    TracedRows,
-    close_position,
-    damped_step,
-    is_closed,
-)
+from udkjax.equations.position_closure import CLOSED, is_closed
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large
-from udkjax.equations.textbook import prepare
 from udkjax.integrate import native_engine
-from udkjax.integrate.derivatives import Function, Linear, Mask, select
-from udkjax.pinv import SVD
+from udkjax.integrate.closure import close_by_jax, close_by_machine_code
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -74,10 +64,10 @@ class Closure(NamedTuple):
     scales: Scales
 
     @property
-    def is_closed(self) -> Any:
+    def is_closed(self) -> Bool[Array | np.ndarray, ""]:
         """Whether the residuals are within `CLOSED` of the scene's scales, or rounding."""
-        given: Any = self.scales, self.state.q, self.state.v, self.psi, self.psi_dot
-        xp: Any = np if _known(given) else jnp
+        given = self.scales, self.state.q, self.state.v, self.psi, self.psi_dot
+        xp = np if _is_known(given) else jnp
         scales, q, v, psi, psi_dot = jax.tree.map(xp.asarray, given)
         return is_closed(scales, q.ravel(), v.ravel(), psi, psi_dot, xp)
 
@@ -98,38 +88,50 @@ def assemble(
     return closure.state
 
 
+class CachedClosure(NamedTuple):
+    """The closure of a mechanism at a time."""
+
+    mechanism: "weakref.ref[Mechanism]"
+    time: float
+    closure: Closure
+
+
+# The last closure of each mechanism that still exists: who simulates it again need not close it again.
+_cache: dict[int, CachedClosure] = {}
+
+
 def close(
     mechanism: Mechanism,
     t: ArrayLike = 0.0,
     state: State | None = None,
     analysis: Analysis | None = None,
 ) -> Closure:
-    """As `assemble`, with the residuals instead of an error.
+    """Close a mechanism as `assemble` does, and return the residuals with the state, in place of an error.
 
     Where all numbers are known the closure is, too, also while something else is traced.
     """
-    if not _known((mechanism, t, state)):
+    if not _is_known((mechanism, t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
         return _close(mechanism.without_origin, analysis, t, state)
-    of, when, found = _latest.get(id(mechanism), (None, 0.0, None))
-    if found is not None and state is None and of is not None and of() is mechanism and when == np.asarray(t).item():
-        return found
+    key, time = id(mechanism), np.asarray(t).item()
+    cached = _cache.get(key)
+    if state is None and cached is not None and cached.mechanism() is mechanism and cached.time == time:
+        return cached.closure
     with jax.ensure_compile_time_eval():
         scales = (analyse(mechanism) if analysis is None else analysis).scales
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
         q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
         with np.errstate(all="ignore"):  # what is not finite does not close
-            q, v, psi, psi_dot, rank = _assembled_at_once(mechanism, scales, np.asarray(t).item(), q, v)
+            q, v, psi, psi_dot, rank = _close_known(mechanism, scales, time, q, v)
         state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
         found = Closure(state_found, number(psi), number(psi_dot), jax.device_put(np.asarray(rank)), scales)
     if state is None:
-        key = id(mechanism)
-        _latest[key] = (weakref.ref(mechanism, lambda _: _latest.pop(key, None)), np.asarray(t).item(), found)
+        _cache[key] = CachedClosure(weakref.ref(mechanism, lambda _: _cache.pop(key, None)), time, found)
     return found
 
 
-def _assembled_at_once(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> Any:
-    """q and v closed, what is left of Psi and Psi_dot, and the rank of D, of known numbers."""
+def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> tuple:
+    """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D, of known numbers."""
     if not is_large(mechanism):  # for which it takes longer to compile anything
         return DenseRows(mechanism, scales).assemble(t, q, v)
     if native_engine.closes(mechanism):
@@ -139,99 +141,16 @@ def _assembled_at_once(mechanism: Mechanism, scales: Scales, t: float, q: np.nda
     return SparseRows(mechanism).assemble(t, q, v)
 
 
-# How each mechanism that still exists was last assembled: who simulates it again need not close it again.
-_latest: dict[int, tuple[Any, float, Closure | None]] = {}
-
-
 @eqx.filter_jit
 def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State | None) -> Closure:
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
-    close = _by_machine_code if native_engine.closes(mechanism) else _assembled
+    close = close_by_machine_code if native_engine.closes(mechanism) else close_by_jax
     q, v, psi, psi_dot, rank = close(mechanism, analysis, number(t), q, v)
     return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales)
 
 
-def _assembled(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
-    return TracedRows(prepare(mechanism, SVD(), analysis=analysis)).assemble(_closed, t, q, v)
-
-
-class Assembly(Function):
-    """q and v of a closed state, of the numbers of a mechanism and a guess. `rest` is what else they depend on."""
-
-    rest: Any
-    tree: Any = eqx.field(static=True)
-    is_plain: bool = eqx.field(static=True, default=False)
-
-    @property
-    def plain(self) -> "Assembly":
-        return replace(self, is_plain=True)
-
-    def guess(self, xs: list[Array]) -> tuple[Any, ...]:
-        """The mechanism, its analysis, and t, q and v."""
-        return eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
-
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        return list(_assembled(*self.guess(xs))[:2])
-
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        *_, q, v = self.guess(xs)
-        return [q.shape, v.shape]
-
-    def forward(self, xs: list[Array], moving: Mask, vs: list[Array], run: Any) -> list[Array]:
-        guess, which = self._native(xs, moving)
-        if guess is None:
-            return super().forward(xs, moving, vs, run)
-        rest = iter(vs)
-        change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in moving])
-        return list(native_engine.closed_along(guess, _native_inputs(which), _native_inputs(change)))
-
-    def backward(self, xs: list[Array], moving: Mask, ws: list[Array], run: Any) -> list[Array]:
-        guess, which = self._native(xs, moving)
-        if guess is None:
-            return super().backward(xs, moving, ws, run)
-        found = native_engine.closed_back(guess, _native_inputs(which), *ws)
-        pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_native_inputs(which), found)), strict=True)
-        return [bar for m, bar in pairs if m is True]
-
-    def _native(self, xs: list[Array], moving: Mask) -> tuple[Any, Any]:
-        """What machine code takes, if it closes the mechanism and has derivatives along what is moving."""
-        which = jax.tree.unflatten(self.tree, moving)
-        mechanism, analysis, t, q, v = self.guess(xs)
-        others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
-        if self.is_plain or others or not native_engine.closes(mechanism):
-            return None, None
-        return (mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v), which
-
-
-def _native_inputs(tree: Any) -> tuple[Any, Any, Any]:
-    """Of a mechanism, an analysis, t, q and v: what machine code has derivatives along."""
-    mechanism, _, _, q, v = tree
-    return mechanism, q, v
-
-
-def _by_machine_code(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
-    arrays, rest = eqx.partition((mechanism, analysis, t, q, v), eqx.is_inexact_array)
-    xs, tree = jax.tree.flatten(arrays)
-    return _closed_by_code(Assembly(rest, tree), xs)
-
-
-@eqx.filter_custom_jvp
-def _closed_by_code(function: Assembly, xs: list[Array]) -> tuple[Any, Any, Any, Any, Any]:
-    mechanism, analysis, t, q, v = function.guess(xs)
-    return native_engine.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
-
-
-@_closed_by_code.def_jvp
-def _(primals, tangents):
-    function, xs = primals
-    found = _closed_by_code(function, xs)
-    moving = tuple(dx is not None for dx in tangents[1])
-    linear = Linear(function=function, xs=xs, run=(), moving=moving)
-    return found, (*linear.applied(select(tangents[1], moving)), None, None, None)
-
-
-def _known(tree: Any) -> bool:
+def _is_known(tree: PyTree) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -294,28 +213,3 @@ def check(mechanism: Mechanism) -> Check:
         residual_after=float(jnp.abs(closure.psi).max(initial=0.0)),
         closed=closed,
     )
-
-
-@jax.custom_jvp
-def _closed(rows: TracedRows, t: Any, q: Any) -> Any:
-    return close_position(rows, t, q)
-
-
-def _closed_plain(rows: TracedRows, t: Any, q: Any) -> Any:
-    """The same steps as `_closed`, in a loop of fixed length that reverse mode can follow.
-
-    A step that no longer lowers the residual is taken in the derivative all the same: at a closed state it changes nothing but
-    the tangent, which it projects to the manifold.
-    """
-
-    def body(q, _):
-        ahead, better = damped_step(rows, t, q)
-        return jnp.where(better, ahead, q + rows.correction(t, q)), None
-
-    return jax.lax.scan(body, q, None, length=ITERATIONS)[0]
-
-
-@_closed.defjvp
-def _(primals, tangents):
-    _, tangent = jax.jvp(_closed_plain, primals, tangents)
-    return _closed(*primals), tangent

@@ -1,22 +1,21 @@
-"""The motion of a mechanism as a diffrax solver takes it: each step with care, and returned to the constraint manifold."""
+"""A diffrax solver for constrained motion: each step ends on the constraint manifold."""
 
-from typing import Any
+from collections.abc import Callable
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from udkjax.integrate.counting import tally
-from udkjax.integrate.multistep import Multistep
-from udkjax.integrate.projection import lasting, project
-from udkjax.integrate.wrapper import Wrapper
+from udkjax.integrate.projection import error_after_projection, project
+from udkjax.integrate.solvers.counting import Wrapper, tally
+from udkjax.integrate.solvers.multistep import Multistep
 
 
 class Constrained(Wrapper):
     """A diffrax solver for the motion of a mechanism: `args` are its equations, y is (q, v) in one vector.
 
-    With `projected` each step ends on the constraint manifold. A derivative at its end that the solver would keep for the next
+    With `projected` each step ends on the constraint manifold. A derivative at its end that the solver would store for the next
     step (FSAL) belongs to the state before projection; told that the state has jumped, the solver takes a new one. (Not so a
     multistep method, which would forget its whole history: it sees for itself that its newest point was moved.) What projection
     takes back of an error hardly counts. Where the equations integrate only some coordinates, errors are those of these alone.
@@ -32,29 +31,29 @@ class Constrained(Wrapper):
         equations, solver = args.fix_partition(t0, *jnp.split(y0, 2)), self.solver
         judged = None if equations.independent is None else jnp.tile(equations.independent, 2)
         if judged is not None:
-            solver = _judging(solver, judged)
+            solver = _with_norm_of(solver, judged)
         y1, error, dense, state, result = solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
         if self.projected:
             y1 = project(equations, t1, y1)
             if error is not None and not isinstance(self.solver, Multistep):
-                error = jnp.concatenate(lasting(equations, t1, *jnp.split(y1, 2), *jnp.split(error, 2))[:2])
+                error = jnp.concatenate(error_after_projection(equations, t1, *jnp.split(y1, 2), *jnp.split(error, 2))[:2])
         if judged is not None:
             error = jnp.where(judged, jnp.asarray(error), jnp.where(jnp.isfinite(y1), 0.0, jnp.nan))
         return y1, tally(self.solver, error, solver_state, state, made_jump), dense, state, result
 
 
-class _Among(eqx.Module):
+class _NormOf(eqx.Module):
     """A norm of some components."""
 
-    norm: Any
+    norm: Callable[[Float[Array, "2n"]], Float[Array, ""]]
     components: Bool[Array, "2n"]
 
-    def __call__(self, y: Float[Array, "2n"]) -> Any:
+    def __call__(self, y: Float[Array, "2n"]) -> Float[Array, ""]:
         return self.norm(jnp.where(self.components, y, 0))
 
 
-def _judging(solver: diffrax.AbstractSolver, components: Bool[Array, "2n"]) -> Any:
-    """A multistep method judges its errors itself: let it see those of some components alone."""
+def _with_norm_of(solver: diffrax.AbstractSolver, components: Bool[Array, "2n"]) -> diffrax.AbstractSolver:
+    """Return a multistep method, which judges its errors itself, with a norm of some components alone."""
     if not isinstance(solver, Multistep):
         return solver
-    return eqx.tree_at(lambda s: s.root_finder.norm, solver, _Among(solver.root_finder.norm, components))
+    return eqx.tree_at(lambda s: s.root_finder.norm, solver, _NormOf(solver.root_finder.norm, components))

@@ -55,7 +55,7 @@ def _run(function: "Run", xs: list[Array]) -> IntegratorOutput:
 def _(primals, tangents):
     moving = tuple(dx is not None for dx in tangents[1])
     if not any(moving):
-        return _run(*primals), IntegratorOutput(*[None] * len(IntegratorOutput._fields))
+        return _run(*primals), IntegratorOutput._make([None] * len(IntegratorOutput._fields))
     shapes = eqx.filter_eval_shape(_run, *primals)
 
     def in_parts(at: Any, *directions: list[Array]) -> tuple[list[Any], ...]:
@@ -72,7 +72,9 @@ def _(primals, tangents):
 
     known = list(shapes), [shapes[k] for k in SMOOTH]
     raw, change = split_jvp(in_parts, at_once, primals, select(tangents[1], moving), None, known)
-    return IntegratorOutput(*raw), IntegratorOutput(*[change[SMOOTH.index(k)] if k in SMOOTH else None for k in range(len(raw))])
+    return IntegratorOutput(*raw), IntegratorOutput._make(
+        change[SMOOTH.index(k)] if k in SMOOTH else None for k in range(len(raw))
+    )
 
 
 @eqx.filter_custom_jvp
@@ -86,7 +88,7 @@ def _as_run(function: "Run", xs: list[Array], raw: IntegratorOutput) -> Integrat
 def _(primals, tangents):
     *at, raw = primals
     if all(dx is None for dx in tangents[1]):
-        return raw, IntegratorOutput(*[None] * len(raw))
+        return raw, IntegratorOutput._make([None] * len(raw))
     return raw, eqx.filter_jvp(_run, tuple(at), tuple(tangents[:2]))[1]
 
 

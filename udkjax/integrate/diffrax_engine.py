@@ -6,17 +6,16 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.constrained import Constrained
-from udkjax.integrate.counting import NOT_KNOWN, Counting, evaluations
-from udkjax.integrate.first_step import first_step
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.outcome import stopped
+from udkjax.integrate.outcome import status_at_end
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import project_all, violation
-from udkjax.integrate.tableau import is_explicit
+from udkjax.integrate.solvers import is_explicit
+from udkjax.integrate.solvers.counting import NOT_KNOWN, CountingController, evaluations
 from udkjax.native.steps import DONE, GROW, SAFETY, SHRINK, STEP_LIMIT, STEP_TOO_SMALL
 
 
@@ -34,7 +33,7 @@ def integrate_by_diffrax(
         y0=y0,
         args=problem.equations,
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], controller_state=True),
-        stepsize_controller=Counting(_controller(problem)),
+        stepsize_controller=CountingController(_controller(problem)),
         adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
         max_steps=problem.max_steps,
         progress_meter=meter or diffrax.NoProgressMeter(),
@@ -50,7 +49,7 @@ def integrate_by_diffrax(
     violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, STEP_LIMIT, STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, DONE, status)
-    status = stopped(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
+    status = status_at_end(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
     found = evaluations(run.controller_state)
     right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (problem.h is None))  # one chooses the first step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
@@ -58,8 +57,8 @@ def integrate_by_diffrax(
     return IntegratorOutput(q, v, violated, reached, status, t_end[0], end[0], *steps, right_hand_sides)
 
 
-def derivative(t: Any, y: Float[Array, "2n"], equations: AbstractSystem) -> Float[Array, "2n"]:
-    """(v, a)."""
+def derivative(t: Float[ArrayLike, ""], y: Float[Array, "2n"], equations: AbstractSystem) -> Float[Array, "2n"]:
+    """Return (v, a)."""
     return jnp.concatenate(equations.rates(t, *jnp.split(y, 2)))
 
 
@@ -68,7 +67,19 @@ def _first_step(problem: Problem, y0: Array) -> Array:
     return first_step(y0, derivative(ts[0], stop_gradients(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol, unit)
 
 
-def _controller(problem: Problem) -> Any:
+def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, unit: Array) -> Array:
+    """Return a step over which the state y (n,), with this slope, changes by a small part of itself. `unit` is that of `atol`.
+
+    As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off.
+    """
+    y, slope, span, rtol, atol, unit = stop_gradients((y, slope, span, rtol, atol, unit))
+    scale = atol * unit + rtol * jnp.abs(y)
+    size, rate = jnp.max(jnp.abs(y) / scale, initial=0.0), jnp.max(jnp.abs(slope) / scale, initial=0.0)
+    ordinary = jnp.isfinite(rate) & (rate > 0) & (size > 0)
+    return jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, rate, 1.0), span), 1e-4 * span)
+
+
+def _controller(problem: Problem) -> diffrax.AbstractStepSizeController:
     # Every coordinate and velocity meets its tolerance: the mean over a large mechanism would hide one that does not.
     settings: dict[str, Any] = {"norm": optx.max_norm, "dtmin": problem.smallest, "force_dtmin": False}
     if is_explicit(problem.solver):  # the same steps as by machine code

@@ -1,12 +1,14 @@
-"""Positions of a driven mechanism by machine code, as far as they are to be relied on (native/marching.py)."""
+"""Positions of a driven mechanism by machine code (native/marching.py), and how many of them are right."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from types import ModuleType
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.dense_rows import DenseRows
@@ -18,20 +20,23 @@ from udkjax.native.program import UnsupportedError
 from udkjax.native.tableau import EULER
 from udkjax.scene.mechanism import Mechanism
 
+Scalar = Float[ArrayLike, ""]
+Vector = Float[Array, "..."] | Float[np.ndarray, "..."]
 APPROACH = 16  # steps from where the mechanism is to the first value
+DEPENDENT = 1e-10  # of a row's square: what is left of one that depends on others; march ends long before
 
 
 class March(NamedTuple):
-    """Positions and their derivatives by the value, of which the first so many are to be relied on."""
+    """Positions and their derivatives by the value; the first `trusted` of them are right."""
 
-    q: Float[Array, "T n"]
-    dq: Float[Array, "T n"]
-    ddq: Float[Array, "T n"]
+    q: Float[Array | np.ndarray, "T n"]
+    dq: Float[Array | np.ndarray, "T n"]
+    ddq: Float[Array | np.ndarray, "T n"]
     trusted: Int[Array, ""]
 
 
-def marches(mechanism: Mechanism, analysis: Analysis) -> bool:
-    """Whether machine code can follow a mechanism."""
+def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
+    """Tell whether machine code can follow a mechanism."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64 or is_large(mechanism):
         return False
     try:
@@ -41,7 +46,7 @@ def marches(mechanism: Mechanism, analysis: Analysis) -> bool:
     return True
 
 
-def march(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Float[ArrayLike, "T"]) -> March:
+def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> March:
     """Follow the positions over the values, from the closed position q at the value s. Without derivatives.
 
     The mechanism's driver has the value for its time; `unit` is what values are measured by.
@@ -50,7 +55,7 @@ def march(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, v
     return _march(native_p.bind(*inputs, kind=_kind(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
 
 
-def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Any) -> March:
+def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> March:
     """As `march`, of known numbers, by NumPy: nothing is traced or compiled for it."""
     kind = _kind(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
@@ -63,16 +68,16 @@ def psi_at_once(mechanism: Mechanism, analysis: Analysis, q: np.ndarray) -> np.n
     return DenseRows(mechanism, analysis.scales).violation(0.0, q, q)[0]
 
 
-def _by_numpy(x: Any) -> Any:
+def _by_numpy(x: PyTree) -> PyTree:
     return np.asarray(x) if eqx.is_array(x) else x
 
 
-def _march(found: Any, xp: Any) -> March:
+def _march(found: Sequence[Vector], xp: ModuleType) -> March:
     q, dq, ddq = (x[0, APPROACH:] for x in found[:3])
     return March(q, dq, ddq, xp.maximum(found[3][0, 0].astype(int) - APPROACH, 0))
 
 
-def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any, values: Any, xp: Any) -> list[Any]:
+def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector, xp: ModuleType) -> list:
     scales, n = analysis.scales, analysis.coordinates
     approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
     settings = {"length": scales.length, "omega": unit, "rtol": 1.0, "atol": 1.0, "smallest": 1.0}
@@ -89,10 +94,7 @@ def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Any, s: Any, q: Any,
     return [xp.asarray(given[name], float)[None] for name in INPUTS]
 
 
-DEPENDENT = 1e-10  # of a row's square: what is left of one that depends on others; march ends long before
-
-
-def _of_unit_masses(mechanism: Mechanism, length: Any, xp: Any) -> Mechanism:
+def _of_unit_masses(mechanism: Mechanism, length: Scalar, xp: ModuleType) -> Mechanism:
     """Bodies of 1 kg with the characteristic length for radius of gyration: positions do not depend on masses."""
     bodies = lambda m: [x for b in m.bodies.values() for x in (b.mass, b.inertia)]  # noqa: E731
     one = xp.ones_like(length)

@@ -17,7 +17,7 @@ from udkjax.equations.structure import is_large, leaves_as_scalars
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.integrate.tableau import is_explicit, method_of
+from udkjax.integrate.solvers import is_explicit, method_of
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS, SETTINGS
 from udkjax.native.operation import Kind, Tableau, compiled, native_p, shapes_of, written
 from udkjax.native.program import UnsupportedError

@@ -1,11 +1,11 @@
 """How a run ended and what it took, from what the solver left behind."""
 
-from typing import Any
+from types import ModuleType
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.problem import IntegratorOutput
@@ -23,7 +23,7 @@ class Run(eqx.Module):
     drift_tol: Float[Array, ""]
 
 
-def outcome(run: Run, xp: Any = jnp) -> tuple[Array, Array, Bool[Array, "T"]]:
+def outcome(run: Run, xp: ModuleType = jnp) -> tuple[Array, Array, Bool[Array, "T"]]:
     """Return the `Result`, the time (s) that belongs to it, and which of the output times count."""
     code = xp.where(run.raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
     code = xp.where(run.raw.status == NOT_FINITE, Result.not_finite, code)
@@ -36,10 +36,10 @@ def outcome(run: Run, xp: Any = jnp) -> tuple[Array, Array, Bool[Array, "T"]]:
     return code, xp.where(started, time, run.ts[0]), reached & (started | first)
 
 
-def stopped(equations: AbstractSystem, span: Array, status: Array, t: Array, y: Array) -> Array:
-    """The status of a run that ended in (t, y), and whether its step became too small because of what is not finite there.
+def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Array, y: Array) -> Array:
+    """Return the status of a run that ended in (t, y): `NOT_FINITE` where its step became too small beside what is not finite.
 
-    Or right ahead.
+    That may be in (t, y) itself or up to `AHEAD` of the span later.
     """
     q, v = jnp.split(y, 2)
     times = t + jnp.array([0.0, AHEAD]) * span
@@ -51,15 +51,18 @@ def stopped(equations: AbstractSystem, span: Array, status: Array, t: Array, y: 
     return jnp.where((status == STEP_TOO_SMALL) & ~is_finite, NOT_FINITE, status)
 
 
-def _drift(run: Run, code: Array, xp: Any) -> tuple[Array, Array, Bool[Array, "T"]]:
-    """The first output time at which a row of Psi is violated, also one that the method leaves out, ends the solution."""
+def _drift(run: Run, code: Array, xp: ModuleType) -> tuple[Array, Array, Bool[Array, "T"]]:
+    """Return code, time and the reached times, where the first output time at which a row of Psi is violated ends the solution.
+
+    That holds for rows that the method leaves out, too.
+    """
     lost = run.raw.reached & ~(run.raw.violation <= run.drift_tol)
     drifted, first = xp.any(lost), xp.argmax(lost)
     reached = run.raw.reached & (~drifted | (xp.arange(len(run.ts)) <= first))
     return xp.where(drifted, Result.drift, code), xp.where(drifted, run.ts[first], run.raw.t), reached
 
 
-def counts(raw: IntegratorOutput, projected: bool, outputs: int, xp: Any = jnp) -> dict[str, Any]:
+def counts(raw: IntegratorOutput, projected: bool, outputs: int, xp: ModuleType = jnp) -> dict[str, Int[Array, ""]]:
     """Count steps and what follows from them; right-hand sides are -1 where they are not known."""
     return {
         "steps": raw.tried,

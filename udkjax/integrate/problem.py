@@ -1,14 +1,17 @@
-"""What an integrator is given, and what it leaves: the same for all of them."""
+"""The input and the output of an integrator: the same for all of them."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.gradients import stop_gradients
+
+if TYPE_CHECKING:
+    import diffrax
 
 
 class Problem(eqx.Module):
@@ -18,19 +21,20 @@ class Problem(eqx.Module):
     ts: Float[Array, "T"]
     q: Float[Array, "n"]
     v: Float[Array, "n"]
-    rtol: Array
-    atol: Array
-    smallest: Array  # step (s)
-    h: Array | None  # the first step; None: chosen
-    length: Array | None  # of the system, which `atol` is relative to (m); None: its coordinates are of order one as they are
-    rate: Array  # of the system and the run (1/s)
-    solver: Any = eqx.field(static=True)
+    rtol: Float[Array, ""]
+    atol: Float[Array, ""]
+    smallest: Float[Array, ""]  # step (s)
+    h: Float[Array, ""] | None  # the first step; None: chosen
+    # Of the system, which `atol` is relative to (m); None: its coordinates are of order one as they are.
+    length: Float[Array, ""] | None
+    rate: Float[Array, ""]  # of the system and the run (1/s)
+    solver: "diffrax.AbstractSolver | None" = eqx.field(static=True)
     projected: bool = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
     breakpoints: Float[Array, "k"] | None = None  # the times where the motion is not smooth, in any order; None: it is
 
-    def units(self) -> tuple[Any, Any]:
-        """What `atol` is relative to, of coordinates and of velocities (n,)."""
+    def units(self) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+        """Return the units of `atol` for coordinates and for velocities."""
         one = jnp.ones(len(self.q))
         if self.length is not None:
             one = jnp.where(np.arange(len(self.q)) % 3 == 2, one, self.length)
@@ -38,15 +42,15 @@ class Problem(eqx.Module):
 
 
 class IntegratorOutput(NamedTuple):
-    """A run as an integrator leaves it: `status` is one of those above, from `DONE` on."""
+    """A run as an integrator leaves it: `status` is one of `native.steps`, from `DONE` on."""
 
-    q: Any  # (T, n), not yet reached ones of any value
-    v: Any
-    violation: Any  # (T,) the largest of any row of Psi there, over its scale
-    reached: Any  # (T,)
-    status: Any
-    t: Any
-    y: Any  # (2n,) at t
-    tried: Any
-    accepted: Any
-    evaluations: Any
+    q: Float[Array, "T n"]  # of any value where it was not reached
+    v: Float[Array, "T n"]
+    violation: Float[Array, "T"]  # the largest of any row of Psi there, over its scale
+    reached: Bool[Array, "T"]
+    status: Int[Array, ""]
+    t: Float[Array, ""]  # the end
+    y: Float[Array, "2n"]  # at t
+    tried: Int[Array, ""]  # steps
+    accepted: Int[Array, ""]
+    evaluations: Int[Array, ""]

@@ -1,11 +1,9 @@
-"""Return states to the constraint manifold."""
-
-from typing import Any
+"""Projection: return states to the constraint manifold."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.integrate.gradients import stop_gradients
@@ -16,21 +14,23 @@ class Projection(eqx.Module):
     """Project positions and velocities after each step, by the smallest change in the mass metric (the default stabilization)."""
 
 
-def project(equations: AbstractSystem, t: Any, y: Float[Array, "2n"]) -> Float[Array, "2n"]:
-    """(q, v) on the manifold."""
+def project(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, "2n"]:
+    """Return (q, v) on the manifold."""
     q, v = jnp.split(y, 2)
     return jnp.concatenate(equations.project(t, q, v))
 
 
-def lasting(equations: AbstractSystem, t: Any, q: Array, v: Array, dq: Array, dv: Array) -> TangentPart:
-    """The errors dq and dv of a step that ends in q and v, with what projection takes back of them counted by `TAKEN_BACK`."""
+def error_after_projection(
+    equations: AbstractSystem, t: Float[ArrayLike, ""], q: Array, v: Array, dq: Array, dv: Array
+) -> TangentPart:
+    """Return the errors dq and dv of a step that ends in q and v; what projection takes back counts by `TAKEN_BACK`."""
     equations, t, q, v, dq, dv = stop_gradients((equations, t, q, v, dq, dv))
     left = equations.tangent_part(t, q, v, dq, dv)
     return TangentPart(left.dq + TAKEN_BACK * (dq - left.dq), left.dv + TAKEN_BACK * (dv - left.dv))
 
 
-def violation(equations: AbstractSystem, t: Any, y: Float[Array, "2n"]) -> Float[Array, ""]:
-    """The largest of any row of Psi over its scale, also of those that the method leaves out."""
+def violation(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, ""]:
+    """Return the largest of any row of Psi over its scale, also of those that the method leaves out."""
     if not equations.constrained:
         return jnp.zeros(())
     equations, t, y = stop_gradients((equations, t, y))
@@ -38,7 +38,7 @@ def violation(equations: AbstractSystem, t: Any, y: Float[Array, "2n"]) -> Float
 
 
 def project_all(equations: AbstractSystem, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:
-    """States at many times, each returned to the manifold.
+    """Return states at many times, each projected to the manifold.
 
     An interpolated state lies off it by the error of the interpolation: it takes one projection more than a step.
     """

@@ -20,12 +20,12 @@ from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
 from udkjax.integrate.derivatives import differentiable
+from udkjax.integrate.events.simulate_events import Choices, simulate_events
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_engine import known, reason_for_diffrax, rows_kept
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
-from udkjax.integrate.simulate_events import Choices, simulate_events
 from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.native.steps import SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
@@ -150,10 +150,11 @@ def simulate(
                 else "progress"
             )
             raise ValueError(f"a run with events takes a Mechanism, JAX's own derivatives and no progress meter: not {what}")
+        assert analysis is not None  # a mechanism has one
         more = (SMALLEST_STEP, isinstance(stabilization, Projection), solver, max_steps, max_events, engine)
         baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
-        told: Any = (number(rtol), number(atol), method, baumgarte, formulation, drift, _step(dt0), *more)
-        solution = simulate_events(mechanism, events, analysis, ts, state, closure, Choices(*told))
+        given: Any = (number(rtol), number(atol), method, baumgarte, formulation, drift, _step(dt0), *more)
+        solution = simulate_events(mechanism, events, analysis, ts, state, closure, Choices(*given))
         return _required(solution, mechanism, closure, throw)
 
     def run(analysis: Analysis | None) -> tuple[Solution, Any]:

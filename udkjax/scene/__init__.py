@@ -1,51 +1,39 @@
 """What exists: bodies, joints, drivers, force elements, the mechanism of them all, and its files. No equations."""
 
-from udkjax.scene import library
-from udkjax.scene.bodies import GROUND, Body, Frame, Point, between
-from udkjax.scene.checks import SceneError
-from udkjax.scene.drivers import Driver, Motion, Polynomial, Sine, Spline
-from udkjax.scene.forces import Force, ForceElement, Friction, Spring, Torque, TorsionSpring
-from udkjax.scene.joints import Angle, Cam, Constraint, Distance, Gear, Joint, Prismatic, Profile, Rack, Revolute, Slot, Weld
-from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.reshaping import with_angle, with_length
-from udkjax.scene.toml_files import dumps, load, loads, save
-
-__all__ = [
-    "GROUND",
-    "Angle",
-    "Body",
-    "Cam",
-    "Constraint",
-    "Distance",
-    "Driver",
-    "Force",
-    "ForceElement",
-    "Frame",
-    "Friction",
-    "Gear",
-    "Joint",
-    "Mechanism",
-    "Motion",
-    "Point",
-    "Polynomial",
-    "Prismatic",
-    "Profile",
-    "Rack",
-    "Revolute",
-    "SceneError",
-    "Sine",
-    "Slot",
-    "Spline",
-    "Spring",
-    "Torque",
-    "TorsionSpring",
-    "Weld",
-    "between",
-    "dumps",
-    "library",
-    "load",
-    "loads",
-    "save",
-    "with_angle",
-    "with_length",
-]
+from udkjax.scene import library as library
+from udkjax.scene.bodies import GROUND as GROUND
+from udkjax.scene.bodies import Body as Body
+from udkjax.scene.bodies import Frame as Frame
+from udkjax.scene.bodies import Point as Point
+from udkjax.scene.bodies import between as between
+from udkjax.scene.checks import SceneError as SceneError
+from udkjax.scene.drivers import Driver as Driver
+from udkjax.scene.drivers import Motion as Motion
+from udkjax.scene.drivers import Polynomial as Polynomial
+from udkjax.scene.drivers import Sine as Sine
+from udkjax.scene.drivers import Spline as Spline
+from udkjax.scene.forces import Force as Force
+from udkjax.scene.forces import ForceElement as ForceElement
+from udkjax.scene.forces import Friction as Friction
+from udkjax.scene.forces import Spring as Spring
+from udkjax.scene.forces import Torque as Torque
+from udkjax.scene.forces import TorsionSpring as TorsionSpring
+from udkjax.scene.joints import Angle as Angle
+from udkjax.scene.joints import Cam as Cam
+from udkjax.scene.joints import Constraint as Constraint
+from udkjax.scene.joints import Distance as Distance
+from udkjax.scene.joints import Gear as Gear
+from udkjax.scene.joints import Joint as Joint
+from udkjax.scene.joints import Prismatic as Prismatic
+from udkjax.scene.joints import Profile as Profile
+from udkjax.scene.joints import Rack as Rack
+from udkjax.scene.joints import Revolute as Revolute
+from udkjax.scene.joints import Slot as Slot
+from udkjax.scene.joints import Weld as Weld
+from udkjax.scene.mechanism import Mechanism as Mechanism
+from udkjax.scene.reshaping import with_angle as with_angle
+from udkjax.scene.reshaping import with_length as with_length
+from udkjax.scene.toml_files import dumps as dumps
+from udkjax.scene.toml_files import load as load
+from udkjax.scene.toml_files import loads as loads
+from udkjax.scene.toml_files import save as save

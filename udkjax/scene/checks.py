@@ -207,12 +207,12 @@ def _check_references(path: str, kind: str | None, value: object, known: KnownNa
 
 
 def _check_bodies(where: str, cls: type, table: Table) -> Iterator[str]:
-    """Iterate over the mistakes of an element's bodies: two for every type of the format, none of them twice."""
+    """Iterate over the mistakes of an element's bodies: as many as a type of the format has, none of them twice."""
     bodies = table.get("bodies")
     if not isinstance(bodies, list | tuple):
         return
-    if is_in_format(cls) and len(bodies) != 2:
-        yield f"{where}.bodies: must name 2 bodies, is {abbreviate(bodies)}"
+    if is_in_format(cls) and len(bodies) != (n := getattr(cls, "n_bodies", 2)):
+        yield f"{where}.bodies: must name {n} {'body' if n == 1 else 'bodies'}, is {abbreviate(bodies)}"
     carrier = [table["carrier"]] if table.get("carrier", GROUND) != GROUND else []
     attached = [*bodies, *carrier]
     twice = {name: None for name in attached if isinstance(name, str) and attached.count(name) > 1}

@@ -1,7 +1,7 @@
 """Force elements: springs, dampers, constant loads and friction, each by its potential energy, its loads, or the sum of both."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ class ForceElement(eqx.Module):
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
+    n_bodies: ClassVar[int] = 2  # how many `bodies` a type of the scene format names
 
     def potential(self, t: Number, *frames: Frame) -> Number | None:
         """Return the potential energy V (J), or None; the load is -dV/dq."""

@@ -8,7 +8,7 @@ when a joint is made ("as in the initial guess") is filled in by the mechanism.
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Self, TypeVar
+from typing import ClassVar, Self, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ class Constraint(eqx.Module):
     """Anything that holds Psi(t, q) = 0: a joint or a driver. A subclass writes `residual`, nothing more."""
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
+    n_bodies: ClassVar[int] = 2  # how many `bodies` a type of the scene format names
 
     __getattr__ = renamed_attributes("Constraint", attached="frame_names", resolved="complete")
     __init_subclass__ = renamed_methods(attached="frame_names", resolved="complete")

@@ -25,14 +25,20 @@ def type_name(cls: type) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
 
-def _by_name(module: types.ModuleType, *names: str) -> dict[str, type]:
-    return {type_name(getattr(module, name)): getattr(module, name) for name in names}
+def _by_type(module: types.ModuleType, base: type) -> dict[str, type]:
+    """Return the public classes that a module derives from `base`, by their names in a file, in the order of the module."""
+    return {
+        type_name(cls): cls
+        for name, cls in vars(module).items()
+        if isinstance(cls, type) and issubclass(cls, base) and cls is not base
+        if cls.__module__ == module.__name__ and not name.startswith("_")
+    }
 
 
 CLASSES_BY_TYPE: dict[str, dict[str, type]] = {
-    "joint": _by_name(joints, "Revolute", "Prismatic", "Slot", "Weld", "Distance", "Angle", "Gear", "Rack", "Cam"),
-    "force": _by_name(forces, "Spring", "TorsionSpring", "Force", "Torque", "Friction"),
-    "motion": _by_name(drivers, "Polynomial", "Sine", "Spline"),
+    "joint": _by_type(joints, joints.Joint),
+    "force": _by_type(forces, forces.ForceElement),
+    "motion": _by_type(drivers, drivers.Motion),
 }
 CLASSES_WITHOUT_TYPE: dict[str, type] = {
     "body": Body,

@@ -62,5 +62,5 @@ def trust(accuracy: Accuracy) -> dict[str, str]:
 
 def table(title: str, lines: dict[str, str]) -> str:
     """Lay out names and values below a title."""
-    width = max(map(len, lines))
+    width = max(map(len, lines), default=0)
     return "\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in lines.items())])

@@ -1,9 +1,10 @@
 """Pictures of a sweep, from its dataset alone: a map of each number that is kept of a member, and one of how members ended."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice, product
 from math import prod
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,8 +14,15 @@ from udkjax.show.style import COLOURS, legend
 
 with OptionalImport():
     from matplotlib.axes import Axes
-    from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, Normalize
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap, LogNorm, Normalize
     from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    import xarray
+
+Colours = tuple[Colormap | str, Normalize]
 
 RESULT, MEMBER = "result", "member"  # the variable of the codes, and the dimension of a design
 OTHER = "not computed"  # what has a code of no `Result`
@@ -25,7 +33,7 @@ COLUMNS = 4  # of panels
 PANELS = 12  # of one picture; of the dimensions that these cannot show, the first values are drawn
 
 
-def pictures(data: Any) -> dict[str, Figure]:
+def pictures(data: "xarray.Dataset") -> dict[str, Figure]:
     """Draw the dataset of a sweep: `result`, and every variable with one number a member, not the same for all of them.
 
     Two dimensions are the axes of a map, those with most values; each combination of the others has a panel. One dimension is a
@@ -35,14 +43,18 @@ def pictures(data: Any) -> dict[str, Figure]:
     return {name: _picture(data, name) for name in (RESULT, *differing)}
 
 
-def scalars(data: Any) -> list[str]:
-    """The variables with one number for each member."""
-    return [n for n in data.data_vars if n != RESULT and data[n].dims == data[RESULT].dims and data[n].dtype.kind in "iuf"]
+def scalars(data: "xarray.Dataset") -> list[str]:
+    """Return the variables with one number for each member."""
+    return [str(n) for n in data.data_vars if n != RESULT and data[n].dims == data[RESULT].dims and data[n].dtype.kind in "iuf"]
 
 
-def _picture(data: Any, name: str) -> Figure:
+def _dims(data: "xarray.Dataset") -> tuple[str, ...]:
+    return tuple(map(str, data[RESULT].dims))
+
+
+def _picture(data: "xarray.Dataset", name: str) -> Figure:
     across, panels = _layout(data)
-    count, others = len(panels), [d for d in data[RESULT].dims if d not in across]
+    count, others = len(panels), [d for d in _dims(data) if d not in across]
     columns = min(count, COLUMNS, data.sizes[others[-1]] if others else 1)
     rows = -(-count // columns)
     figure = Figure(figsize=(1.2 + 3.4 * columns, 0.8 + 2.9 * rows), layout="constrained")
@@ -66,7 +78,7 @@ def _picture(data: Any, name: str) -> Figure:
     return figure
 
 
-def draw_panel(axes: Axes, data: Any, name: str) -> Any:
+def draw_panel(axes: Axes, data: "xarray.Dataset", name: str) -> ScalarMappable | None:
     """Draw `result` or another variable with one number a member; return what a colour bar needs, None of a line."""
     across, panels = _layout(data)
     if len(panels) > 1:
@@ -74,7 +86,7 @@ def draw_panel(axes: Axes, data: Any, name: str) -> Any:
     return _panel(axes, data.isel(panels[0][0]), name, across, _codes() if name == RESULT else _scale(data[name].values))
 
 
-def _panel(axes: Axes, part: Any, name: str, across: Sequence[str], colours: tuple[Any, Any]) -> Any:
+def _panel(axes: Axes, part: "xarray.Dataset", name: str, across: Sequence[str], colours: Colours) -> ScalarMappable | None:
     if MEMBER in across:
         return _points(axes, part, name, *colours)
     if len(across) == 1:
@@ -82,9 +94,9 @@ def _panel(axes: Axes, part: Any, name: str, across: Sequence[str], colours: tup
     return _map(axes, part, name, across, *colours)
 
 
-def _layout(data: Any) -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
+def _layout(data: "xarray.Dataset") -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
     """The dimensions that are drawn across, and for each panel which values of the others it has, and what is said of them."""
-    dims = data[RESULT].dims
+    dims = _dims(data)
     longest = sorted(dims, key=lambda d: (_numeric(data, d), data.sizes[d]), reverse=True)[:2]
     across = (MEMBER,) if MEMBER in dims else tuple(d for d in dims if d in longest)
     others = [d for d in dims if d not in across]
@@ -94,7 +106,9 @@ def _layout(data: Any) -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]
     ]
 
 
-def _map(axes: Axes, part: Any, name: str, across: Sequence[str], cmap: Any, norm: Any) -> Any:
+def _map(
+    axes: Axes, part: "xarray.Dataset", name: str, across: Sequence[str], cmap: Colormap | str, norm: Normalize
+) -> ScalarMappable:
     """A heatmap: the first dimension upwards, the second to the right."""
     up, right = across
     values = np.ma.masked_invalid(_drawable(part[name], name).transpose(up, right).values)
@@ -109,7 +123,7 @@ def _map(axes: Axes, part: Any, name: str, across: Sequence[str], cmap: Any, nor
     return drawn
 
 
-def _line(axes: Axes, part: Any, name: str, dim: str) -> None:
+def _line(axes: Axes, part: "xarray.Dataset", name: str, dim: str) -> None:
     """A value over one axis; where a member failed, a cross at the lower edge."""
     codes, values = part[RESULT].values, _drawable(part[name], name).values
     numeric = _numeric(part, dim)
@@ -137,9 +151,9 @@ def _line(axes: Axes, part: Any, name: str, dim: str) -> None:
     _label(axes, words(part, dim), "" if name == RESULT else words(part, name))
 
 
-def _points(axes: Axes, part: Any, name: str, cmap: Any, norm: Any) -> Any:
+def _points(axes: Axes, part: "xarray.Dataset", name: str, cmap: Colormap | str, norm: Normalize) -> ScalarMappable:
     """Members of a design over its first two axes, or its only one."""
-    names = [c for c in part.coords if part[c].dims == (MEMBER,) and part[c].dtype.kind in "iuf" and c != MEMBER][:2]
+    names = [str(c) for c in part.coords if part[c].dims == (MEMBER,) and part[c].dtype.kind in "iuf" and c != MEMBER][:2]
     values = _drawable(part[name], name).values
     x = part[names[0]].values if names else np.arange(len(values))
     y = part[names[1]].values if len(names) > 1 else values
@@ -154,38 +168,38 @@ def _points(axes: Axes, part: Any, name: str, cmap: Any, norm: Any) -> Any:
     return drawn
 
 
-def _key(figure: Figure, drawn: Any, data: Any, name: str) -> None:
+def _key(figure: Figure, drawn: ScalarMappable, data: "xarray.Dataset", name: str) -> None:
     """What the colours mean."""
     bar = figure.colorbar(drawn, ax=figure.axes, aspect=30)
     if name == RESULT:
         name_results(bar)
 
 
-def name_results(bar: Any) -> None:
+def name_results(bar: Colorbar) -> None:
     """Name the colours of a colour bar of results."""
     bar.set_ticks(range(len(Result) + 1), labels=[_result(code) for code in range(len(Result) + 1)])
     bar.ax.tick_params(length=0)
 
 
-def _codes() -> tuple[Any, Any]:
+def _codes() -> Colours:
     """A colour for each result, and one for what is none."""
     count = len(Result) + 1
     return ListedColormap(SHADES[:count]), BoundaryNorm(np.arange(count + 1) - 0.5, count)
 
 
-def _scale(values: np.ndarray) -> tuple[Any, Any]:
+def _scale(values: np.ndarray) -> Colours:
     """Colours from the smallest to the largest value, logarithmic where these are far apart."""
     finite = values[np.isfinite(values)]
     low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
     return "viridis", LogNorm(low, high) if _decades(finite) else Normalize(low, high)
 
 
-def _drawable(values: Any, name: str) -> Any:
+def _drawable(values: "xarray.DataArray", name: str) -> "xarray.DataArray":
     """Codes of no `Result` are drawn as one."""
     return values.where(values.isin([int(r) for r in Result]), len(Result)) if name == RESULT else values
 
 
-def _edges(part: Any, dim: str, scale: Any) -> np.ndarray:
+def _edges(part: "xarray.Dataset", dim: str, scale: Callable[[str], object]) -> np.ndarray:
     """Where the cells of a map begin and end: half way between the values, of labels between their places."""
     if not _numeric(part, dim):
         return np.arange(part.sizes[dim] + 1) - 0.5
@@ -209,19 +223,19 @@ def _decades(values: np.ndarray) -> bool:
     return values.size > 0 and values.min() > 0 and values.max() >= DECADES * values.min()
 
 
-def _numeric(data: Any, dim: str) -> bool:
+def _numeric(data: "xarray.Dataset", dim: str) -> bool:
     """Whether a dimension has numbers on it that are apart, in order."""
     values = data[dim].values
     return values.dtype.kind in "iuf" and (len(values) < 2 or bool(np.all(np.diff(values) > 0) or np.all(np.diff(values) < 0)))
 
 
-def words(data: Any, name: str) -> str:
-    """A variable or an axis, with its unit."""
+def words(data: "xarray.Dataset", name: str) -> str:
+    """Return the words for a variable or an axis, with its unit."""
     units = data[name].attrs.get("units", "")
     return f"{name.replace('_', ' ')} ({units})" if units not in ("", "1") else name.replace("_", " ")
 
 
-def _value(data: Any, dim: str, index: int) -> str:
+def _value(data: "xarray.Dataset", dim: str, index: int) -> str:
     value = data[dim].values[index]
     return f"{dim} {value:.4g}" if data[dim].dtype.kind in "iuf" else str(value)
 
@@ -237,7 +251,7 @@ def _result(code: int) -> str:
     return Result(code).name.replace("_", " ") if code in list(Result) else OTHER
 
 
-def save_pictures(data: Any, folder: Any) -> Iterator[str]:
+def save_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
     """Write each picture to the folder, and iterate over the names of the files."""
     for name, figure in pictures(data).items():
         figure.savefig(folder / f"{name}.png", dpi=150)

@@ -1,7 +1,7 @@
 """What the command line says about a sweep, before it and after it."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from udkjax.study.sweep.cost import SweepCost
 from udkjax.study.sweep.plan import Plan
 from udkjax.study.sweep.sweep_progress import duration
 from udkjax.study.wording import plural
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def estimate_summary(plan: Plan, cost: SweepCost) -> str:
@@ -32,7 +35,7 @@ def estimate_summary(plan: Plan, cost: SweepCost) -> str:
     return table(f"{plan.mechanism.name or 'mechanism'}: a sweep", lines)
 
 
-def sweep_results(data: Any) -> dict[str, Any]:
+def sweep_results(data: "xarray.Dataset") -> dict[str, Any]:
     """Return how many members of a sweep ended in which way, and the range of each number that was kept."""
     codes, counts = np.unique(data[RESULT].values, return_counts=True)
     known = {int(result): result.name for result in Result}
@@ -46,7 +49,7 @@ def sweep_results(data: Any) -> dict[str, Any]:
     return {"members": int(data[RESULT].size), "results": ended, "ranges": ranges}
 
 
-def sweep_summary(data: Any, seconds: float) -> str:
+def sweep_summary(data: "xarray.Dataset", seconds: float) -> str:
     """Describe how the members of a sweep ended, and the range of each number that was kept."""
     found = sweep_results(data)
     ended = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in found["results"].items())

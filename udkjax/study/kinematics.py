@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.march import march, march_at_once, marches, psi_at_once
+from udkjax.integrate.march import can_march, march, march_at_once, psi_at_once
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
@@ -116,7 +116,7 @@ def kinematics(
     if values.ndim != 1 or not len(values):
         raise ValueError(f"values must be a list of at least one number, not of the shape {values.shape}; batch it by jax.vmap")
     driven, q = _start(mechanism, driver, values, state, held)
-    if is_known((driven, q, values, rate, acceleration)) and marches(driven.mechanism, driven.analysis):
+    if is_known((driven, q, values, rate, acceleration)) and can_march(driven.mechanism, driven.analysis):
         given = np.asarray(q), np.asarray(values), np.asarray(rate), np.asarray(acceleration)
         found = _at_once(driven, *given, mechanism.body_names)
         if found is not None:
@@ -199,7 +199,7 @@ def _solve(driven: Driven, s: Any, q: Any, values: Any, fast: bool = True) -> Po
     """By machine code as far as that is to be relied on, if it may be `fast`, and with care from there on."""
     curve = Curve.of(driven)
     points, first = no_points(len(values), len(q)), jnp.asarray(0)
-    if fast and marches(driven.mechanism, driven.analysis):
+    if fast and can_march(driven.mechanism, driven.analysis):
         found = march(*stop_gradients((driven.mechanism, driven.analysis, driven.unit, s, q, values)))
         first, last = found.trusted, jnp.maximum(found.trusted - 1, 0)
         some = first > 0

@@ -1,4 +1,5 @@
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -8,6 +9,15 @@ import udkjax as udk
 OMEGA = 4.0  # rad/s: the crank of the slider-crank turns by OMEGA t
 CRANK, ROD = 0.5, 1.5
 CHROMIUM = ("/usr/bin/chromium", "/usr/bin/chromium-browser")
+
+
+class Motion(NamedTuple):
+    """What `animate` needs of a run."""
+
+    ts: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    cause: str = ""
 
 
 def slider_crank_run(ts):
@@ -21,7 +31,7 @@ def slider_crank_run(ts):
     zero = np.zeros_like(ts)
     q = [(*pin / 2, a), (*(pin + arm / 2), tilt), (*(pin + arm), zero)]
     v = [(*pin_rate / 2, w + zero), (*(pin_rate + arm_rate / 2), rate), (*(pin_rate + arm_rate), zero)]
-    return SimpleNamespace(ts=ts, q=np.moveaxis(np.array(q), -1, 0), v=np.moveaxis(np.array(v), -1, 0))
+    return Motion(ts=ts, q=np.moveaxis(np.array(q), -1, 0), v=np.moveaxis(np.array(v), -1, 0))
 
 
 def pins_at(t):

@@ -2,13 +2,13 @@
 
 import io
 from contextlib import contextmanager
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import udkjax as udk
+from tests.show.player.conftest import Motion
 from udkjax.show.player.page import module
 from udkjax.show.player.sketch import THEMES
 
@@ -116,7 +116,7 @@ def test_two_runs_move_in_step(shown, slider_crank, closed_form):
     one = closed_form.run(np.linspace(0, 2, 81))
     ts = np.linspace(0, 2, 41)  # the same motion a quarter of a second later, at other instants
     late = closed_form.run(ts + 0.25)
-    animation = udk.animate(slider_crank, {"one": one, "late": SimpleNamespace(ts=ts, q=late.q, v=late.v)}, measures=())
+    animation = udk.animate(slider_crank, {"one": one, "late": Motion(ts=ts, q=late.q, v=late.v)}, measures=())
     with shown(animation) as page:
         plain(page)
         page.evaluate(f"{PLAYER}.seek(0.7)")
@@ -265,7 +265,7 @@ def test_modes_swing(shown, slider_crank):
 
 
 def test_markup_and_script_in_names_are_text(shown, hostile):
-    still = SimpleNamespace(ts=np.zeros(1), q=np.asarray(hostile.mechanism.q0)[None], v=np.zeros((1, 1, 3)))
+    still = Motion(ts=np.zeros(1), q=np.asarray(hostile.mechanism.q0)[None], v=np.zeros((1, 1, 3)))
     animation = udk.animate(
         hostile.mechanism,
         dict.fromkeys(hostile.names[:2], still),

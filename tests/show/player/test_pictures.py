@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 import udkjax as udk
-from udkjax.show.player import pictures
+from udkjax.show.player import films
 from udkjax.show.player.marks import marks
 from udkjax.show.player.sketch import THEMES, Sketch, view_of
 
@@ -28,7 +28,7 @@ def ring_centre(picture, place):
 @pytest.mark.parametrize("t", [0.0, 0.5125, 1.7])
 def test_pins_of_a_picture_are_where_the_closed_form_says(animation, closed_form, t):
     view = view_of(animation.data["bounds"], 900)
-    picture = pictures.image(animation, t, 900)
+    picture = films.image(animation, t, 900)
     pins = closed_form.pins(t)
     for name in ("P", "B"):  # O is under the arrow of its motor
         x, y = pins[name]

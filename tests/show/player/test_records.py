@@ -2,12 +2,12 @@
 
 import json
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.show.player.conftest import Motion
 from udkjax.show.player.marks import body_points, corners_of, marks, placed
 from udkjax.show.player.measures import measures_of, rank_of, reaction_arrows, singular_values_over_time
 from udkjax.show.player.page import page
@@ -116,7 +116,7 @@ def test_singular_values_and_rank_of_the_papers_linkage():
     mech = udk.library.parallelogram()
     poses = np.stack([mech.q0, mech.q0])
     poses[1] = np.nan
-    run = SimpleNamespace(ts=np.zeros(2), q=poses, v=0 * poses)
+    run = Motion(ts=np.zeros(2), q=poses, v=0 * poses)
     values = singular_values_over_time(mech, run)
     assert values.shape == (2, 12) and np.isnan(values[1]).all()
     assert values[0, 10] > 0.1 and values[0, 11] < 1e-14
@@ -140,7 +140,7 @@ def test_measures_are_those_of_the_equations(slider_crank, run):
 
 def test_arrows_are_the_reactions():
     mech = udk.library.compound_pendulum(0.3)
-    run = SimpleNamespace(ts=np.zeros(1), q=np.asarray(mech.q0)[None], v=np.zeros((1, 1, 3)))
+    run = Motion(ts=np.zeros(1), q=np.asarray(mech.q0)[None], v=np.zeros((1, 1, 3)))
     anchors, forces, unique = reaction_arrows(mech, run)
     (name,) = mech.joints
     expected = udk.reactions(mech, run)[name][mech.body_names[0]][0, :2]
@@ -152,7 +152,7 @@ def test_arrows_are_the_reactions():
 
 def test_arrows_say_which_forces_redundant_joints_share():
     mech = udk.library.parallelogram()
-    run = SimpleNamespace(ts=np.zeros(1), q=np.asarray(mech.q0)[None], v=np.zeros((1, 4, 3)))
+    run = Motion(ts=np.zeros(1), q=np.asarray(mech.q0)[None], v=np.zeros((1, 4, 3)))
     assert reaction_arrows(mech, run)[2] == [False] * 6  # how the three links share the coupler's weight along them is open
     arrows = udk.animate(mech, run, measures=(), reactions=True).data["runs"][0]["reactions"]
     assert arrows["unique"] == [False] * 6
@@ -161,11 +161,11 @@ def test_arrows_say_which_forces_redundant_joints_share():
 def test_a_run_that_failed_is_shown_as_far_as_it_came(slider_crank, run):
     q = run.q.copy()
     q[50:] = np.nan
-    broken = SimpleNamespace(ts=run.ts, q=q, v=run.v, cause="not finite at t = 1.25 s")
+    broken = Motion(ts=run.ts, q=q, v=run.v, cause="not finite at t = 1.25 s")
     record, poses = run_record(slider_crank, broken, "", (), False, None)
     assert len(poses) == record["q"]["rows"] == 50 and "1.25 s" in record["note"]
     with pytest.raises(ValueError, match="has no state to show: not finite"):
-        run_record(slider_crank, SimpleNamespace(ts=run.ts, q=np.nan * q, v=run.v, cause=broken.cause), "", (), False, None)
+        run_record(slider_crank, Motion(ts=run.ts, q=np.nan * q, v=run.v, cause=broken.cause), "", (), False, None)
 
 
 def test_long_runs_are_thinned_out_and_stay_exact(slider_crank, closed_form):
@@ -195,7 +195,7 @@ def test_several_runs_and_wrong_ones(slider_crank, run, closed_form):
     short = closed_form.run(np.linspace(0.5, 1.0, 11))
     data = udk.animate(slider_crank, {"long": run, "short": short}, measures=()).data
     assert [r["label"] for r in data["runs"]] == ["long", "short"] and (data["start"], data["end"]) == (0.0, 2.0)
-    batch = SimpleNamespace(ts=run.ts, q=run.q[None], v=run.v[None])
+    batch = Motion(ts=run.ts, q=run.q[None], v=run.v[None])
     with pytest.raises(ValueError, match="members of a batch one by one"):
         udk.animate(slider_crank, batch)
     with pytest.raises(ValueError, match="no run"):

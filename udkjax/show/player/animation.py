@@ -2,14 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from udkjax.scene import Mechanism
+from udkjax.show.player import pictures
+from udkjax.show.player.marks import Shapes
+from udkjax.show.player.measures import Measures, Trajectory
+from udkjax.show.player.packing import Json
 from udkjax.show.player.page import frame, page
-from udkjax.show.player.records import mode_record, motion_of, player_data, run_record
+from udkjax.show.player.records import Traces, mode_record, motion_of, player_data, run_record
+
+if TYPE_CHECKING:
+    from udkjax.show.player.widget import PlayerWidget
 
 FRAME_HEIGHT = 560  # px, of the player inside another page
 
@@ -17,7 +25,7 @@ FRAME_HEIGHT = 560  # px, of the player inside another page
 class Animation:
     """What `animate` returns. In a notebook it shows itself: as a widget where anywidget is installed, else in a frame."""
 
-    def __init__(self, data: dict[str, Any]):
+    def __init__(self, data: Json):
         self.data = data
         self._motions = [motion_of(record) for record in data["runs"]]
 
@@ -25,7 +33,7 @@ class Animation:
         """Return one self-contained HTML page. `theme` is "light" or "dark"; by default, what the reader's system prefers."""
         return page(self.data, {"theme": theme, "autoplay": autoplay})
 
-    def widget(self) -> Any:
+    def widget(self) -> "PlayerWidget":
         """Return an anywidget with `time` (s) and `playing`, which follow the player and move it; needs the extra `notebook`."""
         from udkjax.show.player.widget import PlayerWidget
 
@@ -35,7 +43,7 @@ class Animation:
         """Write the animation, in the format that the name ends with.
 
         Args:
-            path: .html, the player; .gif or .mp4 (extra `video`), the motion; .svg, .png or .dxf (extra `dxf`), one pose.
+            path: .html, the player; .gif (extra `plot`) or .mp4 (`video`), the motion; .svg, .png (`plot`), .dxf (`dxf`), a pose.
             t: time of the pose (s); by default the first.
             options: of html, `theme` and `autoplay`; of gif and mp4, `fps` (1/s), `width` (px), `theme` and `speed` (seconds of
                 motion in one second; by default that of the player); of svg and png, `width` (px) and `theme`.
@@ -47,22 +55,23 @@ class Animation:
             ValueError: a name that ends otherwise.
             ImportError: a package of an extra is missing; says which.
         """
-        from udkjax.show.player import pictures
-
         path = Path(path)
         kind = path.suffix.lower()
         if kind == ".html":
             path.write_text(self.html(**options), encoding="utf-8")
-        elif kind == ".gif":
-            pictures.save_gif(self, path, **options)
-        elif kind == ".mp4":
-            pictures.save_mp4(self, path, **options)
         elif kind == ".svg":
             path.write_text(pictures.svg(self, t, **options), encoding="utf-8")
-        elif kind == ".png":
-            pictures.image(self, t, **options).save(path)
         elif kind == ".dxf":
             pictures.save_dxf(self, path, t)
+        elif kind in (".gif", ".mp4", ".png"):
+            from udkjax.show.player import films  # which needs an extra
+
+            if kind == ".gif":
+                films.save_gif(self, path, **options)
+            elif kind == ".mp4":
+                films.save_mp4(self, path, **options)
+            else:
+                films.image(self, t, **options).save(path)
         else:
             raise ValueError(f"{path.name}: an animation is written as .html, .gif, .mp4, .svg, .png or .dxf")
         return path
@@ -75,7 +84,7 @@ class Animation:
     def _repr_html_(self) -> str:
         return frame(self.data, FRAME_HEIGHT)
 
-    def _repr_mimebundle_(self, **options: Any) -> Any:
+    def _repr_mimebundle_(self, **options: Any) -> dict[str, Any] | tuple[dict[str, Any], dict[str, Any]]:
         try:
             bundle = self.widget()._repr_mimebundle_(**options)
         except ImportError:
@@ -91,12 +100,12 @@ class Animation:
 
 def animate(
     mechanism: Mechanism | Mapping[str, Mechanism],
-    solution: Any = None,
+    solution: Trajectory | Mapping[str, Trajectory] | None = None,
     *,
-    measures: Sequence[str] | Mapping[str, Any] = ("violation", "energy", "rank"),
+    measures: Measures = ("violation", "energy", "rank"),
     reactions: bool = False,
-    traces: Sequence[str | tuple[str, Any]] | None = None,
-    shapes: Mapping[str, Any] | None = None,
+    traces: Traces | None = None,
+    shapes: Shapes | None = None,
     title: str | None = None,
 ) -> Animation:
     """Show the motion of a mechanism, or several motions side by side and in step.
@@ -119,12 +128,12 @@ def animate(
     Raises:
         ValueError: a batch, a name that is not known, or a run without any state.
     """
-    runs: dict[str, Any] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
+    runs: dict[str, Trajectory | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
     if not runs:
         raise ValueError("there is no run to show")
     found = []
     for label, run in runs.items():
-        one: Any = mechanism[label] if isinstance(mechanism, Mapping) else mechanism
+        one = mechanism[label] if isinstance(mechanism, Mapping) else mechanism
         run = _Still(one) if run is None else run
         if np.ndim(run.ts) != 1 or np.shape(run.q) != (len(run.ts), len(one.bodies), 3):
             raise ValueError(
@@ -137,8 +146,8 @@ def animate(
 
 def animate_modes(
     mechanism: Mechanism,
-    q: Any,
-    shapes: Float[Any, "modes bodies 3"],
+    q: ArrayLike,
+    shapes: ArrayLike,
     frequencies: Sequence[float] | None = None,
     labels: Sequence[str] | None = None,
     title: str | None = None,

@@ -1,7 +1,7 @@
 """Runs that `udkjax simulate` or `Solution.to_xarray` wrote, read again to be shown."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,11 +44,11 @@ def read_run(path: Path) -> RunFile:
             raise ValueError(f"{path}: q is over {data['q'].dims}, not one run over time, body and coordinate")
         if list(data["body"].values) != list(mechanism.bodies):
             raise ValueError(f"{path}: its bodies are not those of its scene")
-        others = {_named(data[name]): np.asarray(data[name], float) for name in data.data_vars if data[name].dims == ("time",)}
+        others = {_label(data[name]): np.asarray(data[name], float) for name in data.data_vars if data[name].dims == ("time",)}
         ts, q, v = (np.asarray(data[name], float) for name in ("time", "q", "v"))
         return RunFile(mechanism, ts, q, v, str(data.attrs.get("cause", "")), others)
 
 
-def _named(variable: Any) -> str:
+def _label(variable: "xarray.DataArray") -> str:
     units = variable.attrs.get("units", "")
     return f"{variable.name} ({units})" if units not in ("", "1") else str(variable.name)

@@ -25,20 +25,23 @@ mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How large a pin or
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
 from udkjax.scene import (
     GROUND,
     Cam,
     Distance,
+    Driver,
     Force,
+    ForceElement,
     Friction,
     Gear,
+    Joint,
     Mechanism,
     Prismatic,
     Rack,
@@ -49,8 +52,10 @@ from udkjax.scene import (
     TorsionSpring,
     Weld,
 )
+from udkjax.show.player.packing import Json
 
-Mark = dict[str, Any]
+Mark = Json
+Shapes = Mapping[str, ArrayLike]  # points (n, 2) by body
 Poses = Float[np.ndarray, "T bodies 3"]
 PROFILE_POINTS = 180  # of a cam's outline
 SAME_PLACE = 1e-9  # of the largest coordinate: attachments that are closer are one point
@@ -58,7 +63,7 @@ ROD = 0.01  # of the inertia: how near to that of a uniform rod it must be for o
 MARGIN = 0.08  # of the length of a mechanism: how far a rail goes beyond what slides on it
 
 
-def marks(mechanism: Mechanism, poses: Float[ArrayLike, "T bodies 3"], shapes: Mapping[str, Any] | None = None) -> list[Mark]:
+def marks(mechanism: Mechanism, poses: ArrayLike, shapes: Shapes | None = None) -> list[Mark]:
     """Return the marks of a mechanism, the farthest first.
 
     Args:
@@ -106,7 +111,7 @@ def _distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"
 class _Drawing:
     """The marks of one mechanism, in the order in which they cover one another."""
 
-    def __init__(self, mechanism: Mechanism, poses: Poses, shapes: Mapping[str, Any]):
+    def __init__(self, mechanism: Mechanism, poses: Poses, shapes: Shapes):
         self.mechanism, self.poses = mechanism, poses
         self.number = {GROUND: -1, **{body: k for k, body in enumerate(mechanism.bodies)}}
         self.points = body_points(mechanism)
@@ -148,16 +153,16 @@ class _Drawing:
                 found.append({"kind": "disc", "body": k, "at": [0.0, 0.0], "radius": radius})
         return found
 
-    def _joint(self, name: str, joint: Any) -> None:
+    def _joint(self, name: str, joint: Joint) -> None:
         match joint:
             case Revolute():
-                self._pin(name, self._held(joint))
+                self._pin(name, self._held(joint.bodies, joint.points))
             case Weld():
-                self.elements.append({"kind": "weld", **self._held(joint)})
+                self.elements.append({"kind": "weld", **self._held(joint.bodies, joint.points)})
             case Prismatic() | Slot():
                 self._rail(joint)
             case Distance():
-                a, b = self._anchors(joint)
+                a, b = self._anchors(joint.bodies, joint.points)
                 self.elements.append({"kind": "rod", "a": a, "b": b})
                 for k, x, y in (a, b):
                     self._pin(name, {"body": int(k), "at": [x, y]})
@@ -172,25 +177,25 @@ class _Drawing:
                 self.wheels.append({"kind": "outline", "body": self.number[joint.bodies[0]], "points": rim.tolist()})
                 self.elements.append({"kind": "roller", **self._at(joint.bodies[1], joint.points[1])})
                 self.shaped.add(joint.bodies[0])
-            case _ if getattr(joint, "points", None) is not None and len(joint.bodies) == 2:  # a joint of the user's own
-                self._pin(name, self._held(joint))
+            case _ if (points := getattr(joint, "points", None)) is not None and len(joint.bodies) == 2:
+                self._pin(name, self._held(joint.bodies, points))
 
-    def _pin(self, name: str, place: dict[str, Any]) -> None:
+    def _pin(self, name: str, place: Mark) -> None:
         self.pins.append({"kind": "pin", "name": name, **place})
         if place["body"] < 0:
             self.rails.append({"kind": "support", **place})
 
-    def _driver(self, driver: Any) -> None:
+    def _driver(self, driver: Driver) -> None:
         if driver.coordinate == "angle":
             self.elements.append({"kind": "motor", **self._axle(driver.bodies)})
         elif driver.coordinate == "distance":
-            a, b = self._anchors(driver)
+            a, b = self._anchors(driver.bodies, driver.points)
             self.elements.append({"kind": "piston", "a": a, "b": b})
 
-    def _force(self, force: Any) -> None:
+    def _force(self, force: ForceElement) -> None:
         match force:
             case Spring():
-                a, b = self._anchors(force)
+                a, b = self._anchors(force.bodies, force.points)
                 self.elements.append({"kind": "spring", "a": a, "b": b, "damper": force.damping is not None})
             case TorsionSpring():
                 self.elements.append({"kind": "spiral", **self._axle(force.bodies)})
@@ -204,7 +209,7 @@ class _Drawing:
                 sign = 1 if float(force.value) >= 0 else -1
                 self.elements.append({"kind": "torque", **self._axle(force.bodies), "sign": sign})
 
-    def _rail(self, joint: Any) -> None:
+    def _rail(self, joint: Prismatic | Slot) -> None:
         one, two = joint.bodies
         axis = float(joint.axis)
         slot = isinstance(joint, Slot)
@@ -215,7 +220,7 @@ class _Drawing:
         if slot:
             self.pins.append({"kind": "roller", **self._at(two, joint.points[1])})
         else:
-            block = {"kind": "block", **self._at(two, joint.points[1]), "axis": axis - float(joint.angle)}
+            block = {"kind": "block", **self._at(two, joint.points[1]), "axis": axis - float(np.asarray(joint.angle))}
             self.elements.append(block)
             self.shaped.add(two)
 
@@ -239,7 +244,7 @@ class _Drawing:
         self.wheels.append({"kind": "wheel", **self._at(two, (0.0, 0.0)), "radius": radius, "internal": False})
         self.shaped.add(two)
 
-    def _travel(self, one: str, at: Any, axis: float, two: str, point: Any) -> tuple[float, float]:
+    def _travel(self, one: str, at: ArrayLike, axis: float, two: str, point: ArrayLike) -> tuple[float, float]:
         """The least and the largest displacement (m) along an axis of body `one`, from its point `at`, of a point of `two`."""
         frames, others = self._frames(one), self._frames(two)
         gap = placed(point, others) - placed(at, frames)
@@ -250,32 +255,31 @@ class _Drawing:
     def _frames(self, body: str) -> Float[np.ndarray, "T 3"]:
         return np.zeros((len(self.poses), 3)) if body == GROUND else self.poses[:, self.number[body]]
 
-    def _at(self, body: str, point: Any) -> dict[str, Any]:
+    def _at(self, body: str, point: ArrayLike) -> Mark:
         return {"body": self.number[body], "at": np.asarray(point, float).tolist()}
 
-    def _held(self, joint: Any) -> dict[str, Any]:
-        """Where a joint is: on the ground, if it holds something to it, else on its first body."""
-        side = 1 if joint.bodies[1] == GROUND else 0
-        return self._at(joint.bodies[side], joint.points[side])
+    def _held(self, bodies: Sequence[str], points: ArrayLike) -> Mark:
+        """Return the place of a joint: on the ground, if it holds something to it, else on its first body."""
+        side = 1 if bodies[1] == GROUND else 0
+        return self._at(bodies[side], np.asarray(points)[side])
 
-    def _anchors(self, element: Any) -> list[list[float]]:
-        points = np.asarray(element.points, float).tolist()
-        return [[self.number[body], x, y] for body, (x, y) in zip(element.bodies, points, strict=True)]
+    def _anchors(self, bodies: Sequence[str], points: ArrayLike | None) -> list[list[float]]:
+        return [[self.number[body], x, y] for body, (x, y) in zip(bodies, np.asarray(points, float).tolist(), strict=True)]
 
-    def _held_by(self, body: str, other: str) -> dict[str, Any]:
+    def _held_by(self, body: str, other: str) -> Mark:
         """Where a revolute joint holds `body` to `other`, in the frame of `body`; its origin, if none does."""
         for joint in self.mechanism.joints.values():
             if isinstance(joint, Revolute) and set(joint.bodies) == {body, other}:
                 return self._at(body, joint.points[joint.bodies.index(body)])
         return self._at(body, (0.0, 0.0))
 
-    def _axle(self, bodies: Sequence[str]) -> dict[str, Any]:
+    def _axle(self, bodies: Sequence[str]) -> Mark:
         """Where two bodies turn on each other: at their revolute joint, else at the second one's centre of mass."""
         one, two = bodies
         return self._held_by(one if two == GROUND else two, two if two == GROUND else one)
 
 
-def placed(point: Any, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
+def placed(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
     """Return where a point of a body's frame is in ground coordinates (m), for each of its coordinates x, y, angle."""
     x, y = np.asarray(point, float)
     cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])

@@ -1,19 +1,40 @@
 """Numbers over time that a strip below the motion shows, and the arrows of reactions on it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from udkjax.equations import Analysis, analyse, energy, reactions, singular_values, unique_reactions, violation
 from udkjax.equations.determinacy import STATIC_RANK_TOL
 from udkjax.scene import GROUND, Mechanism
 
 ROUNDING = 1e-17  # below any violation (m, rad) or singular value but zero; drawn in place of zero, which has no logarithm
+
+
+# Names of measures, or values over time by name; of several runs, by name and then by the run's label.
+Measures = Sequence[str] | Mapping[str, ArrayLike | Mapping[str, ArrayLike] | None]
+
+
+ReactionArrows = tuple[list[list[float]], Float[np.ndarray, "T joints 2"], list[bool]]  # anchors, forces (N), uniqueness
+
+
+class Trajectory(Protocol):
+    """A motion: times ts (T,) in s, coordinates q and velocities v (T, bodies, 3)."""
+
+    @property
+    def ts(self) -> Array | np.ndarray: ...
+
+    @property
+    def q(self) -> Array | np.ndarray: ...
+
+    @property
+    def v(self) -> Array | np.ndarray: ...
 
 
 class Measure(NamedTuple):
@@ -25,7 +46,7 @@ class Measure(NamedTuple):
     log: bool = False
 
 
-def measures_of(mechanism: Mechanism, solution: Any, wanted: Sequence[str] | Mapping[str, Any], label: str) -> list[Measure]:
+def measures_of(mechanism: Mechanism, solution: Trajectory, wanted: Measures, label: str) -> list[Measure]:
     """Return the measures of a run: those of `MEASURES` by their names, or others as {"name" or "name (unit)": values}.
 
     Values may be under the labels of the runs that have them.
@@ -50,7 +71,7 @@ def measures_of(mechanism: Mechanism, solution: Any, wanted: Sequence[str] | Map
     return found
 
 
-def singular_values_over_time(mechanism: Mechanism, solution: Any) -> Float[np.ndarray, "T k"]:
+def singular_values_over_time(mechanism: Mechanism, solution: Trajectory) -> Float[np.ndarray, "T k"]:
     """Return the singular values of the scaled Jacobian (`udkjax.singular_values`) at each output time, the largest first."""
     values = np.array(_singular_values(mechanism, analyse(mechanism), solution.ts, solution.q))
     values[~np.isfinite(np.asarray(solution.q)).all((1, 2))] = np.nan
@@ -66,17 +87,17 @@ def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
 
 
 @eqx.filter_jit
-def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: Any, q: Any) -> Any:
+def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike) -> Float[Array, "T k"]:
     return jax.vmap(lambda t, q: singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
 
 
-def _violation(mechanism: Mechanism, solution: Any) -> list[Measure]:
+def _violation(mechanism: Mechanism, solution: Trajectory) -> list[Measure]:
     psi = np.asarray(violation(mechanism, solution))
     values = np.abs(psi) * np.asarray(analyse(mechanism).scales.weights)  # radians as an arc of the characteristic length
     return [Measure("violation", "m", np.maximum(values.max(axis=1, initial=0.0), ROUNDING), log=True)]
 
 
-def _energy(mechanism: Mechanism, solution: Any) -> list[Measure]:
+def _energy(mechanism: Mechanism, solution: Trajectory) -> list[Measure]:
     parts = energy(mechanism, solution)
     total = np.asarray(parts.total)
     return [
@@ -86,7 +107,7 @@ def _energy(mechanism: Mechanism, solution: Any) -> list[Measure]:
     ]
 
 
-def _rank(mechanism: Mechanism, solution: Any) -> list[Measure]:
+def _rank(mechanism: Mechanism, solution: Trajectory) -> list[Measure]:
     values = singular_values_over_time(mechanism, solution)
     count = rank_of(values)
     found = [Measure("rank", "", count)]
@@ -99,7 +120,7 @@ def _rank(mechanism: Mechanism, solution: Any) -> list[Measure]:
 MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank}
 
 
-def reaction_arrows(mechanism: Mechanism, solution: Any) -> tuple[list[list[float]], Float[np.ndarray, "T joints 2"], list[bool]]:
+def reaction_arrows(mechanism: Mechanism, solution: Trajectory) -> ReactionArrows:
     """Return what the arrows of reactions need, for each joint and driver that puts a force on a body.
 
     Returns:

@@ -6,13 +6,17 @@ where another follows (LEB128); base64. What is read back is within half a step.
 """
 
 import base64
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+Json = dict[str, Any]  # an object of JSON
 
 
-def packed(table: Float[np.ndarray, "T n"], step: Any) -> dict[str, Any]:
+def pack(table: Float[np.ndarray, "T n"], step: ArrayLike) -> Json:
     """Return a table of finite numbers with its shape and the `step` of each column (or of all) as plain data."""
     table = np.asarray(table, float)
     steps = np.broadcast_to(np.asarray(step, float), table.shape[1:])
@@ -22,8 +26,8 @@ def packed(table: Float[np.ndarray, "T n"], step: Any) -> dict[str, Any]:
     return {"rows": len(table), "steps": steps.tolist(), "bytes": base64.b64encode(_leb128(unsigned)).decode()}
 
 
-def unpacked(data: dict[str, Any]) -> Float[np.ndarray, "T n"]:
-    """Return the table that was `packed`, as the player reads it."""
+def unpack(data: Mapping[str, Any]) -> Float[np.ndarray, "T n"]:
+    """Return the table of `pack`, as the player reads it."""
     whole, value, shift = [], 0, 0
     for byte in base64.b64decode(data["bytes"]):
         value, shift = value | (byte & 127) << shift, shift + 7
@@ -34,7 +38,7 @@ def unpacked(data: dict[str, Any]) -> Float[np.ndarray, "T n"]:
     return columns.cumsum(axis=1).cumsum(axis=1).T * np.asarray(data["steps"])
 
 
-def floats(values: Any) -> str:
+def floats(values: ArrayLike) -> str:
     """Return numbers, finite or not, in single precision."""
     return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
 

@@ -5,13 +5,14 @@ import json
 from functools import cache
 from importlib.resources import files
 from string import Template
-from typing import Any
+
+from udkjax.show.player.packing import Json
 
 # Within <script> no character of a text may end it, begin markup or break a line of JavaScript.
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
-def page(data: dict[str, Any], options: dict[str, Any] | None = None) -> str:
+def page(data: Json, options: Json | None = None) -> str:
     """Return the player of `data` (records.py) as one HTML page; `options` are those of `mount` in player.js."""
     template = Template(files("udkjax.show.player").joinpath("page.html").read_text(encoding="utf-8"))
     return template.substitute(
@@ -22,14 +23,14 @@ def page(data: dict[str, Any], options: dict[str, Any] | None = None) -> str:
     )
 
 
-def frame(data: dict[str, Any], height: int) -> str:
+def frame(data: Json, height: int) -> str:
     """Return the page inside an <iframe> of so many pixels, for notebooks and pages that show HTML."""
     text, title = (html.escape(words, quote=True) for words in (page(data), data["title"]))
     style = f"width:100%;height:{height}px;border:0;border-radius:8px"
     return f'<iframe title="{title}" style="{style}" sandbox="allow-scripts" srcdoc="{text}"></iframe>'
 
 
-def as_json(data: Any) -> str:
+def as_json(data: object) -> str:
     """Return data as JSON that may stand inside <script>. What is not finite has no place in it: ValueError."""
     return json.dumps(data, separators=(",", ":"), allow_nan=False).translate(ESCAPES)
 

@@ -19,19 +19,20 @@ runs       a list of
     reactions      {anchors, usual (N), unique: booleans, force: packed table of T rows, x and y of each anchor}, or null
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from udkjax.equations import analyse
 from udkjax.scene import Mechanism
-from udkjax.show.player.marks import body_points, marks, placed
-from udkjax.show.player.measures import measures_of, reaction_arrows
-from udkjax.show.player.packing import floats, packed, unpacked
+from udkjax.show.player.marks import Shapes, body_points, marks, placed
+from udkjax.show.player.measures import Measures, Trajectory, measures_of, reaction_arrows
+from udkjax.show.player.packing import Json, floats, pack, unpack
 
-Record = dict[str, Any]
+Record = Json
+Traces = Sequence[str | tuple[str, ArrayLike]]  # joints, bodies, or points of bodies
 PRECISION = (
     1e-5  # of positions, in characteristic lengths, and of angles, in rad: a hundredth of a pixel on a screen of a thousand
 )
@@ -49,12 +50,12 @@ STILL = 1e-6  # characteristic lengths: what moves less has no path
 
 def run_record(
     mechanism: Mechanism,
-    solution: Any,
+    solution: Trajectory,
     label: str,
-    measures: Sequence[str] | Mapping[str, Any],
+    measures: Measures,
     with_reactions: bool,
-    traces: Sequence[str | tuple[str, Any]] | None,
-    shapes: Mapping[str, Any] | None = None,
+    traces: Traces | None,
+    shapes: Shapes | None = None,
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
     """Return one run as plain data, and its poses; a run that failed is shown as far as it came."""
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
@@ -72,10 +73,10 @@ def run_record(
         "note": _cause(solution) if count < len(ts) else "",
         "bodies": list(mechanism.bodies),
         "marks": marks(mechanism, poses, shapes),
-        "traces": traced(mechanism, poses, traces, length),
-        "time": packed(ts[shown, None], TIME_PRECISION * max(np.ptp(ts), frame)),
-        "q": packed(poses.reshape(len(shown), -1), steps),
-        "v": packed(frame * v[shown].reshape(len(shown), -1), steps),
+        "traces": trace_anchors(mechanism, poses, traces, length),
+        "time": pack(ts[shown, None], TIME_PRECISION * max(np.ptp(ts), frame)),
+        "q": pack(poses.reshape(len(shown), -1), steps),
+        "v": pack(frame * v[shown].reshape(len(shown), -1), steps),
         "frame": frame,
         "mode": None,
         "measures": [
@@ -90,13 +91,13 @@ def run_record(
         largest = np.linalg.norm(forces, axis=2).max(axis=1, initial=0.0)
         usual = float(np.quantile(largest, USUAL)) or float(largest.max(initial=0.0))
         if usual > 0:
-            table = packed(forces.reshape(len(shown), -1), FORCE_PRECISION * usual)
+            table = pack(forces.reshape(len(shown), -1), FORCE_PRECISION * usual)
             record["reactions"] = {"anchors": anchors, "usual": usual, "unique": unique, "force": table}
     return record, poses
 
 
 def mode_record(
-    mechanism: Mechanism, q: Any, shape: Any, frequency: float | None, label: str
+    mechanism: Mechanism, q: ArrayLike, shape: ArrayLike, frequency: float | None, label: str
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
     """Return a mode q + amplitude shape sin(phase) as plain data, its shape scaled to a swing that one sees, and its poses."""
     q, shape = np.asarray(q, float), np.asarray(shape, float).reshape(np.shape(q))
@@ -126,7 +127,7 @@ def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]
     if record["mode"]:
         q, swing = (np.reshape(record["mode"][name], shape) for name in ("q", "shape"))
         return lambda t: q + np.sin(2 * np.pi * t) * swing
-    ts, q, v = (unpacked(record[name]) for name in ("time", "q", "v"))
+    ts, q, v = (unpack(record[name]) for name in ("time", "q", "v"))
 
     def at(t: float) -> Float[np.ndarray, "bodies 3"]:
         j = int(np.clip(np.searchsorted(ts[:, 0], t, side="right"), 1, max(len(ts) - 1, 1)))
@@ -159,7 +160,9 @@ def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.nda
     }
 
 
-def traced(mechanism: Mechanism, poses: Any, wanted: Sequence[str | tuple[str, Any]] | None, length: float) -> list[list[float]]:
+def trace_anchors(
+    mechanism: Mechanism, poses: Float[np.ndarray, "T bodies 3"], wanted: Traces | None, length: float
+) -> list[list[float]]:
     """Return the anchors whose paths are drawn: those of the joints and bodies that are named, or of the pins that move.
 
     Raises:
@@ -182,7 +185,7 @@ def traced(mechanism: Mechanism, poses: Any, wanted: Sequence[str | tuple[str, A
     return [anchor for _, anchor in found[:MOST_TRACES]]
 
 
-def _anchor(mechanism: Mechanism, bodies: list[str], wanted: str | tuple[str, Any]) -> list[float]:
+def _anchor(mechanism: Mechanism, bodies: list[str], wanted: str | tuple[str, ArrayLike]) -> list[float]:
     name, point = (wanted, None) if isinstance(wanted, str) else wanted
     if point is not None:
         if name not in bodies:
@@ -202,7 +205,7 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
     """The rectangle that holds everything that is drawn in any pose: left, bottom, right, top (m)."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
 
-    def hold(body: int, at: Any, radius: float = 0.0) -> None:
+    def hold(body: int, at: ArrayLike, radius: float = 0.0) -> None:
         nonlocal low, high
         path = placed(at, np.zeros((1, 3)) if body < 0 else poses[:, body])
         low, high = np.minimum(low, path.min(axis=0) - radius), np.maximum(high, path.max(axis=0) + radius)
@@ -226,7 +229,7 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
 
 
 def _ends(record: Record) -> tuple[float, float]:
-    ts = unpacked(record["time"])[:, 0]
+    ts = unpack(record["time"])[:, 0]
     return float(ts[0]), float(ts[-1])
 
 
@@ -240,6 +243,6 @@ def _speed(duration: float) -> float:
     return min((s for s in SPEEDS if s >= 1 and duration / s <= longest), default=SPEEDS[-1])
 
 
-def _cause(solution: Any, before: str = "") -> str:
+def _cause(solution: Trajectory, before: str = "") -> str:
     cause = getattr(solution, "cause", "")
     return f"{before}{cause}" if cause else ""

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from udkjax.show.player.marks import Mark, placed
 
@@ -24,7 +25,7 @@ THEMES: dict[str, dict[str, Any]] = {
 POINT = 420.0  # px: of pictures whose shorter side is this long a symbol's unit is one pixel
 MARGIN = 44.0  # px
 ROUND = 48  # corners of a circle that is drawn as a line
-Points = Float[Any, "points 2"]
+Points = Float[np.ndarray, "points 2"] | Sequence[np.ndarray]
 
 
 class View(NamedTuple):
@@ -107,13 +108,13 @@ class Sketch:
     def _fill(self, body: int) -> str:
         return mix(self._edge(body), self.theme["back"], self.theme["tint"])
 
-    def _line(self, points: Any, width: float, stroke: str, fill: str = "", closed: bool = False) -> None:
+    def _line(self, points: ArrayLike, width: float, stroke: str, fill: str = "", closed: bool = False) -> None:
         self.shapes.append(Line(self.layer, np.asarray(points, float), width * self.pt, stroke, fill, closed))
 
-    def _circle(self, centre: Any, radius: float, fill: str = "", stroke: str = "", width: float = 1.5) -> None:
+    def _circle(self, centre: ArrayLike, radius: float, fill: str = "", stroke: str = "", width: float = 1.5) -> None:
         self.shapes.append(Circle(self.layer, np.asarray(centre, float), radius, width * self.pt, stroke, fill))
 
-    def _turned(self, place: np.ndarray, angle: float, points: Any) -> np.ndarray:
+    def _turned(self, place: np.ndarray, angle: float, points: ArrayLike) -> np.ndarray:
         """Points of a frame of pixels (y downwards) at a place, whose x axis is turned anticlockwise by an angle."""
         cos, sin = np.cos(angle), np.sin(angle)
         return place + np.asarray(points, float) @ np.array([[cos, -sin], [sin, cos]])

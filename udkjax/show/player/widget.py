@@ -1,7 +1,5 @@
 """The player as a widget of notebooks (Jupyter, Marimo, VS Code, Colab)."""
 
-from typing import Any
-
 from udkjax.extras import OptionalImport
 from udkjax.show.player.page import module
 
@@ -11,9 +9,12 @@ with OptionalImport():
 
 
 class PlayerWidget(anywidget.AnyWidget):
-    """Shows `data` (records.py). `time` (s) and `playing` follow the player when it stops or is moved, and move it when set."""
+    """A widget that shows `data` (records.py).
 
-    _esm: Any = module()
+    `time` (s) and `playing` follow the player when it stops or is moved, and move it when set.
+    """
+
+    _esm = module()
     data = traitlets.Dict().tag(sync=True)
     time = traitlets.Float(0.0).tag(sync=True)
     playing = traitlets.Bool(False).tag(sync=True)

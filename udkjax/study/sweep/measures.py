@@ -93,10 +93,10 @@ def measures_of(given: Any, reference: Any, ts: np.ndarray) -> tuple[Measure, ..
 
 def _measure(key: str, given: Any, reference: Any, ts: np.ndarray) -> Measure:
     if isinstance(given, str):
-        if given not in BY_NAME:
-            near = suggestion(given, BY_NAME) or f"; known are {', '.join(BY_NAME)}"
+        if given not in MEASURES:
+            near = suggestion(given, MEASURES) or f"; known are {', '.join(MEASURES)}"
             raise ValueError(f"measure {quote(given)}: there is none of this name{near}")
-        along, compute, labels = BY_NAME[given]
+        along, compute, labels = MEASURES[given]
         if given == "error":
             reference = _reference(reference, ts)
         return Measure(given, along, compute, labels, reference if given == "error" else None, "" if key == given else key)
@@ -179,7 +179,7 @@ def _rank(run: Run) -> dict[str, Array]:
 
 _STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
 # Whether all output times are needed, the function, and its variables.
-BY_NAME: dict[str, tuple[bool, Callable[[Run], dict[str, Array]], dict[str, Label]]] = {
+MEASURES: dict[str, tuple[bool, Callable[[Run], dict[str, Array]], dict[str, Label]]] = {
     "final": (
         False,
         _final,

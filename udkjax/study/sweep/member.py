@@ -17,8 +17,7 @@ from jaxtyping import Array, Int, PyTree
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.assembly import Closure, State, close
 from udkjax.integrate.simulate import simulate
-from udkjax.integrate.solvers import forward_mode
-from udkjax.integrate.tableau import is_explicit
+from udkjax.integrate.solvers import forward_mode, is_explicit
 from udkjax.pinv import Auto, Elimination
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism

@@ -15,16 +15,15 @@ The differences at t_{n+1}, where f is P(t_{n+1}) + d, are phi_i(n+1) = f - sum_
 L. F. Shampine, M. K. Gordon, Computer Solution of Ordinary Differential Equations, 1975, chapters 5 and 6.
 """
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, PyTree
 
+Scalar = Float[Array, ""]
 HIGHEST = 12  # order; beyond it the methods are hardly stable
 # Gauss's points and weights on [0, 1]: they integrate every c_i exactly, and without cancellation, since no c_i is negative.
 POINTS, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.leggauss(HIGHEST // 2 + 1), (1.0, 0.0)))
@@ -41,30 +40,30 @@ def _adams_moulton(count: int) -> np.ndarray:
 GAMMA = _adams_moulton(HIGHEST + 2)
 
 
-class Formula(eqx.Module):
-    """What depends on the times alone. Index 0 belongs to i = 1."""
+class StepCoefficients(eqx.Module):
+    """The coefficients of a step, which depend on its times alone. Index 0 belongs to i = 1."""
 
-    h: Any
+    h: Float[Array, ""]
     beta: Float[Array, "N"]
     g: Float[Array, "N"]  # integrals of c_i from 0 to 1
     errors: Float[Array, "N"]  # h sigma_j |gamma*_j|: with phi_{j+1}(n+1), the local error of order j, were all steps equal to h
 
-    def gains(self, k: Any) -> Any:
-        """With d, the difference between the results of orders k and k + 1."""
+    def gains(self, k: Int[Array, ""]) -> Float[Array, ""]:
+        """Return the factor that makes of d the difference between the results of orders k and k + 1."""
         return self.h * jnp.abs(self.g[k - 1] - self.g[k])
 
 
-def formula(h: Any, ages: Float[Array, "N"]) -> Formula:
-    """From the step ahead and the ages psi_0(n) = 0, psi_1(n), ... of the values."""
+def step_coefficients(h: Float[Array, ""], ages: Float[Array, "N"]) -> StepCoefficients:
+    """Return the coefficients of a step, from the step ahead and the ages psi_0(n) = 0, psi_1(n), ... of the values."""
     j = jnp.arange(1, len(ages))
     ahead = h + ages[:-1]
     beta = jnp.concatenate([jnp.ones_like(ages[:1]), jnp.cumprod(ahead / ages[1:])])
     sigma = jnp.concatenate([jnp.ones_like(ages[:1]), jnp.cumprod(j * h / ahead)])
-    return Formula(h, beta, integrals(1.0, h, ages), h * sigma * GAMMA[: len(ages)])
+    return StepCoefficients(h, beta, integrate_basis(jnp.ones(()), h, ages), h * sigma * GAMMA[: len(ages)])
 
 
-def integrals(s: Any, h: Any, ages: Float[Array, "N"]) -> Float[Array, "N"]:
-    """Of c_1, ..., c_N from 0 to s."""
+def integrate_basis(s: Scalar, h: Scalar, ages: Float[Array, "N"]) -> Float[Array, "N"]:
+    """Return the integrals of c_1, ..., c_N from 0 to s."""
     at = s * POINTS[:, None]
     factors = (at * h + ages[:-1]) / (h + ages[:-1])
     c = jnp.concatenate([jnp.ones_like(factors[:, :1]), jnp.cumprod(factors, axis=1)], axis=1)
@@ -74,9 +73,9 @@ def integrals(s: Any, h: Any, ages: Float[Array, "N"]) -> Float[Array, "N"]:
 class DifferenceInterpolation(diffrax.AbstractLocalInterpolation):
     """The polynomial that the step itself has integrated, of the step's order."""
 
-    t0: Any
-    t1: Any
-    y0: Any
+    t0: Scalar
+    t1: Scalar
+    y0: PyTree[Array]
     ages: Float[Array, "N"]
     terms: Float[Array, "N y"]  # phi*_1, ..., phi*_k, d, 0, ...
 
@@ -85,5 +84,5 @@ class DifferenceInterpolation(diffrax.AbstractLocalInterpolation):
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
         y0, unravel = ravel_pytree(self.y0)
         h = jnp.where(self.t1 == self.t0, 1.0, self.t1 - self.t0)
-        s = (t0 - self.t0) / h
-        return unravel(y0 + h * (integrals(s, h, self.ages) @ self.terms))
+        s = jnp.asarray((t0 - self.t0) / h)
+        return unravel(y0 + h * (integrate_basis(s, h, self.ages) @ self.terms))

@@ -9,79 +9,22 @@ Ready-made ones: `JointLimit`, `Contact`. Numbers that are traced or differentia
 is the condition, as those of the ready-made ones do: what a plain function closes over is fixed when it is compiled.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from typing import Literal, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from udkjax.scene.bodies import GROUND, Frame, Point, between
+from udkjax.integrate.events.actions import Action, Attach, Impact, Lock, Stop
+from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_of, joint_coordinate, require_name
+from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import number, optional_number
-from udkjax.scene.joints import Joint, Prismatic, Revolute, Slot
+from udkjax.scene.fields import Number, number, optional_number
 from udkjax.scene.mechanism import Mechanism
-
-Frames = Mapping[str, Frame]
-FIXED = Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
-
-
-# --- actions
-
-
-class Action(eqx.Module):
-    """What an event does."""
-
-
-class Stop(Action):
-    """End the run: `Result.event_stop`."""
-
-
-class Log(Action):
-    """Note time and state, and go on."""
-
-
-class Impact(Action):
-    """Reverse the rate of the condition, g >= 0 being what is allowed: g_dot+ = -restitution g_dot-.
-
-    The jump of the velocities is the smallest in the metric of M that keeps all constraints (impact.py): no friction. Rebounds
-    that have become too small to follow end in rest: with `at_rest="hold"` the condition is held at zero, as a constraint, until
-    the contact would have to pull; with "stop" the run ends there (`Result.at_rest`).
-    """
-
-    restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
-    at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
-
-
-class Release(Action):
-    """Take a joint or driver away, from then on: one of the scene's, or what `Attach` or `Lock` has added, by its name."""
-
-    name: str = eqx.field(static=True)
-
-
-class Attach(Action):
-    """Add a joint, under a `name`, from then on. Numbers that it leaves to the guess are those of the state at the event.
-
-    Velocities jump as in an inelastic impact: the smallest change in the metric of M that the new constraints allow.
-    """
-
-    joint: Joint
-    name: str = eqx.field(static=True)
-
-
-class Lock(Action):
-    """Stop all motion in a revolute or prismatic joint or a slot's sliding, where it is, as `Attach` does.
-
-    What it adds is called as the joint with ".lock" behind it: `Release("elbow.lock")` takes it away again.
-    """
-
-    joint: str = eqx.field(static=True)
-
-
-# --- events
 
 
 class Event(eqx.Module):
@@ -93,13 +36,13 @@ class Event(eqx.Module):
     whose condition is zero at the start, and falling, happens at once.
     """
 
-    condition: Callable[[Any, Frames], Any]
+    condition: Callable[[Number, Frames], ArrayLike]
     action: Action = Stop()
     direction: int = eqx.field(static=True, default=0)
     name: str = eqx.field(static=True, default="")
 
     def expand(self, mechanism: Mechanism) -> list["Event"]:
-        """This event as a list: ready-made ones stand for several."""
+        """Return this event as a list: ready-made ones stand for several."""
         return [self]
 
 
@@ -118,7 +61,7 @@ class JointLimit(eqx.Module):
     name: str = eqx.field(static=True, default="")
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
-        """One event for each limit."""
+        """Return one event for each limit."""
         name, found = self.name or self.joint, []
         coordinate = joint_coordinate(mechanism, self.joint, f"limit {quote(name)}")
         if self.lower is None and self.upper is None:
@@ -126,7 +69,7 @@ class JointLimit(eqx.Module):
         for side, limit, sign in (("lower", self.lower, 1.0), ("upper", self.upper, -1.0)):
             if limit is not None:
                 action = Impact(self.restitution, self.at_rest)
-                found.append(Event(_Within(coordinate, limit, number(sign)), action, -1, f"{name}.{side}"))
+                found.append(Event(WithinLimit(coordinate, limit, number(sign)), action, -1, f"{name}.{side}"))
         return found
 
 
@@ -147,15 +90,15 @@ class Contact(eqx.Module):
     name: str = eqx.field(static=True, default="")
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
-        """The event."""
+        """Return the event, as a list."""
         name = self.name or f"{self.body} on {self.on}"
         for body in (self.body, self.on):
-            _require(body, [*mechanism.body_names, GROUND], f"contact {quote(name)}", "body")
+            require_name(body, [*mechanism.body_names, GROUND], f"contact {quote(name)}", "body")
         if self.body == self.on:
             raise ValueError(f"contact {quote(name)}: {quote(self.body)} cannot touch itself")
         if not isinstance(self.normal, Tracer) and not np.any(np.asarray(self.normal)):
             raise ValueError(f"contact {quote(name)}: the normal must not be zero")
-        gap = _Gap((self.body, self.on), self.point, self.through, self.normal)
+        gap = Gap((self.body, self.on), self.point, self.through, self.normal)
         return [Event(gap, Impact(self.restitution, self.at_rest), -1, name)]
 
 
@@ -175,76 +118,26 @@ class Events(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def of(self, name: str) -> Float[Array, "k"]:
-        """The times (s) of the events of one name, of a single run."""
-        _require(name, self.names, "events", "event")
+        """Return the times (s) of the events of one name, of a single run."""
+        require_name(name, self.names, "events", "event")
         return self.time[np.asarray(self.index) == self.names.index(name)]
 
     @property
-    def counts(self) -> dict[str, Any]:
-        """How many events there were of each name."""
+    def counts(self) -> dict[str, Int[Array, ""]]:
+        """The number of events of each name."""
         return {name: (self.index == k).sum(-1) for k, name in enumerate(self.names)}
 
 
-# --- the conditions of the ready-made ones
+class ExpandsToEvents(Protocol):
+    """An `Event`, or what stands for several."""
+
+    def expand(self, mechanism: Mechanism) -> list[Event]:
+        """Return the events, for a mechanism."""
+        ...
 
 
-class JointCoordinate(eqx.Module):
-    """What moves in a joint: theta2 - theta1 (rad), or the distance of point 2 from point 1 along the axis (m)."""
-
-    bodies: tuple[str, ...] = eqx.field(static=True)
-    points: Float[Array, "2 2"] | None = None
-    axis: Float[Array, ""] | None = None
-
-    def of(self, one: Frame, two: Frame) -> Any:
-        """The coordinate."""
-        if self.points is None or self.axis is None:
-            return two.angle - one.angle
-        return one.vector((jnp.cos(self.axis), jnp.sin(self.axis))).dot(between(self.points, one, two))
-
-
-class _Within(eqx.Module):
-    """How far a joint is from its limit."""
-
-    coordinate: JointCoordinate
-    limit: Float[Array, ""]
-    sign: Float[Array, ""]
-
-    @property
-    def bodies(self) -> tuple[str, ...]:
-        return self.coordinate.bodies
-
-    def __call__(self, t: Any, frames: Frames) -> Any:
-        return self.sign * (self.coordinate.of(*(frames[name] for name in self.bodies)) - self.limit)
-
-
-class _Gap(eqx.Module):
-    """How far a point is from a line."""
-
-    bodies: tuple[str, ...] = eqx.field(static=True)
-    point: Float[Array, "2"]
-    through: Float[Array, "2"]
-    normal: Float[Array, "2"]
-
-    def __call__(self, t: Any, frames: Frames) -> Any:
-        one, two = (frames[name] for name in self.bodies)
-        p, q, n = one.point(self.point), two.point(self.through), two.vector(self.normal)
-        return Point(p.x - q.x, p.y - q.y).dot(n) / jnp.sqrt(self.normal[0] ** 2 + self.normal[1] ** 2)
-
-
-def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoordinate:
-    """The coordinate of a joint of a mechanism, by its name; `where` begins the message of an error."""
-    _require(joint, mechanism.joint_names, where, "joint")
-    found = mechanism.joints[joint]
-    if isinstance(found, Revolute):
-        return JointCoordinate(found.bodies)
-    if isinstance(found, Prismatic | Slot):
-        return JointCoordinate(found.bodies, found.points, found.axis)
-    kinds = "a revolute or prismatic joint, or a slot"
-    raise ValueError(f"{where}: {quote(joint)} is a {type(found).__name__}, and must be {kinds}")
-
-
-def expanded(events: Sequence[Any], mechanism: Mechanism) -> tuple[Event, ...]:
-    """All events, each with a name of its own; raise `ValueError` where one cannot be."""
+def expand_events(events: Sequence[ExpandsToEvents], mechanism: Mechanism) -> tuple[Event, ...]:
+    """Return all events, each with a name of its own. Raises `ValueError` where one cannot be."""
     found: list[Event] = []
     for k, event in enumerate(events):
         if not hasattr(event, "expand"):
@@ -253,7 +146,7 @@ def expanded(events: Sequence[Any], mechanism: Mechanism) -> tuple[Event, ...]:
             name = one.name or f"event{k + 1}"
             if any(name == other.name for other in found):
                 raise ValueError(f"event {quote(name)}: two events have this name; give one of them another (`name=`)")
-            found.append(_named(one, name))
+            found.append(_with_name(one, name))
     for event in found:
         _check(event, mechanism)
     if not found:
@@ -261,26 +154,15 @@ def expanded(events: Sequence[Any], mechanism: Mechanism) -> tuple[Event, ...]:
     return tuple(found)
 
 
-def frames_of(names: Sequence[str], q: Array, v: Array | None = None) -> dict[str, Frame]:
-    """The frames of all bodies by name, and the ground's, of flat q and v; without v they have no velocities."""
-    q = q.reshape(-1, 3)
-    rates = [()] * len(names) if v is None else v.reshape(-1, 3)
-    frames: dict[str, Frame] = {GROUND: FIXED}
-    for name, x, dx in zip(names, q, rates, strict=True):
-        seen: Any = (*x, jnp.cos(x[2]), jnp.sin(x[2]), *dx)
-        frames[name] = Frame(*seen)
-    return frames
-
-
 def sees_velocity(event: Event, mechanism: Mechanism) -> bool:
-    """Whether a condition depends on velocities: frames that have none do not serve it."""
+    """Tell whether a condition depends on velocities: it then fails with frames that have none."""
     try:
         return event.condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel())) is None
     except (TypeError, AttributeError, ValueError):  # as arithmetic with None raises, of Python, JAX or NumPy
         return True
 
 
-def _named(event: Event, name: str) -> Event:
+def _with_name(event: Event, name: str) -> Event:
     return Event(event.condition, event.action, -1 if isinstance(event.action, Impact) else event.direction, name)
 
 
@@ -298,7 +180,7 @@ def _check(event: Event, mechanism: Mechanism) -> None:
         name = error.args[0]
         raise ValueError(f"{where}: no body named {quote(str(name))}{suggestion(name, mechanism.body_names)}") from error
     if not any(isinstance(x, Tracer) for x in jax.tree.leaves(event)):
-        known: Any = np.linspace(0.1, 0.9, mechanism.q0.size)
+        known = np.linspace(0.1, 0.9, mechanism.q0.size)
         with jax.ensure_compile_time_eval():
             found = event.condition(0.0, frames_of(mechanism.body_names, known, known))
         if isinstance(found, Tracer):  # its derivatives by them would be lost
@@ -320,9 +202,4 @@ def _check(event: Event, mechanism: Mechanism) -> None:
         if action.name in mechanism.constraints:
             raise ValueError(f"{where}: {quote(action.name)} is in the scene already; attach the joint under another name")
         for body in action.joint.bodies:
-            _require(body, [*mechanism.body_names, GROUND], where, "body")
-
-
-def _require(name: str, known: Sequence[str], where: str, what: str) -> None:
-    if name not in known:
-        raise ValueError(f"{where}: no {what} named {quote(name)}{suggestion(name, known)}")
+            require_name(body, [*mechanism.body_names, GROUND], where, "body")

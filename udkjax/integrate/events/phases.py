@@ -6,18 +6,20 @@ the run by following every event from every phase; each then has equations, and 
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.integrate.events import FIXED, Attach, Event, Impact, JointCoordinate, Lock, Release, frames_of, joint_coordinate
-from udkjax.scene.bodies import GROUND
+from udkjax.integrate.events.actions import Attach, Impact, Lock, Release
+from udkjax.integrate.events.conditions import Frames, JointCoordinate, frames_of, joint_coordinate
+from udkjax.integrate.events.event import Event
+from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
 from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import number, optional_number
+from udkjax.scene.fields import Number, number, optional_number
 from udkjax.scene.joints import Angle, Joint, fill
 from udkjax.scene.mechanism import Mechanism, Origin
 
@@ -43,7 +45,7 @@ class Phases(eqx.Module):
     tables: Tables = eqx.field(static=True)
 
     def with_added(self, phase: int, joints: Sequence[Joint]) -> Mechanism:
-        """The mechanism of a phase with the joints as the events have added them."""
+        """Return the mechanism of a phase with the joints as the events have added them."""
         mechanism = self.mechanisms[phase]
         for (_, name), joint in zip(self.added_by, joints, strict=True):
             if name in mechanism.joint_names:
@@ -52,17 +54,17 @@ class Phases(eqx.Module):
         return mechanism
 
     def first_added(self) -> tuple[Joint, ...]:
-        """What events add, as it would be at the initial guess."""
-        return tuple(self.resolved(k, self.mechanisms[0].q0.ravel()) for k in range(len(self.added)))
+        """Return the joints that events add, as they would be at the initial guess."""
+        return tuple(self.joint_at(k, self.mechanisms[0].q0.ravel()) for k in range(len(self.added)))
 
-    def resolved(self, k: int, q: Array) -> Joint:
-        """What the k-th of them is when it is added at q."""
+    def joint_at(self, k: int, q: Array) -> Joint:
+        """Return the k-th joint that events add, added at q."""
         joint, frames = self.added[k], frames_of(self.mechanisms[0].body_names, q)
         return jax.tree.map(number, joint.complete(*(frames[name] for name in joint.frame_names)))
 
 
 def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis) -> Phases:
-    """Find the phases of a mechanism with events. Raises `ValueError` where there are too many."""
+    """Return the phases of a mechanism with events. Raises `ValueError` where there are too many."""
     added, added_by = _additions(mechanism, events)
     names = [name for _, name in added_by]
     known = [*mechanism.constraints, *names]
@@ -73,7 +75,7 @@ def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis)
     first: frozenset[str] = frozenset(mechanism.constraints)
     found, steps = [first], []
     for active in found:  # which grows while it is followed
-        rows = [_steps(event, active, names, added_by, k) for k, event in enumerate(events)]
+        rows = [_next_phases(event, active, names, added_by, k) for k, event in enumerate(events)]
         for target in (x for row in rows for x in row):
             if target not in found:
                 found.append(target)
@@ -117,8 +119,10 @@ def _additions(mechanism: Mechanism, events: Sequence[Event]) -> tuple[list[Join
     return joints, by
 
 
-def _steps(event: Event, active: frozenset[str], names: Sequence[str], by: Sequence[tuple[int, str]], k: int) -> Any:
-    """The constraints after an event, after it has come to rest, and after its contact has let go."""
+def _next_phases(
+    event: Event, active: frozenset[str], names: Sequence[str], by: Sequence[tuple[int, str]], k: int
+) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
+    """Return the constraints after an event, after it has come to rest, and after its contact has let go."""
     action = event.action
     added = frozenset(name for i, name in by if i == k)
     after = active - {action.name} if isinstance(action, Release) else active | added
@@ -135,7 +139,7 @@ def _contact(event: Event) -> str:
 
 
 def _analysis(phase: Mechanism, of_own: Callable[[], Analysis]) -> Analysis:
-    """That of a phase. What is added by traced numbers is taken to be independent of the scene's own constraints."""
+    """Return the analysis of a phase. What is added by traced numbers counts as independent of the scene's own constraints."""
     found = analyse(phase)
     own = of_own() if found.redundant_rows is None else found
     if own.redundant_rows is None or found.redundant_rows is not None:
@@ -149,7 +153,7 @@ def _row(analysis: Analysis, name: str) -> int:
 
 
 def _with(mechanism: Mechanism, active: frozenset[str], extra: dict[str, Joint]) -> Mechanism:
-    """The mechanism with the constraints that are active, of its own and others."""
+    """Return the mechanism with the constraints that are active, of its own and others."""
     if active == frozenset(mechanism.constraints):
         return mechanism
     joints = {name: joint for name, joint in mechanism.joints.items() if name in active}
@@ -167,29 +171,30 @@ def _with(mechanism: Mechanism, active: frozenset[str], extra: dict[str, Joint])
 
 
 class HeldContact(Joint):
-    """A contact at rest: its condition is kept at zero. 1 row, in the condition's unit."""
+    """A contact at rest: its condition stays zero. 1 row, in the condition's unit."""
 
     labels: tuple[str, ...] = eqx.field(static=True)  # the names by which the condition knows the bodies
-    condition: Callable[[Any, Any], Any]
+    condition: Callable[[Number, Frames], ArrayLike]
 
     @classmethod
     def of(cls, event: Event, mechanism: Mechanism) -> "HeldContact":
-        """That of an event; of all bodies, unless its condition has an attribute `bodies`."""
+        """Return the contact of an event, of all bodies unless its condition has an attribute `bodies`."""
         bodies = getattr(event.condition, "bodies", mechanism.body_names)
         return cls(bodies=bodies, labels=tuple(bodies), condition=event.condition)
 
     def residual(self, t, *frames):
-        return [self.condition(t, {GROUND: FIXED, **dict(zip(self.labels, frames, strict=True))})]
+        return [self.condition(t, {GROUND: GROUND_FRAME_AT_REST, **dict(zip(self.labels, frames, strict=True))})]
 
 
 class Displacement(Joint):
     """Point 2 stays where it is along `axis` of body 1. 1 row (m): its distance from point 1 along it, less `position`."""
 
-    points: Any = eqx.field(converter=number)
-    axis: Any = eqx.field(converter=number)
-    position: Any = eqx.field(converter=optional_number, default=None)
+    points: Float[Array, "2 2"] = eqx.field(converter=number)
+    axis: Float[Array, ""] = eqx.field(converter=number)
+    position: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)
 
     def residual(self, t, *frames):
+        assert self.position is not None  # `complete` fills it in
         return [self._along(*frames) - self.position]
 
     def complete(self, *frames):

@@ -1,7 +1,7 @@
 """Gear's backward differentiation formulas, of variable order and step."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -9,27 +9,46 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from udkjax.integrate import newton
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.multistep import Multistep, check_orders, field, from_controller, scale, steered
+from udkjax.integrate.solvers import newton
+from udkjax.integrate.solvers.multistep import (
+    Flag,
+    Multistep,
+    Scalar,
+    Tolerances,
+    Unravel,
+    check_orders,
+    error_scale,
+    steer_error,
+    tolerances_from_controller,
+    vector_field,
+)
 
-HIGHEST = 5  # the formula of order six is of little use, the seventh unstable
-STRICTER = 8.0  # than the tolerance: the errors of many steps add up, and near a jump they grow
-# By how much, beyond that, the estimated error of the next step shall be below the tolerance, if it is of order k - 1, k or
-# k + 1; and the part of the error that an iteration may leave. VODE has 6, 6, 10 and 0.1. With these an error made of many steps
-# is a few times the tolerance, and the same error takes no more right-hand sides than VODE (see tests).
+Vector = Float[Array, "n"]
+Terms = PyTree[diffrax.AbstractTerm]
+
+HIGHEST = 5  # the formula of order six is of little use, the seventh unstable (Hairer, Wanner II, section V.1)
+# As in VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), whose names are behind them.
+WORTHWHILE = 1.5  # THRESH: the step grows by no smaller factor; while it is steady, M serves and the error estimates are good
+LARGEST, SMALLEST = 10.0, 0.2  # ETAMX3, ETAMXF: factors of a step; those of diffrax.PIDController, by default
+NO_DIVISION_BY_ZERO = 1e-6  # ADDON
+# By how much the estimated error of the next step shall be below the tolerance, if it is of order k - 1, k or k + 1 (BIAS1,
+# BIAS2, BIAS3: 6, 6, 10), beyond STRICTER; and the part of the error that an iteration may leave (CORTES: 0.1). In brackets are
+# VODE's own numbers. With these an error made of many steps is a few times the tolerance, and the same error takes no more
+# right-hand sides than VODE (tests/integrate/test_bdf.py).
+STRICTER = 8.0
 LOWER, SAME, HIGHER = 10.0, 10.0, 15.0
 NEWTON_SHARE = 0.02
+# Not of a published code.
 BETTER = 1.1  # another order allows a step larger by this factor, or it is not taken
-WORTHWHILE = 1.5  # the step grows by no smaller factor: while it is steady, M is kept and the error estimates are good
-LARGEST, SMALLEST = 10.0, 0.2  # factors of a step; those of diffrax.PIDController, by default
 LOST = 0.05  # what replaces so small a part of the step planned is of order one: there has been a jump
+REPEATED = 1e-3  # relative: a step that is so much smaller than planned was rejected before
 
 
-class State(eqx.Module):
-    """What a step leaves to the next: the history, and the choices.
+class BDFState(eqx.Module):
+    """The state of the solver after a step: the history, and the choices.
 
     Of the states accepted at times[0], times[1], ..., newest first, it keeps the modified divided differences
 
@@ -44,7 +63,7 @@ class State(eqx.Module):
     order: Int[Array, ""]  # of the next step
     wait: Int[Array, ""]  # steps before another order is considered
     planned: Float[Array, ""]  # the next step
-    newton: newton.Kept
+    newton: newton.NewtonState
 
     @property
     def evaluations(self):
@@ -62,19 +81,19 @@ class State(eqx.Module):
         return self.newton.factorizations
 
 
-class Interpolation(diffrax.AbstractLocalInterpolation):
+class BDFInterpolation(diffrax.AbstractLocalInterpolation):
     """The polynomial through the states at the end of a step and before, as many as the order of the step and one."""
 
-    t0: Any
-    t1: Any
-    times: Any
-    phi: Any
+    t0: Scalar
+    t1: Scalar
+    times: Float[Array, "m"]
+    phi: PyTree[Array]  # (m, ...)
 
     def evaluate(self, t0, t1=None, left=True):
         del left
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
-        weights = _weights(self.times, t0)
+        weights = _weights(self.times, jnp.asarray(t0))
         return jax.tree.map(lambda phi: jnp.tensordot(weights, phi, 1), self.phi)
 
 
@@ -102,10 +121,10 @@ class BDF(Multistep):
 
     max_order: int = eqx.field(default=HIGHEST, static=True)
     min_order: int = eqx.field(default=1, static=True)
-    root_finder: Any = eqx.field(default_factory=from_controller)
+    root_finder: Tolerances = eqx.field(default_factory=tolerances_from_controller)
     root_find_max_steps: int = eqx.field(default=newton.ITERATIONS, static=True)
 
-    interpolation_cls: ClassVar = Interpolation
+    interpolation_cls: ClassVar = BDFInterpolation
 
     def __check_init__(self):
         check_orders(self.min_order, self.max_order, HIGHEST)
@@ -115,21 +134,27 @@ class BDF(Multistep):
 
     def init(self, terms, t0, t1, y0, args):
         y = ravel_pytree(y0)[0]
-        return self._begin(newton.nothing_kept(len(y), y.dtype), field(terms, t0, y0, args), t0, t1, y)
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+        return self._begin(newton.initial_state(len(y), y.dtype), vector_field(terms, t0, y0, args), t0, t1, y)
 
-    def _begin(self, kept: newton.Kept, f: Float[Array, "n"], t0: Any, t1: Any, y: Float[Array, "n"]) -> State:
-        """A history of one state, as if the state had always changed at the rate f."""
+    def _begin(
+        self, iteration: newton.NewtonState, f: Float[Array, "n"], t0: Scalar, t1: Scalar, y: Float[Array, "n"]
+    ) -> BDFState:
+        """Return a history of one state, as if the state had always changed at the rate f."""
         m, h = self.max_order + 2, t1 - t0
         phi = jnp.zeros((m, len(y)), y.dtype).at[0].set(y).at[1].set(h * f)
-        one, kept = jnp.array(1), newton.outdated(eqx.tree_at(lambda k: k.evaluations, kept, kept.evaluations + 1))
-        return State(t0 - h * jnp.arange(m), phi, one, one, one + 1, jnp.asarray(h), kept)
+        one, iteration = (
+            jnp.array(1),
+            newton.invalidate(eqx.tree_at(lambda k: k.evaluations, iteration, iteration.evaluations + 1)),
+        )
+        return BDFState(jnp.asarray(t0 - h * jnp.arange(m)), phi, one, one, one + 1, jnp.asarray(h), iteration)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         unravel = ravel_pytree(y0)[1]
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         tolerances, h = stop_gradients(self.root_finder), t1 - t0
         state = self._history(terms, t0, t1, y0, args, solver_state, made_jump)
-        retried = h < (1 - 1e-3) * state.planned
+        retried = h < (1 - REPEATED) * state.planned
         k = jnp.where(h < LOST * state.planned, 1, state.order)
 
         psi = t1 - state.times  # p and its derivative at t1, from the first k + 1 rows
@@ -141,9 +166,9 @@ class BDF(Multistep):
         gamma = jnp.cumsum(1 / (1.0 + i))[k - 1]
         error = _error_constant(k, h / psi)
 
-        size = _Size(tolerances.norm, unravel, ravel_pytree(scale(tolerances, y0, y0))[0], STRICTER * error / NEWTON_SHARE)
+        size = _Size(tolerances.norm, unravel, ravel_pytree(error_scale(tolerances, y0, y0))[0], STRICTER * error / NEWTON_SHARE)
         equation = newton.Implicit(terms, args, unravel, t1, predicted, v, h / gamma)
-        e, found, kept = newton.solve(equation, stop_gradients(size), state.newton, self.root_find_max_steps)
+        e, found, iteration = newton.solve(equation, stop_gradients(size), state.newton, self.root_find_max_steps)
         e = jnp.where(found, e, 0.0)
 
         j = i[:, None]  # new differences: phi[j] = y1 - (the sum of the parts before j), taken from e so that little cancels
@@ -151,7 +176,7 @@ class BDF(Multistep):
         phi = signs @ parts + e
         y1 = unravel(phi[0])
 
-        weighed = _Size(tolerances.norm, unravel, ravel_pytree(scale(tolerances, y0, y1))[0], STRICTER)
+        weighed = _Size(tolerances.norm, unravel, ravel_pytree(error_scale(tolerances, y0, y1))[0], STRICTER)
         errors = stop_gradients(_errors(k, h / psi, phi, weighed).at[1].set(error * weighed(e)))
         accept = found & (errors[1] <= 1)
         factor, order, wait = self._choose(k, errors, state.wait, retried)
@@ -159,15 +184,24 @@ class BDF(Multistep):
         points = jnp.minimum(state.points + 1, self.max_order + 1)
         order = jnp.maximum(order, jnp.minimum(self.min_order, points))
         times = jnp.concatenate([t1[None], state.times[:-1]])
-        new = State(times, phi, points, order, wait, stop_gradients(h * factor), kept)
-        y_error = steered(tolerances, y0, y1, accept, jnp.where(accept, factor, shrink))
+        new = BDFState(times, phi, points, order, wait, stop_gradients(h * factor), iteration)
+        y_error = steer_error(tolerances, y0, y1, accept, jnp.where(accept, factor, shrink))
         y_error = jax.tree.map(lambda x: jnp.where(found, x, jnp.inf), y_error)
         through = jnp.where((i <= k)[:, None], phi, 0.0)
         dense = {"times": times, "phi": jax.vmap(unravel)(through)}
         return y1, y_error, dense, new, diffrax.RESULTS.successful
 
-    def _history(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: State, made_jump: Any) -> State:
-        """The history moved to end in y0, if that is not the last state but its projection; or a new one.
+    def _history(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        t0: Scalar,
+        t1: Scalar,
+        y0: PyTree,
+        args: PyTree,
+        state: BDFState,
+        made_jump: Flag,
+    ) -> BDFState:
+        """Return the history, moved to end in y0 if that is not the last state but its projection; or a new one.
 
         Moved as a whole, its differences remain smooth: with the newest state alone replaced, a run projected at each step took
         three times the steps.
@@ -178,13 +212,15 @@ class BDF(Multistep):
             return state
 
         def begin():
-            new = self._begin(state.newton, field(terms, t0, y0, args), t0, t1, y)
+            new = self._begin(state.newton, vector_field(terms, t0, y0, args), t0, t1, y)
             return jax.tree.map(lambda a, b: jnp.where(made_jump, a, b), new, state)
 
         return jax.lax.cond(eqxi.unvmap_any(made_jump), begin, lambda: state)
 
-    def _choose(self, k: Any, errors: Float[Array, "3"], wait: Any, retried: Any) -> tuple[Any, Any, Any]:
-        """After an accepted step: the factor of the next, its order, and how long to wait with another.
+    def _choose(
+        self, k: Int[Array, ""], errors: Float[Array, "3"], wait: Int[Array, ""], retried: Bool[Array, ""]
+    ) -> tuple[Float[Array, ""], Int[Array, ""], Int[Array, ""]]:
+        """Return, after an accepted step, the factor of the next, its order, and how many steps to wait with another.
 
         A better order is taken also where the step does not grow: a run may stand far above the error that it aims at, since a
         step that was accepted does not shrink.
@@ -203,36 +239,38 @@ class BDF(Multistep):
 
 
 class _Size(eqx.Module):
-    """How large a vector is, in the controller's norm."""
+    """The controller's norm of a vector, relative to a scale, times a factor."""
 
-    norm: Any
-    unravel: Callable = eqx.field(static=True)
+    norm: Callable[[PyTree[Array]], Float[Array, ""]]
+    unravel: Unravel = eqx.field(static=True)
     scale: Float[Array, "n"]
-    factor: Any
+    factor: Float[Array, ""] | float
 
     def __call__(self, x: Float[Array, "n"]) -> Float[Array, ""]:
         return self.factor * self.norm(self.unravel(x / self.scale))
 
 
-def _weights(times: Float[Array, "m"], t: Any) -> Float[Array, "m"]:
-    """Of phi, in the polynomial that it stands for, at t."""
-    return jnp.concatenate([jnp.ones(1, times.dtype), jnp.cumprod((t - times[:-1]) / (times[0] - times[1:]))])
+def _weights(times: Float[Array, "m"], t: Scalar) -> Float[Array, "m"]:
+    """Return the weights of phi in the polynomial that it stands for, at t."""
+    return jnp.concatenate([jnp.ones(1, times.dtype), jnp.cumprod((jnp.asarray(t) - times[:-1]) / (times[0] - times[1:]))])
 
 
-def _error_constant(k: Any, alpha: Float[Array, "m"]) -> Float[Array, ""]:
-    """Of the local error of order k, relative to the correction; alpha[i] = h / (t - times[i])."""
+def _error_constant(k: Int[Array, ""], alpha: Float[Array, "m"]) -> Float[Array, ""]:
+    """Return the constant of the local error of order k, relative to the correction; alpha[i] = h / (t - times[i])."""
     i = jnp.arange(len(alpha))
     uneven = jnp.sum(jnp.where(i < k, alpha - 1 / (1.0 + i), 0.0))
     return jnp.maximum(alpha[k], jnp.abs(alpha[k] + uneven))
 
 
-def _errors(k: Any, alpha: Float[Array, "m"], phi: Float[Array, "m n"], size: _Size) -> Float[Array, "3"]:
-    """Norms of h^(j+1) y^(j+1) / (j + 1), the local errors of orders j = k - 1, k, k + 1 with a constant step."""
+def _errors(k: Int[Array, ""], alpha: Float[Array, "m"], phi: Float[Array, "m n"], size: _Size) -> Float[Array, "3"]:
+    """Return the norms of h^(j+1) y^(j+1) / (j + 1), the local errors of orders j = k - 1, k, k + 1 with a constant step."""
     i = jnp.arange(len(alpha))
     constants = jnp.cumprod((1.0 + i) * alpha) / (1.0 + i)
     rows = jnp.minimum(k + jnp.arange(3), len(alpha) - 1)
     return constants[rows - 1] * jax.vmap(size)(phi[rows])
 
 
-def _factor(error: Any, order: Any, below: Any) -> Any:
-    return 1 / ((below * error) ** (1 / (order + 1)) + 1e-6)
+def _factor(error: Float[Array, "*k"], order: Int[Array, "*k"], below: Array | float) -> Float[Array, "*k"]:
+    """Return the factor of a step whose error is to be `below` times smaller than the tolerance."""
+    size = jnp.power(below * error, 1 / (order + 1))
+    return 1 / (size + NO_DIVISION_BY_ZERO)

@@ -1,12 +1,13 @@
 """Verner's pair of orders 6 and 5, the method of the codes DVERK and DIVPRK."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
 from udkjax.native.tableau import row
 
@@ -45,10 +46,10 @@ DENSE = np.array(
 class VernerInterpolation(diffrax.AbstractLocalInterpolation):
     """y(t0 + s h) = y0 + sum_i b_i(s) k_i, of order 4: no stage beyond those of the step."""
 
-    t0: Any
-    t1: Any
-    y0: Any
-    k: Any
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+    y0: PyTree[Array]
+    k: PyTree[Array]  # (stages, ...)
 
     def __init__(self, *, t0, t1, y0, y1, k):
         del y1  # is y0 + sum_i b_i(1) k_i

@@ -1,10 +1,11 @@
 """What the multistep methods of variable order share: how they steer the step, and how they count.
 
 A method of variable order chooses its next order and step together. diffrax leaves the step to its controller, which sees an
-error estimate of one fixed order. So the methods here say what they want in the language of that controller: `steered` gives it
-an error from which `PIDController` draws the very factor that the method has chosen.
+error estimate of one fixed order. So the methods here say what they want in the language of that controller: `steer_error` gives
+it an error from which `PIDController` draws the very factor that the method has chosen.
 """
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import diffrax
@@ -13,47 +14,53 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+
+Scalar = Float[Array, ""]
+Flag = Bool[ArrayLike, ""]
+Unravel = Callable[[Float[Array, "n"]], PyTree[Array]]
 
 SAFETY = 0.9  # of diffrax.PIDController, by default
 ERROR_ORDER = 2  # that the controller is told: the order of the error of the first step, which is of order one
 
 
 class Tolerances(eqx.Module):
-    """What a step may err, and in which norm.
+    """The error that a step may make, and its norm.
 
     As `root_finder` of a method it stands where diffrax, looking for a root finder, puts its controller's tolerances.
     """
 
-    rtol: Any
-    atol: Any
-    norm: Any = optx.rms_norm
+    rtol: Float[ArrayLike, ""]
+    atol: PyTree[ArrayLike]
+    norm: Callable[[PyTree[Array]], Float[Array, ""]] = optx.rms_norm
 
 
-def from_controller() -> Any:
-    """Tolerances that `diffeqsolve` replaces by those of its step size controller."""
+def tolerances_from_controller() -> Tolerances:
+    """Return tolerances that `diffeqsolve` replaces by those of its step size controller."""
     make: Any = diffrax.with_stepsize_controller_tols
     return make(Tolerances)()
 
 
-def scale(tolerances: Tolerances, y0: Any, y1: Any) -> Any:
-    """atol + rtol max(|y0|, |y1|), as the controller has it."""
+def error_scale(tolerances: Tolerances, y0: PyTree[Array], y1: PyTree[Array]) -> PyTree[Array]:
+    """Return atol + rtol max(|y0|, |y1|), as the controller has it."""
     return jax.tree.map(lambda a, b: tolerances.atol + tolerances.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), y0, y1)
 
 
-def steered(tolerances: Tolerances, y0: Any, y1: Any, accept: Any, factor: Any) -> Any:
-    """An error estimate from which the controller accepts the step or not, and multiplies its size by `factor`.
+def steer_error(
+    tolerances: Tolerances, y0: PyTree[Array], y1: PyTree[Array], accept: Bool[Array, ""], factor: Float[Array, ""]
+) -> PyTree[Array]:
+    """Return an error estimate from which the controller accepts the step or not, and multiplies its size by `factor`.
 
     The controller takes SAFETY / norm(error / scale)^(1 / ERROR_ORDER); it never shrinks a step after one that it accepted.
     """
     factor = jnp.where(accept, jnp.maximum(factor, 1.0), jnp.minimum(factor, SAFETY * (1 - 1e-3)))
     size = (SAFETY / jax.lax.stop_gradient(factor)) ** ERROR_ORDER
     ones = jax.tree.map(jnp.ones_like, y0)
-    return jax.tree.map(lambda s: size / tolerances.norm(ones) * s, scale(tolerances, y0, y1))
+    return jax.tree.map(lambda s: size / tolerances.norm(ones) * s, error_scale(tolerances, y0, y1))
 
 
-def field(terms: Any, t: Any, y: Any, args: Any) -> Float[Array, "n"]:
-    """The derivative of y, as a vector."""
+def vector_field(terms: PyTree[diffrax.AbstractTerm], t: Scalar, y: PyTree[Array], args: PyTree) -> Float[Array, "n"]:
+    """Return the derivative of y, as a vector."""
     unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # of the time that a step would take
     return ravel_pytree(terms.vf_prod(t, y, args, unit))[0]
 
@@ -72,7 +79,7 @@ class Multistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     `made_jump` begins a new history.
     """
 
-    root_finder: eqx.AbstractVar[Any]
+    root_finder: eqx.AbstractVar[Tolerances]
     term_structure: ClassVar = diffrax.AbstractTerm
 
     def func(self, terms, t0, y0, args):

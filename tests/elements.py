@@ -1,0 +1,42 @@
+"""One of each type of the scene format: where a new joint, driver or force element is one line and meets every test.
+
+It is then read from a file and written to one; its rows are counted; and its loads, or Psi, Psi_q, Psi_dot and gamma, in both
+engines are held against JAX's derivatives of what it states.
+"""
+
+import udkjax.scene as udk
+
+P = ((0.2, -0.1), (-0.3, 0.15))  # attachments (m)
+BODIES = {
+    "b": udk.Body(1.0, 0.1, [0.3, -0.2], 0.4, [0.1, 0.2], -0.3),
+    "a": udk.Body(2.0, 0.2, [1.0, 0.5], -1.1),
+    "c": udk.Body(0.7, 1.9, [-0.4, 0.1], 2.0),
+}
+JOINTS = {
+    "revolute": udk.Revolute(["ground", "b"], P),
+    "prismatic": udk.Prismatic(["a", "b"], P, axis=0.3),
+    "slot": udk.Slot(["a", "b"], P, axis=0.3),
+    "weld": udk.Weld(["a", "ground"], P),
+    "distance": udk.Distance(["a", "b"], P),
+    "angle": udk.Angle(["c", "b"]),
+    "gear": udk.Gear(["a", "b"], [0.1, 0.2]),
+    "inner gear": udk.Gear(["a", "b"], [0.1, 0.2], internal=True, carrier="c"),
+    "rack": udk.Rack(["ground", "b"], radius=0.2, axis=0.1),
+    "cam": udk.Cam(["a", "b"], P, udk.Profile([-1.0, 0.5, 2.0, 4.0], [1.0, 1.1, 1.2, 1.1])),
+}
+ROWS = {"revolute": 2, "prismatic": 2, "weld": 3}  # how many; all other joints have one
+DRIVERS = {
+    "turn": udk.Driver(["ground", "b"], "angle", udk.Polynomial([0.1, 2.0, -0.7, 0.2])),
+    "push": udk.Driver(["ground", "b"], "x", udk.Sine(1.0, 2.0, 0.3, -0.2)),
+    "lift": udk.Driver(["a", "b"], "y", udk.Spline([0.0, 1.0, 3.0], [0.0, 0.5, 0.1]), P),
+    "stretch": udk.Driver(["a", "b"], "distance", udk.Polynomial([1.0]), P),
+}
+FORCES = {
+    "damped": udk.Spring(["a", "b"], P, stiffness=10.0, length=0.4, damping=0.3),
+    "undamped": udk.Spring(["ground", "b"], P, stiffness=10.0, length=0.4),
+    "torsion": udk.TorsionSpring(["a", "b"], stiffness=3.0, damping=0.2, angle=0.1),
+    "push": udk.Force("a", [1.0, 2.0], point=[0.1, 0.4]),
+    "follow": udk.Force("a", [1.0, 2.0], point=[-0.3, 0.2], frame="body"),
+    "torque": udk.Torque(["a", "b"], value=0.7),
+    "rub": udk.Friction("revolute", torque=0.5, velocity=0.3),
+}

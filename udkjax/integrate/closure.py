@@ -1,0 +1,130 @@
+"""The closure of a mechanism as a function of its numbers: by machine code or by JAX, with derivatives of any order."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from udkjax.equations.analysis import Analysis
+from udkjax.equations.position_closure import ITERATIONS, TracedRows, close_position, damped_step
+from udkjax.equations.scales import Scales, rank_tolerance
+from udkjax.equations.textbook import prepare
+from udkjax.integrate import native_engine
+from udkjax.integrate.derivatives import Function, Linear, Mask, select
+from udkjax.integrate.gradients import TreeDef
+from udkjax.pinv import SVD
+from udkjax.scene.mechanism import Mechanism
+
+Closed = tuple[Array, Array, Array, Array, Array]  # q, v, Psi, Psi_dot, the rank of D
+Guess = tuple[Mechanism, Analysis, Array, Array, Array]  # and t, q, v
+NativeGuess = tuple[Mechanism, Scales, Float[Array, ""], Array, Array, Array]  # mechanism, scales, rank tolerance, t, q, v
+
+
+def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array) -> Closed:
+    """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D."""
+    return TracedRows(prepare(mechanism, SVD(), analysis=analysis)).assemble(_close_position, t, q, v)
+
+
+def close_by_machine_code(
+    mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array
+) -> Closed:
+    """Return the same as `close_by_jax`, by machine code."""
+    arrays, rest = eqx.partition((mechanism, analysis, t, q, v), eqx.is_inexact_array)
+    xs, tree = jax.tree.flatten(arrays)
+    return _close_by_code(Assembly(rest, tree), xs)
+
+
+class Assembly(Function):
+    """q and v of a closed state as a function of the numbers of a mechanism and a guess; `rest` has all that is no number."""
+
+    rest: PyTree
+    tree: TreeDef = eqx.field(static=True)
+    is_plain: bool = eqx.field(static=True, default=False)
+
+    @property
+    def plain(self) -> "Assembly":
+        return replace(self, is_plain=True)
+
+    def guess(self, xs: list[Array]) -> Guess:
+        """Return the mechanism, its analysis, and t, q and v."""
+        return eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
+
+    def __call__(self, xs: list[Array]) -> list[Array]:
+        return list(close_by_jax(*self.guess(xs))[:2])
+
+    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
+        *_, q, v = self.guess(xs)
+        return [q.shape, v.shape]
+
+    def forward(self, xs: list[Array], has_tangent: Mask, vs: list[Array], run: PyTree) -> list[Array]:
+        guess, which = self._native(xs, has_tangent)
+        if guess is None:
+            return super().forward(xs, has_tangent, vs, run)
+        rest = iter(vs)
+        change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in has_tangent])
+        return list(native_engine.closed_along(guess, _native_inputs(which), _native_inputs(change)))
+
+    def backward(self, xs: list[Array], has_tangent: Mask, ws: list[Array], run: PyTree) -> list[Array]:
+        guess, which = self._native(xs, has_tangent)
+        if guess is None:
+            return super().backward(xs, has_tangent, ws, run)
+        found = native_engine.closed_back(guess, _native_inputs(which), *ws)
+        pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_native_inputs(which), found)), strict=True)
+        return [bar for m, bar in pairs if m is True]
+
+    def _native(self, xs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
+        """Return the arguments of machine code and the inputs with tangents; None where it has no such derivatives."""
+        which = jax.tree.unflatten(self.tree, has_tangent)
+        mechanism, analysis, t, q, v = self.guess(xs)
+        others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
+        if self.is_plain or others or not native_engine.closes(mechanism):
+            return None, None
+        return (mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v), which
+
+
+def _native_inputs(tree: PyTree) -> PyTree:
+    """Return the mechanism, q and v of a guess: the inputs along which machine code has derivatives."""
+    mechanism, _, _, q, v = tree
+    return mechanism, q, v
+
+
+@eqx.filter_custom_jvp
+def _close_by_code(function: Assembly, xs: list[Array]) -> Closed:
+    mechanism, analysis, t, q, v = function.guess(xs)
+    return native_engine.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
+
+
+@_close_by_code.def_jvp
+def _(primals, tangents):
+    function, xs = primals
+    found = _close_by_code(function, xs)
+    has_tangent = tuple(dx is not None for dx in tangents[1])
+    linear = Linear(function=function, xs=xs, run=(), moving=has_tangent)
+    return found, (*linear.applied(select(tangents[1], has_tangent)), None, None, None)
+
+
+@jax.custom_jvp
+def _close_position(rows: TracedRows, t: Array, q: Array) -> Array:
+    return close_position(rows, t, q)
+
+
+def _close_position_plain(rows: TracedRows, t: Array, q: Array) -> Array:
+    """Take the same steps as `_close_position`, in a loop of fixed length that reverse mode can follow.
+
+    A step that no longer lowers the residual is taken in the derivative all the same: at a closed state it changes nothing but
+    the tangent, which it projects to the manifold.
+    """
+
+    def body(q, _):
+        following, better = damped_step(rows, t, q)
+        return jnp.where(better, following, q + rows.correction(t, q)), None
+
+    return jax.lax.scan(body, q, None, length=ITERATIONS)[0]
+
+
+@_close_position.defjvp
+def _(primals, tangents):
+    _, tangent = jax.jvp(_close_position_plain, primals, tangents)
+    return _close_position(*primals), tangent

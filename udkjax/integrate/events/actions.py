@@ -1,0 +1,58 @@
+"""Actions: what an event does."""
+
+from typing import Literal
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from udkjax.scene.fields import number
+from udkjax.scene.joints import Joint
+
+
+class Action(eqx.Module):
+    """The base of all actions."""
+
+
+class Stop(Action):
+    """End the run: `Result.event_stop`."""
+
+
+class Log(Action):
+    """Note time and state, and go on."""
+
+
+class Impact(Action):
+    """Reverse the rate of the condition, g >= 0 being what is allowed: g_dot+ = -restitution g_dot-.
+
+    The jump of the velocities is the smallest in the metric of M that keeps all constraints (`jumps`): no friction. Rebounds
+    that have become too small to follow end in rest: with `at_rest="hold"` the condition is held at zero, as a constraint, until
+    the contact would have to pull; with "stop" the run ends there (`Result.at_rest`).
+    """
+
+    restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
+
+
+class Release(Action):
+    """Take a joint or driver away, from then on: one of the scene's, or what `Attach` or `Lock` has added, by its name."""
+
+    name: str = eqx.field(static=True)
+
+
+class Attach(Action):
+    """Add a joint, under a `name`, from then on. Numbers that it leaves to the guess are those of the state at the event.
+
+    Velocities jump as in an inelastic impact: the smallest change in the metric of M that the new constraints allow.
+    """
+
+    joint: Joint
+    name: str = eqx.field(static=True)
+
+
+class Lock(Action):
+    """Stop all motion in a revolute or prismatic joint or a slot's sliding, where it is, as `Attach` does.
+
+    What it adds is called as the joint with ".lock" behind it: `Release("elbow.lock")` takes it away again.
+    """
+
+    joint: str = eqx.field(static=True)

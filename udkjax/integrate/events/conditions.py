@@ -1,0 +1,87 @@
+"""Conditions of events: the frames that they see, the coordinate of a joint, the gap of a contact."""
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame, Point, between
+from udkjax.scene.checks import quote, suggestion
+from udkjax.scene.fields import Number
+from udkjax.scene.joints import Prismatic, Revolute, Slot
+from udkjax.scene.mechanism import Mechanism
+
+Frames = Mapping[str, Frame]
+
+
+def frames_of(names: Sequence[str], q: Array | np.ndarray, v: Array | np.ndarray | None = None) -> dict[str, Frame]:
+    """Return the frames of all bodies by name, and the ground's, of flat q and v; without v they have no velocities."""
+    q = q.reshape(-1, 3)
+    rates = [()] * len(names) if v is None else v.reshape(-1, 3)
+    frames: dict[str, Frame] = {GROUND: GROUND_FRAME_AT_REST}
+    for name, x, dx in zip(names, q, rates, strict=True):
+        frames[name] = Frame(x[0], x[1], x[2], jnp.cos(x[2]), jnp.sin(x[2]), *dx)
+    return frames
+
+
+class JointCoordinate(eqx.Module):
+    """The coordinate of a joint: theta2 - theta1 (rad), or the distance of point 2 from point 1 along the axis (m)."""
+
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    points: Float[Array, "2 2"] | None = None
+    axis: Float[Array, ""] | None = None
+
+    def of(self, one: Frame, two: Frame) -> Number:
+        """Return the coordinate, of the frames of its bodies."""
+        if self.points is None or self.axis is None:
+            return two.angle - one.angle
+        return one.vector((jnp.cos(self.axis), jnp.sin(self.axis))).dot(between(self.points, one, two))
+
+
+class WithinLimit(eqx.Module):
+    """The condition of a joint limit: the distance of the joint from its limit."""
+
+    coordinate: JointCoordinate
+    limit: Float[Array, ""]
+    sign: Float[Array, ""]
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        return self.coordinate.bodies
+
+    def __call__(self, t: Number, frames: Frames) -> Number:
+        return self.sign * (self.coordinate.of(*(frames[name] for name in self.bodies)) - self.limit)
+
+
+class Gap(eqx.Module):
+    """The condition of a contact: the distance of a point from a line (m)."""
+
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    point: Float[Array, "2"]
+    through: Float[Array, "2"]
+    normal: Float[Array, "2"]
+
+    def __call__(self, t: Number, frames: Frames) -> Number:
+        one, two = (frames[name] for name in self.bodies)
+        p, q, n = one.point(self.point), two.point(self.through), two.vector(self.normal)
+        return Point(p.x - q.x, p.y - q.y).dot(n) / jnp.sqrt(self.normal[0] ** 2 + self.normal[1] ** 2)
+
+
+def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoordinate:
+    """Return the coordinate of a joint of a mechanism, by its name. Raises ValueError, whose message begins with `where`."""
+    require_name(joint, mechanism.joint_names, where, "joint")
+    found = mechanism.joints[joint]
+    if isinstance(found, Revolute):
+        return JointCoordinate(found.bodies)
+    if isinstance(found, Prismatic | Slot):
+        return JointCoordinate(found.bodies, found.points, found.axis)
+    kinds = "a revolute or prismatic joint, or a slot"
+    raise ValueError(f"{where}: {quote(joint)} is a {type(found).__name__}, and must be {kinds}")
+
+
+def require_name(name: str, known: Sequence[str], where: str, what: str) -> None:
+    """Raise ValueError where a name is not known."""
+    if name not in known:
+        raise ValueError(f"{where}: no {what} named {quote(name)}{suggestion(name, known)}")

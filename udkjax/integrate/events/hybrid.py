@@ -1,0 +1,229 @@
+"""A mechanism with events as a hybrid system: a flow in each phase, and conditions along it. `jumps` leads between phases."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from udkjax.equations.formulations import Formulation
+from udkjax.equations.quantities import equations_of
+from udkjax.equations.scales import Scales
+from udkjax.equations.textbook import TextbookEquations, prepare
+from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.integrate import native_engine
+from udkjax.integrate.derivatives import differentiable
+from udkjax.integrate.events.actions import Action, Impact
+from udkjax.integrate.events.conditions import frames_of
+from udkjax.integrate.events.event import Event, sees_velocity
+from udkjax.integrate.events.phases import Phases
+from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.joints import Joint
+
+if TYPE_CHECKING:
+    import diffrax
+
+T = TypeVar("T")
+Added = tuple[Joint, ...]  # the joints that events add, with the numbers that they have now
+Condition = Callable[[Float[Array, ""], Float[Array, "n"], Float[Array, "n"]], Float[Array, "k"]]  # of t, q and v
+
+
+class RunState(NamedTuple):
+    """Where a run is: time, coordinates, velocities, phase."""
+
+    t: Float[Array, ""]
+    q: Float[Array, "n"]
+    v: Float[Array, "n"]
+    phase: Int[Array, ""]
+    added: Added
+
+
+class ConditionValues(NamedTuple):
+    """The conditions of all E events, then the contact force of each contact at rest, and their rates, in one state."""
+
+    h: Float[Array, "2E"]
+    rate: Float[Array, "2E"]  # 0 of forces
+    rate_2: Float[Array, "2E"]  # 0 of forces, and of conditions that depend on velocities
+    normals: Float[Array, "E n"]  # dh/dq of the conditions
+    a: Float[Array, "n"]
+    scale: Float[Array, "2E"]  # the change of a condition by a displacement of L or a turn of one radian
+
+
+class Hybrid(eqx.Module):
+    """All numbers and choices of a run with events, but its initial state and output times."""
+
+    phases: Phases
+    events: tuple[Event, ...]
+    rtol: Float[Array, ""]
+    atol: Float[Array, ""]
+    smallest: Float[Array, ""]  # step (s)
+    h: Float[Array, ""] | None  # the first step (s)
+    length: Float[Array, ""] | None
+    rate: Float[Array, ""]  # of the system and the run (1/s)
+    method: Pseudoinverse
+    baumgarte: Baumgarte | None
+    formulation: Formulation | None
+    solver: "diffrax.AbstractSolver | None" = eqx.field(static=True)
+    projects: bool = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    engine: str = eqx.field(static=True)
+
+    # --- what is known of the events
+
+    @property
+    def count(self) -> int:
+        """The number E of events."""
+        return len(self.events)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the bodies."""
+        return self.phases.mechanisms[0].body_names
+
+    @property
+    def scales(self) -> Scales:
+        """The characteristic length, time and mass of the scene."""
+        return self.phases.analyses[0].scales
+
+    def mask(self, *actions: type[Action]) -> Bool[np.ndarray, "E"]:
+        """Tell which events have an action of these kinds."""
+        return np.array([isinstance(e.action, actions) for e in self.events])
+
+    @property
+    def impacts(self) -> Bool[np.ndarray, "E"]:
+        """Which events are impacts."""
+        return self.mask(Impact)
+
+    @property
+    def by_velocity(self) -> Bool[np.ndarray, "E"]:
+        """Which conditions depend on velocities."""
+        return np.array([sees_velocity(e, self.phases.mechanisms[0]) for e in self.events])
+
+    def table(self, name: str) -> Int[Array, "phases E"]:
+        """Return one of the tables of the phases."""
+        return jnp.array(getattr(self.phases.tables, name))
+
+    def is_held(self, phase: Int[Array, ""]) -> Bool[Array, "E"]:
+        """Tell which contacts are at rest in a phase."""
+        return self.table("held")[phase] >= 0
+
+    # --- the flow
+
+    def problem(self, phase: int, ts: Array, q: Array, v: Array, added: Added) -> Problem:
+        """Return what to integrate in a phase."""
+        mechanism, analysis = self.phases.with_added(phase, added), self.phases.analyses[phase]
+        equations = equations_of(mechanism, self.method, self.baumgarte, self.formulation, analysis)
+        return Problem(
+            equations,
+            ts,
+            q,
+            v,
+            self.rtol,
+            self.atol,
+            self.smallest,
+            self.h,
+            self.length,
+            self.rate,
+            solver=self.solver,
+            projected=equations.constrained and self.projects,
+            max_steps=self.max_steps,
+            breakpoints=mechanism.breakpoints,
+        )
+
+    def problem_of_guess(self, phase: int) -> Problem:
+        """Return the problem of a phase at the initial guess, for what does not depend on the state."""
+        first = self.phases.mechanisms[0]
+        return self.problem(phase, jnp.zeros(2), first.q0.ravel(), first.v0.ravel(), self.phases.first_added())
+
+    def reasons(self) -> tuple[str, ...]:
+        """Return why machine code cannot integrate each phase; empty where it can."""
+        return tuple(self._reason_for_diffrax(self.problem_of_guess(k)) for k in range(len(self.phases.mechanisms)))
+
+    def _reason_for_diffrax(self, problem: Problem) -> str:
+        return "it was asked for" if self.engine == "diffrax" else native_engine.reason_for_diffrax(problem)
+
+    def flow(self, ts: Float[Array, "T"], state: RunState, derivatives: bool) -> IntegratorOutput:
+        """Integrate from a state over the times `ts`, the first of which is its own; with `derivatives`, differentiably."""
+
+        def of_phase(phase: int, ts: Array, q: Array, v: Array, added: Added) -> IntegratorOutput:
+            problem = self.problem(phase, ts, q, v, added)
+            native = not self._reason_for_diffrax(problem)
+            if derivatives or not native:
+                return differentiable(problem, native)
+            return native_engine.solve(problem)
+
+        return self.in_phase(state.phase, of_phase, ts, state.q, state.v, state.added)
+
+    def in_phase(self, phase: Int[Array, ""], function: Callable[..., T], *arguments: object) -> T:
+        """Return `function(phase, *arguments)`, with the phase as a Python int for each branch."""
+        count = len(self.phases.mechanisms)
+        if count == 1:
+            return function(0, *arguments)
+        branches = [lambda *x, k=k: function(k, *x) for k in range(count)]
+        return jax.lax.switch(phase, branches, *arguments)
+
+    def textbook(self, phase: int, added: Added) -> TextbookEquations:
+        """Return the equations of a phase, solved by SVD."""
+        return prepare(self.phases.with_added(phase, added), SVD(), self.baumgarte, self.phases.analyses[phase])
+
+    def accelerations(self, state: RunState) -> Float[Array, "n"]:
+        """Return a in one state."""
+        t, q, v, phase, added = state
+        return self.in_phase(phase, lambda p, t, q, v, added: self.textbook(p, added).accelerations(t, q, v), t, q, v, added)
+
+    # --- conditions
+
+    def conditions(self, t: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "E"]:
+        """Return the conditions of all events."""
+        frames = frames_of(self.names, q, v)
+        return jnp.stack([jnp.asarray(e.condition(t, frames), float) for e in self.events])
+
+    def conditions_and_rates(self, t: Array, q: Array, v: Array) -> tuple[Float[Array, "E"], Float[Array, "E"]]:
+        """Return the conditions, and the rates of those that depend on positions alone."""
+        return _with_rate(self.conditions, t, q, v, jnp.zeros_like(v))
+
+    def values(self, state: RunState) -> ConditionValues:
+        """Return conditions, contact forces, and their rates."""
+        t, q, v, phase, added = state
+        a, pressure = self.in_phase(phase, self._accelerations_and_pressures, t, q, v, added)
+        g, g_dot = _with_rate(self.conditions, t, q, v, a)
+        rates = lambda t, q, v: _with_rate(self.conditions, t, q, v, jnp.zeros_like(a))[1]  # noqa: E731
+        g_ddot = jnp.where(self.by_velocity, 0.0, _with_rate(rates, t, q, v, a)[1])
+        by_q = jax.jacfwd(self.conditions, 1)(t, q, v)
+        unit, zeros = self.scales.coordinates(len(q)), jnp.zeros(self.count)
+        size = jnp.max(jnp.abs(by_q) * jnp.maximum(unit, jnp.abs(q)), axis=1)
+        if self.by_velocity.any():
+            by_v = jax.jacfwd(self.conditions, 2)(t, q, v)
+            size = jnp.maximum(size, jnp.max(jnp.abs(by_v) * jnp.maximum(unit * self.rate, jnp.abs(v)), axis=1))
+        force = self.scales.mass * self.scales.length * self.rate**2
+        scale = stop_gradients(jnp.append(size, zeros + force))
+        return ConditionValues(jnp.append(g, pressure), jnp.append(g_dot, zeros), jnp.append(g_ddot, zeros), by_q, a, scale)
+
+    def rate_of_pressure(self, k: Int[Array, ""], state: RunState, a: Float[Array, "n"]) -> Float[Array, ""]:
+        """Return the rate of the contact force of event k, whose contact is at rest."""
+        t, q, v, phase, added = state
+
+        def of_phase(p: int, t: Array, q: Array, v: Array, added: Added) -> Array:
+            if not any(row >= 0 for row in self.phases.tables.held[p]):
+                return jnp.zeros(self.count)
+            return _with_rate(lambda t, q, v: self._accelerations_and_pressures(p, t, q, v, added)[1], t, q, v, a)[1]
+
+        return self.in_phase(phase, of_phase, t, q, v, added)[k]
+
+    def _accelerations_and_pressures(self, phase: int, t: Array, q: Array, v: Array, added: Added) -> tuple[Array, Array]:
+        """Return a, and minus the multipliers of the contacts at rest in a phase, 1 for all other events."""
+        equations, held = self.textbook(phase, added), np.array(self.phases.tables.held[phase])
+        a, ones = equations.accelerations(t, q, v), jnp.ones(self.count)
+        if not np.any(held >= 0):
+            return a, ones
+        return a, jnp.where(held >= 0, -equations.multipliers(t, q, v)[np.maximum(held, 0)], ones)
+
+
+def _with_rate(f: Condition, t: Array, q: Array, v: Array, a: Array) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
+    """Return f(t, q, v) and its rate along the motion."""
+    return jax.jvp(f, (jnp.asarray(t, float), q, v), (jnp.ones(()), v, a))

@@ -1,0 +1,239 @@
+"""A run with events, as a function of all its numbers: its loop, and its derivatives through the events."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from udkjax.integrate.derivatives import replaced, select
+from udkjax.integrate.events.crossings import ZERO_RATE
+from udkjax.integrate.events.hybrid import Hybrid, RunState
+from udkjax.integrate.events.jumps import apply_event
+from udkjax.integrate.events.loop import run_loop
+from udkjax.integrate.gradients import TreeDef, stop_gradients
+from udkjax.integrate.solution import Result
+
+OUTPUTS = 32  # of one piece
+
+
+class EventRun(NamedTuple):
+    """The outputs and events of a run, NaN where it did not get. In derivatives a field is None that has none."""
+
+    q: Float[Array, "T n"]
+    v: Float[Array, "T n"]
+    time: Float[Array, ""]  # the end of the run
+    event_time: Float[Array, "K"]
+    event_q: Float[Array, "K 2 n"]  # before and after
+    event_v: Float[Array, "K 2 n"]
+    event_index: Int[Array, "K"]
+    event_phase: Int[Array, "K"]
+    count: Int[Array, ""]
+    code: Int[Array, ""]
+    totals: Int[Array, "4"]
+
+
+class RunInput(NamedTuple):
+    """The initial state of a run with events, and its output times."""
+
+    ts: Float[Array, "T"]
+    q: Float[Array, "n"]
+    v: Float[Array, "n"]
+    code: Int[Array, ""]  # a `Result` that is known before
+    drift_tol: Float[Array, ""]
+
+
+def run_events(hybrid: Hybrid, given: RunInput, max_events: int) -> EventRun:
+    """Run a system with events. What is smooth in the result has first derivatives, forward and reverse."""
+    arrays, rest = eqx.partition((hybrid, given), eqx.is_inexact_array)
+    xs, tree = jax.tree.flatten(arrays)
+    return _run(FixedPart(rest, tree, max_events), xs)
+
+
+class FixedPart(eqx.Module):
+    """What a run depends on besides its numbers."""
+
+    rest: PyTree
+    tree: TreeDef = eqx.field(static=True)
+    max_events: int = eqx.field(static=True)
+
+    def combine(self, xs: Sequence[Array]) -> tuple[Hybrid, RunInput]:
+        """Return the system and the input of the run with these numbers."""
+        return eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
+
+
+@eqx.filter_custom_jvp
+def _run(fixed: FixedPart, xs: list[Array]) -> EventRun:
+    hybrid, given = fixed.combine(xs)
+    state = RunState(given.ts[0], given.q, given.v, jnp.array(0), hybrid.phases.first_added())
+    loop = run_loop(hybrid, given.ts, state, given.code, given.drift_tol, fixed.max_events)
+    record, smooth = loop.record, (loop.q, loop.v, loop.state.t)
+    events = record.t, record.q, record.v, record.index, record.phase, record.count
+    return EventRun(*smooth, *events, loop.code, loop.totals)
+
+
+@_run.def_jvp
+def _(primals, tangents):
+    fixed, xs = primals
+    found = _run(*primals)
+    has_tangent = tuple(dx is not None for dx in tangents[1])
+    if not any(has_tangent):
+        return found, EventRun._make([None] * len(found))
+    if jax.tree.unflatten(fixed.tree, has_tangent)[1].ts:
+        raise NotImplementedError("a run with events has no derivatives by its output times")
+
+    xs = [_differentiate_once(x) for x in xs]
+
+    def replay_from(*some: Array) -> tuple[Array, ...]:
+        hybrid, given = fixed.combine(replaced(xs, has_tangent, some))
+        return replay(hybrid, given, stop_gradients(found))
+
+    change = jax.jvp(replay_from, select(xs, has_tangent), select(tangents[1], has_tangent))[1]
+    return found, EventRun._make([*change, *(None for _ in found[len(change) :])])
+
+
+@jax.custom_jvp
+def _differentiate_once(x: Array) -> Array:
+    """Return a number that the first derivatives depend on: they are right at fixed event times, and so have no derivatives."""
+    return x
+
+
+@_differentiate_once.defjvp
+def _(primals, tangents):
+    raise NotImplementedError("a run with events has first derivatives only: take differences of these")
+
+
+# --- derivatives
+#
+# Between events the flow has derivatives of its own, along the state in which it begins and all numbers. At an event the state
+# y before it, taken at the time t0 at which it was found, and so at a fixed time, meets the condition a little later or earlier:
+# h(t0 + d, y + f d) = 0 gives d = -h / h_dot to first order (the theorem of implicit functions). The jump J is done there, and
+# the state that it leaves is taken back to t0 with the flow f+ behind it:
+#
+#     y+ = J(t0 + d, y + f d) - f+ d,        dy+ = J_y dy - (J_y f + J_t - f+) h_y dy / h_dot,
+#
+# the saltation matrix (Leine and Nijmeijer 2004, section 7.5), written without forming it: d is zero, and has derivatives.
+
+
+class PieceStart(NamedTuple):
+    """Where a piece of a run begins."""
+
+    state: RunState
+    written: Int[Array, ""]  # outputs so far
+    event: Int[Array, ""]  # the next one
+    shift: Float[Array, ""]  # the change d of the time of the last event
+
+
+class PieceOutput(NamedTuple):
+    """The outputs of a piece, and the event at its end; numbers that are too large stand for none."""
+
+    rows: Int[Array, "W"]
+    q: Float[Array, "W n"]
+    v: Float[Array, "W n"]
+    event: Int[Array, ""]
+    event_time: Float[Array, ""]
+    event_q: Float[Array, "2 n"]
+    event_v: Float[Array, "2 n"]
+
+
+def replay(hybrid: Hybrid, given: RunInput, found: EventRun) -> tuple[Array, ...]:
+    """Return what is smooth in a run that is known, as a function with its first derivatives: the first fields of `EventRun`."""
+    ts, T, K, n = stop_gradients(given.ts), len(given.ts), len(found.event_time), len(given.q)
+    width = min(OUTPUTS, T)
+    pieces = K + -(-T // (width - 1)) + 2
+
+    def piece(start: PieceStart, _: None) -> tuple[PieceStart, PieceOutput]:
+        def skip() -> tuple[PieceStart, PieceOutput]:
+            rows = jnp.full(width, T), jnp.zeros((width, n)), jnp.zeros((width, n))
+            return start, PieceOutput(*rows, *_no_event(n, K))
+
+        goes_on = (start.state.t < found.time) | (start.event < found.count)
+        return jax.lax.cond(goes_on, lambda: _integrate_piece(hybrid, ts, found, width, start), skip)
+
+    state = RunState(ts[0], given.q, given.v, jnp.array(0), hybrid.phases.first_added())
+    end, out = jax.lax.scan(piece, PieceStart(state, jnp.array(0), jnp.array(0), jnp.zeros(())), None, length=pieces)
+    rows = out.rows.ravel()
+    q, v = (jnp.full((T, n), jnp.nan).at[rows].set(x.reshape(-1, n), mode="drop") for x in (out.q, out.v))
+    last = (ts == found.time)[:, None]
+    q, v = jnp.where(last, end.state.q, q), jnp.where(last, end.state.v, v)
+    times = jnp.full(K, jnp.nan).at[out.event].set(out.event_time, mode="drop")
+    qs, vs = (jnp.full((K, 2, n), jnp.nan).at[out.event].set(x, mode="drop") for x in (out.event_q, out.event_v))
+    stopped = (found.code == Result.event_stop) | (found.code == Result.at_rest)
+    time = jnp.where(stopped, times[jnp.maximum(found.count - 1, 0)], found.time)
+    return q, v, time, times, qs, vs
+
+
+def _integrate_piece(
+    hybrid: Hybrid, ts: Float[Array, "T"], found: EventRun, width: int, start: PieceStart
+) -> tuple[PieceStart, PieceOutput]:
+    """Integrate to the next event, or as far as there is room for outputs, and apply the event."""
+    state, written, event, shift = start
+    T, K = len(ts), len(found.event_time)
+    output = written + np.arange(width)
+    due = ts[jnp.minimum(output, T - 1)]
+    comes = event < found.count
+    j = jnp.minimum(event, K - 1)
+    aim = jnp.where(comes, found.event_time[j], found.time)
+    end = jnp.maximum(jnp.where(output[-1] < T - 1, jnp.minimum(aim, due[-1]), aim), state.t)
+    happens = comes & (end == aim)
+    short = end - state.t <= 2 * hybrid.smallest
+    times = jnp.concatenate([state.t[None], jnp.clip(due, state.t, end), end[None]])
+    raw = hybrid.flow(jnp.where(short, state.t + 100 * hybrid.smallest * np.arange(width + 2), times), state, derivatives=True)
+    own = (short | (times <= state.t))[:, None]
+    q = jnp.where(own, state.q + (times - state.t)[:, None] * state.v, raw.q)
+    v = jnp.where(own, state.v, raw.v)
+    rows = jnp.where((output < T) & (due < end), output, T)
+    at_end = RunState(end, q[-1], v[-1], state.phase, state.added)
+
+    def jump() -> tuple[RunState, Array, tuple[Array, Array, Array, Array]]:
+        known = at_end._replace(q=_with_value(at_end.q, found.event_q[j, 0]), v=_with_value(at_end.v, found.event_v[j, 0]))
+        after, d, (t, qs, vs) = _apply_at_fixed_time(hybrid, found.event_index[j], known, shift, short)
+        return after, d, (j, t, qs, vs)
+
+    after, shift, record = jax.lax.cond(happens, jump, lambda: (at_end, shift, _no_event(len(state.q), K)))
+    following = PieceStart(after, written + jnp.sum(rows < T), event + happens, shift)
+    return following, PieceOutput(rows, q[1:-1], v[1:-1], *record)
+
+
+def _apply_at_fixed_time(
+    hybrid: Hybrid, index: Int[Array, ""], state: RunState, shift: Float[Array, ""], again: Array
+) -> tuple[RunState, Float[Array, ""], tuple[Array, Array, Array]]:
+    """Apply an event that was found at the time of `state`, and return the state after it at that time.
+
+    Args:
+        hybrid: the system.
+        index: of the event, as in `EventRecord`.
+        state: the state before it.
+        shift: the change d of the time of the event before.
+        again: whether no time has passed since then.
+
+    Returns:
+        The state after the event at the fixed time, the change d of the event's time, and time and states at the event.
+    """
+    E = hybrid.count
+    rests, k = index >= 2 * E, jnp.where(index >= 2 * E, index - 2 * E, index)
+    values = hybrid.values(state)
+    rate = values.rate[k]
+    if any(row >= 0 for rows in hybrid.phases.tables.held for row in rows):
+        rate = jnp.where(k >= E, hybrid.rate_of_pressure(k % E, state, values.a), rate)
+    h, rate = values.h[k] - stop_gradients(values.h[k]), stop_gradients(rate)
+    is_transversal = jnp.abs(rate) > ZERO_RATE * values.scale[k] * hybrid.rate
+    # What happens again at the same instant, where the condition stands still, happens when the first event does.
+    d = jnp.where(is_transversal, -h / jnp.where(is_transversal, rate, 1.0), jnp.where(again, shift, 0.0))
+    before = state._replace(t=state.t + d, q=state.q + d * state.v, v=state.v + d * values.a)
+    after = apply_event(hybrid, k, rests, before, hybrid.values(before)).state
+    fixed = after._replace(t=state.t, q=after.q - d * after.v, v=after.v - d * hybrid.accelerations(after))
+    return fixed, d, (before.t, jnp.stack([before.q, after.q]), jnp.stack([before.v, after.v]))
+
+
+def _no_event(n: int, K: int) -> tuple[Array, Array, Array, Array]:
+    """Return the number, time and states that stand for no event."""
+    return jnp.array(K), jnp.zeros(()), jnp.zeros((2, n)), jnp.zeros((2, n))
+
+
+def _with_value(x: Array, value: Array) -> Array:
+    """Return a known value, with the derivatives of x."""
+    return x + stop_gradients(jnp.where(jnp.isfinite(value), value, x) - x)

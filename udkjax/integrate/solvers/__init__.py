@@ -1,0 +1,66 @@
+"""Solvers of diffrax: its own, and those that are written here, by name and with the tableaus of the explicit ones.
+
+diffrax is imported where one is asked for: that takes as long as all of JAX.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from udkjax.native.tableau import DOPRI8, Method, method
+
+if TYPE_CHECKING:
+    import diffrax
+
+OWN = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # the solvers of this folder, and their modules
+
+
+def own_solver(name: str) -> "type[diffrax.AbstractSolver]":
+    """Return the class of a solver that is written here. Raises KeyError where there is none of this name."""
+    return getattr(import_module(f"udkjax.integrate.solvers.{OWN[name]}"), name)
+
+
+def solver_named(name: str) -> "diffrax.AbstractSolver":
+    """Return the solver of this name: `Adams`, `BDF`, `Verner65`, or any solver of diffrax that needs no arguments.
+
+    Raises:
+        ValueError: there is no such solver.
+    """
+    import diffrax
+
+    solver = own_solver(name) if name in OWN else getattr(diffrax, name, None)
+    if not (isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver)):
+        raise ValueError(f"{name!r} is no solver: it is none of {', '.join(OWN)}, nor a solver of diffrax such as 'Dopri8'")
+    return solver()
+
+
+def forward_mode() -> "diffrax.AbstractAdjoint":
+    """Return the adjoint with which `simulate` is differentiated forward."""
+    import diffrax
+
+    return diffrax.ForwardMode()
+
+
+def is_explicit(solver: "diffrax.AbstractSolver | None") -> bool:
+    """Whether a solver is an explicit Runge-Kutta method with one tableau; None is the default, which is."""
+    if solver is None:
+        return True
+    import diffrax
+
+    return isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau)
+
+
+def method_of(solver: "diffrax.AbstractERK | None") -> Method:
+    """Read the tableau of a solver; None is the default."""
+    if solver is None:
+        return DOPRI8
+    import diffrax
+
+    tableau: Any = solver.tableau
+    order: Any = solver.error_order(diffrax.ODETerm(lambda t, y, args: y))
+    c, stages, b, error = np.append(0.0, tableau.c), tableau.a_lower, np.asarray(tableau.b_sol), np.asarray(tableau.b_error)
+    ends = bool(tableau.fsal and error[-1] != 0)
+    if tableau.fsal and not ends:  # the last stage is there for interpolation, or for the next step
+        c, stages, b, error = c[:-1], stages[:-1], b[:-1], error[:-1]
+    return method(c, stages, b, error, order, ends)

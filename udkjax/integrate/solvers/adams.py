@@ -1,0 +1,282 @@
+"""Adams methods of variable order and step.
+
+Order and step are chosen as in STEP by Shampine and Gordon: while a run starts, the order rises and the step doubles at every
+step. Then the order falls as soon as a lower one promises no larger error, and rises after k + 1 steps of one size, when the next
+difference is known.
+"""
+
+from collections.abc import Callable
+from typing import ClassVar, Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.solvers.divided_differences import HIGHEST, DifferenceInterpolation, StepCoefficients, step_coefficients
+from udkjax.integrate.solvers.multistep import (
+    Flag,
+    Multistep,
+    Scalar,
+    Tolerances,
+    Unravel,
+    check_orders,
+    error_scale,
+    steer_error,
+    tolerances_from_controller,
+    vector_field,
+)
+
+# Of the iteration, as in VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), whose names are behind them.
+ITERATIONS = 3  # MAXCOR
+ITERATION_SHARE = 0.1  # CORTES: of the tolerance, that may be left to an iteration that stops
+RATE_MEMORY = 0.3  # CRDOWN: of the rate of convergence; a single fast iteration does not count for all
+# Of the choice of order and step, as in STEP (Shampine, Gordon 1975, chapter 10): the step doubles at most, and order one, of
+# whose estimates less is known, is left or taken only where that halves the error.
+LARGEST = 2.0
+HALF = 0.5
+# Not of a published code. With these an error made of many steps is a few times the tolerance, and takes no more right-hand sides
+# than STEP or VODE (tests/integrate/test_adams.py).
+STRICTER = 8.0  # than the tolerance: the errors of its many short steps add up
+SHARE = 0.25  # of the tolerance: the error that the next step is chosen for; STEP, whose steps only halve or double, has 0.5
+RUNGS = 4.0  # a step changes by powers of 2^(1/4): the factor does not follow the rounding errors in an estimate
+SMALLEST = 0.25  # factor of a step; STEP halves once or twice
+LOST = 0.05  # a step that so small a part of the one planned has to replace begins again with order one: there was a jump
+NEGLIGIBLE = 1e-4  # relative to the tolerance: estimates below are of rounding errors, and say nothing about the order
+EVEN = 1e-2  # relative: two steps that differ by less count as of one size
+# Of rounding.
+ROUNDING = 1e-14  # relative: a compiler may compute the same state twice, and not quite the same
+TINY = 1e-300  # in the place of zero, where an error divides
+
+
+# --- the choice of order and step
+
+Vector = Float[Array, "y"]
+Field = Callable[[Scalar, Vector], Vector]
+Size = Callable[[Float[Array, "rows y"]], Float[Array, "rows"]]
+
+
+class ErrorEstimates(eqx.Module):
+    """Estimated local errors of orders k - 2 to k + 1, relative to the tolerance, were all steps of one size."""
+
+    k_minus_2: Scalar
+    k_minus_1: Scalar
+    k: Scalar
+    k_plus_1: Scalar
+
+
+class OrderControl(eqx.Module):
+    """The state of the choice of order and step."""
+
+    order: Int[Array, ""]  # of the next step
+    step: Scalar  # the next step that is planned
+    equal_steps: Int[Array, ""]  # the number of steps of equal size up to here
+    starting: Bool[Array, ""]  # order and step rise with every step
+
+
+def first_order_control(h: Scalar) -> OrderControl:
+    """Return the state for a history of one value, with a first step h."""
+    return OrderControl(jnp.array(1), jnp.asarray(h), jnp.array(1), jnp.array(True))
+
+
+def choose_order(
+    control: OrderControl, h: Scalar, points: Int[Array, ""], errors: ErrorEstimates, least: int, most: int
+) -> tuple[OrderControl, Scalar]:
+    """Choose the next order and step after an accepted step.
+
+    Args:
+        control: the state before the step.
+        h: the step.
+        points: the number of values in the history.
+        errors: the estimates of the step.
+        least: the lowest order that may be taken.
+        most: the highest one.
+
+    Returns:
+        The state after it, and the factor by which the step grows.
+    """
+    k, e = control.order, errors
+    equal_steps = jnp.where(jnp.abs(h - control.step) < EVEN * h, control.equal_steps + 1, 1)
+    falling = jnp.where(k > 2, jnp.maximum(e.k_minus_1, e.k_minus_2) <= e.k, (k == 2) & (e.k_minus_1 <= HALF * e.k))
+    falling = falling & (e.k > NEGLIGIBLE)
+    shrunk = (h < (1 - EVEN) * control.step) & (points > 2)  # it was rejected; the first step is only a guess
+    starting = control.starting & ~shrunk & ~falling & (k < most)
+
+    judged = (equal_steps > k) & (points >= k + 2)
+    down = falling | (judged & (k > 1) & (e.k_minus_1 <= jnp.minimum(e.k, e.k_plus_1)))
+    up = judged & ~down & (e.k_plus_1 < jnp.where(k > 1, 1.0, HALF) * e.k)
+    up = (up | starting | (k < least)) & (k < most) & (k < points)
+    down = down & ~up & (k > least)
+    order = k + up - down
+    error = jnp.where(down, e.k_minus_1, jnp.where(up & judged, e.k_plus_1, e.k))
+    growth = jnp.where(starting, LARGEST, jnp.maximum(step_factor(error, order), 1.0))
+    return OrderControl(order, h * growth, equal_steps, starting), growth
+
+
+def step_factor(error: Scalar, order: Int[Array, ""]) -> Scalar:
+    """Return the factor of a step with this error, of a method of this order."""
+    factor = (SHARE / jnp.maximum(error, TINY)) ** (1 / (order + 1))
+    return 2 ** (jnp.floor(RUNGS * jnp.log2(jnp.clip(factor, SMALLEST, LARGEST))) / RUNGS)
+
+
+# --- the solver
+
+
+class History(eqx.Module):
+    """The state of the solver at t_n."""
+
+    ages: Float[Array, "N"]  # t_n - t_{n-j}, j = 0, 1, ...
+    phi: Float[Array, "N y"]
+    y: Float[Array, "y"]  # to which phi belongs
+    exact: Bool[Array, ""]  # whether phi_1 is f(t_n, y), not a value that the corrector has used
+    points: Int[Array, ""]  # that are known: so many rows of phi count
+    control: OrderControl
+    rate: Scalar  # at which the iteration converged
+    evaluations: Int[Array, ""]
+
+
+class Adams(Multistep):
+    """Adams-Bashforth-Moulton methods of orders 1 to 12: the order and the step vary.
+
+    The integral of the polynomial through the k newest values of f predicts the next state, that of the polynomial through one
+    value more corrects it (so that the result is of order k + 1). With `corrector="pece"` the value is f at the predicted state,
+    and f at the corrected state goes into the history: two calls of f a step, one where the error is too large. With
+    `corrector="iteration"` f is called again until the state has converged: mostly one or two calls, but at larger steps it is
+    less stable. Order and step follow from the estimated errors of orders k - 2 to k + 1.
+
+    Use it as any diffrax solver, with a `PIDController` of default factors, which tells it the tolerances; for a given sequence
+    of steps, give them as `root_finder=Tolerances(rtol, atol)`. Its solver state counts `evaluations`.
+
+    Source: L. F. Shampine, M. K. Gordon, Computer Solution of Ordinary Differential Equations, 1975 (the code STEP), with
+    formulas for steps that all differ, and a step that follows the error more closely. The iteration is stopped as in VODE.
+    """
+
+    corrector: Literal["pece", "iteration"] = eqx.field(default="pece", static=True)
+    min_order: int = eqx.field(default=1, static=True)
+    max_order: int = eqx.field(default=HIGHEST, static=True)
+    root_finder: Tolerances = eqx.field(default_factory=tolerances_from_controller)
+    root_find_max_steps: int = eqx.field(default=ITERATIONS, static=True)
+
+    interpolation_cls: ClassVar[Callable[..., DifferenceInterpolation]] = DifferenceInterpolation
+
+    def __check_init__(self):
+        check_orders(self.min_order, self.max_order, HIGHEST)
+        if self.corrector not in ("pece", "iteration"):
+            raise ValueError(f'corrector is "pece" or "iteration", not {self.corrector!r}')
+
+    def order(self, terms):
+        return self.max_order
+
+    def init(self, terms, t0, t1, y0, args):
+        y, unravel = ravel_pytree(y0)
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+        return self._begin(t1 - t0, y, _field(terms, args, unravel)(t0, y), jnp.array(1))
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y, unravel = ravel_pytree(y0)
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+        f, h = _field(terms, args, unravel), t1 - t0
+        h = jnp.where(h > 0, h, solver_state.control.step)  # of a member of a batch that has come to its end
+        state, displaced = self._update_newest(f, t0, h, y, solver_state, made_jump)
+        k, rule, row = state.control.order, step_coefficients(h, state.ages), jnp.arange(1, self.max_order + 3)[:, None]
+        star = jnp.where(row <= state.points, rule.beta[:, None] * state.phi, 0.0)
+        used = jnp.where(row <= k, star, 0.0)
+        predicted, slope = y + h * (rule.g @ used), jnp.sum(used, axis=0)
+
+        size = _sizes(self.root_finder, unravel, y0, unravel(predicted))
+        d, found, calls, rate = self._correct(lambda y: f(t1, y), predicted, slope, rule, size, state)
+        y1 = predicted + h * rule.g[k] * d
+        finite = jnp.all(jnp.isfinite(y1))
+        y1 = jnp.where(finite, y1, jnp.nan)  # what the controller is prepared for
+
+        size, estimates = _sizes(self.root_finder, unravel, y0, unravel(y1)), stop_gradients(rule)
+        below = jnp.stack([d, d + star[k - 1], d + star[k - 1] + star[jnp.maximum(k - 2, 0)]])
+        same, lower, lowest = estimates.errors[jnp.maximum(k - jnp.arange(3), 0)] * size(below)
+        error = estimates.gains(k) * size(d[None])[0]
+        accept = found & finite & (error <= 1)
+        again = accept & ~displaced & (self.corrector == "pece")
+        value = jax.lax.cond(again, lambda: f(t1, y1), lambda: slope + d)
+
+        points = jnp.minimum(state.points + 1, len(row))
+        phi = value - jnp.concatenate([jnp.zeros_like(star[:1]), jnp.cumsum(star, axis=0)[:-1]])
+        phi = jnp.where(row <= points, phi, 0.0)
+        errors = ErrorEstimates(lowest, lower, same, estimates.errors[k + 1] * size(phi[k + 1][None])[0])
+        control, growth = choose_order(state.control, estimates.h, points, errors, self.min_order, self.max_order)
+        shrink = jnp.where(found & finite, step_factor(error, k), SMALLEST)
+
+        ages = jnp.concatenate([jnp.zeros_like(state.ages[:1]), h + state.ages[:-1]])
+        exact = again | (self.corrector == "iteration")
+        new = History(ages, phi, y1, exact, points, control, rate, state.evaluations + calls + again)
+        dense = {"y0": y0, "ages": state.ages, "terms": jnp.where(row == k + 1, d, used)}
+        y1 = unravel(y1)
+        y_error = steer_error(self.root_finder, y0, y1, accept, jnp.where(accept, growth, shrink))
+        return y1, y_error, dense, new, diffrax.RESULTS.successful
+
+    def _begin(self, h: Scalar, y: Vector, f: Vector, evaluations: Int[Array, ""]) -> History:
+        """Return a history of one value."""
+        rows, one = self.max_order + 2, jnp.array(1)
+        phi = jnp.zeros((rows, len(y)), y.dtype).at[0].set(f)
+        return History(
+            h * jnp.arange(rows),
+            phi,
+            y,
+            jnp.array(True),
+            one,
+            first_order_control(stop_gradients(h)),
+            jnp.ones_like(h),
+            evaluations,
+        )
+
+    def _update_newest(
+        self, f: Field, t0: Scalar, h: Scalar, y: Vector, state: History, made_jump: Flag
+    ) -> tuple[History, Bool[Array, ""]]:
+        """Return the history with f(t0, y) as its newest value, or a new one; and whether y is not the end of the last step.
+
+        Where y was displaced, it will be again: then f at the end of a step is left for the next step to call.
+        """
+        displaced = jnp.max(jnp.abs(y - state.y), initial=0.0) > ROUNDING * jnp.max(jnp.abs(y), initial=0.0)
+        stale = displaced | ~state.exact | made_jump
+        value = jax.lax.cond(stale, lambda: f(t0, y), lambda: state.phi[0])
+        calls = state.evaluations + stale
+        updated = eqx.tree_at(lambda s: (s.phi, s.evaluations), state, (state.phi + (value - state.phi[0]), calls))
+        lost = (h < LOST * state.control.step) | made_jump
+        return jax.tree.map(lambda a, b: jnp.where(lost, a, b), self._begin(h, y, value, calls), updated), displaced
+
+    def _correct(
+        self, f: Callable[[Vector], Vector], y: Vector, slope: Vector, rule: StepCoefficients, size: Size, state: History
+    ) -> tuple[Vector, Bool[Array, ""], Int[Array, ""], Scalar]:
+        """Return d, by which f exceeds its extrapolated value `slope`, whether it was found, the calls of f, and the rate."""
+        if self.corrector == "pece":
+            return f(y) - slope, jnp.array(True), jnp.array(1), state.rate
+        k = state.control.order
+        c, weight = rule.h * rule.g[k], stop_gradients(rule).gains(k)
+
+        def iterate(carry, _):
+            d, change, rate, done, calls = carry
+            now = jax.lax.cond(done, lambda: d, lambda: f(y + c * d) - slope)
+            changed = weight * size((now - d)[None])[0]
+            measured = jnp.where(calls == 0, rate, jnp.maximum(RATE_MEMORY * rate, changed / jnp.maximum(change, TINY)))
+            rate, calls = jnp.where(done, rate, measured), calls + ~done
+            done = done | (changed * jnp.minimum(rate, 1.0) <= ITERATION_SHARE)
+            return (now, changed, rate, done, calls), None
+
+        expected = stop_gradients(state.rate * rule.h / state.ages[1])  # the rate is proportional to the step
+        start = (jnp.zeros_like(y), jnp.zeros_like(weight), expected, jnp.array(False), jnp.array(0))
+        (d, _, rate, found, calls), _ = jax.lax.scan(iterate, start, length=self.root_find_max_steps)
+        return d, found, calls, rate
+
+
+def _field(terms: PyTree[diffrax.AbstractTerm], args: PyTree, unravel: Unravel) -> Field:
+    """Return f as a function of time and of the state as a vector."""
+    return lambda t, y: vector_field(terms, t, unravel(y), args)
+
+
+def _sizes(tolerances: Tolerances, unravel: Unravel, y0: PyTree, y1: PyTree) -> Size:
+    """Return the function that gives the norms of the rows of a matrix, relative to what a step may err."""
+    tolerances, y0, y1 = stop_gradients((tolerances, y0, y1))
+    allowed = error_scale(tolerances, y0, y1)
+    size = jax.vmap(lambda x: STRICTER * tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))
+    return lambda rows: size(stop_gradients(rows))

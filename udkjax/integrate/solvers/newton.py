@@ -1,0 +1,171 @@
+"""Modified Newton for implicit multistep methods: a Jacobian that is used while it serves.
+
+An implicit step looks for the correction e to a predicted state y,
+
+    e = c (f(t, y + e) - v),        c = h / gamma,
+
+with v the predicted derivative. Newton's method, with a matrix M = I - c J that may be some steps old, repeats
+
+    M d = c (f(t, y + e) - v) - e,        e <- e + d.
+
+Its limit does not depend on M, nor does its derivative, which is that of the equation by the implicit function theorem. When to
+take a new J and a new M, when to stop and when to give up are the rules of VODE (Brown, Byrne, Hindmarsh, "VODE: a
+variable-coefficient ODE solver", SIAM J. Sci. Stat. Comput. 10 (1989) 1038), whose names stand behind the numbers below.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import lu_factor, lu_solve
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from udkjax.integrate.solvers.multistep import Unravel, vector_field
+
+ITERATIONS = 3  # MAXCOR: with one matrix, by default; more rarely help
+JACOBIAN_STEPS, MATRIX_STEPS = 50, 20  # MSBJ, MSBP: for which they are used at most
+CHANGE = 0.3  # CCMAX: of c, relatively, up to which M is used
+FASTEST = 0.3  # CRDOWN: the rate of convergence falls by this factor an iteration at most; one fast iteration proves little
+DIVERGING = 2.0  # RDIV: ratio of successive corrections at which to give up
+
+
+class Implicit(eqx.Module):
+    """The equation e = c (f(t, y + e) - v) of a step, in vectors (n,)."""
+
+    terms: PyTree
+    args: PyTree
+    unravel: Unravel
+    t: Float[Array, ""]
+    y: Float[Array, "n"]
+    v: Float[Array, "n"]
+    c: Float[Array, ""]
+
+    def field(self, e: Float[Array, "n"]) -> Float[Array, "n"]:
+        """Return f(t, y + e)."""
+        return vector_field(self.terms, self.t, self.unravel(self.y + e), self.args)
+
+    def with_jacobian(self, e: Float[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
+        """Return f(t, y + e) and its derivative, from one call of the vector field."""
+        jacobian, f = jax.jacfwd(lambda e: (self.field(e),) * 2, has_aux=True)(e)
+        return f, jacobian
+
+
+class NewtonState(eqx.Module):
+    """The state of the iteration after a step: J, the factors of M, their ages in steps, the rate of convergence, and counts."""
+
+    jacobian: Float[Array, "n n"]
+    lu: Float[Array, "n n"]
+    pivots: Int[Array, "n"]
+    c: Float[Array, ""]  # of M
+    jacobian_age: Int[Array, ""]
+    matrix_age: Int[Array, ""]
+    rate: Float[Array, ""]
+    evaluations: Int[Array, ""]
+    jacobians: Int[Array, ""]
+    factorizations: Int[Array, ""]
+
+
+def initial_state(n: int, dtype: DTypeLike) -> NewtonState:
+    """Return the state before the first step."""
+    matrix, none, one = jnp.zeros((n, n), dtype), jnp.array(0), jnp.ones((), dtype)
+    return NewtonState(matrix, matrix, jnp.arange(n, dtype=jnp.int32), one, none, none, one, none, none, none)
+
+
+def invalidate(state: NewtonState) -> NewtonState:
+    """Return the state with a Jacobian too old for the next step."""
+    return eqx.tree_at(lambda k: k.jacobian_age, state, jnp.full_like(state.jacobian_age, JACOBIAN_STEPS))
+
+
+class _Iteration(eqx.Module):
+    state: NewtonState
+    e: Float[Array, "n"]
+    size: Float[Array, ""]  # of the last correction
+    count: Int[Array, ""]
+    fresh: Bool[Array, ""]  # the Jacobian is of this step
+    renew: Bool[Array, ""]  # take a Jacobian now
+    factor: Bool[Array, ""]  # and factorize M
+    converged: Bool[Array, ""]
+    failed: Bool[Array, ""]
+
+
+@eqx.filter_custom_jvp
+def solve(
+    equation: Implicit, size: Callable[[Float[Array, "n"]], Float[Array, ""]], state: NewtonState, iterations: int
+) -> tuple[Float[Array, "n"], Bool[Array, ""], NewtonState]:
+    """Return e, whether it was found, and the state for the next step.
+
+    `size` is a pytree that is called: of a correction it tells how much it matters, which shall be less than one. After so many
+    `iterations` with one matrix it is given up.
+    """
+    renew = state.jacobian_age >= JACOBIAN_STEPS
+    factor = renew | (state.matrix_age >= MATRIX_STEPS) | ~(jnp.abs(equation.c / state.c - 1) <= CHANGE)
+    no = jnp.array(False)
+    start = _Iteration(state, jnp.zeros_like(equation.y), jnp.ones_like(equation.c), jnp.array(0), no, renew, factor, no, no)
+
+    def iterate(now: _Iteration) -> _Iteration:
+        f, state = _matrices(equation, now)
+        residual = equation.c * (f - equation.v) - now.e
+        d = 2 / (1 + equation.c / state.c) * lu_solve((state.lu, state.pivots), residual)
+        far = size(d)
+        first = now.count == 0
+        rate = jnp.where(first, state.rate, jnp.maximum(FASTEST * state.rate, far / now.size))
+        converged = far * jnp.minimum(1.0, rate) <= 1
+        hopeless = ~first & ~(far <= DIVERGING * now.size) | (now.count == iterations - 1) | ~jnp.isfinite(far)
+        stuck, fresh = ~converged & hopeless, now.fresh | now.renew
+        again = stuck & ~fresh
+        state = eqx.tree_at(lambda k: k.rate, state, jnp.where(jnp.isfinite(rate) & ~stuck, rate, 1.0))
+        e, far, count = (jnp.where(again, a, b) for a, b in ((0.0, now.e + d), (1.0, far), (0, now.count + 1)))
+        return _Iteration(state, e, far, count, fresh, again, again, converged, stuck & fresh)
+
+    end = jax.lax.while_loop(lambda now: ~(now.converged | now.failed), iterate, start)
+    state = eqx.tree_at(
+        lambda k: (k.jacobian_age, k.matrix_age), end.state, (end.state.jacobian_age + 1, end.state.matrix_age + 1)
+    )
+    return end.e, end.converged, state
+
+
+@solve.def_jvp
+def _(primals, tangents):
+    equation = primals[0]
+    e, found, state = solve(*primals)
+    residual = lambda p: p.c * (p.field(e) - p.v)  # noqa: E731
+    rhs = eqx.filter_jvp(residual, (equation,), (tangents[0],))[1]
+    matrix = jnp.eye(len(e), dtype=e.dtype) - equation.c * jax.jacfwd(equation.field)(e)
+    return (e, found, state), (jnp.linalg.solve(matrix, rhs), None, jax.tree.map(lambda _: None, state))
+
+
+def _matrices(equation: Implicit, now: _Iteration) -> tuple[Float[Array, "n"], NewtonState]:
+    """Return f, and the state with a new J and a new M where they are due.
+
+    Both are branches, also under vmap while no member needs them.
+    """
+    state, renew = now.state, now.renew
+
+    def renewed():
+        f, jacobian = equation.with_jacobian(now.e)
+        return f, jnp.where(renew, jacobian, state.jacobian)
+
+    f, jacobian = jax.lax.cond(eqxi.unvmap_any(renew), renewed, lambda: (equation.field(now.e), state.jacobian))
+
+    def factorized():
+        lu, pivots = lu_factor(jnp.eye(len(f), dtype=f.dtype) - equation.c * jacobian)
+        return jnp.where(now.factor, lu, state.lu), jnp.where(now.factor, pivots, state.pivots)
+
+    lu, pivots = jax.lax.cond(eqxi.unvmap_any(now.factor), factorized, lambda: (state.lu, state.pivots))
+    new = lambda a, b, pred: jnp.where(pred, a, b)  # noqa: E731
+    state = NewtonState(
+        jacobian,
+        lu,
+        pivots,
+        c=new(equation.c, state.c, now.factor),
+        jacobian_age=new(0, state.jacobian_age, renew),
+        matrix_age=new(0, state.matrix_age, now.factor),
+        rate=new(1.0, state.rate, now.factor),
+        evaluations=state.evaluations + 1,
+        jacobians=state.jacobians + renew,
+        factorizations=state.factorizations + now.factor,
+    )
+    return f, state

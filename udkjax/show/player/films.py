@@ -1,0 +1,102 @@
+"""Animations in pixels: PNG of a pose, GIF and MP4 of the motion."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from udkjax.extras import OptionalImport
+from udkjax.show.player.pictures import Posed, sketches
+from udkjax.show.player.sketch import THEMES, Circle, Line
+
+with OptionalImport():
+    from PIL import Image, ImageDraw
+
+SMOOTH = 3  # times: a picture of pixels is drawn so much larger, and made smaller
+MOST_FRAMES = 1500  # of a film
+GIF_TICK = 0.01  # s: what a GIF counts the time of a frame in
+
+
+def image(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light") -> Image.Image:
+    """Return one pose of each run, side by side, as a picture of pixels."""
+    view, found = sketches(animation, t, width, theme, SMOOTH)
+    whole = Image.new("RGB", (view.width * len(found), view.height), THEMES[theme]["back"])
+    for k, sketch in enumerate(found):
+        panel = Image.new("RGB", (view.width, view.height), THEMES[theme]["back"])
+        draw = ImageDraw.Draw(panel)
+        for shape in sketch.shapes:
+            _paint(draw, shape)
+        whole.paste(panel, (k * view.width, 0))
+    small = whole.width // SMOOTH // 2 * 2, whole.height // SMOOTH // 2 * 2  # MP4 wants even numbers
+    return whole.resize(small, Image.Resampling.LANCZOS)
+
+
+def _paint(draw: ImageDraw.ImageDraw, shape: Line | Circle) -> None:
+    width = round(shape.width)
+    if isinstance(shape, Circle):
+        (x, y), r = shape.centre, shape.radius + (shape.width / 2 if shape.stroke else 0)
+        draw.ellipse((x - r, y - r, x + r, y + r), shape.fill or None, shape.stroke or None, width if shape.stroke else 0)
+        return
+    points = [(float(x), float(y)) for x, y in shape.points]
+    if shape.fill:
+        draw.polygon(points, shape.fill)
+    if shape.stroke and width:
+        draw.line([*points, points[0]] if shape.closed else points, shape.stroke, width, joint="curve")
+        for x, y in points:  # round ends and corners
+            r = width / 2 - 0.5
+            draw.ellipse((x - r, y - r, x + r, y + r), shape.stroke)
+
+
+def film_times(animation: Posed, fps: float, speed: float | None) -> np.ndarray:
+    """Return the time on the timeline of each frame; a film that would be too long is refused."""
+    data = animation.data
+    speed = float(data["speed"] if speed is None else speed)
+    if not (0 < fps < np.inf and 0 < speed < np.inf):
+        raise ValueError(f"fps {fps:g} and speed {speed:g} must be positive")
+    count = max(1, round((data["end"] - data["start"]) / speed * fps))
+    if count > MOST_FRAMES:
+        raise ValueError(
+            f"{count} frames are more than {MOST_FRAMES}: give a higher speed than {speed:g}, or fewer fps than {fps:g}"
+        )
+    return data["start"] + speed / fps * np.arange(count)
+
+
+def save_gif(
+    animation: Posed, path: Path, fps: float = 25.0, width: int = 480, theme: str = "light", speed: float | None = None
+) -> None:
+    """Write the motion as a GIF that repeats for ever. It counts in hundredths of a second: fps is 100 over a whole number."""
+    tick = max(2, round(1 / fps / GIF_TICK))  # browsers slow down what is faster
+    times = film_times(animation, 1 / (tick * GIF_TICK), speed)
+    palette = image(animation, times[0], width, theme).quantize(64)  # one for all frames, so that nothing flickers
+    frames = [image(animation, t, width, theme).quantize(palette=palette, dither=Image.Dither.NONE) for t in times]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=10 * tick, loop=0, optimize=True)
+
+
+def save_mp4(
+    animation: Posed, path: Path, fps: float = 30.0, width: int = 960, theme: str = "light", speed: float | None = None
+) -> None:
+    """Write the motion as an H.264 film; needs the extra `video` (imageio-ffmpeg)."""
+    with OptionalImport():
+        import imageio_ffmpeg
+    frames = _frames(animation, film_times(animation, fps, speed), width, theme)
+    first = next(frames)
+    size = first.shape[1], first.shape[0]
+    film = imageio_ffmpeg.write_frames(
+        str(path),
+        size,
+        fps=fps,  # pyright: ignore[reportArgumentType]
+        macro_block_size=2,
+        quality=7,
+        output_params=["-movflags", "+faststart"],
+    )
+    film.send(None)
+    film.send(first.tobytes())
+    for frame in frames:
+        film.send(frame.tobytes())
+    film.close()
+
+
+def _frames(animation: Posed, times: np.ndarray, width: int, theme: str) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    for t in times:
+        yield np.asarray(image(animation, float(t), width, theme))
