@@ -48,6 +48,13 @@ def test_inverse(tmp_path, capsys):
     assert udkjax("inverse", EXAMPLES / "parallelogram.toml", "--t1", 0.3) == 2
 
 
+def test_a_scene_that_finds_no_rest_says_so(tmp_path, capsys):
+    scene = tmp_path / "fall.toml"
+    scene.write_text('format = 1\n[[body]]\nname = "stone"\nmass = 1.0\ninertia = 0.1\n')
+    assert udkjax("statics", scene) == 1
+    assert "no position of rest was found" in capsys.readouterr().err
+
+
 def test_statics_and_modes_of_the_papers_linkage(tmp_path, capsys):
     rest = results(capsys, "statics", EXAMPLES / "parallelogram.toml", "--stable", "--out", tmp_path / "s.nc")["equilibria"]
     assert rest[0]["stable"]

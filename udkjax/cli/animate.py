@@ -2,11 +2,19 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from udkjax.cli.common import Json, load, refuse, show
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from udkjax import Mechanism
+    from udkjax.show.player.measures import Trajectory
+
+    ShownRun = tuple[Mechanism, Trajectory, dict[str, np.ndarray]]  # and further measures by name
 
 KINDS = (".html", ".gif", ".mp4", ".svg", ".png", ".dxf")
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN.nc|SCENE.toml")]
@@ -70,7 +78,7 @@ def animate(
     film = {"fps": fps, "speed": speed} if kind in (".gif", ".mp4") else {}
     page = {"autoplay": autoplay} if kind == ".html" else {} if kind == ".dxf" else {"width": width}
     look = {"theme": theme} if kind != ".dxf" else {}
-    options: dict[str, Any] = {name: value for name, value in (film | page | look).items() if value is not None}
+    options = {name: value for name, value in (film | page | look).items() if value is not None}
     try:
         found = udk.animate(
             {name: mechanism for name, (mechanism, _, _) in runs.items()},
@@ -88,7 +96,7 @@ def animate(
     show(results, f"wrote {out} ({size / 1e3:.0f} kB)", json)
 
 
-def _run(file: Path, t1: float, dt: float) -> tuple[Any, Any, dict[str, Any]]:
+def _run(file: Path, t1: float, dt: float) -> "ShownRun":
     """Return the mechanism of a file, its run, and further measures."""
     if file.suffix.lower() == ".toml":
         mechanism, _ = load(file)
@@ -109,9 +117,9 @@ def _run(file: Path, t1: float, dt: float) -> tuple[Any, Any, dict[str, Any]]:
     return run.mechanism, run, run.others
 
 
-def _measures(wanted: tuple[str, ...], runs: dict[str, tuple[Any, Any, dict[str, Any]]]) -> dict[str, Any]:
-    """The measures by name: those that are computed as None, and variables of the files' own for each run."""
-    found: dict[str, Any] = {}
+def _measures(wanted: tuple[str, ...], runs: dict[str, "ShownRun"]) -> "dict[str, dict[str, np.ndarray] | None]":
+    """Return the measures by name: those that are computed as None, and variables of the files' own for each run."""
+    found: dict[str, dict[str, np.ndarray] | None] = {}
     for name in wanted:
         own = {
             label: {key: value for key, value in others.items() if key.split(" (")[0] == name}

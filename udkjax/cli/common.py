@@ -27,7 +27,7 @@ import sys
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from udkjax.cli.exits import BAD_INPUT, BAD_RUN, INTERRUPTED, fail, refuse, say
 from udkjax.extras import OptionalImport
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 __all__ = ["BAD_INPUT", "BAD_RUN", "INTERRUPTED", "Json", "Quiet", "Scene", "fail", "load", "refuse", "say", "show"]
 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml")]
+JsonValue = dict[str, "JsonValue"] | list["JsonValue"] | str | float | bool | None
 Json = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
@@ -64,7 +65,7 @@ def load(scene: Path) -> tuple["Mechanism", str]:
         refuse(problem)
 
 
-def show(results: Mapping[str, Any], text: str, json: bool) -> None:
+def show(results: Mapping[str, object], text: str, json: bool) -> None:
     """Write what a command found to stdout: as text, or as one JSON object, and the text then to stderr.
 
     Args:
@@ -79,14 +80,14 @@ def show(results: Mapping[str, Any], text: str, json: bool) -> None:
         print(text)
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> JsonValue:
     """Return a value as JSON knows it: arrays and tuples as lists, enumerations by name, paths as text, NaN and inf as None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, Enum):
         return value.name
-    if hasattr(value, "tolist"):  # an array or a number of NumPy or JAX
-        return plain(value.tolist())
+    if (tolist := getattr(value, "tolist", None)) is not None:  # of an array or a number of NumPy or JAX
+        return plain(tolist())
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(item) for item in value]
     if isinstance(value, float):

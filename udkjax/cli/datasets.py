@@ -2,9 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from udkjax.cli.common import refuse
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 
 def check_target(out: Path | None) -> None:
@@ -16,9 +19,9 @@ def check_target(out: Path | None) -> None:
 def write(
     out: Path | None,
     scene: str,
-    variables: Mapping[str, tuple[Sequence[str], Any, str]],
-    coordinates: Mapping[str, Any],
-    settings: Mapping[str, Any],
+    variables: Mapping[str, "tuple[Sequence[str], ArrayLike, str]"],
+    coordinates: Mapping[str, "ArrayLike"],
+    settings: Mapping[str, object],
 ) -> None:
     """Write variables, each its dimensions, values and unit, to a file if there is to be one, with the scene and versions.
 

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -115,7 +115,7 @@ def identify(
         fail("the fit has not settled" if not estimate.converged else "the measurements do not show every parameter")
 
 
-def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], results: Mapping[str, Any], out: Path) -> list[str]:
+def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], results: Mapping[str, object], out: Path) -> list[str]:
     """Write everything, and return the names of the files."""
     import csv
     import json

@@ -2,11 +2,14 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from udkjax.cli.common import Json, Scene, fail, load, refuse, show
 from udkjax.cli.datasets import check_target, write
 from udkjax.extras import OptionalImport
+
+if TYPE_CHECKING:
+    from udkjax import Mechanism
 
 with OptionalImport():
     import tyro
@@ -66,7 +69,7 @@ def kinematics(
         lines["singular at"] = ", ".join(f"{float(s):g}" for s, n in zip(found.values, names, strict=True) if n == "singular")
     if others is not None:
         lines["branches"] = f"{len(others)} at {first:g}"
-    results: dict[str, Any] = {
+    results: dict[str, object] = {
         "driver": driver,
         "travel": [travel.lower, travel.upper],
         "values": found.values,
@@ -98,7 +101,7 @@ def _default(given: float | None, limit: float, otherwise: float) -> float:
     return limit if math.isfinite(limit) else otherwise
 
 
-def _value(mech: Any, driver: str) -> float:
+def _value(mech: "Mechanism", driver: str) -> float:
     """The value of a coordinate where the mechanism starts."""
     import udkjax as udk
     from udkjax.study.drive import value_of

@@ -3,7 +3,8 @@
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from types import ModuleType
+from typing import Annotated
 
 import tyro
 
@@ -81,7 +82,7 @@ def report(
     show({"runs": verdicts, "files": files}, "\n".join(f"wrote {file}" for file in files), json)
 
 
-def _module(name: str) -> Any:
+def _module(name: str) -> ModuleType:
     """Import a module of the study: of the installed package, or of a clone."""
     package = "udkjax.paper" if find_spec("udkjax.paper") else "experiments.paper"
     try:

@@ -128,7 +128,7 @@ def _stopwatch() -> Iterator[dict[str, float]]:
 
     seconds, spans = {"all": 0.0, "compiling": 0.0}, []
 
-    def listen(event: str, duration_secs: float, **_: Any) -> None:
+    def listen(event: str, duration_secs: float, **_: object) -> None:
         if event.startswith("/jax/core/compile/"):
             end = time.perf_counter()
             while spans and spans[-1][0] > end - duration_secs:  # what is traced inside this is a part of it

@@ -6,11 +6,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from udkjax.cli.common import INTERRUPTED, Json, Quiet, Scene, fail, load, refuse, say, show
+
+if TYPE_CHECKING:
+    import distributed
+
+    from udkjax import Mechanism
 
 Grid = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GRID.toml")]
 
@@ -99,7 +104,7 @@ def _arguments(grid: Path) -> dict[str, Any]:
         refuse(str(problem))
 
 
-def _estimate(mech: Any, arguments: dict[str, Any], memory: int, json: bool) -> None:
+def _estimate(mech: "Mechanism", arguments: dict[str, Any], memory: int, json: bool) -> None:
     from udkjax.show.sweep_summary import estimate_summary
     from udkjax.study.sweep.cost import estimate_cost
     from udkjax.study.sweep.plan import make_plan
@@ -109,7 +114,7 @@ def _estimate(mech: Any, arguments: dict[str, Any], memory: int, json: bool) -> 
     show(asdict(found), estimate_summary(plan, found), json)
 
 
-def _sweep(mech: Any, text: str, arguments: dict[str, Any], out: Path, json: bool, **choices: Any) -> None:
+def _sweep(mech: "Mechanism", text: str, arguments: dict[str, Any], out: Path, json: bool, **choices: Any) -> None:
     import udkjax as udk
     from udkjax.show.sweep_figures import save_pictures
     from udkjax.show.sweep_summary import sweep_results, sweep_summary
@@ -127,8 +132,8 @@ def _sweep(mech: Any, text: str, arguments: dict[str, Any], out: Path, json: boo
 
 
 @contextmanager
-def _client(engine: str, scheduler: str | None) -> Iterator[Any]:
-    """What the tasks are given to, if they are."""
+def _client(engine: str, scheduler: str | None) -> "Iterator[distributed.Client | None]":
+    """Yield the client that tasks are given to; None where they are not."""
     if engine != "dask" and scheduler is None:
         yield None
         return
