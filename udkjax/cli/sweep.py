@@ -13,8 +13,6 @@ import tyro
 from udkjax.cli.common import INTERRUPTED, Json, Quiet, Scene, fail, load, refuse, say, show
 
 if TYPE_CHECKING:
-    import distributed
-
     from udkjax import Mechanism
 
 Grid = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GRID.toml")]
@@ -132,7 +130,7 @@ def _sweep(mech: "Mechanism", text: str, arguments: dict[str, Any], out: Path, j
 
 
 @contextmanager
-def _client(engine: str, scheduler: str | None) -> "Iterator[distributed.Client | None]":
+def _client(engine: str, scheduler: str | None) -> Iterator[object]:
     """Yield the client that tasks are given to; None where they are not."""
     if engine != "dask" and scheduler is None:
         yield None
