@@ -148,7 +148,7 @@ def steps(request):
             start = solver.init(terms, 0.0, h, exact(0.0, args), args)
             values = [f(-h * j, exact(-h * j, args), args) for j in range(rows)]
             phi = jnp.stack([sum((-1) ** j * math.comb(i, j) * values[j] for j in range(i + 1)) for i in range(rows)])
-            fixed = lambda s: eqx.tree_at(lambda s: (s.pace.order, s.pace.planned), s, (order, h))  # noqa: E731
+            fixed = lambda s: eqx.tree_at(lambda s: (s.control.order, s.control.step), s, (order, h))  # noqa: E731
             start = eqx.tree_at(lambda s: (s.phi, s.points), start, (phi, jnp.array(rows)))
 
             def step(i, carry):
