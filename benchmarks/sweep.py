@@ -147,7 +147,8 @@ def _sweep(size: Size, end: float, folder: str, killed: bool) -> dict[str, float
 
     memory = MEMORY * int(np.prod(size))
     data = udk.sweep(udk.library.parallelogram(), **arguments(size, end), out=folder, memory=memory, progress=progress)
-    digest = hashlib.sha256(b"".join(np.ascontiguousarray(data[name].values).tobytes() for name in sorted(data.data_vars)))
+    names = sorted(map(str, data.data_vars))
+    digest = hashlib.sha256(b"".join(np.ascontiguousarray(data[name].values).tobytes() for name in names))
     Path(f"{folder}.digest").write_text(digest.hexdigest())
     assert int((data.result != 0).sum()) == 0, "members failed"
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

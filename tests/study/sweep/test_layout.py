@@ -11,6 +11,7 @@ import udkjax as udk
 from udkjax.study.sweep.axes import scale_to_range
 from udkjax.study.sweep.fingerprint import fingerprint
 from udkjax.study.sweep.layout import lay_out
+from udkjax.study.sweep.measures import MeasureChoice
 from udkjax.study.sweep.plan import make_plan
 
 TS = [0.0, 1.0]
@@ -112,7 +113,7 @@ def test_mistakes_are_named(linkage, axes, arguments, message):
 def test_all_mistakes_are_named_at_once(linkage):
     assert len(problems(linkage, {"a": [1.0], "b": [2.0]}, "c", derivatives=["d"], progress=True)) == 5
     with pytest.raises(udk.SweepError, match="engine: there is no 'gpu'; known are auto, devices, dask"):
-        udk.sweep(linkage, {"rtol": [1e-4]}, TS, engine="gpu")
+        udk.sweep(linkage, {"rtol": [1e-4]}, TS, engine="gpu")  # pyright: ignore[reportArgumentType]
 
 
 def test_gains_are_varied_of_a_stabilization_that_has_some(linkage):
@@ -120,7 +121,7 @@ def test_gains_are_varied_of_a_stabilization_that_has_some(linkage):
 
 
 def test_the_fingerprint_tells_what_decides_the_results(linkage):
-    def of(values=(1e-4, 1e-6), measure: object = "final", mechanism=linkage, factor=2.0, **settings):
+    def of(values=(1e-4, 1e-6), measure: MeasureChoice = "final", mechanism=linkage, factor=2.0, **settings):
         length = udk.Axis([1.0], of=lambda m, x: m.with_parameters({"body.coupler.mass": factor * x}))
         return fingerprint(make_plan(mechanism, {"rtol": values, "x": length}, TS, measure, **settings))
 

@@ -23,7 +23,12 @@ def test_a_measure_goes_by_the_name_that_it_is_given():
 
 
 def test_only_what_needs_all_output_times_gets_them():
-    assert [m.along for m in measures_of(["final", "counts", "violation", len], None, TS)] == [False, False, True, True]
+    assert [m.along for m in measures_of(["final", "counts", "violation", lambda m, s: s.q], None, TS)] == [
+        False,
+        False,
+        True,
+        True,
+    ]
 
 
 def test_a_users_arrays_are_labelled_by_their_shapes():

@@ -10,12 +10,14 @@ import inspect
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
+
+from udkjax.integrate.assembly import State
 
 # The settings of a run that are choices; what each is where none is given, or given as None.
 CHOICES = {
@@ -49,7 +51,17 @@ class Axis:
 class Zipped(NamedTuple):
     """Axes of equal length that advance together, along one dimension."""
 
-    axes: Mapping[str, Any]
+    axes: Mapping[str, "AxisValues"]
+
+
+class Distribution(Protocol):
+    """A frozen distribution of scipy.stats."""
+
+    def ppf(self, q: Any) -> Any: ...
+
+
+# Numbers (n, ...) or choices, or for a design a range or a distribution; with or without an `Axis` around them.
+AxisValues: TypeAlias = Axis | Zipped | Distribution | State | ArrayLike | Sequence[object]
 
 
 @dataclass(frozen=True, eq=False)

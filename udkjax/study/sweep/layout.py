@@ -13,7 +13,7 @@ from udkjax.pinv import Auto
 from udkjax.scene.checks import Mistakes, SceneError, abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
-from udkjax.study.sweep.axes import CHOICES, Axis, Column, Design, Dimension, Zipped, labels_of, scale_to_range
+from udkjax.study.sweep.axes import CHOICES, Axis, AxisValues, Column, Design, Dimension, Zipped, labels_of, scale_to_range
 from udkjax.study.units import NUMBERS, units_of
 
 MEMBER = "member"  # the dimension of a design
@@ -27,7 +27,7 @@ class SweepError(Mistakes):
     subject = "sweep"
 
 
-def lay_out(mechanism: Mechanism, axes: Mapping[str, Any], design: Design | None = None) -> tuple[Dimension, ...]:
+def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: Design | None = None) -> tuple[Dimension, ...]:
     """Return the dimensions of a sweep over `axes`. Raises `SweepError`."""
     problems: list[str] = []
     ranges = [name for name, given in axes.items() if design is not None and not isinstance(given, Zipped) and _is_range(given)]
@@ -61,13 +61,13 @@ def lay_out(mechanism: Mechanism, axes: Mapping[str, Any], design: Design | None
     return tuple(found)
 
 
-def _is_range(given: Any) -> bool:
+def _is_range(given: AxisValues) -> bool:
     """Whether a design fills this axis: all but choices."""
     values = given.values if isinstance(given, Axis) else given
     return hasattr(values, "ppf") or _numbers(values) is not None
 
 
-def _column(mechanism: Mechanism, name: str, given: Any, unit: np.ndarray | None, problems: list[str]) -> Column | None:
+def _column(mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray | None, problems: list[str]) -> Column | None:
     """One axis, or None where its mistake is among the problems."""
     axis = given if isinstance(given, Axis) else Axis(given)
     of = (name,) if axis.of is None else axis.of

@@ -1,13 +1,13 @@
 """Measures: what is kept of each member, and nothing else is computed."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from udkjax.equations.quantities import energy, violation
 from udkjax.equations.scales import rank_tolerance
@@ -16,6 +16,12 @@ from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
+
+UserMeasure: TypeAlias = Callable[[Mechanism, Solution], ArrayLike | Mapping[str, ArrayLike]]
+OneMeasure: TypeAlias = str | UserMeasure
+MeasureChoice: TypeAlias = OneMeasure | Sequence[OneMeasure] | Mapping[str, OneMeasure]
+# Coordinates (T, bodies, 3) that runs are compared with, or a function (mechanism, ts) of them.
+Reference: TypeAlias = Solution | ArrayLike | Callable[[Mechanism, Array], ArrayLike] | None
 
 NOT_REACHED = -1  # the rank at output times that a run has not reached
 
@@ -26,7 +32,7 @@ class Run(NamedTuple):
     mechanism: Mechanism
     solution: Solution
     method: Any
-    reference: Any  # (T, bodies, 3), or a function (mechanism, ts) of it, or None
+    reference: Reference
 
 
 class Label(NamedTuple):
@@ -45,7 +51,7 @@ class Measure:
     along: bool  # whether it needs all output times, not only the end
     compute: Callable[[Run], Mapping[str, Array]]
     labels: Mapping[str, Label]  # empty: of a user's function
-    reference: Any = None
+    reference: Reference = None
     renamed: str = ""  # the key that it was given under
 
     def of(self, mechanism: Mechanism, solution: Solution, method: Any) -> dict[str, Array]:
@@ -59,7 +65,7 @@ class Measure:
         return {self._key(name): label for name, label in self.labels.items()}
 
     @property
-    def function(self) -> Callable[[Mechanism, Solution], Any] | None:
+    def function(self) -> UserMeasure | None:
         """The user's function, if it is one."""
         return self.compute.function if isinstance(self.compute, _UserMeasure) else None
 
@@ -79,19 +85,20 @@ def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) ->
     return Label(tuple(dims), "", "")
 
 
-def measures_of(given: Any, reference: Any, ts: np.ndarray) -> tuple[Measure, ...]:
+def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray) -> tuple[Measure, ...]:
     """Read `measure`: a name, a function of (mechanism, solution), a sequence of such, or a dict of them. Raises ValueError."""
     if isinstance(given, Mapping):
         items = [(str(key), value) for key, value in given.items()]
     else:
-        items = [("", value) for value in (given if isinstance(given, list | tuple) else [given])]
+        several = given if isinstance(given, list | tuple) else [cast(OneMeasure, given)]
+        items = [("", value) for value in several]
     found = tuple(_measure(key, value, reference, ts) for key, value in items)
     if reference is not None and not any(measure.name == "error" for measure in found):
         raise ValueError('reference: only the measure "error" looks at it, which is not among the measures')
     return found
 
 
-def _measure(key: str, given: Any, reference: Any, ts: np.ndarray) -> Measure:
+def _measure(key: str, given: OneMeasure, reference: Reference, ts: np.ndarray) -> Measure:
     if isinstance(given, str):
         if given not in MEASURES:
             near = suggestion(given, MEASURES) or f"; known are {', '.join(MEASURES)}"
@@ -110,7 +117,7 @@ def _measure(key: str, given: Any, reference: Any, ts: np.ndarray) -> Measure:
 class _UserMeasure:
     """A user's function, whose single array goes by the measure's name."""
 
-    function: Callable[[Mechanism, Solution], Any]
+    function: UserMeasure
     name: str
 
     def __call__(self, run: Run) -> dict[str, Array]:
@@ -120,7 +127,7 @@ class _UserMeasure:
         return {self.name: jnp.asarray(found)}
 
 
-def _reference(given: Any, ts: np.ndarray) -> Any:
+def _reference(given: Reference, ts: np.ndarray) -> Reference:
     if given is None:
         raise ValueError(
             'measure "error" needs reference=: a Solution, coordinates (T, bodies, 3), or a function (mechanism, ts)'

@@ -10,13 +10,14 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Int
+from numpy.typing import ArrayLike
 
 from udkjax.equations.analysis import analyse
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.sweep.axes import Column, Design, Dimension, structure_of
+from udkjax.study.sweep.axes import AxisValues, Column, Design, Dimension, structure_of
 from udkjax.study.sweep.layout import SweepError, check_settings, check_tangents, lay_out
-from udkjax.study.sweep.measures import Measure, measures_of
+from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
 
 OUTSIDE = ("throw", "progress", "adjoint")  # arguments of simulate that a sweep decides about
 
@@ -128,12 +129,12 @@ class Plan:
 
 def make_plan(
     mechanism: Mechanism,
-    axes: Mapping[str, Any],
-    ts: Any,
-    measure: Any = "final",
+    axes: Mapping[str, AxisValues],
+    ts: ArrayLike,
+    measure: MeasureChoice = "final",
     *,
     design: Design | None = None,
-    reference: Any = None,
+    reference: Reference = None,
     derivatives: Sequence[str] = (),
     **settings: Any,
 ) -> Plan:
