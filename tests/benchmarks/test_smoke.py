@@ -110,6 +110,7 @@ def test_first_guesses_of_every_measurement_are_around_the_truth():
         assert len(m.ts) == round(m.end * m.rate) + 1
 
 
+@pytest.mark.slow
 def test_the_command_writes_figures_table_and_page(tmp_path):
     """With figures of an earlier run in the folder, which it does not repeat."""
     earlier = [{"name": "udkjax", "start": -45.0, "outputs": "end only", "target": 1e-6, "per_second": 123.0}]

@@ -136,7 +136,7 @@ def data_null(theta):
 # --- principles
 
 
-@pytest.mark.parametrize("name", fast(["double_pendulum", "driven_pendulum", "slider_crank", "elliptic_trammel"], SMALL))
+@pytest.mark.parametrize("name", fast(["driven_pendulum", "slider_crank"], SMALL))
 def test_agrees_with_the_augmented_equations(mechanisms, kkt, closed, name):
     """One large linear system in a and lambda, by NumPy."""
     mech = mechanisms[name]
@@ -156,9 +156,7 @@ def terms(mech, t, q, v):
     return A, gamma, loads.force(mech, t, q, v), constraints.psi(mech, t, q), constraints.psi_dot(mech, t, q, v)
 
 
-@pytest.mark.parametrize(
-    "name", fast(["parallelogram", "scissor_lift", "planetary_gear"], ["double_pendulum", "parallelogram", *LARGE])
-)
+@pytest.mark.parametrize("name", fast(["parallelogram", "planetary_gear"], ["double_pendulum", "parallelogram", *LARGE]))
 def test_gauss_principle(mechanisms, closed, name):
     """Among all accelerations that satisfy the constraints it is nearest to the free ones, in the metric of the masses."""
     mech = mechanisms[name]
@@ -243,8 +241,10 @@ def test_projection_is_the_smallest_change(nearby, name):
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    [("parallelogram", udk.Auto()), ("slider_crank", udk.SVD())],
-    ids=["parallelogram-Auto", "slider_crank-SVD"],
+    [
+        pytest.param("parallelogram", udk.Auto(), id="parallelogram-Auto"),
+        pytest.param("slider_crank", udk.SVD(), id="slider_crank-SVD", marks=pytest.mark.slow),
+    ],
 )
 def test_the_tangential_part_is_what_projection_leaves(mechanisms, nearby, method, name):
     """Of small changes of a closed state; against the projection itself, which is linear in velocities."""

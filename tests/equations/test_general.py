@@ -155,6 +155,7 @@ def test_a_blade_on_ice_runs_in_a_circle(stabilization):
     assert udk.violation(knife(), sol).shape == (len(TS), 0)  # no Psi
 
 
+@pytest.mark.slow
 def test_a_blade_that_is_steered():
     """With a constant torque the path is Cornu's spiral: the angle grows with the square of time, the speed stays."""
     sol = run(knife(0.8), [0.0, 0.0, 0.0], [2.0, 0.0, 0.0])

@@ -15,6 +15,7 @@ from scipy.special import ellipj, ellipk
 import udkjax as udk
 from benchmarks.integrators import FINER, Work, vode
 from benchmarks.problems import NOT_STIFF, pendulum
+from tests.choices import fast
 from udkjax.integrate.solvers.counting import CountingController, Wrapper, count_evaluations, evaluations, tally
 from udkjax.integrate.solvers.multistep import Tolerances
 
@@ -60,7 +61,7 @@ def swing():
     return {corrector: program(pendulum, udk.Adams(corrector=corrector)) for corrector in ("pece", "iteration")}
 
 
-@pytest.fixture(scope="module", params=["pece", "iteration"])
+@pytest.fixture(scope="module", params=fast(["pece"], ["pece", "iteration"]))
 def pendulums(swing, request):
     return swing[request.param]
 

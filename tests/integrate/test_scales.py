@@ -58,6 +58,7 @@ def test_to_the_last_digit_where_the_units_are_powers_of_two(name):
 
 
 @pytest.mark.parametrize("method", [udk.SVD(), pytest.param(udk.Varga(), marks=pytest.mark.slow)], ids=["SVD", "Varga"])
+@pytest.mark.slow
 def test_and_by_methods_that_compare_rows_of_metres_with_rows_of_radians(method):
     for units in UNITS[::2]:
         dq, dv = deviation(udk.library.slider_crank(), units, method, TS[:5])

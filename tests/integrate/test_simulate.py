@@ -249,7 +249,7 @@ def counted(held):
 @pytest.mark.parametrize(
     ("solver", "held"),
     [
-        pytest.param(diffrax.Dopri8(), False, id="Dopri8-free"),
+        pytest.param(diffrax.Dopri8(), False, id="Dopri8-free", marks=pytest.mark.slow),
         pytest.param(diffrax.Tsit5(), True, id="Tsit5-projected"),
         pytest.param(diffrax.Tsit5(), False, id="Tsit5-free"),
         *(

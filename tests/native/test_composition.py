@@ -177,6 +177,7 @@ for k in range(20):
 """
 
 
+@pytest.mark.slow
 def test_processes_share_the_folder(folder):
     """Several make and read the same files at once."""
     environment = {**os.environ, "UDKJAX_CACHE": str(folder), "PYTHONPATH": os.path.dirname(__file__)}

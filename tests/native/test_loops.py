@@ -240,7 +240,11 @@ def test_constants_by_jax_are_those_of_the_loops(at):
     assert_allclose(found[2:], at.constants[2:], rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("width", [1, machine.lanes()], indirect=True)
+@pytest.mark.parametrize(
+    ("at", "width"),
+    [("loaded", 1), ("loaded", machine.lanes()), ("linkage", machine.lanes()), ("gears", machine.lanes())],
+    indirect=True,
+)
 @pytest.mark.parametrize("name", ["end_of_step", "equation_terms"])
 def test_machine_code_runs_the_loops(at, name, code, width):
     program = getattr(at.code, name)

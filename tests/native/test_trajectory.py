@@ -22,7 +22,8 @@ TOL = 1e-9
 # Loops know no pieces of the state; and what does not depend on how the equations are written is tested once.
 WRITTEN_OUT = pytest.mark.parametrize("served", ["written out"], indirect=True)
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
-LARGE = ("chain", "excavator", "n_four_bar", "peaucellier", "planetary_gear", "scissor_lift", "driven_pendulum", "four_bar")
+LARGE = """simple_pendulum compound_pendulum driven_pendulum chain excavator n_four_bar peaucellier planetary_gear scissor_lift
+    four_bar""".split()
 
 
 @jax.jit
@@ -262,6 +263,7 @@ def pushed(times=(0.25, 0.6)):
 @pytest.mark.parametrize(
     "ts", [np.linspace(0.0, 1.0, 11), np.linspace(0.1, 0.55, 4), np.array([0.0, 0.25, 0.6]), np.array([0.25, 0.3, 0.9])], ids=str
 )
+@WRITTEN_OUT
 @pytest.mark.parametrize("projected", [True, False])
 def test_runs_start_anew_behind_breakpoints(ts, projected):
     """Also where output times are breakpoints, and where the first and the last are."""
@@ -390,6 +392,7 @@ def test_what_was_reached_before_a_run_failed_is_right():
 
 
 @WRITTEN_OUT
+@pytest.mark.slow
 def test_a_mechanism_that_cannot_be_closed_is_no_run(served):
     del served
     far = udk.Mechanism(

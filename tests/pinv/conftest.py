@@ -1,35 +1,14 @@
-"""The register of methods, where a new one is one line and meets every test; and matrices with exactly known pseudoinverses."""
+"""Each method, and matrices with exactly known pseudoinverses."""
 
 import json
-from collections.abc import Callable
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
-
-
-class Entry(NamedTuple):
-    name: str
-    make: Callable[..., Pseudoinverse]
-    power: int = 1  # the error is of the order of eps cond^power
-    own_threshold: bool = False  # decides the rank as well as it can by its default only
-
-
-METHODS = [
-    Entry("SVD", SVD),
-    Entry("Varga", Varga),
-    Entry("Householder", Householder),
-    Entry("GramSchmidt", GramSchmidt),
-    Entry("GramSchmidt once", partial(GramSchmidt, twice=False), power=2),
-    Entry("Greville", Greville, power=2, own_threshold=True),
-    Entry("Elimination", Elimination, power=2, own_threshold=True),
-    Entry("Auto", Auto),
-]
+from tests.pinv.methods import METHODS, Entry
 
 
 class Exact(NamedTuple):

@@ -75,6 +75,7 @@ def test_a_linkage_stops_at_its_toggle():
     np.testing.assert_allclose(np.sin((np.asarray(found.q[:8, 2, 2]) - exact) / 2), 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_travel_has_two_ends_and_exact_derivatives():
     a, b, c, g = STUCK
     mech = udk.library.four_bar(np.pi / 3, lengths=(a, b, c), ground=g)
