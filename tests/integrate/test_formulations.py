@@ -115,6 +115,7 @@ def test_constraints_hold_without_stabilization(mech, expected):
     assert sol.settings["stabilization"] == "NoneType"
 
 
+@pytest.mark.slow
 def test_only_what_is_independent_is_judged():
     """One step of a size that would fail: the error has one coordinate and its velocity; the others are zero."""
     mech = LINKAGE

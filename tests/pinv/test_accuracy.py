@@ -117,6 +117,7 @@ SHAPES = (1, 5), (5, 1), (3, 7), (7, 3)
 @pytest.mark.parametrize(
     "shape", [pytest.param(s, id=str(s), marks=pytest.mark.slow if s in SHAPES[1:3] else ()) for s in SHAPES]
 )
+@pytest.mark.parametrize("entry", entries("Varga", "Greville", "Elimination", "Auto"), indirect=True)
 def test_shapes_and_degenerate_matrices(entry, shape):
     rng = np.random.default_rng(3)
     m, n = shape

@@ -132,6 +132,7 @@ def test_second_derivatives_in_every_mode(matrices):
         close(hessian[None], hessians[0][None], 1e-11)
 
 
+@pytest.mark.slow
 def test_third_derivative():
     """x(s) = A(s)^+ b with A(s) = u(s) v^T, |u|, |v| = 1, is v (u . b): three derivatives in closed form, at rank one."""
     v = jnp.array([0.6, 0.8, 0.0])

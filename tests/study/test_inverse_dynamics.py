@@ -11,6 +11,7 @@ from tests.choices import fast
 SCENES = {"driven pendulum": udk.library.driven_pendulum, "slider crank": lambda: udk.library.slider_crank(0.3, 4.0)}
 
 
+@pytest.mark.slow
 def test_the_torque_of_a_slider_crank_is_that_of_its_closed_form():
     """By energy: crank, rod and slider have V(s) and T = J(s) s_dot^2 / 2, so the torque is J'(s) s_dot^2 / 2 + V'(s)."""
     r, rod, (m1, m2, m3), g, omega = 0.5, 1.5, (1.0, 1.5, 2.0), 9.81, 4.0
@@ -65,6 +66,7 @@ def test_redundant_joints_and_redundant_drivers():
 
 
 @pytest.mark.parametrize("name", fast(["driven pendulum"], SCENES))
+@pytest.mark.slow
 def test_efforts_are_what_the_drivers_reactions_say(name):
     """For as many drivers as degrees of freedom: -lambda of the driver's row, found by forward dynamics."""
     mech = SCENES[name]()
