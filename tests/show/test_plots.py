@@ -13,7 +13,7 @@ import udkjax as udk
 from udkjax.equations.quantities import Energy
 from udkjax.integrate import Result, Solution
 from udkjax.show import plots
-from udkjax.show.plots import apart, attachments, outline, placed, trajectory
+from udkjax.show.plots import attachments, farthest_instants, outline, to_ground, trajectory
 from udkjax.study import exact_coordinates
 
 
@@ -51,9 +51,9 @@ def test_outline_visits_points_in_turn():
     np.testing.assert_array_equal(square[0], square[-1])
 
 
-def test_placed_turns_anticlockwise():
+def test_to_ground_turns_anticlockwise():
     np.testing.assert_allclose(
-        placed(np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([3.0, 4.0, np.pi / 2])), [[3, 5], [2, 4]], atol=1e-15
+        to_ground(np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([3.0, 4.0, np.pi / 2])), [[3, 5], [2, 4]], atol=1e-15
     )
 
 
@@ -73,11 +73,11 @@ def test_trajectory_draws_the_mechanism_where_it_is(linkage, exact):
 
 
 def test_poses_are_far_apart(exact):
-    chosen = apart(exact, 4)
+    chosen = farthest_instants(exact, 4)
     assert chosen[0] == 0 and len(set(chosen)) == 4
     angles = exact[chosen, 0, 2]
     assert np.ptp(angles) == pytest.approx(np.ptp(exact[:, 0, 2]))
-    assert apart(exact[:1].repeat(3, axis=0), 4) == [0]  # a mechanism that stands has one pose
+    assert farthest_instants(exact[:1].repeat(3, axis=0), 4) == [0]  # a mechanism that stands has one pose
 
 
 def test_two_pictures_do_not_share_anything(linkage, exact):

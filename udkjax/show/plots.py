@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from udkjax.deprecation import deprecated_getattr
 from udkjax.equations import energy, violation
 from udkjax.equations.quantities import Energy
 from udkjax.extras import OptionalImport
 from udkjax.integrate import Solution
 from udkjax.scene import GROUND, Mechanism
 from udkjax.show import fit_figures, sweep_figures
-from udkjax.show.poses import apart, attachments, outline, placed
+from udkjax.show.poses import attachments, farthest_instants, outline, to_ground
 from udkjax.show.style import COLOURS, DASHES, MARKERS, legend, plain
 from udkjax.study.accuracy import largest_violation
 
@@ -33,7 +34,16 @@ with OptionalImport():
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["COLOURS", "apart", "attachments", "legend", "outline", "placed", "trajectory"]  # and every function that draws
+__all__ = [
+    "COLOURS",
+    "attachments",
+    "farthest_instants",
+    "legend",
+    "outline",
+    "to_ground",
+    "trajectory",
+]  # and every function that draws
+__getattr__ = deprecated_getattr(__name__, {"apart": "farthest_instants", "placed": "to_ground"})
 
 WIDE = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
 ROUNDING = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
@@ -75,15 +85,15 @@ def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"],
     held = attachments(mech)
     for place in range(len(mech.bodies)):
         axes.plot(*q[:, place, :2].T, color=COLOURS[place % len(COLOURS)], lw=0.6, alpha=0.6, zorder=1)
-    for instant in reversed(apart(q, ghosts + 1)):
+    for instant in reversed(farthest_instants(q, ghosts + 1)):
         strength = 1.0 if instant == 0 else 0.22
         for place, body in enumerate(mech.bodies):
             colour = COLOURS[place % len(COLOURS)]
-            x, y = placed(outline(held[body]), q[instant, place]).T
+            x, y = to_ground(outline(held[body]), q[instant, place]).T
             axes.fill(x, y, facecolor=colour, alpha=0.25 * strength, lw=0, zorder=2)
             axes.plot(x, y, color=colour, alpha=strength, lw=2.6, solid_capstyle="round", solid_joinstyle="round", zorder=3)
             if instant == 0:
-                axes.plot(*placed(held[body], q[0, place]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
+                axes.plot(*to_ground(held[body], q[0, place]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
                 axes.plot(*q[0, place, :2], "o", ms=3, color=colour, zorder=4)
     axes.plot(*held[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
     return _plane(axes)
@@ -236,13 +246,13 @@ def draw_mode(
         swing: how far the points that hold bodies move at most, as a part of the mechanism's size.
     """
     q, shape, held = np.asarray(q, float), np.asarray(shape, float), attachments(mech)
-    rest = np.concatenate([placed(held[body], q[k]) for k, body in enumerate(mech.bodies)] + [held[GROUND], q[:, :2]])
+    rest = np.concatenate([to_ground(held[body], q[k]) for k, body in enumerate(mech.bodies)] + [held[GROUND], q[:, :2]])
     tiny = LINEAR * shape / np.abs(shape).max()
-    moved = [placed(held[body], q[k] + tiny[k]) - placed(held[body], q[k]) for k, body in enumerate(mech.bodies)]
+    moved = [to_ground(held[body], q[k] + tiny[k]) - to_ground(held[body], q[k]) for k, body in enumerate(mech.bodies)]
     scale = swing * np.ptp(rest, axis=0).max() / np.abs(np.concatenate([*moved, tiny[:, :2]])).max()
     for sign, colour, style in ((0, "0.6", "-"), (1, COLOURS[0], "-"), (-1, COLOURS[1], "--")):
         for k, body in enumerate(mech.bodies):
-            x, y = placed(outline(held[body]), q[k] + sign * scale * tiny[k]).T
+            x, y = to_ground(outline(held[body]), q[k] + sign * scale * tiny[k]).T
             axes.plot(x, y, style, color=colour, lw=2.2 if sign else 3.4, solid_capstyle="round", zorder=2 + abs(sign))
     axes.plot(*held[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
     return _plane(axes)

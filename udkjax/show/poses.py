@@ -6,7 +6,7 @@ from jaxtyping import Float
 from udkjax.scene import GROUND, Mechanism
 
 
-def apart(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[int]:
+def farthest_instants(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[int]:
     """Return up to `count` instants, from the first on, whose poses differ most: each is the farthest from those before it."""
     poses = np.concatenate([q[..., :2], np.cos(q[..., 2:]), np.sin(q[..., 2:])], axis=-1).reshape(len(q), -1)
     chosen, distance = [0], np.linalg.norm(poses - poses[0], axis=1)
@@ -36,7 +36,7 @@ def outline(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners
     return points[order if flat else np.append(order, order[0])]
 
 
-def placed(points: Float[np.ndarray, "points 2"], coordinates: Float[np.ndarray, "3"]) -> Float[np.ndarray, "points 2"]:
+def to_ground(points: Float[np.ndarray, "points 2"], coordinates: Float[np.ndarray, "3"]) -> Float[np.ndarray, "points 2"]:
     """Return where points of a body's own frame are, in ground coordinates."""
     x, y, angle = coordinates
     cos, sin = np.cos(angle), np.sin(angle)

@@ -110,7 +110,7 @@ def test_every_kind_of_mark_is_drawn():
     every = marks(mech, mech.q0[None])
     found = {mark["kind"] for mark in every}
     methods = {name[1:] for name in vars(Sketch) if name.startswith("_") and not name.startswith("__")}
-    helpers = {"body", "anchor", "at", "edge", "fill", "line", "circle", "turned", "hatch", "rail_frame", "along", "turn", "head"}
+    helpers = {"body", "anchor", "at", "edge", "fill", "line", "circle", "rotate", "hatch", "rail_frame", "along", "turn", "head"}
     assert found == methods - helpers
     sketch = Sketch(every, np.asarray(mech.q0), view_of((-1, -1, 4, 2), 600))
     assert {shape.layer for shape in sketch.shapes} == found

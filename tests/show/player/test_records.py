@@ -8,7 +8,7 @@ import pytest
 
 import udkjax as udk
 from tests.show.player.conftest import Motion
-from udkjax.show.player.marks import body_points, corners_of, marks, placed
+from udkjax.show.player.marks import body_points, corners_of, marks, to_ground
 from udkjax.show.player.measures import measures_of, rank_of, reaction_arrows, singular_values_over_time
 from udkjax.show.player.page import page
 from udkjax.show.player.records import PRECISION, run_record
@@ -103,7 +103,7 @@ def test_corners_of_plates_and_ends_of_bars():
     assert closed and sorted(map(tuple, corners)) == [(0, 0), (0, 2), (2, 0)]
     ends, closed = corners_of(np.array([[1.0, 1], [0, 0], [3, 3]]))
     assert not closed and abs(ends[0] - ends[-1]).tolist() == [3, 3]
-    np.testing.assert_allclose(placed((1, 0), np.array([[3.0, 4.0, np.pi / 2]])), [[3, 5]], atol=1e-15)
+    np.testing.assert_allclose(to_ground((1, 0), np.array([[3.0, 4.0, np.pi / 2]])), [[3, 5]], atol=1e-15)
 
 
 def test_points_that_hold_bodies_are_named_once():

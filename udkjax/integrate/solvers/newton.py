@@ -144,17 +144,17 @@ def _matrices(equation: Implicit, now: _Iteration) -> tuple[Float[Array, "n"], N
     """
     state, renew = now.state, now.renew
 
-    def renewed():
+    def take_jacobian():
         f, jacobian = equation.with_jacobian(now.e)
         return f, jnp.where(renew, jacobian, state.jacobian)
 
-    f, jacobian = jax.lax.cond(eqxi.unvmap_any(renew), renewed, lambda: (equation.field(now.e), state.jacobian))
+    f, jacobian = jax.lax.cond(eqxi.unvmap_any(renew), take_jacobian, lambda: (equation.field(now.e), state.jacobian))
 
-    def factorized():
+    def factorize():
         lu, pivots = lu_factor(jnp.eye(len(f), dtype=f.dtype) - equation.c * jacobian)
         return jnp.where(now.factor, lu, state.lu), jnp.where(now.factor, pivots, state.pivots)
 
-    lu, pivots = jax.lax.cond(eqxi.unvmap_any(now.factor), factorized, lambda: (state.lu, state.pivots))
+    lu, pivots = jax.lax.cond(eqxi.unvmap_any(now.factor), factorize, lambda: (state.lu, state.pivots))
     new = lambda a, b, pred: jnp.where(pred, a, b)  # noqa: E731
     state = NewtonState(
         jacobian,

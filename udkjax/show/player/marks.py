@@ -247,7 +247,7 @@ class _Drawing:
     def _travel(self, one: str, at: ArrayLike, axis: float, two: str, point: ArrayLike) -> tuple[float, float]:
         """The least and the largest displacement (m) along an axis of body `one`, from its point `at`, of a point of `two`."""
         frames, others = self._frames(one), self._frames(two)
-        gap = placed(point, others) - placed(at, frames)
+        gap = to_ground(point, others) - to_ground(at, frames)
         direction = axis + frames[:, 2]
         along = gap[:, 0] * np.cos(direction) + gap[:, 1] * np.sin(direction)
         return float(along.min()), float(along.max())
@@ -279,7 +279,7 @@ class _Drawing:
         return self._held_by(one if two == GROUND else two, two if two == GROUND else one)
 
 
-def placed(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
+def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
     """Return where a point of a body's frame is in ground coordinates (m), for each of its coordinates x, y, angle."""
     x, y = np.asarray(point, float)
     cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])
@@ -302,6 +302,6 @@ def _local(frame: Float[np.ndarray, "3"], place: Float[np.ndarray, "2"]) -> Floa
 
 def _size(drawing: _Drawing) -> float:
     """How far the points of a mechanism are apart (m)."""
-    every = [placed(point, drawing._frames(body)[:1])[0] for body, points in drawing.points.items() for point in points]
+    every = [to_ground(point, drawing._frames(body)[:1])[0] for body, points in drawing.points.items() for point in points]
     every += [frame[:2] for frame in drawing.poses[0]]
     return float(np.ptp(np.array(every), axis=0).max()) or 1.0

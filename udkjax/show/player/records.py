@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from udkjax.equations import analyse
 from udkjax.scene import Mechanism
-from udkjax.show.player.marks import Shapes, body_points, marks, placed
+from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
 from udkjax.show.player.measures import Measures, Trajectory, measures_of, reaction_arrows
 from udkjax.show.player.packing import Json, floats, pack, unpack
 
@@ -177,7 +177,7 @@ def trace_anchors(
             continue
         k = bodies.index(body)
         for point in points.tolist() or [[0.0, 0.0]]:
-            path = placed(point, poses[:, k])
+            path = to_ground(point, poses[:, k])
             moves = np.ptp(path, axis=0).max() > STILL * length
             if moves and all(np.abs(path - other).max() > STILL * length for other, _ in found):
                 found.append((path, [k, *point]))
@@ -207,7 +207,7 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
 
     def hold(body: int, at: ArrayLike, radius: float = 0.0) -> None:
         nonlocal low, high
-        path = placed(at, np.zeros((1, 3)) if body < 0 else poses[:, body])
+        path = to_ground(at, np.zeros((1, 3)) if body < 0 else poses[:, body])
         low, high = np.minimum(low, path.min(axis=0) - radius), np.maximum(high, path.max(axis=0) + radius)
 
     for mark in record["marks"]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from udkjax.show.player.marks import Mark, placed
+from udkjax.show.player.marks import Mark, to_ground
 
 THEMES: dict[str, dict[str, Any]] = {
     "light": {
@@ -97,7 +97,7 @@ class Sketch:
         return np.zeros(3) if body < 0 else self.pose[body]
 
     def _anchor(self, body: float, x: float, y: float) -> np.ndarray:
-        return self.px(placed((x, y), self._body(int(body))[None])[0])
+        return self.px(to_ground((x, y), self._body(int(body))[None])[0])
 
     def _at(self, mark: Mark) -> np.ndarray:
         return self._anchor(mark["body"], *mark["at"])
@@ -114,7 +114,7 @@ class Sketch:
     def _circle(self, centre: ArrayLike, radius: float, fill: str = "", stroke: str = "", width: float = 1.5) -> None:
         self.shapes.append(Circle(self.layer, np.asarray(centre, float), radius, width * self.pt, stroke, fill))
 
-    def _turned(self, place: np.ndarray, angle: float, points: ArrayLike) -> np.ndarray:
+    def _rotate(self, place: np.ndarray, angle: float, points: ArrayLike) -> np.ndarray:
         """Points of a frame of pixels (y downwards) at a place, whose x axis is turned anticlockwise by an angle."""
         cos, sin = np.cos(angle), np.sin(angle)
         return place + np.asarray(points, float) @ np.array([[cos, -sin], [sin, cos]])
@@ -122,7 +122,7 @@ class Sketch:
     def _hatch(self, place: np.ndarray, angle: float, x0: float, x1: float, y: float) -> None:
         step = 5 * self.pt
         for x in np.arange(x0 + step, x1 + 0.01 * self.pt, step):
-            self._line(self._turned(place, angle, [(x, y), (x - step, y + step)]), 1, self.theme["soft"])
+            self._line(self._rotate(place, angle, [(x, y), (x - step, y + step)]), 1, self.theme["soft"])
 
     def _link(self, mark: Mark) -> None:
         corners = [self._anchor(mark["body"], *point) for point in mark["points"]]
@@ -148,7 +148,7 @@ class Sketch:
         parts = np.array([(0, -1), (0.25, -1), (0.35, 1), (0.65, 1), (0.75, -1)])
         turn = 2 * np.pi / teeth * (np.arange(teeth)[:, None] + parts[:, 0]).ravel()
         reach = np.tile(radius + parts[:, 1] * depth / 2, teeth)
-        rim = self._turned(place, angle, reach[:, None] * np.column_stack([np.cos(turn), np.sin(turn)]))
+        rim = self._rotate(place, angle, reach[:, None] * np.column_stack([np.cos(turn), np.sin(turn)]))
         if mark["internal"]:
             self._circle(place, radius + depth + 5 * self.pt, fill, edge)
             self._line(rim, 1.3, edge, self.theme["back"], True)
@@ -156,7 +156,7 @@ class Sketch:
         self._line(rim, 1.3, edge, fill, True)
         for spoke in 2 * np.pi * np.arange(3) / 3:
             ends = np.array([min(9 * self.pt, 0.3 * radius), 0.8 * radius])[:, None] * [np.cos(spoke), np.sin(spoke)]
-            self._line(self._turned(place, angle, ends), 2.2, mix(edge, fill, 0.25))
+            self._line(self._rotate(place, angle, ends), 2.2, mix(edge, fill, 0.25))
 
     def _outline(self, mark: Mark) -> None:
         corners = [self._anchor(mark["body"], *point) for point in mark["points"]]
@@ -173,11 +173,11 @@ class Sketch:
             turn = np.linspace(-np.pi / 2, np.pi / 2, 9)
             ends = r * np.column_stack([np.cos(turn), np.sin(turn)])
             outline = np.concatenate([[b - r, 0] + ends, [a + r, 0] - ends])
-            self._line(self._turned(place, angle, outline), 1.3, self._edge(mark["body"]), self.theme["back"], True)
+            self._line(self._rotate(place, angle, outline), 1.3, self._edge(mark["body"]), self.theme["back"], True)
         elif mark["body"] >= 0:
-            self._line(self._turned(place, angle, [(a, 0), (b, 0)]), 3, self._edge(mark["body"]))
+            self._line(self._rotate(place, angle, [(a, 0), (b, 0)]), 3, self._edge(mark["body"]))
         else:
-            self._line(self._turned(place, angle, [(a, y), (b, y)]), 1.5, self.theme["soft"])
+            self._line(self._rotate(place, angle, [(a, y), (b, y)]), 1.5, self.theme["soft"])
             self._hatch(place, angle, a, b, y)
 
     def _rack(self, mark: Mark) -> None:
@@ -185,14 +185,14 @@ class Sketch:
         pt, step, colour = self.pt, 9 * self.pt, self._edge(mark["body"])
         parts = ((0, 2), (0.3, -2), (0.7, -2), (1, 2))
         teeth = [(x + part * step, y * pt) for x in np.arange(a, b, step) for part, y in parts]
-        self._line(self._turned(place, angle, teeth), 1.4, colour)
-        self._line(self._turned(place, angle, [(a, 7 * pt), (b, 7 * pt)]), 1.4, colour)
+        self._line(self._rotate(place, angle, teeth), 1.4, colour)
+        self._line(self._rotate(place, angle, [(a, 7 * pt), (b, 7 * pt)]), 1.4, colour)
         if mark["body"] < 0:
             self._hatch(place, angle, a, b, 7 * pt)
 
     def _block(self, mark: Mark) -> None:
         x, y = 15 * self.pt, 9 * self.pt
-        corners = self._turned(self._at(mark), self._body(mark["body"])[2] + mark["axis"], [(-x, -y), (x, -y), (x, y), (-x, y)])
+        corners = self._rotate(self._at(mark), self._body(mark["body"])[2] + mark["axis"], [(-x, -y), (x, -y), (x, y), (-x, y)])
         self._line(corners, 1.5, self._edge(mark["body"]), self._fill(mark["body"]), True)
 
     def _support(self, mark: Mark) -> None:
@@ -210,7 +210,7 @@ class Sketch:
 
     def _weld(self, mark: Mark) -> None:
         r = 4.5 * self.pt
-        corners = self._turned(self._at(mark), self._body(mark["body"])[2], [(-r, -r), (r, -r), (r, r), (-r, r)])
+        corners = self._rotate(self._at(mark), self._body(mark["body"])[2], [(-r, -r), (r, -r), (r, r), (-r, r)])
         self._line(corners, 0, "", self.theme["ink"], True)
 
     def _rod(self, mark: Mark) -> None:
@@ -231,7 +231,7 @@ class Sketch:
         zigzag = [(end + (length - 2 * end) * (k + 0.5) / turns, shift + (high if k % 2 else -high)) for k in range(turns)]
         beside = ([(end, shift)], [(length - end, shift)]) if damper else ([], [])
         line = [(0, 0), (end, 0), *beside[0], *zigzag, *beside[1], (length - end, 0), (length, 0)]
-        self._line(self._turned(place, angle, line), 1.5, ink)
+        self._line(self._rotate(place, angle, line), 1.5, ink)
         if damper:
             y, box, right, piston = 9 * pt, 0.38 * length, 0.62 * length, 0.5 * length
             for width, points in (
@@ -240,17 +240,17 @@ class Sketch:
                 (1.5, [(box, y - 5 * pt), (right, y - 5 * pt), (right, y + 5 * pt), (box, y + 5 * pt)]),
                 (1.5, [(right, y), (length - end, y), (length - end, 0)]),
             ):
-                self._line(self._turned(place, angle, points), width, ink)
+                self._line(self._rotate(place, angle, points), width, ink)
 
     def _spiral(self, mark: Mark) -> None:
         k = np.arange(61)
         line = ((5 + 8 * k / 60) * self.pt)[:, None] * np.column_stack([np.cos(0.25 * k), np.sin(0.25 * k)])
-        self._line(self._turned(self._at(mark), self._body(mark["body"])[2], line), 1.3, self.theme["ink"])
+        self._line(self._rotate(self._at(mark), self._body(mark["body"])[2], line), 1.3, self.theme["ink"])
 
     def _piston(self, mark: Mark) -> None:
         place, angle, length = self._along(mark)
         for end, width, colour in ((1.0, 3, "ink"), (0.55, 9, "ink"), (0.55, 6, "back")):
-            self._line(self._turned(place, angle, [(0, 0), (end * length, 0)]), width, self.theme[colour])
+            self._line(self._rotate(place, angle, [(0, 0), (end * length, 0)]), width, self.theme[colour])
 
     def _motor(self, mark: Mark) -> None:
         self._turn(self._at(mark), 11, 1)
