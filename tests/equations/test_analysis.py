@@ -106,8 +106,18 @@ print(udk.analyse(mechanism).redundant_rows, udk.accelerations(mechanism, 0.0, m
 
 
 MODULES = position_closure, dense_rows, redundancy, scales, sparse_rows
-DENSE = ["CLOSED", "ROUNDING", "STRIDE", "DEPENDENT", "CLEAR", "NEGLIGIBLE", "WANDER", "RANK_TOL", "ORDINARY_MASS_RATIO"]
-SPARSE = ["NO_PIVOT", "CLEAR", "NEGLIGIBLE"]
+DENSE = [
+    "CLOSED_TOL",
+    "ROUNDING_UNITS",
+    "LONGEST_STEP",
+    "DEPENDENT_TOL",
+    "CLEAR_TOL",
+    "NEGLIGIBLE_SHARE",
+    "HEADING_NOISE",
+    "RANK_TOL",
+    "ORDINARY_MASS_RATIO",
+]
+SPARSE = ["DEPENDENT_PIVOT", "CLEAR_TOL", "NEGLIGIBLE_SHARE"]
 
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])

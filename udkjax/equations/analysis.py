@@ -28,7 +28,7 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import is_large, structure
 from udkjax.scene.mechanism import Mechanism
 
-CACHE_SIZE = 256  # analyses at hand; the one that was made first makes room
+ANALYSIS_CACHE_SIZE = 256  # analyses that are stored; the one that was asked for longest ago makes room
 
 
 class Analysis(eqx.Module):
@@ -101,7 +101,7 @@ Stored = TypeVar("Stored")
 
 
 class _Cache(Generic[Stored]):
-    """The `CACHE_SIZE` values that were asked for last, by their keys."""
+    """The `ANALYSIS_CACHE_SIZE` values that were asked for last, by their keys."""
 
     def __init__(self):
         self._found: OrderedDict[Hashable, Stored] = OrderedDict()
@@ -115,7 +115,7 @@ class _Cache(Generic[Stored]):
         found = make()
         with self._lock:
             self._found[key] = found
-            while len(self._found) > CACHE_SIZE:
+            while len(self._found) > ANALYSIS_CACHE_SIZE:
                 self._found.popitem(last=False)
         return found
 

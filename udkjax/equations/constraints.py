@@ -1,8 +1,8 @@
 """The constraints of a mechanism along a motion: Psi, Psi_q, Psi_dot and gamma (de Falco, Pennestri, Vita 2005, section 3).
 
-Each joint and driver says what its residual is, and nothing more; all derivatives are taken of that by JAX. Here this is done
-as it reads, on arrays, without regard to which entries are zero; elements of the same structure are evaluated together
-(structure.py). Faster forms of the same functions are held against this one.
+Each joint and driver defines its residual alone; JAX takes all derivatives of it. The functions are written as the paper has
+them, on arrays, without regard to which entries are zero; elements of the same structure are evaluated together (structure.py).
+The tests hold the faster forms of the same functions against these.
 
 In all of them t is the time (s), and q and v are the coordinates and velocities of the n / 3 bodies, x, y (m) and angle (rad) of
 one after another: flat (n,), or (bodies, 3), which is made flat. The m rows are those of the joints in their order, then those
@@ -20,7 +20,7 @@ from udkjax.equations.structure import ElementKind, element_kinds, evaluate_by_k
 from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 
-State = Float[ArrayLike, "n"] | Float[ArrayLike, "n/3 3"]
+State = Float[ArrayLike, "n"] | Float[ArrayLike, "bodies 3"]
 
 
 def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
@@ -109,7 +109,7 @@ def rate_along_motion(f: Callable[[Array, Array], Array], t: ArrayLike, q: State
     return jax.jvp(f, (t, q), (jnp.ones_like(t), v))[1]
 
 
-def bodies(state: State) -> Float[Array, "n/3 3"]:
+def bodies(state: State) -> Float[Array, "bodies 3"]:
     """q or v as an array (bodies, 3)."""
     return vector(state).reshape(-1, 3)
 

@@ -17,11 +17,11 @@ from udkjax.expressions import ScalarProgram
 from udkjax.scene.mechanism import Mechanism
 
 # Singular values of D with rows of length one at a closed position, relative to the largest. Up to half of the digits a singular
-# value counts as zero: redundant rows leave rounding errors. From `CLEAR` on it does not; the rank of a position with one in
+# value counts as zero: redundant rows leave rounding errors. From `CLEAR_TOL` on it does not; the rank of a position with one in
 # between, which is merely close to a singular configuration, is in doubt.
-DEPENDENT = float(np.sqrt(np.finfo(float).eps))
-CLEAR = 1e-4
-NEGLIGIBLE = 1e-6  # of a combination of rows of length one: a share of a row below it is rounding
+DEPENDENT_TOL = float(np.sqrt(np.finfo(float).eps))
+CLEAR_TOL = 1e-4
+NEGLIGIBLE_SHARE = 1e-6  # of a combination of rows of length one: a share of a row below it is rounding
 
 
 class TruncatedPseudoinverse(NamedTuple):
@@ -102,12 +102,12 @@ class DensePosition(NamedTuple):
 
     @property
     def rank(self) -> int:
-        return int(np.sum(self.sigma > DEPENDENT * self.sigma[0]))
+        return int(np.sum(self.sigma > DEPENDENT_TOL * self.sigma[0]))
 
     @property
     def is_clear(self) -> bool:
         """Whether the rank is beyond doubt: near a singular configuration small residuals are large distances from closure."""
-        return bool(np.all((self.sigma <= DEPENDENT * self.sigma[0]) | (self.sigma > CLEAR * self.sigma[0])))
+        return bool(np.all((self.sigma <= DEPENDENT_TOL * self.sigma[0]) | (self.sigma > CLEAR_TOL * self.sigma[0])))
 
     @property
     def smallest(self) -> float:

@@ -16,13 +16,13 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, Time, Vector
 from udkjax.equations.formulations import Formulation, WrappedSystem, null_space_accelerations
-from udkjax.equations.position_closure import STRIDE
+from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 from udkjax.scene.fields import number
 
-NEWTON_STEPS = 10  # Newton's, from a prediction that is good: three or four are usual
+PARTITION_NEWTON_STEPS = 10  # from the prediction of a step; three or four are usual
 
 
 class CoordinatePartitioning(Formulation):
@@ -73,7 +73,7 @@ class PartitionedSystem(WrappedSystem):
         fixed = self.fix_partition(t, q, v)
         closed, v = _solve_dependent(fixed, t, q, v)
         # Farther from where the step predicts it, it might be another assembly of the mechanism: a shorter step is taken.
-        near = self.equations.size(closed - q) <= STRIDE
+        near = self.equations.size(closed - q) <= LONGEST_STEP
         return jnp.where(near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
@@ -119,7 +119,7 @@ def _solve_dependent(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) ->
 
     def goes_on(state):
         _, change, k = state
-        return (k < NEWTON_STEPS) & (change > tol)
+        return (k < PARTITION_NEWTON_STEPS) & (change > tol)
 
     def step(state):
         q, _, k = state

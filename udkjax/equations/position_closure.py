@@ -19,14 +19,13 @@ from udkjax.equations.abstract_system import MechanismSystem, Time
 from udkjax.equations.scales import Scales
 from udkjax.equations.structure import AnyArray, ArrayLibrary
 
-# Of the scene's scales: what counts as closed. Rounding leaves 1e-15; a scene that cannot be closed leaves what its lengths are
-# wrong by.
-CLOSED = 1e-9
-ROUNDING = 32.0  # units of rounding of the coordinates: a residual below is not worth a step
-STRIDE = 0.3  # rad, and of the characteristic length: the longest change of a coordinate in one step
-ITERATIONS = 40
-HALVINGS = 12
-
+# Psi in units of the scene's scales, at or below which a position counts as closed. Rounding leaves 1e-15; a scene that cannot be
+# closed leaves the error of its lengths.
+CLOSED_TOL = 1e-9
+ROUNDING_UNITS = 32.0  # of eps and of the largest coordinate: a residual below is rounding, and takes no step
+LONGEST_STEP = 0.3  # rad, and characteristic lengths: the longest change of a coordinate in one step, so that the branch stays
+CLOSURE_ITERATIONS = 40  # of Gauss-Newton: near a solution it doubles the digits, and five or six are usual
+STEP_HALVINGS = 12  # of one step: 2^-12 of it has to lower the residual, or the position cannot be closed
 
 State = TypeVar("State")
 Assembly = tuple[AnyArray, AnyArray, AnyArray, AnyArray, ArrayLike]  # q, v, Psi, Psi_dot and the rank of D
@@ -51,21 +50,21 @@ class Rows(Protocol[AnyArray]):
 
 def rounding(scales: Scales, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
     """Return the residual that rounding errors of the coordinates leave."""
-    return ROUNDING * float(jnp.finfo(q.dtype).eps) * xp.maximum(1.0, scales.size(q, xp))
+    return ROUNDING_UNITS * float(jnp.finfo(q.dtype).eps) * xp.maximum(1.0, scales.size(q, xp))
 
 
 def is_closed(scales: Scales, q: AnyArray, v: AnyArray, psi: AnyArray, psi_dot: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Whether Psi and Psi_dot are within `CLOSED` of the scene's scales, or rounding."""
-    open_by = xp.maximum(CLOSED, rounding(scales, q, xp))
+    """Whether Psi and Psi_dot are within `CLOSED_TOL` of the scene's scales, or rounding."""
+    open_by = xp.maximum(CLOSED_TOL, rounding(scales, q, xp))
     rate = xp.maximum(scales.rate, scales.size(v, xp))
     return (scales.violation(psi, xp) <= open_by) & (scales.violation(psi_dot, xp) <= open_by * rate)
 
 
 def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """A Gauss-Newton step, shortened so that no coordinate changes by more than `STRIDE`."""
+    """A Gauss-Newton step, shortened so that no coordinate changes by more than `LONGEST_STEP`."""
     step = rows.correction(t, q)
     longest = rows.scales.size(step, xp)
-    return step * xp.where(longest > STRIDE, STRIDE / xp.where(longest > STRIDE, longest, 1.0), 1.0)
+    return step * xp.where(longest > LONGEST_STEP, LONGEST_STEP / xp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
 
 
 def _python_loop(condition: Callable[[State], ArrayLike], body: Callable[[State], State], state: State) -> State:
@@ -87,10 +86,10 @@ def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = j
 
     def is_worse(trial: tuple[AnyArray, Any]) -> ArrayLike:
         scale, k = trial
-        return (k < HALVINGS) & ~(xp.linalg.norm(fixed.residual(t, current + scale * fixed_step)) < size)
+        return (k < STEP_HALVINGS) & ~(xp.linalg.norm(fixed.residual(t, current + scale * fixed_step)) < size)
 
     scale, k = loop(is_worse, lambda trial: (0.5 * trial[0], trial[1] + 1), (xp.ones(()), 0))
-    improves = (k < HALVINGS) & (size > rounding(rows.scales, current, xp))
+    improves = (k < STEP_HALVINGS) & (size > rounding(rows.scales, current, xp))
     return xp.where(improves, q + scale * step, q), improves
 
 
@@ -100,14 +99,14 @@ def close_position(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary 
 
     def goes_on(state: tuple[AnyArray, Any, int]) -> ArrayLike:
         _, improves, k = state
-        return improves & (k < ITERATIONS)
+        return improves & (k < CLOSURE_ITERATIONS)
 
     return loop(goes_on, lambda state: (*damped_step(rows, t, state[0], xp), state[2] + 1), (q, xp.asarray(True), 0))[0]
 
 
 def driver_time_step(scales: Scales) -> float:
     """The time (s) by which drivers move on from one position to the next: they turn about as far as the random motion."""
-    return STRIDE / float(scales.rate) if scales.rate > 0.0 else 0.0
+    return LONGEST_STEP / float(scales.rate) if scales.rate > 0.0 else 0.0
 
 
 class TracedRows(NamedTuple):

@@ -14,16 +14,16 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from udkjax.equations.abstract_system import Time
-from udkjax.equations.dense_rows import NEGLIGIBLE, KinematicRows
-from udkjax.equations.position_closure import STRIDE
+from udkjax.equations.dense_rows import NEGLIGIBLE_SHARE, KinematicRows
+from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.equations.scales import Scales
 from udkjax.equations.structure import is_large
 from udkjax.scene.mechanism import Mechanism
 
-SAMPLES = 24  # positions to look at where the first shows rows that depend on each other
-MANY = 300  # rows of a scene of which a third of the positions is looked at, since each of them takes the longer
-WANDER = 0.3  # of the direction of the random motion: how much of it is new at each position
-ORDINARY = 0.05  # a position counts as ordinary if its smallest singular value is this part of the largest
+POSITION_SAMPLES = 24  # positions of the random motion, where the first one shows rows that depend on each other
+FEWER_SAMPLES_FROM = 300  # rows of Psi: a scene of more takes a third of the positions, each of which takes long
+HEADING_NOISE = 0.3  # share of the direction of the random motion that is new at each position
+ORDINARY_TOL = 0.05  # of the largest singular value: a position whose smallest one is above decides on the rows
 
 
 class ClosedPosition(Protocol):
@@ -93,19 +93,19 @@ def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Positi
     found = [first]
     random = np.random.default_rng(0)
     heading = random.standard_normal(rows.size)
-    for k in range(SAMPLES if rows.count <= MANY else SAMPLES // 3):
+    for k in range(POSITION_SAMPLES if rows.count <= FEWER_SAMPLES_FROM else POSITION_SAMPLES // 3):
         full = [p for p in found if p.is_clear and p.rank == rows.count]
         if full:
             return full[:1]
         last = found[-1]
-        heading = heading / np.linalg.norm(heading) + WANDER * random.standard_normal(rows.size) / np.sqrt(rows.size)
+        heading = heading / np.linalg.norm(heading) + HEADING_NOISE * random.standard_normal(rows.size) / np.sqrt(rows.size)
         heading = last.tangent_part(heading)  # onward, so that the motion gets around
         step = rows.metric * heading
-        moved = last.q + STRIDE * step / max(rows.scales.size(step, np), 1e-300)
+        moved = last.q + LONGEST_STEP * step / max(rows.scales.size(step, np), 1e-300)
         position = rows.close(rows.driver_time_step * (k + 1), moved)
         if position is None or not position.is_clear or not np.any(heading):  # stuck: jump
             heading, jump = random.standard_normal(rows.size), random.uniform(-1.0, 1.0, rows.size)
-            position = rows.close(rows.driver_time_step * (k + 1), first.q + STRIDE * rows.metric * jump)
+            position = rows.close(rows.driver_time_step * (k + 1), first.q + LONGEST_STEP * rows.metric * jump)
         found.extend([] if position is None else [position])
     found = [p for p in found if p.is_clear]
     if not found or (len(found) == 1 and found[0] is first and first.rank < rows.size):
@@ -120,7 +120,7 @@ def choose_redundant_rows(rows: PositionRows[Position], positions: list[Position
         return ()
     chosen = []
     for members, found in rows.split_rows(positions):
-        ordinary = [part for part in found if part.smallest > ORDINARY] or found
+        ordinary = [part for part in found if part.smallest > ORDINARY_TOL] or found
         chosen += members[list(choose_dispensable([part.null_space for part in ordinary]))].tolist()
     return tuple(sorted(chosen))
 
@@ -131,7 +131,7 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
     position = rows.close(0.0, np.asarray(q, float).ravel()) if rows.count else None
     if position is None:
         return ()
-    involved = np.asarray((abs(position.null_space) > NEGLIGIBLE).sum(axis=1)).ravel() > 0
+    involved = np.asarray((abs(position.null_space) > NEGLIGIBLE_SHARE).sum(axis=1)).ravel() > 0
     names = [name for (name, _), part in zip(rows.names, involved, strict=True) if part]
     return tuple(dict.fromkeys(names))
 

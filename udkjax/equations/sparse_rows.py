@@ -18,18 +18,19 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from udkjax.equations.abstract_system import Time
-from udkjax.equations.dense_rows import CLEAR, NEGLIGIBLE
+from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
 from udkjax.equations.structure import leaves_as_vector
+from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
 from udkjax.scene.mechanism import Mechanism
 
-# A pivot is the square of a length. Up to here it is what rounding leaves of a dependent row: the default of `pinv.Elimination`.
-NO_PIVOT = float(np.finfo(float).eps) ** (2 / 3)
-DAMPING = RANK_TOL**2  # of D D^T in closing: what truncation at `RANK_TOL` is to singular values
-COLUMNS = 64  # of a null space that are solved for at a time, which bounds the memory of their dense form
+# Pivots of rows of length one, which are squares of lengths: at or below it a row depends on those before it.
+DEPENDENT_PIVOT = default_rank_tol(np.dtype(float)) ** 2
+DAMPING = RANK_TOL**2  # added to D D^T in closing, as the truncation of singular values at `RANK_TOL` is for small scenes
+NULL_SPACE_BATCH = 64  # columns of a null space that are solved for at a time, which bounds the memory of their dense form
 
 
 SparseMatrix: TypeAlias = Any  # of SciPy, whose annotations leave the shape open
@@ -52,7 +53,7 @@ class SparsePosition(NamedTuple):
     @property
     def is_clear(self) -> bool:
         """Whether the rank is beyond doubt."""
-        return bool(np.all(self.pivots[self.independent] > CLEAR**2))
+        return bool(np.all(self.pivots[self.independent] > CLEAR_TOL**2))
 
     @property
     def smallest(self) -> float:
@@ -75,13 +76,13 @@ class SparsePosition(NamedTuple):
         independent = self.D[self.independent]
         solve = splu(csc_array(independent @ independent.T), **_SYMMETRIC).solve
         blocks = []
-        for start in range(0, count, COLUMNS):
-            dependent = self.dependent[start : start + COLUMNS]
+        for start in range(0, count, NULL_SPACE_BATCH):
+            dependent = self.dependent[start : start + NULL_SPACE_BATCH]
             right = (independent @ self.D[dependent].T).toarray()
             found = np.zeros((rows, len(dependent)))
             found[self.independent] = -solve(right)
             found[dependent, np.arange(len(dependent))] = 1.0
-            found[np.abs(found) < NEGLIGIBLE] = 0.0
+            found[np.abs(found) < NEGLIGIBLE_SHARE] = 0.0
             blocks.append(coo_array(found))
         return csc_array(_stack_columns(blocks, rows))
 
@@ -177,7 +178,7 @@ class SparseRows:
 
     def _position(self, t: Time, q: np.ndarray, D: SparseMatrix) -> SparsePosition:
         pivots = find_pivots(csr_array(D @ D.T), self._order)
-        has_pivot = pivots > NO_PIVOT
+        has_pivot = pivots > DEPENDENT_PIVOT
         return SparsePosition(t, q, D, pivots, np.flatnonzero(has_pivot), np.flatnonzero(~has_pivot))
 
 
@@ -194,7 +195,7 @@ def find_pivots(gram: SparseMatrix, order: list[int]) -> np.ndarray:
     for j, below in enumerate(column):
         pivot = below.pop(j, 0.0)
         pivots[order[j]] = pivot
-        if pivot <= NO_PIVOT:
+        if pivot <= DEPENDENT_PIVOT:
             continue
         rows = sorted(below)
         for n, k in enumerate(rows):

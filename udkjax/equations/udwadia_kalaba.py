@@ -6,9 +6,9 @@ A mechanism's constraints Psi(t, q) = 0, masses M and loads F give, with
 
     a = a_F + M^(-1/2) D^+ b,        lambda = -(D^+)^T D^+ b,        M a + Psi_q^T lambda = F,
 
-whatever the rank of D: the accelerations that satisfy the constraints, or violate them least, and of these the nearest to a_F in
-the metric of M (Gauss's principle), and the multipliers of least norm. Every symbol is a function on arrays, differentiable
-to any order; every faster form is held against these. t, q and v are those of constraints.py; `method` is any pseudoinverse.
+whatever the rank of D. These are the accelerations that satisfy the constraints, or violate them least, and that are nearest to
+a_F in the metric of M (Gauss's principle); the multipliers are those of least norm. Each symbol is a function on arrays,
+differentiable to any order, and the tests hold every faster form against it. `method` is any pseudoinverse.
 
 Rows of Psi in metres and rows in radians have singular values of different units. Weights w (m,) of the rows make them comparable
 to one another, so that one threshold of the rank serves all (`Scales.weights`: 1 for metres, a length for radians): D and b stand
@@ -33,7 +33,7 @@ Weights = Float[ArrayLike, "m"] | None
 class Baumgarte(eqx.Module):
     """Feed the violation back: Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0, alpha and beta in 1/s.
 
-    Gains of 2 to 5 hold what redundancy and rounding excite; the hundreds of the literature only make the problem stiff.
+    Gains of 2 to 5 hold the drift that redundancy and rounding excite; the hundreds of the literature make the problem stiff.
     """
 
     alpha: Float[Array, ""]
@@ -170,7 +170,7 @@ def project(
         q and v (n,).
     """
 
-    def newton(_: int, q: Array) -> Array:
+    def newton(_: Array, q: Array) -> Array:
         return q - inverse_sqrt_mass(mechanism) * (
             pseudoinverse(method, D(mechanism, t, q, w)) @ weigh(w, constraints.psi(mechanism, t, q))
         )

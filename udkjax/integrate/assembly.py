@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseRows
-from udkjax.equations.position_closure import CLOSED, is_closed
+from udkjax.equations.position_closure import CLOSED_TOL, is_closed
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large
@@ -65,7 +65,7 @@ class Closure(NamedTuple):
 
     @property
     def is_closed(self) -> Bool[Array | np.ndarray, ""]:
-        """Whether the residuals are within `CLOSED` of the scene's scales, or rounding."""
+        """Whether the residuals are within `CLOSED_TOL` of the scene's scales, or rounding."""
         given = self.scales, self.state.q, self.state.v, self.psi, self.psi_dot
         xp = np if _is_known(given) else jnp
         scales, q, v, psi, psi_dot = jax.tree.map(xp.asarray, given)
@@ -161,13 +161,13 @@ def require_closed(mechanism: Mechanism, closure: Closure) -> None:
         return
     names = analyse(mechanism).row_names
     psi, psi_dot, rows = (np.asarray(x) for x in (closure.psi, closure.psi_dot, closure.scales.rows))
-    open_position = bool(np.max(np.abs(psi) / rows) > CLOSED) or not np.all(np.isfinite(psi))
+    open_position = bool(np.max(np.abs(psi) / rows) > CLOSED_TOL) or not np.all(np.isfinite(psi))
     residual = psi if open_position else psi_dot
     worst: dict[str, tuple[float, float]] = {}  # over the row's scale, and as it is
     for (name, _), r, unit in zip(names, residual, rows, strict=True):
         worst[name] = max(worst.get(name, (0.0, 0.0)), (abs(float(r)) / float(unit), abs(float(r))))
     largest = max(size for size, _ in worst.values())
-    listed = sorted((n for n in worst if not worst[n][0] <= CLOSED * largest), key=lambda n: -worst[n][0])
+    listed = sorted((n for n in worst if not worst[n][0] <= CLOSED_TOL * largest), key=lambda n: -worst[n][0])
     text = ", ".join(f'"{n}" ({worst[n][1]:.2g})' for n in listed[:8]) + (", ..." if len(listed) > 8 else "")
     if open_position:
         cause = f"the mechanism cannot be closed near its initial guess; open (m, rad): {text}"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.position_closure import ITERATIONS, TracedRows, close_position, damped_step
+from udkjax.equations.position_closure import CLOSURE_ITERATIONS, TracedRows, close_position, damped_step
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.textbook import prepare
 from udkjax.integrate import native_engine
@@ -121,7 +121,7 @@ def _close_position_plain(rows: TracedRows, t: Array, q: Array) -> Array:
         following, better = damped_step(rows, t, q)
         return jnp.where(better, following, q + rows.correction(t, q)), None
 
-    return jax.lax.scan(body, q, None, length=ITERATIONS)[0]
+    return jax.lax.scan(body, q, None, length=CLOSURE_ITERATIONS)[0]
 
 
 @_close_position.defjvp

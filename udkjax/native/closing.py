@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.equations.position_closure import HALVINGS, ITERATIONS, ROUNDING, STRIDE
+from udkjax.equations.position_closure import CLOSURE_ITERATIONS, LONGEST_STEP, ROUNDING_UNITS, STEP_HALVINGS
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.fallback import write_solve
 from udkjax.native.ir import INT, POINTER, Function, Value
@@ -74,7 +74,7 @@ class Closing(Trajectory):
             for name in "qv":
                 f.store(f.load(work, i + p[f"P3 {name}"]), work, i + p[f"X {name}"])
         better, steps = f.variable(1.0), f.variable(0, INT)
-        with f.while_(lambda: (better.value > 0.5) & (steps.value < ITERATIONS)):
+        with f.while_(lambda: (better.value > 0.5) & (steps.value < CLOSURE_ITERATIONS)):
             steps.value = steps.value + 1
             before = size()
             largest, longest = f.variable(1.0), f.variable(0.0)
@@ -82,15 +82,15 @@ class Closing(Trajectory):
                 q = f.load(work, i + p["X q"])
                 largest.value = f.max(f.abs(q) * f.load(work, i + p["inverse unit"]), largest.value)
                 f.store(q, work, i + p["C"])
-            better.value = f.select(before > largest.value * (ROUNDING * np.finfo(float).eps), f.const(1.0), 0.0)
+            better.value = f.select(before > largest.value * (ROUNDING_UNITS * np.finfo(float).eps), f.const(1.0), 0.0)
             with f.if_(better.value > 0.5):
                 self._correction(f, s, POSITION, "X dq")
                 with f.each(n) as i:
                     step = f.abs(f.load(work, i + p["X dq"])) * f.load(work, i + p["inverse unit"])
                     longest.value = f.max(step, longest.value)
-                scale = f.variable(f.select(longest.value > STRIDE, STRIDE / longest.value, f.const(1.0)))
+                scale = f.variable(f.select(longest.value > LONGEST_STEP, LONGEST_STEP / longest.value, f.const(1.0)))
                 halvings, better.value = f.variable(0, INT), 0.0
-                with f.while_(lambda: (better.value < 0.5) & (halvings.value < HALVINGS)):
+                with f.while_(lambda: (better.value < 0.5) & (halvings.value < STEP_HALVINGS)):
                     moved(scale.value)
                     better.value = f.select(size() < before, f.const(1.0), 0.0)
                     scale.value = scale.value * 0.5
@@ -99,7 +99,7 @@ class Closing(Trajectory):
                     moved(f.const(0.0))
                 with f.if_(better.value > 0.5):
                     taken = scale.value * 2.0
-                    limited = f.select(longest.value > STRIDE, f.const(1.0), 0.0)
+                    limited = f.select(longest.value > LONGEST_STEP, f.const(1.0), 0.0)
                     self._before(f, "q", lambda: self._taken(f, POSITION, taken, limited))
         self._taken(f, POSITION, f.const(1.0), f.const(0.0))
         for _ in range(VELOCITIES):

@@ -20,7 +20,7 @@ vectors turn is left out, which costs as much of the derivative as their product
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from udkjax.equations.position_closure import ITERATIONS
+from udkjax.equations.position_closure import CLOSURE_ITERATIONS
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.expressions import ScalarProgram, cotangents, tangents
 from udkjax.native.closing import POSITION, VELOCITIES, VELOCITY, Closing
@@ -117,7 +117,7 @@ class Back(_Moving):
     outputs = ("numbersbar", "qbar", "vbar")
 
     def _add_record(self, numbers: int):
-        n, most, p = self.n, ITERATIONS + 1 + VELOCITIES, self.places
+        n, most, p = self.n, CLOSURE_ITERATIONS + 1 + VELOCITIES, self.places
         self.row = 3 + 2 * n  # of the record: kind, scale, whether it was limited, q and v before
         p.add("record", most * self.row)
         p.add("records")

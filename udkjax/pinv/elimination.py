@@ -10,9 +10,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.pinv.rule import Dense, dot, exceeds
+
+
+def default_rank_tol(dtype: np.dtype) -> float:
+    """eps^(1/3): the relative length at or below which the remainder of a row is rounding, where rows are eliminated."""
+    return float(jnp.finfo(dtype).eps) ** (1 / 3)
 
 
 class EliminationFactors(NamedTuple):
@@ -35,7 +41,7 @@ class Elimination(Dense):
         gram = dot(D, D.T)
         length = jnp.sqrt(jnp.diagonal(gram))
         unit = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
-        tol = float(jnp.finfo(D.dtype).eps) ** (1 / 3) if self.rank_tol is None else self.rank_tol
+        tol = default_rank_tol(D.dtype) if self.rank_tol is None else self.rank_tol
         threshold = tol if self.relative else tol * unit
         L, independent, order = _cholesky(gram * unit[:, None] * unit, jnp.broadcast_to(threshold**2, unit.shape))
         L = length[:, None] * L

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.rule import Dense, dot, exceeds
 
 
@@ -32,8 +33,7 @@ class Greville(Dense):
 
     def factor(self, D: Float[Array, "m n"]) -> GrevilleFactors:
         rows, columns = D.shape
-        eps = float(jnp.finfo(D.dtype).eps)
-        threshold = self.threshold(D, jnp.linalg.norm(D, axis=1).max(), default=eps ** (1 / 3))
+        threshold = self.threshold(D, jnp.linalg.norm(D, axis=1).max(), default=default_rank_tol(D.dtype))
 
         def append(state, row):
             plus, rank = state

@@ -17,7 +17,7 @@ from udkjax.scene.fields import Table
 from udkjax.scene.mechanism import Mechanism, name_elements
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, is_in_format, keys, table_of, type_name
 
-FORMAT = 1
+FORMAT_VERSION = 1
 
 
 def load(path: str | os.PathLike[str]) -> Mechanism:
@@ -99,7 +99,7 @@ def dumps(mechanism: Mechanism) -> str:
     if problems:
         raise SceneError(problems, mechanism.name)
     title = {"name": mechanism.name} if mechanism.name else {}
-    lines = _lines({"format": FORMAT, **title, "gravity": mechanism.gravity})
+    lines = _lines({"format": FORMAT_VERSION, **title, "gravity": mechanism.gravity})
     for entry in entries:
         lines += ["", f"[[{entry.section}]]", *_lines({"name": entry.name, **_type_of(entry.cls or object), **entry.table})]
     return "\n".join(lines) + "\n"
@@ -127,9 +127,9 @@ def _check_head(scene: Table) -> Iterator[str]:
     """Iterate over the mistakes at the top of a file."""
     version = scene.get("format")
     if version is None:
-        yield f"format: missing; write format = {FORMAT}"
-    elif version is True or version != FORMAT:
-        yield f"format: this version of udkjax reads format {FORMAT}, not {abbreviate(version)}"
+        yield f"format: missing; write format = {FORMAT_VERSION}"
+    elif version is True or version != FORMAT_VERSION:
+        yield f"format: this version of udkjax reads format {FORMAT_VERSION}, not {abbreviate(version)}"
     if not isinstance(scene.get("name", ""), str):
         yield f"name: must be a string, is {abbreviate(scene['name'])}"
     expected = ("format", "name", "gravity", *SECTIONS)

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations.constraints import gamma, psi
-from udkjax.equations.position_closure import ROUNDING
+from udkjax.equations.position_closure import ROUNDING_UNITS
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.scene.mechanism import Mechanism
@@ -99,7 +99,7 @@ class Curve(eqx.Module):
     def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
         """Whether the residual is what rounding leaves of it."""
         size = jnp.max(jnp.abs(self.residual(X) / (self.weights * self.rows)))
-        return size <= ROUNDING * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
+        return size <= ROUNDING_UNITS * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
 
     def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
         """Return the nearest point of the curve; `fixed`: of the same value. And whether there is one."""

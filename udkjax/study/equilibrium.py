@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations import loads
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.position_closure import HALVINGS, STRIDE
+from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
 from udkjax.integrate.assembly import State, close
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv import SVD
@@ -140,7 +140,7 @@ def _settle(curve: Curve, analysis: Analysis, t: Any, q: Any, free: int, stable:
         here = at(q)
         step = here.directions @ _towards_rest(here, stable)
         longest = analysis.scales.size(step)
-        step = step * jnp.where(longest > STRIDE, STRIDE / jnp.where(longest > STRIDE, longest, 1.0), 1.0)
+        step = step * jnp.where(longest > LONGEST_STEP, LONGEST_STEP / jnp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
         size = jnp.linalg.norm(here.force)
 
         def trial(state: Any) -> Any:
@@ -154,7 +154,7 @@ def _settle(curve: Curve, analysis: Analysis, t: Any, q: Any, free: int, stable:
             return 0.5 * scale, j + 1, closed & better, new
 
         def worse(state: Any) -> Any:
-            return (state[1] < HALVINGS) & ~state[2]
+            return (state[1] < STEP_HALVINGS) & ~state[2]
 
         _, _, better, new = jax.lax.while_loop(worse, trial, (jnp.ones(()), 0, jnp.asarray(False), q))
         return jnp.where(better, new, q), k + 1, better & (size > 0)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.position_closure import STRIDE
+from udkjax.equations.position_closure import LONGEST_STEP
 
 STEP = 0.1  # of the characteristic length, and rad: from one position to the next of a neighbourhood
 POSITIONS = 12  # of a neighbourhood
@@ -87,7 +87,7 @@ class Positions:
             heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(len(heading)) / np.sqrt(len(heading))
             allowed = last.right @ (last.right.T @ heading)
             size = np.linalg.norm(allowed)
-            t += self.rows.driver_time_step * STEP / STRIDE
+            t += self.rows.driver_time_step * STEP / LONGEST_STEP
             direction = allowed / size if size > 0.0 else allowed
             moved = self.displace(last, direction, STEP, t) or self.displace(last, direction, STEP, last.t)
             if moved is None or self.distance(moved, last) < MOVED * STEP:

@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 
 from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.redundancy import ORDINARY, choose_redundant_rows, kinematic_rows, sample_positions
+from udkjax.equations.redundancy import ORDINARY_TOL, choose_redundant_rows, kinematic_rows, sample_positions
 from udkjax.equations.scales import known_scales
 from udkjax.equations.sparse_rows import SparseRows
 from udkjax.scene.checks import quote
@@ -35,7 +35,7 @@ DEPENDENT = 1e-6
 DIFFERENCE_STEP = 1e-5  # of a parameter's value: the step of the central differences
 # Of a parameter's size, which is its value, or less where that changes a row by more than the row's own size: the step after
 # which a mechanism must close again. What opens to second order does so by 1e-4 of the size, ten million times what is left of
-# closing (`closing.CLOSED`).
+# closing (`position_closure.CLOSED_TOL`).
 CLOSING_STEP = 1e-2
 SMALL_VALUE = 1e-5  # of the size by effect: a value as small as this, such as that of a coordinate, counts as zero
 MOST_POSITIONS = 4  # positions that are closed again
@@ -107,7 +107,7 @@ class RedundantLoops:
         if not self.redundant:
             return
         self._drivers = mechanism.driver_names
-        self._positions = [p for p in found if p.smallest > ORDINARY] or found
+        self._positions = [p for p in found if p.smallest > ORDINARY_TOL] or found
         self._names = [name for name, _ in rows.names]
         self._redundant_rows = list(choose_redundant_rows(rows, found))
         self._measure(rows, steps, _length(here))

@@ -1,0 +1,40 @@
+"""Annotated shapes of the textbook's functions and of the pseudoinverses, which beartype holds against the arrays."""
+
+import subprocess
+import sys
+
+CODE = """
+from jaxtyping import TypeCheckError, install_import_hook
+
+methods = "svd varga greville householder gram_schmidt elimination auto orthogonal".split()
+modules = [f"udkjax.equations.{name}" for name in ("constraints", "loads", "udwadia_kalaba", "determinacy")]
+with install_import_hook([*modules, *(f"udkjax.pinv.{name}" for name in methods)], "beartype.beartype"):
+    import udkjax as udk
+    from udkjax.equations import constraints, determinacy, loads
+    from udkjax.equations import udwadia_kalaba as uk
+
+import numpy as np
+
+A = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0]])
+for method in (udk.SVD(), udk.Varga(), udk.Greville(), udk.Householder(), udk.GramSchmidt(), udk.Elimination(), udk.Auto()):
+    assert method(A).shape == (3, 2) and method.solve(A, np.ones(2)).rank == 1
+
+mech, svd = udk.library.slider_crank(), udk.SVD()
+for q, v in ((mech.q0, mech.v0), (mech.q0.ravel(), mech.v0.ravel())):
+    constraints.psi(mech, 0.0, q), constraints.psi_dot(mech, 0.0, q, v), constraints.gamma(mech, 0.0, q, v)
+    loads.force(mech, 0.0, q, v), loads.kinetic_energy(mech, v), loads.potential_energy(mech, 0.0, q, v)
+    uk.accelerations(mech, 0.0, q, v, svd, udk.Baumgarte()), uk.multipliers(mech, 0.0, q, v, svd)
+    uk.project(mech, 0.0, q, v, svd), uk.tangent_part(mech, 0.0, q, v.ravel(), svd)
+    determinacy.uniqueness(mech, 0.0, q)
+
+for wrong in (lambda: constraints.psi_q(mech, 0.0, q.reshape(-1, 3)[:, :2]), lambda: uk.tangent_part(mech, 0.0, q, v[:-1], svd)):
+    try:
+        wrong()
+    except TypeCheckError:
+        print("refused")
+"""
+
+
+def test_arrays_have_the_annotated_shapes():
+    found = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True)
+    assert found.stdout.split() == ["refused", "refused"], found.stderr[-2000:]
