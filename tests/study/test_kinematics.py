@@ -147,6 +147,7 @@ def test_a_position_where_branches_meet_says_so():
     np.testing.assert_allclose(found.q[:, 2, 2], values, atol=1e-7)
 
 
+@pytest.mark.slow  # in the fast tests: by the command line, and of a driven pendulum by inverse dynamics
 def test_drivers_along_time_and_other_drivers_held():
     mech = udk.library.slider_crank(0.3, 4.0, gravity=0.0)
     ts = np.linspace(0.0, 1.0, 9)
