@@ -1,4 +1,4 @@
-"""What moves a mechanism: pure functions of its numbers, time, coordinates and velocities."""
+"""Equations of motion: pure functions of a mechanism's numbers, time, coordinates and velocities."""
 
 from udkjax.equations.analysis import Analysis as Analysis
 from udkjax.equations.analysis import analyse as analyse

@@ -81,7 +81,7 @@ class DenseRows:
         return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._run(self._programs.psi, t, q, q)))
 
     def assemble(self, t: Time, q: np.ndarray, v: np.ndarray) -> Assembly[np.ndarray]:
-        """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
+        """Return q closed, v as the constraints allow it, the remaining Psi and Psi_dot, and the rank of D."""
         if not self.count:
             return q, v, *self.violation(t, q, v), 0
         q = close_position(self, t, q, np)

@@ -1,4 +1,4 @@
-"""Which multipliers equilibrium alone decides (Wojtyra 2009), and the rank of the constraints in the scene's own units.
+"""Uniqueness of multipliers by equilibrium alone (Wojtyra 2009), and the rank of the constraints in the scene's own units.
 
 lambda and lambda + N y give the same M a + Psi_q^T lambda = F for every y, where N spans the null space of Psi_q^T. So a number
 c^T lambda is the same for all of them, that is unique, if and only if c^T N = 0; of one multiplier, if its row of N is zero.

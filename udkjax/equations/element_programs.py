@@ -38,7 +38,7 @@ class ElementPrograms:
         return found
 
     def _find_constants(self):
-        """Find the sines and cosines, which come from the bodies, and what depends on parameters alone, computed once."""
+        """Find the sines and cosines, which bodies share, and the constants, which depend on parameters alone."""
         angles = {s.index: body for name, body, s in self.state if name == "angle"}
         for index, node in enumerate(self.graph.nodes):
             name = node.detail.primitive.name if node.kind == "apply" else ""

@@ -57,7 +57,7 @@ class ImplicitDerivative(ABC):
     @property
     @abstractmethod
     def result_count(self) -> int:
-        """How many scalars are differentiated."""
+        """The number of scalars that are differentiated."""
 
     @cached_property
     @abstractmethod
@@ -66,7 +66,7 @@ class ImplicitDerivative(ABC):
 
     @abstractmethod
     def _prepare(self) -> None:
-        """Differentiate what both modes need."""
+        """Differentiate the expressions that both modes need."""
 
     @abstractmethod
     def _forward(self, tangents: Sequence[Scalar]) -> list[Scalar]: ...

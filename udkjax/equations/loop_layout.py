@@ -1,4 +1,4 @@
-"""Where the numbers of a large scene lie in the arrays of its programs of loops.
+"""The layout of a large scene's numbers in the arrays of its programs of loops.
 
 A loop runs one kernel for every element of a group, or for every body. Its table has one row for each of them, with the places in
 the arrays at which begins what belongs to it: its coordinates, its constants, its rows of Psi, its entries of D.
@@ -57,7 +57,7 @@ class ElementGroup:
 
     @property
     def coordinates(self) -> int:
-        """How many coordinates an element depends on."""
+        """The number of coordinates that an element depends on."""
         return 3 * len(self.bodies)
 
 
@@ -173,7 +173,7 @@ class LoopLayout:
 
     @cached_property
     def d_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of the entries of D: row, column, place in the array `D` (with a one behind it), and by what that is multiplied."""
+        """The entries of D: their rows, columns, places in the array `D` (with a one behind it), and factors."""
         found = [np.zeros((4, 0))]
         for group in self.constraints:
             for place, s in enumerate(group.programs.outputs["D"]):

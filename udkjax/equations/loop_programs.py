@@ -90,17 +90,17 @@ class LoopPrograms:
 
     @property
     def term_count(self) -> int:
-        """How many numbers `equation_terms` returns."""
+        """The number of values that `equation_terms` returns."""
         return self.coordinate_count + self.row_count
 
     @property
     def drop_tol_index(self) -> int:
-        """Which of the constants is `drop_tol`."""
+        """The index of `drop_tol` among the constants."""
         return DROP_TOL
 
     @property
     def prologue_input_count(self) -> int:
-        """How many numbers `prologue` takes."""
+        """The number of values that `prologue` takes."""
         return self._number_count + self._layout.gains + 2
 
     @property
@@ -142,12 +142,12 @@ class LoopPrograms:
 
     @cached_property
     def tangent_part(self) -> LoopProgram:
-        """dq1 and dv1: what projection leaves of the changes dq and dv; distance."""
+        """dq1 and dv1: the parts of the changes dq and dv within the manifold; distance."""
         return _program([self._terms.sincos(), *self._terms.element_terms(("D",))], self._factorize, self._tangent_parts(0))
 
     @cached_property
     def end_of_step(self) -> LoopProgram:
-        """What `project_and_accelerate` and `tangent_part` return, by the same factors."""
+        """The results of `project_and_accelerate` and `tangent_part`, by the same factors."""
         return _program(self._project_and_accelerate, self._tangent_parts(2))
 
     @cached_property
@@ -255,7 +255,7 @@ class LoopPrograms:
 
     @property
     def d_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of the entries of D: row, column, place in the array `D` (with a one behind it), and by what that is multiplied."""
+        """The entries of D: their rows, columns, places in the array `D` (with a one behind it), and factors."""
         return self._layout.d_entries
 
     def constants_of(self, numbers: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The prologue of a large scene: what depends on the numbers of the scene alone, computed once a run."""
+"""The prologue of a large scene: the constants that depend on its numbers alone, computed once a run."""
 
 from collections.abc import Sequence
 

@@ -182,7 +182,7 @@ class LoopTerms:
             yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
 
     def residual_of_solve(self, solve: int, to: int) -> Parts:
-        """What a solution leaves of its right-hand side, right - D jt_x, as the right-hand side of another linear system."""
+        """The remainder right - D jt_x of a linear system, as the right-hand side of another one."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):

@@ -77,7 +77,7 @@ class PartitionedSystem(WrappedSystem):
         return jnp.where(near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Solve the constraints for what is dependent."""
+        """Solve the constraints for the dependent coordinates and velocities."""
         return _solve_dependent(self.fix_partition(t, q, v), t, q, v)
 
     def fix_partition(self, t: Time, q: Vector, v: Vector) -> "PartitionedSystem":

@@ -126,7 +126,7 @@ class TracedRows(NamedTuple):
         return -root * (plus @ psi)
 
     def assemble(self, close: Callable[["TracedRows", Time, Array], Array], t: Time, q: Array, v: Array) -> Assembly[Array]:
-        """Return q closed by `close`, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
+        """Return q closed by `close`, v as the constraints allow it, the remaining Psi and Psi_dot, and the rank of D."""
         if not self.equations.constrained:
             return q, v, *self.equations.violation(t, q, v), 0
         q, rank = close(self, t, q), 0

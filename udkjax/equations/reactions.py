@@ -122,7 +122,7 @@ def unique_reactions(
 def _split_by_body(
     mechanism: Mechanism, q: Array, by_row: Float[Array, "T m n"], total: Callable[[Array], Array], frame: Axes, about: About
 ) -> ByBody:
-    """Split what rows do to coordinates by joints and bodies, (rows, T, 3) each, in other axes and about another point."""
+    """Split the loads of rows by joints and bodies, (rows, T, 3) each, in other axes and about another point."""
     if frame not in ("ground", "body", "joint") or about not in ("centre", "joint"):
         raise ValueError(f'frame is "ground", "body" or "joint", not {frame!r}; about is "centre" or "joint", not {about!r}')
     places = {name: k for k, name in enumerate(mechanism.body_names)}

@@ -1,4 +1,4 @@
-"""The scalar programs of a scene's structure: each computes what it is asked for, and nothing else."""
+"""The scalar programs of a scene's structure: each computes its outputs, and nothing else."""
 
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
@@ -40,7 +40,7 @@ class ScenePrograms:
 
     @cached_property
     def constants(self) -> list[Scalar]:
-        """What the programs need that depends on numbers of the scene alone: computed once a run, by `prologue`."""
+        """The inputs of the programs that depend on numbers of the scene alone: `prologue` computes them once a run."""
         return self._constants_of(self)
 
     def _constants_of(self, *programs: "ScenePrograms") -> list[Scalar]:
@@ -75,7 +75,7 @@ class ScenePrograms:
 
     @cached_property
     def pieces(self) -> ScalarProgram:
-        """In which of its smooth pieces each element is that has several."""
+        """The number of the smooth piece of each element that has several."""
         return self._program("pieces")
 
     @cached_property
@@ -89,12 +89,12 @@ class ScenePrograms:
 
     @property
     def term_count(self) -> int:
-        """How many numbers `equation_terms` returns."""
+        """The number of values that `equation_terms` returns."""
         return len(self._outputs["equation_terms"])
 
     @property
     def drop_tol_index(self) -> int | None:
-        """Which of the constants is `drop_tol`, if any is."""
+        """The index of `drop_tol` among the constants, or None."""
         return next((k for k, s in enumerate(self.constants) if s.index == self.drop_tol.index), None)
 
     def b(self, i: int) -> Scalar:
@@ -186,7 +186,7 @@ class EliminationPrograms(ScenePrograms):
 
     @cached_property
     def tangent_part(self) -> ScalarProgram:
-        """What projection leaves of changes of q and v (after v), without dependent rows; `SparseFactors.distance`."""
+        """The parts of changes of q and v within the manifold (after v), without dependent rows; `SparseFactors.distance`."""
         return self._program("tangent_part", self.changes)
 
     @cached_property
@@ -210,7 +210,7 @@ class EliminationPrograms(ScenePrograms):
         return [c * s for c, s in zip(self.compliance, self.jt(y), strict=True)]
 
     def _correct(self, x: Sequence[Scalar], residual: Sequence[Scalar], dropping: bool = True) -> list[Scalar]:
-        """x - M^(-1) Psi_q^T (D D^T)^(-1) residual: x without what makes the residual."""
+        """x - M^(-1) Psi_q^T (D D^T)^(-1) residual: x corrected so that the residual vanishes."""
         return [c - s for c, s in zip(x, self.minv_jt(self.solve_gram(residual, dropping)), strict=True)]
 
     def _tangent_part(self, dropping: bool) -> list[Scalar]:

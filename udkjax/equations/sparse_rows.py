@@ -1,4 +1,4 @@
-"""Which rows of a large scene depend on each other, by sparse arithmetic: what redundancy.py does by singular values.
+"""Dependent rows of a large scene by sparse elimination, in place of the singular values of dense_rows.py.
 
 D has rows of length one here, and D D^T is eliminated in an order of least fill. A pivot is the square of what remains of its
 row when the rows before it are taken out; a row of which nothing remains depends on those before it, is left out of the
@@ -160,7 +160,7 @@ class SparseRows:
         return self._position(t, q, D)
 
     def assemble(self, t: Time, q: np.ndarray, v: np.ndarray) -> Assembly[np.ndarray]:
-        """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D."""
+        """Return q closed, v as the constraints allow it, the remaining Psi and Psi_dot, and the rank of D."""
         if not self.count:
             return q, v, np.zeros(0), np.zeros(0), 0
         q = close_position(self, t, q, np)

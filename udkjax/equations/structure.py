@@ -68,7 +68,7 @@ def _scalars(leaf: NumericArray) -> list[NumericArray]:
 
 
 class ElementStructure(NamedTuple):
-    """What is traced once for many elements: all of them but the names of their bodies and the values of their numbers."""
+    """The part of an element that is traced once for many: all but the names of its bodies and the values of its numbers."""
 
     tree: TreeDef
     shapes: Shapes
@@ -76,7 +76,7 @@ class ElementStructure(NamedTuple):
 
     @property
     def body_count(self) -> int:
-        """How many of its frames are those of bodies."""
+        """The number of its frames that are not the ground's."""
         return len(self.ground) - sum(self.ground)
 
 

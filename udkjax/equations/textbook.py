@@ -46,7 +46,7 @@ class TextbookEquations(MechanismSystem):
         return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: what projection at q leaves of small changes."""
+        """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: the parts of small changes within the manifold at q."""
         mechanism, w = self.mechanism, self.weights
         of = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
         return TangentPart(*of(jnp.stack([dq, dv])))
@@ -56,7 +56,7 @@ class TextbookEquations(MechanismSystem):
         return constraints.psi(self.mechanism, t, q), constraints.psi_dot(self.mechanism, t, q, v)
 
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
-        """Whether everything that the equation is made of is a number."""
+        """Whether all terms of the equation are finite."""
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in self.matrices(t, q, v)]))
 
     def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
@@ -93,7 +93,7 @@ class TextbookEquations(MechanismSystem):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        """Those of the rows; elimination, which tells no small pivot from rounding, leaves out what is known to be redundant."""
+        """The weights of the rows; zero for redundant ones with elimination, which cannot tell small pivots from rounding."""
         if not isinstance(self.method, Elimination) or not self.redundant:
             return self.scales.weights
         return self.scales.weights.at[np.array(self.redundant)].set(0.0)

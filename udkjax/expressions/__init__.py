@@ -1,4 +1,4 @@
-"""Graphs of scalar expressions, recorded once: what is structurally zero vanishes, what is repeated is computed once."""
+"""Graphs of scalar expressions, recorded once: structural zeros vanish, and equal expressions are computed once."""
 
 from udkjax.deprecation import deprecated_getattr
 from udkjax.expressions.differential import Differential as Differential

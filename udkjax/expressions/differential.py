@@ -23,7 +23,7 @@ Row = dict[int, Scalar]  # partial derivatives, by the index of the node with re
 class Differential:
     """The differentials of `outputs` along `inputs`.
 
-    What `inputs` and `fixed` are made of is not looked at, and `fixed` does not move.
+    Nodes on which `inputs` and `fixed` depend are not differentiated, and `fixed` is constant.
     """
 
     def __init__(self, graph: Graph, outputs: Iterable[Scalar], inputs: Sequence[Scalar], fixed: Iterable[Scalar] = ()):
@@ -42,7 +42,7 @@ class Differential:
         return row if output.sign > 0 else {k: -p for k, p in row.items()}
 
     def forward(self, tangents: Mapping[int, Scalar]) -> Row:
-        """From the tangents of inputs, by index, those of everything that rows refer to. An input without one does not move."""
+        """Return the tangents of all nodes that rows refer to, from those of inputs, by index; others are constant."""
         known = {k: t for k, t in tangents.items() if not t.is_zero}
         for call, results in self._calls.items():
             arguments = [product(self.row(a), known, self.graph) for a in self.graph.nodes[call].arguments]
@@ -50,7 +50,7 @@ class Differential:
         return known
 
     def reverse(self, cotangents: Row) -> list[Scalar]:
-        """From the cotangents of everything that rows refer to, by index, those of the inputs."""
+        """Return the cotangents of the inputs, from those of all nodes that rows refer to, by index."""
         known = dict(cotangents)
         for call, results in reversed(self._calls.items()):
             seeds = {k: known.pop(k) for k in results if k in known}
@@ -196,7 +196,7 @@ def _slope(detail: BoundPrimitive, dtypes: tuple[np.dtype, ...], k: int) -> Clos
 
 
 def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Sequence[Scalar]) -> Row:
-    """The tangents of what an opaque node returns."""
+    """Return the tangents of the results of an opaque node."""
     node = graph.nodes[call]
     arrays, dots = _arrays(node, node.arguments), _arrays(node, tangents)
     active = [k for k, dot in enumerate(dots) if any(not s.is_zero for s in dot.flat)]
@@ -213,7 +213,7 @@ def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Seq
 
 
 def _pull_back(graph: Graph, call: int, seeds: Row, flags: Sequence[bool]) -> list[Scalar]:
-    """The cotangents of the arguments of an opaque node, from those of what it returns."""
+    """Return the cotangents of the arguments of an opaque node, from those of its results."""
     node = graph.nodes[call]
     arrays, wanted = _arrays(node, node.arguments), _outputs(graph, list(seeds))
     active = [k for k, flags in enumerate(_arrays(node, flags)) if flags.any()]

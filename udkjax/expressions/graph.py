@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike
 
 
 class Node(NamedTuple):
-    """One operation; `detail` is what tells it apart besides its arguments: a name, a value, a primitive's parameters."""
+    """One operation; `detail` identifies it besides its arguments: a name, a value, a primitive's parameters."""
 
     kind: (
         str  # input, constant, add, sub, mul, div, sqrt, apply (a JAX primitive on scalars), call (on arrays), pick (from a call)

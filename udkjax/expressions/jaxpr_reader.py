@@ -175,7 +175,7 @@ def _fold(primitive: core.Primitive, parameters: dict, values: Sequence[ArrayLik
 
 
 def _evaluate_constants(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """What a primitive gives for known values, such as indices."""
+    """Evaluate a primitive on known values, such as indices."""
     values = [_values(i).astype(v.aval.dtype) for i, v in zip(inputs, equation.invars, strict=True)]  # an empty one has no type
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*map(jax.numpy.asarray, values), **equation.params)
@@ -188,7 +188,7 @@ def _values(array: np.ndarray) -> np.ndarray:
 
 
 def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
-    """Which elements an indexing with known indices takes: let JAX take them from an array of their places."""
+    """Select the elements of an indexing with known indices: JAX selects them from an array of their places."""
     array, *indices = inputs
     places, outside = np.arange(array.size).reshape(array.shape), array.size  # what stands for an index beyond the end
     parameters = {**equation.params, "fill_value": outside} if "fill_value" in equation.params else equation.params

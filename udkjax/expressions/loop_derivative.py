@@ -25,7 +25,7 @@ class LoopDerivative:
 
     @property
     def forward(self) -> LoopProgram:
-        """The changes of all arrays, from those of what the program does not compute."""
+        """The program of the changes of all arrays, from those of its inputs."""
         parts: list[KernelLoop | Reset] = []
         for part in self._parts:
             if isinstance(part, Reset):
@@ -37,7 +37,7 @@ class LoopDerivative:
 
     @property
     def reverse(self) -> LoopProgram:
-        """The cotangents of all arrays, added to those of what the program returns."""
+        """The program of the cotangents of all arrays, from those of its results."""
         parts: list[KernelLoop | Reset] = []
         for part in reversed(self._parts):
             if isinstance(part, KernelLoop):
@@ -77,7 +77,7 @@ Addressed = list[tuple[Scalar, Address]]
 
 
 def _active(kernel: Kernel, constant_arrays: frozenset[str]) -> tuple[Addressed, Addressed]:
-    """Of inputs that are used, and of outputs: those that have derivatives."""
+    """Return the inputs that are used, and the outputs, that have derivatives."""
     program = kernel.program
     inputs = [(s, address) for s, address in zip(program.inputs, kernel.inputs, strict=True) if program.uses(s)]
     outputs = zip(program.outputs, kernel.outputs, strict=True)
@@ -85,7 +85,7 @@ def _active(kernel: Kernel, constant_arrays: frozenset[str]) -> tuple[Addressed,
 
 
 def _kernel(kernel: Kernel, seeds: Addressed, outputs: Addressed, prefix: str) -> Kernel | None:
-    """A kernel that also takes `seeds`, with what it returns in arrays with a prefix."""
+    """Return a kernel that also takes `seeds`, with its results in arrays with a prefix."""
     if not outputs:
         return None
     inputs = list(zip(kernel.program.inputs, kernel.inputs, strict=True))

@@ -59,7 +59,7 @@ class KernelWriter:
         self._outputs.append((s, Address(array, base, offset, update)))
 
     def kernel(self) -> Kernel:
-        """Return what was written."""
+        """Return the kernel that was written."""
         program = ScalarProgram(self.graph, list(self._inputs), [s for s, _ in self._outputs])
         return Kernel(program, list(self._inputs.values()), [address for _, address in self._outputs])
 

@@ -41,7 +41,7 @@ def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR
 
 
 def complete_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
-    """The same with all of Q (m, m) and what is left of R (m, n): from `rank` on, the columns of Q span what D does not.
+    """Householder's QR with all of Q (m, m) and the remainder of R (m, n): from `rank` on, the columns of Q span what D does not.
 
     Columns stay in their place, only their order is noted. (The pivoted QR of jax.scipy needs MAGMA on a GPU.)
     """

@@ -1,4 +1,4 @@
-"""What the methods by QR share: D^+ = Z Q^T with Z and Q of static shape, whatever the rank."""
+"""The common part of the methods by QR: D^+ = Z Q^T with Z and Q of static shape, whatever the rank."""
 
 from typing import NamedTuple
 

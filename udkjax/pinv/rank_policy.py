@@ -1,4 +1,4 @@
-"""What elimination does with a small pivot: the one decision near singular configurations.
+"""The policy for small pivots in elimination: the one decision near singular configurations.
 
 D D^T = L diag(p) L^T. The pivot p_i, relative to its row's diagonal entry of D D^T, is the square of the sine of the angle
 between row i and the rows eliminated before it: a rounding error where the row depends on them, small near a singular
@@ -14,7 +14,7 @@ from enum import Enum
 
 
 class RankPolicy(Enum):
-    """What elimination does with a pivot below a threshold."""
+    """The treatment of a pivot below a threshold."""
 
     REFUSE = "refuse"
     """Look at no pivot while eliminating, and report whether all exceed `safe_tol`. A step that is not safe is refused; machine

@@ -148,7 +148,7 @@ class Dense(Pseudoinverse):
         return dot(D.T, y)
 
     def threshold(self, D: Float[Array, "m n"], scale: Float[Array, ""], default: float | None = None) -> Float[Array, ""]:
-        """At or below it a singular value, or what stands for one in this method, counts as zero.
+        """The threshold at or below which a singular value, or its substitute in this method, counts as zero.
 
         Where no `rank_tol` is given: `default`, else max(m, n) eps: rounding errors of a factorization relative to its matrix.
         """

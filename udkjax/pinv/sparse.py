@@ -71,11 +71,11 @@ class SparseFactors(NamedTuple):
     pivots: list[tuple[Scalar, Scalar]]  # each with its row's diagonal entry
 
     def exceeding(self, fraction: Scalar | float) -> list[Scalar]:
-        """Which pivots exceed this fraction of their row's diagonal entry: booleans, in the order of elimination."""
+        """Whether each pivot exceeds this fraction of its row's diagonal entry, in the order of elimination."""
         return [greater(pivot, diagonal * fraction) for pivot, diagonal in self.pivots]
 
     def distance(self, graph: Graph) -> Scalar:
-        """From dependence: the root of the smallest pivot relative to its row's diagonal entry, infinite without rows."""
+        """The distance from dependence: the root of the smallest pivot relative to its diagonal entry; infinite of no rows."""
         one = graph.constant(1.0)
         times = [absolute(diagonal * (one / pivot)) for pivot, diagonal in self.pivots]  # by the reciprocals that are there
         while len(times) > 1:  # by halves, so that few wait for others
@@ -142,7 +142,7 @@ def solve(factors: SparseFactors, b: Sequence[Scalar]) -> list[Scalar]:
 
 
 def substitute_forward(lower: Sequence[dict[int, Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
-    """L^-1 b; of rows beyond the columns of L, what these leave."""
+    """L^-1 b; for rows beyond the columns of L, the remainder."""
     y = list(b)
     for j, entries in enumerate(lower):
         for i, entry in entries.items():

@@ -1,4 +1,4 @@
-"""What exists: bodies, joints, drivers, force elements, the mechanism of them all, and its files. No equations."""
+"""Scenes: bodies, joints, drivers, force elements, the mechanism of them all, and its files. No equations."""
 
 from udkjax.scene import library as library
 from udkjax.scene.bodies import GROUND as GROUND

@@ -34,7 +34,7 @@ class Mistakes(ValueError):
 
 
 class SceneError(Mistakes):
-    """A scene cannot be what it says. `problems` lists every mistake, each with the path of the offending entry."""
+    """A scene is wrong. `problems` lists every mistake, each with the path of the offending entry."""
 
     subject = "scene"
 
@@ -135,7 +135,7 @@ def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
 
 
 def find_class(path: str, choices: Mapping[str, type], table: Table) -> tuple[type | None, str]:
-    """Return the class that a table's `type` names, or None and what is wrong with it."""
+    """Return the class that a table's `type` names, or None and the mistake."""
     kind = table.get("type")
     if isinstance(kind, str) and kind in choices:
         return choices[kind], ""

@@ -78,14 +78,14 @@ class StaticValue:
 
 
 class Requirement(NamedTuple):
-    """What each entry of a number must satisfy: `holds` maps the array to a boolean array of the same shape."""
+    """A condition on each entry of a number: `holds` maps the array to a boolean array of the same shape."""
 
     text: str
     holds: Callable[[np.ndarray], np.ndarray]
 
 
 class FieldMetadata(TypedDict, total=False):
-    """What the value of a field must satisfy beyond its annotation."""
+    """Conditions on the value of a field beyond its annotation."""
 
     require: tuple[Requirement, ...]
     at_least: int  # entries

@@ -139,7 +139,7 @@ class Mechanism(eqx.Module):
 
     @property
     def without_origin(self) -> "Mechanism":
-        """The same mechanism without its `origin`: what is compiled for it serves every origin."""
+        """The same mechanism without its `origin`: a program compiled for it serves every origin."""
         if self.origin is None:
             return self
         copy = object.__new__(type(self))

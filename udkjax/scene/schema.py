@@ -75,7 +75,7 @@ def keys(cls: type) -> dict[str, Key]:
 
 
 def table_of(element: eqx.Module) -> dict[str, object]:
-    """Return an element as a table; what is absent (None) is left out, and nested modules stay modules."""
+    """Return an element as a table; absent values (None) are left out, and nested modules stay modules."""
     table = {name: getattr(element, name) for name in keys(type(element))}
     return {name: value for name, value in table.items() if value is not None}
 

@@ -1,4 +1,4 @@
-"""Mechanisms from literature and practice, ready to use: every number is an argument, and what is not driven starts free."""
+"""Mechanisms from literature and practice, ready to use: every number is an argument."""
 
 from udkjax.scene.library.andrews import andrews_squeezer
 from udkjax.scene.library.excavator import excavator

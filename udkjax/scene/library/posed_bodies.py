@@ -1,4 +1,4 @@
-"""What the mechanisms of the library are made with: poses, and bodies that move with them.
+"""Poses, and bodies that move with them, for the mechanisms of the library.
 
 Each mechanism starts closed, with velocities that its constraints allow: its pose q(s) is written over one coordinate s, and
 the velocity is the pose's derivative times the rate of s.
