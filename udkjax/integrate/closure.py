@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.position_closure import CLOSURE_ITERATIONS, TracedRows, close_position, damped_step
+from udkjax.equations.position_closure import CLOSURE_ITERATIONS, Assembly, TracedRows, close_position, damped_step
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.textbook import prepare
 from udkjax.integrate import native_engine
@@ -17,7 +17,7 @@ from udkjax.integrate.gradients import TreeDef
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
 
-Closed = tuple[Array, Array, Array, Array, Array]  # q, v, Psi, Psi_dot, the rank of D
+Closed = Assembly[Array]
 Guess = tuple[Mechanism, Analysis, Array, Array, Array]  # and t, q, v
 NativeGuess = tuple[Mechanism, Scales, Float[Array, ""], Array, Array, Array]  # mechanism, scales, rank tolerance, t, q, v
 
@@ -33,10 +33,10 @@ def close_by_machine_code(
     """Return the same as `close_by_jax`, by machine code."""
     arrays, rest = eqx.partition((mechanism, analysis, t, q, v), eqx.is_inexact_array)
     xs, tree = jax.tree.flatten(arrays)
-    return _close_by_code(Assembly(rest, tree), xs)
+    return _close_by_code(AssemblyFunction(rest, tree), xs)
 
 
-class Assembly(Function):
+class AssemblyFunction(Function):
     """q and v of a closed state as a function of the numbers of a mechanism and a guess; `rest` has all that is no number."""
 
     rest: PyTree
@@ -44,7 +44,7 @@ class Assembly(Function):
     is_plain: bool = eqx.field(static=True, default=False)
 
     @property
-    def plain(self) -> "Assembly":
+    def plain(self) -> "AssemblyFunction":
         return replace(self, is_plain=True)
 
     def guess(self, xs: list[Array]) -> Guess:
@@ -91,7 +91,7 @@ def _native_inputs(tree: PyTree) -> PyTree:
 
 
 @eqx.filter_custom_jvp
-def _close_by_code(function: Assembly, xs: list[Array]) -> Closed:
+def _close_by_code(function: AssemblyFunction, xs: list[Array]) -> Closed:
     mechanism, analysis, t, q, v = function.guess(xs)
     return native_engine.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
 
