@@ -13,23 +13,30 @@ with install_import_hook([*modules, *(f"udkjax.pinv.{name}" for name in methods)
     from udkjax.equations import constraints, determinacy, loads
     from udkjax.equations import udwadia_kalaba as uk
 
+import jax
 import numpy as np
 
-A = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0]])
+A, b = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0]]), np.ones(2)
 for method in (udk.SVD(), udk.Varga(), udk.Greville(), udk.Householder(), udk.GramSchmidt(), udk.Elimination(), udk.Auto()):
-    assert method(A).shape == (3, 2) and method.solve(A, np.ones(2)).rank == 1
+    assert jax.eval_shape(method, A).shape == (3, 2) and jax.eval_shape(method.solve, A, b).x.shape == (3,)
 
 mech, svd = udk.library.slider_crank(), udk.SVD()
+
+
+def everything(q, v):
+    found = [constraints.psi(mech, 0.0, q), constraints.psi_dot(mech, 0.0, q, v), constraints.gamma(mech, 0.0, q, v)]
+    found += [loads.force(mech, 0.0, q, v), loads.kinetic_energy(mech, v), loads.potential_energy(mech, 0.0, q, v)]
+    found += [uk.accelerations(mech, 0.0, q, v, svd, udk.Baumgarte()), uk.multipliers(mech, 0.0, q, v, svd)]
+    found += [uk.project(mech, 0.0, q, v, svd), uk.tangent_part(mech, 0.0, q, v.ravel(), svd)]
+    return found, determinacy.uniqueness(mech, 0.0, q)
+
+
 for q, v in ((mech.q0, mech.v0), (mech.q0.ravel(), mech.v0.ravel())):
-    constraints.psi(mech, 0.0, q), constraints.psi_dot(mech, 0.0, q, v), constraints.gamma(mech, 0.0, q, v)
-    loads.force(mech, 0.0, q, v), loads.kinetic_energy(mech, v), loads.potential_energy(mech, 0.0, q, v)
-    uk.accelerations(mech, 0.0, q, v, svd, udk.Baumgarte()), uk.multipliers(mech, 0.0, q, v, svd)
-    uk.project(mech, 0.0, q, v, svd), uk.tangent_part(mech, 0.0, q, v.ravel(), svd)
-    determinacy.uniqueness(mech, 0.0, q)
+    jax.eval_shape(everything, q, v)  # shapes are known while it is traced
 
 for wrong in (lambda: constraints.psi_q(mech, 0.0, q.reshape(-1, 3)[:, :2]), lambda: uk.tangent_part(mech, 0.0, q, v[:-1], svd)):
     try:
-        wrong()
+        jax.eval_shape(wrong)
     except TypeCheckError:
         print("refused")
 """
