@@ -1,7 +1,8 @@
 """The interface of equations of motion: the functions that an integrator calls."""
 
 from abc import abstractmethod
-from typing import NamedTuple, Protocol, Self
+from types import SimpleNamespace
+from typing import NamedTuple, Protocol, Self, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ class PseudoinverseOperator(Protocol):
     def __matmul__(self, b: Array) -> Array: ...
 
 
-class StateHistory(Protocol):
+class HasStates(Protocol):
     """Times and states, such as those of a `Solution`."""
 
     @property
@@ -42,6 +43,9 @@ class StateHistory(Protocol):
     def v(self) -> Float[ArrayLike, "T bodies 3"]:
         """Velocities (m/s, rad/s)."""
         ...
+
+
+StateHistory: TypeAlias = HasStates | SimpleNamespace  # anything with these attributes
 
 
 class TangentPart(NamedTuple):

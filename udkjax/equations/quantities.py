@@ -1,7 +1,7 @@
 """Quantities of a motion: accelerations, multipliers, energies and violations of the constraints."""
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Literal, NamedTuple, TypeVar, overload
 
 import equinox as eqx
 import jax
@@ -55,6 +55,35 @@ def equations_of(
     else:
         equations = prepare(system, method, baumgarte, analysis)
     return equations if formulation is None else formulation.formulate(equations)
+
+
+@overload
+def accelerations(
+    mechanism: Mechanism | ConstrainedSystem,
+    t: ArrayLike,
+    q: Float[ArrayLike, "bodies 3"],
+    v: Float[ArrayLike, "bodies 3"],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
+    multipliers: Literal[False] = False,
+    formulation: Formulation | None = None,
+    analysis: Analysis | None = None,
+) -> Float[Array, "bodies 3"]: ...
+
+
+@overload
+def accelerations(
+    mechanism: Mechanism | ConstrainedSystem,
+    t: ArrayLike,
+    q: Float[ArrayLike, "bodies 3"],
+    v: Float[ArrayLike, "bodies 3"],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
+    *,
+    multipliers: Literal[True],
+    formulation: Formulation | None = None,
+    analysis: Analysis | None = None,
+) -> tuple[Float[Array, "bodies 3"], Float[Array, "m"]]: ...
 
 
 def accelerations(
