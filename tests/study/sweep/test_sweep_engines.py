@@ -25,10 +25,10 @@ import sys
 import jax, numpy as np, udkjax as udk
 from udkjax.study.sweep.cost import cut_chunks
 from udkjax.study.sweep.chunk import program, run
-from udkjax.study.sweep.plan import planned
+from udkjax.study.sweep.plan import make_plan
 
 axes = {"mass": udk.Axis(np.linspace(1.0, 3.0, 20), of="body.rod.mass"), "rtol": np.geomspace(1e-10, 1e-4, 30)}
-plan = planned(udk.library.compound_pendulum(), axes, [0.0, 3.0])
+plan = make_plan(udk.library.compound_pendulum(), axes, [0.0, 3.0])
 parts = [{"members": chunk.members, **run(plan, chunk)} for chunk in cut_chunks(plan)]
 found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 np.savez(sys.argv[1], **{name: values[np.argsort(found["members"])] for name, values in found.items()})
