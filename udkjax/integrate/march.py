@@ -29,9 +29,9 @@ DEPENDENT = 1e-10  # of a row's square: what is left of one that depends on othe
 class March(NamedTuple):
     """Positions and their derivatives by the value; the first `trusted` of them are right."""
 
-    q: Float[Array | np.ndarray, "T n"]
-    dq: Float[Array | np.ndarray, "T n"]
-    ddq: Float[Array | np.ndarray, "T n"]
+    q: Float[Array, "T n"]
+    dq: Float[Array, "T n"]
+    ddq: Float[Array, "T n"]
     trusted: Int[Array, ""]
 
 
@@ -72,7 +72,7 @@ def _by_numpy(x: PyTree) -> PyTree:
     return np.asarray(x) if eqx.is_array(x) else x
 
 
-def _march(found: Sequence[Vector], xp: ModuleType) -> March:
+def _march(found: Sequence, xp: ModuleType) -> March:
     q, dq, ddq = (x[0, APPROACH:] for x in found[:3])
     return March(q, dq, ddq, xp.maximum(found[3][0, 0].astype(int) - APPROACH, 0))
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from udkjax.extras import OptionalImport
 from udkjax.html import html_table
+from udkjax.integrate.events.event import Events
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
 
@@ -81,7 +82,7 @@ class Solution(eqx.Module):
     atol: Float[Array, ""]
     bodies: tuple[str, ...] = eqx.field(static=True)
     choices: tuple[tuple[str, str], ...] = eqx.field(static=True)  # `settings`, hashable
-    events: Any = None  # `Events`, where there were any to look for
+    events: Events | None = None  # `Events`, where there were any to look for
 
     @property
     def settings(self) -> dict[str, str]:

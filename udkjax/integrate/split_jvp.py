@@ -16,13 +16,15 @@ import jax.core
 import jax.numpy as jnp
 from jax.extend.core import Literal, Primitive, new_jaxpr_eqn, no_effects, set_current_trace
 from jax.interpreters import ad, batching, mlir, partial_eval
+from jaxtyping import Array, PyTree
 
-Parts = Callable[..., tuple[list[Any], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
+Shapes = tuple[list[jax.ShapeDtypeStruct], list[jax.ShapeDtypeStruct]]  # of a value and of its change
+Parts = Callable[..., tuple[list[Array], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
 
 
 def split_jvp(
-    seen: Parts, run: Parts, at: Any, direction: Any, few: int | None = 1, shapes: tuple[list[Any], list[Any]] | None = None
-) -> tuple[list[Any], ...]:
+    seen: Parts, run: Parts, at: PyTree, direction: PyTree, few: int | None = 1, shapes: Shapes | None = None
+) -> tuple[list[Array], ...]:
     """The value at `at` and its change along `direction`, trees of arrays: by `run`; transformations see what `seen` does.
 
     A batch of up to `few` directions at one place is so many directions for `run`, and of any other `seen` is mapped; where it is
@@ -32,7 +34,7 @@ def split_jvp(
     (place, way), static = eqx.partition((at, direction), eqx.is_array)
     (start, places), (ways, form) = jax.tree.flatten(place), jax.tree.flatten(way)
 
-    def function(parts: Parts) -> Callable[..., tuple[list[Any], ...]]:
+    def function(parts: Parts) -> Callable[..., tuple[list[Array], ...]]:
         return lambda at, *directions: parts(
             eqx.combine(places.unflatten(at), static[0]), *(eqx.combine(form.unflatten(d), static[1]) for d in directions)
         )
@@ -45,7 +47,7 @@ class Both:
     """The two forms as functions of lists of arrays: those of the place, then those of one direction after another."""
 
     def __init__(
-        self, seen: Parts, run: Parts, start: Sequence[Any], way: Sequence[Any], few: int | None, shapes: Any | None = None
+        self, seen: Parts, run: Parts, start: Sequence[Array], way: Sequence[Array], few: int | None, shapes: Shapes | None = None
     ):
         self.seen, self.run = partial(self._flat, seen), partial(self._flat, run)
         self.start, self.way, self.few = len(start), len(way), few
@@ -53,17 +55,17 @@ class Both:
             self.shapes = shapes
         self._parts, self._examples = seen, [[jax.ShapeDtypeStruct(x.shape, x.dtype) for x in xs] for xs in (start, way)]
 
-    def _flat(self, parts: Parts, *xs: Any) -> list[Any]:
+    def _flat(self, parts: Parts, *xs: Array) -> list[Array]:
         ways = [xs[k : k + self.way] for k in range(self.start, len(xs), self.way)]
         return [x for found in parts(xs[: self.start], *ways) for x in found]
 
-    def split(self, found: Sequence[Any]) -> tuple[list[Any], ...]:
+    def split(self, found: Sequence[Array]) -> tuple[list[Array], ...]:
         """What was found along one direction, as the two forms return it."""
         return list(found[: self.values]), list(found[self.values :])
 
     @cached_property
-    def shapes(self) -> tuple[list[Any], list[Any]]:
-        """Of the value, and of the change along a direction."""
+    def shapes(self) -> Shapes:
+        """The shapes of the value and of the change along a direction."""
         value, change = jax.eval_shape(self._parts, *self._examples)
         return value, change
 
@@ -80,13 +82,13 @@ class Both:
         return other
 
 
-def _avals(*xs: Any, both: Both) -> list[Any]:
+def _avals(*xs: Array, both: Both) -> list[jax.core.ShapedArray]:
     value, change = both.shapes
     directions = (len(xs) - both.start) // both.way
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in [*value, *change * directions]]
 
 
-def _batched(xs: Sequence[Any], axes: Sequence[int | None], both: Both) -> tuple[list[Any], list[int | None]]:
+def _batched(xs: Sequence[Array], axes: Sequence[int | None], both: Both) -> tuple[list[Array], list[int | None]]:
     size = next(x.shape[axis] for x, axis in zip(xs, axes, strict=True) if axis is not None)
     directions, moved = (len(xs) - both.start) // both.way, any(axis is not None for axis in axes[: both.start])
     if both.few is None:
@@ -100,7 +102,7 @@ def _batched(xs: Sequence[Any], axes: Sequence[int | None], both: Both) -> tuple
         out = [*[0 if moved else None] * both.values, *changes]
         return jax.vmap(both.seen, in_axes=tuple(axes), out_axes=out)(*xs), out
 
-    def way(k: int) -> list[Any]:
+    def way(k: int) -> list[Array]:
         pairs = zip(xs[both.start :], axes[both.start :], strict=True)
         return [x if axis is None else jax.lax.index_in_dim(x, k, axis, keepdims=False) for x, axis in pairs]
 
@@ -111,14 +113,16 @@ def _batched(xs: Sequence[Any], axes: Sequence[int | None], both: Both) -> tuple
     return [*value, *stacked], [*[None] * len(value), *[0] * each]
 
 
-def _derivative(primals: Sequence[Any], tangents: Sequence[Any], both: Both) -> tuple[list[Any], list[Any]]:
+def _derivative(primals: Sequence[Array], tangents: Sequence[Array], both: Both) -> tuple[list[Array], list[Array | ad.Zero]]:
     return _jvp(both.seen, primals, tangents)
 
 
-def _jvp(run: Callable[..., list[Any]], primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+def _jvp(
+    run: Callable[..., list[Array]], primals: Sequence[Array], tangents: Sequence[Array]
+) -> tuple[list[Array], list[Array | ad.Zero]]:
     moving = [not isinstance(dx, ad.Zero) for dx in tangents]
 
-    def function(*some: Any) -> list[Any]:
+    def function(*some: Array) -> list[Array]:
         rest = iter(some)
         return run(*[next(rest) if m else x for x, m in zip(primals, moving, strict=True)])
 
@@ -128,7 +132,7 @@ def _jvp(run: Callable[..., list[Any]], primals: Sequence[Any], tangents: Sequen
     return found, [ad.Zero(jax.typeof(x).to_tangent_aval()) if n else dx for x, dx, n in zip(found, slopes, none, strict=True)]
 
 
-def _part(trace: Any, *xs: Any, both: Both) -> list[Any]:
+def _part(trace: Any, *xs: Array, both: Both) -> list[Array]:
     with set_current_trace(trace):
         return both.seen(*xs)
 
@@ -145,11 +149,11 @@ def _checkpointed(saveable: Any, unknown: Sequence[bool], there: Sequence[bool],
     return value, eqn, [*[False] * both.values, *[True] * changes], [True] * len(eqn.outvars), inputs
 
 
-def _value(*xs: Any, both: Both) -> list[Any]:
+def _value(*xs: Array, both: Both) -> list[Array]:
     return both.seen(*xs)[: both.values]
 
 
-def _value_batched(xs: Sequence[Any], axes: Sequence[int | None], both: Both) -> tuple[list[Any], list[int]]:
+def _value_batched(xs: Sequence[Array], axes: Sequence[int | None], both: Both) -> tuple[list[Array], list[int]]:
     found = jax.vmap(partial(_value, both=both), in_axes=tuple(axes))(*xs)
     return found, [0] * len(found)
 
