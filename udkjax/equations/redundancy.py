@@ -62,6 +62,10 @@ class PositionRows(Protocol[Position]):
     metric: np.ndarray
     driver_time_step: float
 
+    def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
+        """Psi, the lengths of the rows of D, and D with rows of length one."""
+        ...
+
     def close(self, t: Time, q: np.ndarray) -> Position | None:
         """Return a closed position near q, or None."""
         ...

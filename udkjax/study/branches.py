@@ -55,6 +55,6 @@ def branches(
 def _close(mechanism: Mechanism, analysis: Analysis, s: Any, guesses: Any) -> tuple[Array, Array]:
     def one(q: Any) -> tuple[Array, Array]:
         found = close(mechanism, s, State(q, jnp.zeros_like(q)), analysis=analysis)
-        return found.state.q, found.is_closed
+        return found.state.q, jnp.asarray(found.is_closed)
 
     return jax.vmap(one)(guesses)

@@ -19,10 +19,8 @@ from jaxtyping import Array
 from scipy.sparse import csr_array
 
 from udkjax.equations.analysis import analyse
-from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.redundancy import ORDINARY_TOL, choose_redundant_rows, kinematic_rows, sample_positions
+from udkjax.equations.redundancy import ORDINARY_TOL, PositionRows, choose_redundant_rows, kinematic_rows, sample_positions
 from udkjax.equations.scales import known_scales
-from udkjax.equations.sparse_rows import SparseRows
 from udkjax.scene.checks import quote
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
@@ -112,7 +110,7 @@ class RedundantLoops:
         self._redundant_rows = list(choose_redundant_rows(rows, found))
         self._measure(rows, steps, _length(here))
 
-    def _measure(self, rows: KinematicRows | SparseRows, steps: np.ndarray, length_scale: float):
+    def _measure(self, rows: PositionRows, steps: np.ndarray, length_scale: float):
         """Differentiate Psi by each parameter, and project on what no motion makes up for."""
         at = [rows.at(p.t, p.q) for p in self._positions]
         columns = []
