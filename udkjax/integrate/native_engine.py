@@ -13,7 +13,7 @@ from udkjax.equations.elements import has_pieces
 from udkjax.equations.loop_programs import LoopPrograms, loop_programs
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import EliminationPrograms, elimination_programs, scene_programs
-from udkjax.equations.structure import is_large, leaves_as_scalars
+from udkjax.equations.structure import is_large
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.problem import IntegratorOutput, Problem
@@ -61,8 +61,8 @@ def _parts(found: Sequence[Any], n: int) -> tuple[Any, Any, Any, Any, Any]:
 def closed_along(guess: Any, moving: Any, change: Any) -> tuple[Array, Array]:
     """The changes of q and v along a `change` of what is moving of (mechanism, scales, tol, t, q, v)."""
     (mechanism, *_, q, _), (*_, dq, dv) = guess, change
-    n, kind = len(q), _closing(guess[0], _numbers_moving(mechanism, moving[0]), "closing forward")
-    numbers = _vector(_moved(mechanism, moving[0], change[0]), jnp)
+    n, kind = len(q), _closing(mechanism, _moving_of_closing(mechanism, moving[0]), "closing forward")
+    numbers = _vector(_moved(mechanism, moving[0], change[0], kind.moving or ()), jnp)
     along = [numbers, *(jnp.zeros(n) if dx is None else dx for dx in (dq, dv))]
     dstate = native_p.bind(*_guess(*guess), *(x[None, None] for x in along), kind=kind, times=2)[-1][0, 0]
     return dstate[:n], dstate[n:]
@@ -70,35 +70,53 @@ def closed_along(guess: Any, moving: Any, change: Any) -> tuple[Array, Array]:
 
 def closed_back(guess: Any, moving: Any, qbar: Array, vbar: Array) -> Any:
     """The cotangents of what is moving, from those of q and v."""
-    mechanism, n = guess[0], len(qbar)
-    kind = _closing(mechanism, _numbers_moving(mechanism, moving[0]), "closing reverse")
+    mechanism = guess[0]
+    kind = _closing(mechanism, _moving_of_closing(mechanism, moving[0]), "closing reverse")
     bars = jnp.concatenate([qbar, vbar])[None]
     numbers, *states = (x[0] for x in native_p.bind(*_guess(*guess), bars, kind=kind, times=2)[-3:])
-    found, parts = 0, []
-    leaves, tree = jax.tree.flatten(mechanism, is_leaf=lambda x: x is None)
-    for x, m in zip(leaves, jax.tree.leaves(moving[0], is_leaf=lambda x: x is None), strict=True):
-        size = 0 if x is None or (m is not True and not is_large(mechanism)) else np.size(x)
-        parts.append(numbers[found : found + size].reshape(np.shape(x)) if m is True else None)
-        found += size
-    assert len(states[0]) == n
-    return jax.tree.unflatten(tree, parts), *(x if m is True else None for x, m in zip(states, moving[-2:], strict=True))
+    found = _taken_apart(numbers, mechanism, moving[0], kind.moving or ())
+    return found, *(x if m is True else None for x, m in zip(states, moving[-2:], strict=True))
 
 
-def _moved(mechanism: Mechanism, moving: Any, change: Any) -> list[Any]:
-    """The changes of the numbers that `_numbers_moving` marks, in order."""
-    trees = (jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (mechanism, moving, change))
-    leaves = [(x, m is True, dx) for x, m, dx in zip(*trees, strict=True) if x is not None]
-    if is_large(mechanism):
-        return [*(dx if m else jnp.zeros(np.shape(x)) for x, m, dx in leaves), jnp.zeros(2)]
-    return [dx for _, m, dx in leaves if m]
+def _moving_of_closing(mechanism: Mechanism, moving: Any) -> tuple[bool, ...]:
+    """Of the numbers of closing: which have derivatives. Loops do not tell them apart."""
+    numbers = _numbers_moving(mechanism, moving)
+    return (True,) * len(numbers) if is_large(mechanism) else numbers
 
 
-def _numbers_moving(mechanism: Mechanism, moving: Any) -> tuple[bool, ...]:
-    """Of the numbers of a scene and two thresholds: which have derivatives. Loops do not tell them apart."""
-    if is_large(mechanism):
-        return (True,) * (sum(np.size(x) for x in jax.tree.leaves(mechanism)) + 2)
-    leaves = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (mechanism, moving)), strict=True)
+def _numbers_moving(numbers: Any, moving: Any) -> tuple[bool, ...]:
+    """Of the numbers of a tree and two thresholds: which are marked in `moving`."""
+    leaves = zip(*(_leaves(tree) for tree in (numbers, moving)), strict=True)
     return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
+
+
+def _moved(numbers: Any, moving: Any, change: Any, wanted: Sequence[bool]) -> list[Any]:
+    """The changes of the numbers that are `wanted`, in order: zeros of those that do not move."""
+    found, place = [], 0
+    for x, m, dx in zip(*(_leaves(tree) for tree in (numbers, moving, change)), strict=True):
+        if x is not None:
+            if m is True:
+                found.append(dx)
+            elif wanted[place]:
+                found.append(jnp.zeros(np.shape(x)))
+            place += np.size(x)
+    return [*found, jnp.zeros(sum(wanted[place:]))]
+
+
+def _taken_apart(bars: Any, numbers: Any, moving: Any, wanted: Sequence[bool]) -> Any:
+    """The tree of the cotangents of what is moving, from those of the numbers that are `wanted`, in order."""
+    leaves, tree = jax.tree.flatten(numbers, is_leaf=lambda x: x is None)
+    parts, place, found = [], 0, 0
+    for x, m in zip(leaves, _leaves(moving), strict=True):
+        size = 0 if x is None else np.size(x)
+        count = sum(wanted[place : place + size])
+        parts.append(bars[found : found + count].reshape(np.shape(x)) if m is True else None)
+        place, found = place + size, found + count
+    return jax.tree.unflatten(tree, parts)
+
+
+def _leaves(tree: Any) -> list[Any]:
+    return jax.tree.leaves(tree, is_leaf=lambda x: x is None)
 
 
 def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any, xp: Any = jnp) -> list[Any]:
@@ -183,20 +201,6 @@ def serves_derivatives(moving: Any) -> bool:
     return not any(x is True for x in jax.tree.leaves(others))
 
 
-def _constants(equations: TextbookEquations, code: Any) -> Any:
-    """What the code computes of the numbers of the scene and the gains alone: a function of those, and they."""
-    arrays, rest = eqx.partition((equations.mechanism, equations.baumgarte), eqx.is_inexact_array)
-
-    def constants(arrays: Any) -> Any:
-        mechanism, baumgarte = eqx.combine(arrays, rest)
-        numbers = [*jax.tree.leaves(mechanism), *_gains(baumgarte), jnp.zeros(2)]
-        if isinstance(code, LoopPrograms):
-            return code.constants_of(_vector(numbers, jnp))
-        return [jnp.asarray(c) for c in code.prologue(leaves_as_scalars(numbers))]
-
-    return constants, arrays
-
-
 def _numbers_of(problem: Any) -> Any:
     return problem.equations.mechanism, problem.equations.baumgarte
 
@@ -207,15 +211,8 @@ def _gains(baumgarte: Any) -> list[Any]:
 
 def jvp(problem: Any, moving: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is moving."""
-    kind = _kind(problem, _moving(problem, moving), "forward")
-    constants, arrays = _constants(problem.equations, kind.code)
-    still = jax.tree.map(jnp.zeros_like, arrays)
-    dconstants = jax.jvp(constants, (arrays,), (eqx.combine(_numbers_of(change), still),))[1]
-    if isinstance(kind.code, LoopPrograms):
-        along = dconstants if any(kind.moving or ()) else jnp.zeros(0)
-    else:
-        along = _vector([dc for dc, m in zip(dconstants, kind.moving or (), strict=True) if m], jnp)
-    n = len(problem.q)
+    kind, n = _kind(problem, _moving(problem, moving), "forward"), len(problem.q)
+    along = _vector(_moved(*(_numbers_of(x) for x in (problem, moving, change)), kind.moving or ()), jnp)
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     *found, dys, dend = native_p.bind(
         *_inputs(problem, kind.code), *(x[None, None] for x in (along, dq, dv)), kind=kind, times=len(problem.ts)
@@ -227,29 +224,17 @@ def vjp(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
     """The cotangents of what is `moving`, from those of the states at the output times (T, 2n) and of the end (2n,)."""
     kind = _kind(problem, _moving(problem, moving), "reverse")
     bars = [ys[None], end[None]]
-    cbar, qbar, vbar = native_p.bind(*_inputs(problem, kind.code), *bars, kind=kind, times=len(problem.ts))[len(OUTPUTS) :]
-    constants, arrays = _constants(problem.equations, kind.code)
-    values, back = jax.vjp(constants, arrays)
-    if isinstance(kind.code, LoopPrograms):
-        of_constants: Any = cbar[0] if any(kind.moving or ()) else jnp.zeros_like(values)
-    else:
-        found = iter(cbar[0])
-        of_constants = [next(found) if m else jnp.zeros_like(c) for c, m in zip(values, kind.moving or (), strict=True)]
-    (numbers,) = back(of_constants)
+    numbersbar, qbar, vbar = native_p.bind(*_inputs(problem, kind.code), *bars, kind=kind, times=len(problem.ts))[len(OUTPUTS) :]
     none = jax.tree.map(lambda m: None, moving, is_leaf=lambda x: x is None)
-    those = jax.tree.map(lambda m, x: x if m is True else None, _numbers_of(moving), numbers, is_leaf=lambda x: x is None)
+    numbers = _taken_apart(numbersbar[0], _numbers_of(problem), _numbers_of(moving), kind.moving or ())
     q, v = qbar[0] if moving.q is True else None, vbar[0] if moving.v is True else None
-    return eqx.tree_at(lambda p: (*_numbers_of(p), p.q, p.v), none, (*those, q, v), is_leaf=lambda x: x is None)
+    return eqx.tree_at(lambda p: (*_numbers_of(p), p.q, p.v), none, (*numbers, q, v), is_leaf=lambda x: x is None)
 
 
 def _moving(problem: Any, moving: Any) -> tuple[bool, ...]:
-    """Of the constants of the code of derivatives: which depend on what is moving. Loops do not tell them apart."""
-    code = _programs(problem).for_derivatives
-    numbers, which = (jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_numbers_of(problem), _numbers_of(moving)))
-    moves = [m is True for x, m in zip(numbers, which, strict=True) if x is not None for _ in range(np.size(x))]
-    if isinstance(code, LoopPrograms):
-        return (any(moves),) * len(code.constants)
-    return code.prologue.depends_on([*moves, False, False])
+    """Of the numbers of a run: which have derivatives. Loops do not tell them apart."""
+    numbers = _numbers_moving(_numbers_of(problem), _numbers_of(moving))
+    return (any(numbers),) * len(numbers) if is_large(problem.equations.mechanism) else numbers
 
 
 def _programs(problem: Problem) -> EliminationPrograms | LoopPrograms:

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
+from udkjax.native.prologue import REVERSE, write_prologue_reverse
 from udkjax.native.runge_kutta import stage_state
 from udkjax.native.steps import DONE, POINTS, STRETCH
 from udkjax.native.tangents import Differentiated
@@ -28,7 +29,7 @@ class Reverse(Differentiated):
     """A trajectory that is walked back, with cotangents of its outputs and its end; or not, where these have no members."""
 
     inputs = ("ysbar", "endbar")
-    outputs = ("cbar", "qbar", "vbar")
+    outputs = ("numbersbar", "qbar", "vbar")
 
     def __init__(self, plan: Plan, moving: tuple[bool, ...]):
         super().__init__(plan, moving)
@@ -51,6 +52,8 @@ class Reverse(Differentiated):
     def write_derivatives(self):
         for each in self._linearized:
             each.reverse()
+        if self.count:
+            write_prologue_reverse(self, self.numbers_moving, self.moving)
         self._transposed_differences()
         self._step_back()
         self._walk()
@@ -62,8 +65,8 @@ class Reverse(Differentiated):
             for k in self._each_marked(f, accept):
                 self._note(f, s, k)
 
-    def begin_member(self, f: Function, lane: Value, member: Value):
-        del member
+    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
+        del member, constants
         with f.if_(self._walks(f)):
             self._new_record(f, lane)
 
@@ -319,15 +322,24 @@ class Reverse(Differentiated):
                 self._recalled(f, k, self._lane(f, "at", k) - float(POINTS - 1), "P0")
                 self._head(f, k)
         # What is left is that of the first state as it was given, which is the first output, too.
+        constants, bars = (Value(f, f.reserve(DOUBLE, max(c, 1)), POINTER) for c in (self.constants, self.count))
         for k in self._each_marked(f, s.ready > 0.5):
             given(k, f.const(0, INT), "B3")
-            number = self.to_int(f, self._lane(f, "member", k))
-            for name, place, length in (("cbar", "cbar", self.count), ("qbar", "B3 q", n), ("vbar", "B3 v", n)):
-                to = f.at(f.load(call, self.call_fields.index(name), base=POINTER), number * length)
-                with f.each(length) as i:
-                    f.store(f.load(f.given["work"], i * f.width + k + self.start(place, "work")), to, i)
+            for x in "qv":
+                self.copy_lane(f, self._result(f, call, f"{x}bar", k, n), 0, f"B3 {x}", k)
+            if self.count:
+                self.copy_lane(f, constants, 0, "constants", k, count=self.constants)
+                self.copy_lane(f, bars, 0, "cbar", k, count=self.count)
+                numbers = self.member_address(f, call, "numbers", self._lane(f, "member", k))
+                to = self._result(f, call, "numbersbar", k, sum(self.numbers_moving))
+                f.call(REVERSE, numbers, constants, bars, to)
             f.line(f"call void @free(ptr {self._lane(f, 'record', k, POINTER).name})")
         s.ready = f.const(0.0, DOUBLE, f.width)
+
+    def _result(self, f: Function, call: Value, name: str, k: Value, length: int) -> Value:
+        """Where an output of the member in lane k begins, that has so many numbers of each."""
+        number = self.to_int(f, self._lane(f, "member", k))
+        return f.at(f.load(call, self.call_fields.index(name), base=POINTER), number * length)
 
     def _head(self, f: Function, k: Value):
         """What is noted of the step that led to the point where lane k is."""

@@ -7,13 +7,12 @@ is that of equations/loop_programs.py; the length of a step that is limited is a
 from typing import Any
 
 from udkjax.equations.loop_programs import LoopPrograms
-from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
-from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.closing import POSITION, VELOCITY, Closing
 from udkjax.native.closing_derivatives import Along, Back
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.linearized import ByLoops
+from udkjax.native.prologue import write_prologue_forward, write_prologue_reverse
 
 KINDS = {"position": (POSITION, "q"), "velocity": (VELOCITY, "v")}
 
@@ -79,9 +78,8 @@ class ForwardByLoops(ClosingByLoops, Along):
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
-        at = {"numbers": ("numbers", 0), "constants": ("work", self.places["constants"])}
-        at |= {TANGENT + x: ("way", self.ways[x]) for x in ("numbers", "constants")}
-        self.loops.write(LoopDerivative(self.code.prologue.parts, ()).forward, "prologue_along", ("numbers", "way", "work"), at)
+        everything = [True] * self.numbers_moving
+        write_prologue_forward(self, everything, everything)
         for name, correction in self.corrections.items():
             correction.forward()
             self._push(name)
@@ -118,12 +116,8 @@ class ReverseByLoops(ClosingByLoops, Back):
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
-        p = self.places
-        at = {"numbers": ("numbers", 0), "constants": ("work", p["constants"])}
-        at |= {f"{COTANGENT}numbers": ("work", p["numbersbar"]), f"{COTANGENT}constants": ("work", p["cbar"])}
-        back = LoopDerivative(self.code.prologue.parts, ()).reverse.parts
-        program = LoopProgram([Reset(f"{COTANGENT}numbers", 0, self.code.prologue_input_count), *back])
-        self.loops.write(program, "prologue_back", ("numbers", "work"), at)
+        everything = [True] * self.numbers_moving
+        write_prologue_reverse(self, everything, everything)
         for name, correction in self.corrections.items():
             correction.reverse()
             self._pull(name)

@@ -28,7 +28,7 @@ from udkjax.native.fallback import entries
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Layout
 from udkjax.native.least_norm import LEAST_NORM
-from udkjax.native.program import numbered, write
+from udkjax.native.prologue import FORWARD, REVERSE, write_prologue_forward, write_prologue_reverse
 
 
 class _Moving(Closing):
@@ -52,7 +52,7 @@ class Along(_Moving):
     """Closing along directions, each with memory of its own: a `way`.
 
     It calls `push_position` and `push_velocity` (work, scale, limited): the change of the state by a correction of it, so much of
-    it in positions, and whether it was limited; and `prologue_along` (numbers, way, work).
+    it in positions, and whether it was limited.
     """
 
     inputs = ("dnumbers", "dq", "dv")
@@ -78,7 +78,7 @@ class Along(_Moving):
     def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
         f.call("push_velocity" if kind == VELOCITY else "push_position", f.given["work"], scale, limited)
 
-    def begin_member(self, f: Function, lane: Value, member: Value):
+    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
         del lane
         call = self.call_record(f)
         with self._each_way(f) as p:
@@ -86,7 +86,8 @@ class Along(_Moving):
                 start = self.member_address(f, call, name, member)
                 with f.each(count) as i:
                     self._set(f, to, i, f.load(start, p * count + i), "way")
-            f.call("prologue_along", self.member_address(f, call, "numbers", member), f.given["way"], f.given["work"])
+            dnumbers, dconstants = (f.at(f.given["way"], self.ways[x]) for x in ("numbers", "constants"))
+            f.call(FORWARD, self.member_address(f, call, "numbers", member), constants, dnumbers, dconstants)
 
     def _ended_closing(self, f: Function, member: Value):
         call = self.call_record(f)
@@ -110,7 +111,7 @@ class Back(_Moving):
     """Closing, and back: its corrections are recorded and walked back from a cotangent of the state.
 
     It calls `pull_position` and `pull_velocity` (work, scale, limited): from the cotangent B of the state behind a correction to
-    that of the state before it, in X; and `prologue_back` (numbers, work).
+    that of the state before it, in X.
     """
 
     inputs = ("statebar",)
@@ -143,8 +144,8 @@ class Back(_Moving):
         self.copy_lane(f, row, 3 + self.n, "X v", f.const(0, INT))
         self._set(f, "records", 0, self._at(f, "records", 0) + 1.0)
 
-    def begin_member(self, f: Function, lane: Value, member: Value):
-        del lane
+    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
+        del lane, constants
         self._set(f, "records", 0, f.const(0.0))
         with f.each(self.constants) as i:
             self._set(f, "cbar", i, f.const(0.0))
@@ -170,7 +171,8 @@ class Back(_Moving):
                 return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))
 
             f.choose(f.load(row, 0) > 0.5, pull("pull_velocity"), pull("pull_position"))
-        f.call("prologue_back", self.member_address(f, call, "numbers", member), f.given["work"])
+        constants, bars, to = (self.address(f, x) for x in ("constants", "cbar", "numbersbar"))
+        f.call(REVERSE, self.member_address(f, call, "numbers", member), constants, bars, to)
         for name, place, count in (
             ("numbersbar", "numbersbar", self.numbers_moving),
             ("qbar", "B q", self.n),
@@ -189,9 +191,7 @@ class _WrittenOut(_Moving):
         graph, e = code.graph, code.equations
         self.value_count = code.pattern.value_count
         self.changed = [*code.entries, *e.psi, *e.psi_dot, *code.root]
-        inputs = code.prologue.inputs
-        self.numbers = [s for s, m in zip(inputs, moving, strict=True) if m]
-        self.numbers_moving = len(self.numbers)
+        self.moving, self.numbers_moving = moving, sum(moving)
         self.given = [*code.constants, e.t, *e.q, *e.v]
         self.state = [*code.constants, *e.q, *e.v]
         self.graph = graph
@@ -265,14 +265,7 @@ class ClosingForward(_WrittenOut, Along):
         program = ScalarProgram(graph, [*self.given, *seeds.values()], changes)
         places = [("way", w["changes"] + k) for k in range(len(changes))]
         self.write_program(program, "changes", ("work", "way"), inputs, places)
-        seeds = {s: graph.input(("number", s.index), "tangent") for s in self.numbers}
-        program = ScalarProgram(graph, [*self.code.prologue.inputs, *seeds.values()], tangents(graph, self.code.constants, seeds))
-        inputs = [
-            *numbered("numbers", len(self.code.prologue.inputs)),
-            *(("way", w["numbers"] + k) for k in range(self.numbers_moving)),
-        ]
-        places = [("way", w["constants"] + k) for k in range(self.constants)]
-        self.functions.append(write(program, "prologue_along", 1, ("numbers", "way", "work"), inputs, places))
+        write_prologue_forward(self, self.moving, [True] * self.constants)
         self._shared()
         for name, kind in (("push_position", POSITION), ("push_velocity", VELOCITY)):
             self._push(name, kind)
@@ -329,12 +322,7 @@ class ClosingReverse(_WrittenOut, Back):
         inputs = [*self.state_places(), *self.work_places("bars", len(seeds))]
         found = [*self.work_places("G c", self.constants), *self.work_places("G q", n), *self.work_places("G v", n)]
         self.write_program(program, "pull_rows", ("work",), inputs, found)
-        seeds = [graph.input(("constant", k), "cotangent") for k in range(self.constants)]
-        back = cotangents(graph, self.code.constants, seeds, self.numbers)
-        inputs = [*numbered("numbers", len(self.code.prologue.inputs)), *self.work_places("cbar", self.constants)]
-        program = ScalarProgram(graph, [*self.code.prologue.inputs, *seeds], back)
-        places = self.work_places("numbersbar", self.numbers_moving)
-        self.functions.append(write(program, "prologue_back", 1, ("numbers", "work"), inputs, places))
+        write_prologue_reverse(self, self.moving, [True] * self.constants)
         self._shared()
         for name, kind in (("pull_position", POSITION), ("pull_velocity", VELOCITY)):
             self._pull(name, kind)

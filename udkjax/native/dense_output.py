@@ -24,7 +24,7 @@ def write_differences(t: Module, name: str = "differences", to: tuple[str, Layou
         near = (times[k] - times[k + 1]) * STRETCH >= step
         sofar = near if sofar is None else sofar & near
         used.append(sofar)
-    with f.each(t.rowcount) as r:
+    with f.each(t.registers(pointer)) as r:
         known = {x: [t.vector(f, f"P{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
         column = [x for x in known["q"] for _ in range(3)]
         given = {1: known["v"], 2: [a * 0.5 for a in known["a"]]}
@@ -46,7 +46,7 @@ def write_between(t: Module, name: str = "between", to: tuple[str, Layout] | Non
     ahead = [t.spread(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
     if not to:
         setattr(s, "X t", s.next)
-    with f.each(t.rowcount) as r:
+    with f.each(t.registers(pointer)) as r:
         q, v = t.vector(f, f"N{3 * POINTS - 1}", r, pointer), f.const(0.0, DOUBLE, t.plan.vector)
         for k in reversed(range(3 * POINTS - 1)):
             d = ahead[k // 3]

@@ -61,7 +61,7 @@ def write_begin(t: Module):
     put("active", 1.0)
     put("tolerance", settings["atol"])
     put("member", f.op(f"sitofp i64 {member.name} to double", DOUBLE))
-    t.begin_member(f, k, member)
+    t.begin_member(f, k, member, constants)
 
 
 def write_finish(t: Module):

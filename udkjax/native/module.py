@@ -166,7 +166,8 @@ class Module:
     def write_program(
         self, program: ScalarProgram, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]
     ):
-        self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs, name in RARE))
+        lanes = {x: self.ways.width for x in ("way", "out") if "way" in pointers}
+        self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs, name in RARE, lanes))
 
     def work_places(self, name: str, count: int) -> list[Place]:
         return [("work", self.places[name] + k) for k in range(count)]
@@ -181,9 +182,18 @@ class Module:
         self.functions.append(f)
         return f, Lane(f, self.places)
 
+    def layout(self, pointer: str) -> Layout:
+        """How the memory at a pointer is laid out."""
+        return self.places if pointer == "work" else self.ways
+
     def start(self, name: str, pointer: str) -> int:
         """Where an array is, in numbers from a pointer."""
-        return (self.places if pointer == "work" else self.ways)[name] * self.plan.width
+        layout = self.layout(pointer)
+        return layout[name] * layout.width
+
+    def registers(self, pointer: str) -> int:
+        """How many registers the coordinates take."""
+        return -(-self.n * self.layout(pointer).width // self.plan.vector)
 
     def vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
         """One register of an array of coordinates."""
@@ -233,10 +243,11 @@ class Module:
             for name, x in zip(sources, "qva", strict=True):
                 self.put(f, f"{to} {x}", r, f.select(mask, self.vector(f, name, r), self.vector(f, f"{to} {x}", r)))
 
-    def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work"):
-        """The coordinates of lane k to an address."""
-        with f.each(self.n) as i:
-            f.store(f.load(f.given[pointer], i * f.width + k + self.start(name, pointer)), to, i + start)
+    def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work", count: int | None = None):
+        """The coordinates of lane k to an address, or the first numbers of another array."""
+        with f.each(self.n if count is None else count) as i:
+            place = i * self.layout(pointer).width + k + self.start(name, pointer)
+            f.store(f.load(f.given[pointer], place), to, i + start)
 
     def lane_number(self, f: Function, name: str, k: Value, i: Any) -> Value:
         """The i-th number of an array, of lane k."""
@@ -280,14 +291,17 @@ class Module:
     def write_derivatives(self):
         """Its functions."""
 
+    def record_stage(self, f: Function, s: Lane, i: int):
+        """What it does with stage i of a step, whose state is in X."""
+
     def record_step(self, f: Function, s: Lane, accept: Value):
         """What it does with a step once its end is in P3."""
 
     def record_output(self, f: Function, s: Lane):
         """What it does with a state between steps, in X t, X q and O v, of lanes that are `due`."""
 
-    def begin_member(self, f: Function, lane: Value, member: Value):
-        """What it does with a member that is taken into a lane."""
+    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
+        """What it does with a member that is taken into a lane; where its constants are, one after the other."""
 
     def end_members(self, f: Function, s: Lane):
         """What it does with members that are done, in lanes that are `due`."""

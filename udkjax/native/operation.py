@@ -58,14 +58,16 @@ class Tableau:
         return hash(self._key)
 
 
-MODES: dict[str, Any] = {"forward": Forward, "reverse": Reverse}
 CLOSING: dict[str, Any] = {"closing forward": ClosingForward, "closing reverse": ClosingReverse}
 CLOSING_BY_LOOPS: dict[str, Any] = {"closing forward": ForwardByLoops, "closing reverse": ReverseByLoops}
 
 
 @lru_cache(maxsize=256)
-def written(kind: Kind, width: int) -> Trajectory:
-    """A kind of trajectory in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it."""
+def written(kind: Kind, width: int, several: bool = False) -> Trajectory:
+    """A kind of trajectory in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it.
+
+    `several`: whether there may be more than one direction of a single member, which then are side by side.
+    """
     loops = isinstance(kind.code, LoopPrograms)
     if kind.mode == "marching":
         trajectory: Trajectory = Marching(kind.code, width, machine.lanes())
@@ -75,7 +77,11 @@ def written(kind: Kind, width: int) -> Trajectory:
         trajectory = (CLOSING_BY_LOOPS if loops else CLOSING)[kind.mode](kind.code, kind.moving, machine.lanes())
     else:
         plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
-        trajectory = MODES[kind.mode](plan, kind.moving) if kind.moving is not None else Trajectory(plan)  # pyright: ignore
+        if kind.mode == "forward":
+            assert kind.moving is not None
+            trajectory = Forward(plan, kind.moving, machine.lanes() if several else width)
+        else:
+            trajectory = Reverse(plan, kind.moving) if kind.moving is not None else Trajectory(plan)
     main = handler(trajectory, "call_frame")
     trajectory.module = "\n".join([trajectory.text(), *sorted(main.declared), main.text()])
     return trajectory
@@ -84,8 +90,8 @@ def written(kind: Kind, width: int) -> Trajectory:
 class Compiled:
     """The machine code of one kind of trajectory, in so many lanes."""
 
-    def __init__(self, kind: Kind, width: int):
-        self.trajectory = written(kind, width)
+    def __init__(self, kind: Kind, width: int, several: bool = False):
+        self.trajectory = written(kind, width, several)
         self.name, self._run = loaded(self.trajectory.module)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
@@ -132,9 +138,9 @@ def loaded(text: str) -> tuple[str, Any]:
 
 
 @lru_cache(maxsize=256)
-def compiled(kind: Kind, width: int) -> Compiled:
+def compiled(kind: Kind, width: int, several: bool = False) -> Compiled:
     """The machine code of a kind of trajectory."""
-    return Compiled(kind, width)
+    return Compiled(kind, width, several)
 
 
 # --- as an operation of JAX: inputs and outputs have the members first, of an input that all share only one
@@ -167,7 +173,8 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
 
 def _code(inputs: Sequence[Any], kind: Kind) -> Compiled:
     few = kind.mode.startswith("closing") or max(x.shape[0] for x in inputs) <= FEW
-    return compiled(kind, 1 if few else machine.lanes())
+    several = kind.mode == "forward" and few and inputs[-1].shape[1] > 1 and not isinstance(kind.code, LoopPrograms)
+    return compiled(kind, 1 if few else machine.lanes(), several)
 
 
 def _at_once(*inputs: Any, kind: Kind, times: int) -> list[Array]:

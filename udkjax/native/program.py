@@ -44,15 +44,20 @@ def write(
     inputs: Sequence[Place],
     outputs: Sequence[Place],
     rare: bool = False,
+    lanes: Mapping[str, int] | None = None,
 ) -> Function:
-    """A function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs."""
+    """A function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs.
+
+    `lanes` are those of pointers to numbers of another width: what depends on single numbers alone is computed once for all.
+    """
     f = Function(name, [(POINTER, x) for x in pointers], width, rare=rare)
-    writer = Writer(f, program)
+    writer, lanes = Writer(f, program), dict.fromkeys(pointers, width) | dict(lanes or {})
     for s, (pointer, place) in zip(program.inputs, inputs, strict=True):
         if program.uses(s):
-            writer.known[s.index] = as_stored(f, f.load(f.given[pointer], place * width, width), s.node.dtype)
+            x = f.load(f.given[pointer], place * lanes[pointer], lanes[pointer])
+            writer.known[s.index] = as_stored(f, x, s.node.dtype)
     for value, (pointer, place) in zip(writer.run(), outputs, strict=True):
-        f.store(value, f.given[pointer], place * width, width)
+        f.store(value, f.given[pointer], place * lanes[pointer], lanes[pointer])
     return f
 
 

@@ -23,6 +23,7 @@ def write_attempt(t: Module):
             stage_state(t, f, s, i)
             t.accelerate_stage(f, i)
             check_pivots(t, f, s, f"A{i}")
+            t.record_stage(f, s, i)
 
     def clear_stages():
         # They may hold what is no number, of a member that failed: no time at all would still multiply that.

@@ -9,14 +9,14 @@ and the accelerations, the end of a step and the outputs, which are projected, b
 (equations/derivative.py), with what those know of the state from its own evaluation. Interpolation is linear.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from udkjax.native.dense_output import write_between, write_differences
-from udkjax.native.ir import INT, POINTER, Function, Value
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Layout, Plan
 from udkjax.native.linearized import Linearized, linearized
-from udkjax.native.runge_kutta import stage_state
+from udkjax.native.prologue import FORWARD, moving_constants, write_prologue_forward
 from udkjax.native.steps import POINTS
 from udkjax.native.trajectory import Trajectory
 
@@ -24,12 +24,13 @@ from udkjax.native.trajectory import Trajectory
 class Differentiated(Trajectory):
     """What both modes have in common: programs of derivatives, and memory for what they know of a state.
 
-    `moving` says which of the constants of the code have derivatives; positions and velocities do.
+    `moving` says which numbers of the scene have derivatives, and so which constants of the code; positions and velocities do.
     """
 
     def __init__(self, plan: Plan, moving: tuple[bool, ...]):
         super().__init__(plan)
-        self.moving, self.count, self.last = moving, sum(moving), plan.method.stages
+        self.numbers_moving, self.moving = moving, moving_constants(self, moving)
+        self.count, self.last = sum(self.moving), plan.method.stages
         self.of_accelerations = linearized(self, "accelerations")
         self.of_projection = linearized(self, "projection") if plan.projected else None
         for i in range(1, self.last + 1):  # the last: of the end
@@ -57,15 +58,20 @@ class Differentiated(Trajectory):
 
 
 class Forward(Differentiated):
-    """A trajectory with its changes along directions, each with memory of its own, one after another: a `way`."""
+    """A trajectory with its changes along directions.
 
-    inputs = ("dconstants", "dq", "dv")
+    Directions come in groups, each with memory of its own, a `way`: one direction for all members, or, of a single member, as
+    many directions side by side as there are lanes.
+    """
+
+    inputs = ("dnumbers", "dq", "dv")
     outputs = ("dys", "dend")
     directions_in = 1
 
-    def __init__(self, plan: Plan, moving: tuple[bool, ...]):
+    def __init__(self, plan: Plan, moving: tuple[bool, ...], lanes: int):
         super().__init__(plan, moving)
-        self.ways = w = Layout(plan.width, plan.vector)
+        self.ways = w = Layout(lanes, plan.vector)
+        self.group = lanes // plan.width  # directions of a way
         w.add("constants", self.count)
         for name in ("X q", "X v", "O q", "O v"):
             w.add(name, self.n)
@@ -80,18 +86,33 @@ class Forward(Differentiated):
     def write_derivatives(self):
         for each in self._linearized:
             each.forward()
+        if self.count:
+            write_prologue_forward(self, self.numbers_moving, self.moving)
         w = self.ways
         write_differences(self, "tangent_differences", ("way", w))
         write_between(self, "tangent_between", ("way", w))
 
     @contextmanager
     def _each_way(self, f: Function) -> Iterator[Value]:
-        """What is done for every direction, with `way` where its memory is."""
-        call = f.load(f.given["work"], self.places["call"] * f.width, base=POINTER)
+        """What is done for every group of directions, with `way` where its memory is."""
         first = f.load(f.given["work"], self.places["ways"] * f.width, base=POINTER)
-        with f.each(f.load(call, self.call_fields.index("directions"), base=INT)) as p:
-            f.given["way"] = f.at(first, p * (self.ways.size * f.width))
+        with f.each(self._groups(f, self.call_record(f))) as p:
+            f.given["way"] = f.at(first, p * (self.ways.size * self.ways.width))
             yield p
+
+    @contextmanager
+    def _each_direction(self, f: Function, p: Value, lane: Value) -> Iterator[tuple[Value, Value]]:
+        """What is done for every direction of a group, of the member in a lane: its number, and its lane in a way."""
+        with f.each(self.group) as j:
+            direction = p * self.group + j
+            with f.if_(direction < self._directions(f, self.call_record(f))):
+                yield direction, lane if self.group == 1 else j
+
+    def _directions(self, f: Function, call: Value) -> Value:
+        return f.load(call, self.call_fields.index("directions"), base=INT)
+
+    def _groups(self, f: Function, call: Value) -> Value:
+        return f.arithmetic("div", self._directions(f, call) + (self.group - 1), self.group)
 
     def _along(self, f: Function, name: str, kept: str, out: Value | None = None):
         way = f.given["way"]
@@ -102,26 +123,26 @@ class Forward(Differentiated):
         if self.of_projection:
             self._along(f, "forward_projection", "KP")
         else:
-            with f.each(self.rowcount) as r:
+            with f.each(self.registers("way")) as r:
                 for x in "qv":
                     self.put(f, f"O {x}", r, self.vector(f, f"X {x}", r, "way"), "way")
+
+    def record_stage(self, f: Function, s: Lane, i: int):
+        """The changes of the stage's accelerations."""
+        h = self.spread(f, s.step)
+        with self._each_way(f):
+            self._change_stage(f, i, h, "P3")
+            self._along(f, "forward", f"K{i}", self._way_address(f, f"A{i}"))
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         """The changes of the state in P3, from those in P2, where the step began."""
         step = f.select(s.begin > 0.5, 0.0, s.t1 - s.T2)
         h, begin = self.spread(f, step), s.begin > 0.5
-        with self._each_way(f), f.each(self.rowcount) as r:
+        with self._each_way(f), f.each(self.registers("way")) as r:
             for k in range(POINTS - 1):
                 for x in "qva":
                     mine, other = (self.vector(f, f"P{j} {x}", r, "way") for j in (k, k + 1))
                     self.put(f, f"P{k} {x}", r, f.select(accept, other, mine), "way")
-        begins = f.all_of(begin | ~accept)
-        with f.if_(~begins):
-            for i in range(1, self.last):
-                stage_state(self, f, s, i, "P2", step)
-                with self._each_way(f):
-                    self._changed_stage(f, i, h)
-                    self._along(f, "forward", f"K{i}", self._way_address(f, f"A{i}"))
         setattr(s, "X t", s.T3)
         with f.each(self.rowcount) as r:
             for x in "qv":
@@ -129,33 +150,33 @@ class Forward(Differentiated):
         self._evaluate_end(f)
         f.call("evaluation", f.given["work"], self.address(f, "C"), self.address(f, f"K{self.last}"))
         with self._each_way(f):
-            self._changed_stage(f, self.last, h)
-            with f.each(self.rowcount) as r:
+            self._change_stage(f, self.last, h, "P2")
+            with f.each(self.registers("way")) as r:
                 for x in "qv":
                     new = f.select(begin, self.vector(f, f"P2 {x}", r, "way"), self.vector(f, f"X {x}", r, "way"))
                     self.put(f, f"X {x}", r, new, "way")
             self._arrived(f)
-            with f.each(self.rowcount) as r:
+            with f.each(self.registers("way")) as r:
                 for x in "qv":
                     self.put(f, f"X {x}", r, self.vector(f, f"O {x}", r, "way"), "way")
             self._along(f, "forward", f"K{self.last}", self._way_address(f, "N0"))
-            with f.each(self.rowcount) as r:
+            with f.each(self.registers("way")) as r:
                 for name, x in (("O q", "q"), ("O v", "v"), ("N0", "a")):
                     old, new = self.vector(f, f"P3 {x}", r, "way"), self.vector(f, name, r, "way")
                     self.put(f, f"P3 {x}", r, f.select(accept, new, old), "way")
 
-    def _changed_stage(self, f: Function, i: int, h: Value):
-        """The change of the state of stage i, in X of a way."""
-        node, names = float(self.method.nodes[i]), ["P2 a", *self.stage_accelerations[1:]]
-        with f.each(self.rowcount) as r:
-            q, v = self.vector(f, "P2 q", r, "way"), self.vector(f, "P2 v", r, "way")
+    def _change_stage(self, f: Function, i: int, h: Value, start: str):
+        """The change of the state of stage i, in X of a way, of the step from a point."""
+        node, names = float(self.method.nodes[i]), [f"{start} a", *self.stage_accelerations[1:]]
+        with f.each(self.registers("way")) as r:
+            q, v = self.vector(f, f"{start} q", r, "way"), self.vector(f, f"{start} v", r, "way")
             sum_q, sum_v = (self.weighted_sum(f, row[i], r, names, "way") for row in (self.method.q, self.method.v))
             slope = v * node if sum_q is None else f.fma(h, sum_q, v * node)
             self.put(f, "X q", r, f.fma(h, slope, q), "way")
             self.put(f, "X v", r, v if sum_v is None else f.fma(h, sum_v, v), "way")
 
     def _way_address(self, f: Function, name: str) -> Value:
-        return f.at(f.given["way"], self.ways[name] * f.width)
+        return f.at(f.given["way"], self.start(name, "way"))
 
     def record_output(self, f: Function, s: Lane):
         with f.each(self.rowcount) as r:
@@ -169,55 +190,59 @@ class Forward(Differentiated):
                 self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "O q", "O v")
 
     def _write_change(self, f: Function, s: Lane, k: Value, p: Value, number: Value, q: str, v: str):
-        """The change of a state of lane k along direction p."""
-        member = self.to_int(f, f.lane(s.member, k))
-        times, directions = (f.load(self.call_record(f), self.call_fields.index(x), base=INT) for x in ("times", "directions"))
-        row = (member * directions + p) * times + number
-        to = f.at(f.load(self.call_record(f), self.call_fields.index("dys"), base=POINTER), row * (2 * self.n))
-        self.copy_lane(f, to, 0, q, k, "way")
-        self.copy_lane(f, to, self.n, v, k, "way")
+        """The changes of a state of the member in lane k along the directions of group p."""
+        call, member = self.call_record(f), self.to_int(f, f.lane(s.member, k))
+        times = f.load(call, self.call_fields.index("times"), base=INT)
+        with self._each_direction(f, p, k) as (direction, lane):
+            row = (member * self._directions(f, call) + direction) * times + number
+            to = f.at(f.load(call, self.call_fields.index("dys"), base=POINTER), row * (2 * self.n))
+            self.copy_lane(f, to, 0, q, lane, "way")
+            self.copy_lane(f, to, self.n, v, lane, "way")
 
-    def begin_member(self, f: Function, lane: Value, member: Value):
-        with self._each_way(f) as p:
-
-            def given(name: str, count: int, places: list[str]):
-                start = self.member_address(f, self.call_record(f), name, member)
-                with f.each(count) as i:
-                    x = f.load(start, p * count + i)
-                    for place in places:
-                        f.store(x, f.given["way"], (i + self.ways[place]) * f.width + lane)
-
-            given("dconstants", self.count, ["constants"])
-            given("dq", self.n, [f"P{k} q" for k in range(POINTS)])
-            given("dv", self.n, [f"P{k} v" for k in range(POINTS)])
+    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
+        call = self.call_record(f)
+        dconstants = Value(f, f.reserve(DOUBLE, max(self.count, 1)), POINTER)
+        with self._each_way(f) as p, self._each_direction(f, p, lane) as (direction, place):
+            if self.count:
+                dnumbers = f.at(self.member_address(f, call, "dnumbers", member), direction * sum(self.numbers_moving))
+                f.call(FORWARD, self.member_address(f, call, "numbers", member), constants, dnumbers, dconstants)
+            with f.each(self.count) as i:
+                f.store(f.load(dconstants, i), f.given["way"], (i + self.ways["constants"]) * self.ways.width + place)
+            for x in "qv":
+                self._read_state(f, f"d{x}", member, direction, place, [f"P{k} {x}" for k in range(POINTS)])
             with f.each(self.n) as i:
                 for name in (*(f"P{k} a" for k in range(POINTS)), *(f"A{j}" for j in range(1, self.last))):
-                    f.store(0.0, f.given["way"], (i + self.ways[name]) * f.width + lane)
+                    f.store(0.0, f.given["way"], (i + self.ways[name]) * self.ways.width + place)
+
+    def _read_state(self, f: Function, name: str, member: Value, direction: Value, place: Value, to: Sequence[str]):
+        """The change of q or v that is given of a member along a direction, into a lane of a way."""
+        start = self.member_address(f, self.call_record(f), name, member)
+        with f.each(self.n) as i:
+            x = f.load(start, direction * self.n + i)
+            for array in to:
+                f.store(x, f.given["way"], (i + self.ways[array]) * self.ways.width + place)
 
     def end_members(self, f: Function, s: Lane):
         """The changes of the first state, which is taken as it is given, and of the last."""
-        times, directions = (f.load(self.call_record(f), self.call_fields.index(x), base=INT) for x in ("times", "directions"))
+        call = self.call_record(f)
+        times = f.load(call, self.call_fields.index("times"), base=INT)
         with self._each_way(f) as p, f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
             member = self.to_int(f, f.lane(s.member, k))
-            for place, name in (("X q", "dq"), ("X v", "dv")):
-                start = self.member_address(f, self.call_record(f), name, member)
-                with f.each(self.n) as i:
-                    x = f.load(start, p * self.n + i)
-                    f.store(x, f.given["way"], (i + self.ways[place]) * f.width + k)
+            with self._each_direction(f, p, k) as (direction, lane):
+                for x in "qv":
+                    self._read_state(f, f"d{x}", member, direction, lane, [f"X {x}"])
+                row = (member * self._directions(f, call) + direction) * (2 * self.n)
+                to = f.at(f.load(call, self.call_fields.index("dend"), base=POINTER), row)
+                self.copy_lane(f, to, 0, "P3 q", lane, "way")
+                self.copy_lane(f, to, self.n, "P3 v", lane, "way")
             self._write_change(f, s, k, p, f.const(0, INT), "X q", "X v")
             self._write_change(f, s, k, p, times - 1, "P3 q", "P3 v")
-            to = f.at(
-                f.load(self.call_record(f), self.call_fields.index("dend"), base=POINTER),
-                (member * directions + p) * (2 * self.n),
-            )
-            self.copy_lane(f, to, 0, "P3 q", k, "way")
-            self.copy_lane(f, to, self.n, "P3 v", k, "way")
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
         """Memory for all directions."""
-        count = f.load(call, self.call_fields.index("directions"), base=INT)
-        block, start = self.allocate(f, count * (self.ways.size * f.width))
-        with f.each(count * (self.ways.size * f.width)) as i:
+        size = self._groups(f, call) * (self.ways.size * self.ways.width)
+        block, start = self.allocate(f, size)
+        with f.each(size) as i:
             f.store(0.0, start, i)
         f.store(start, f.given["work"], self.places["ways"] * f.width, base=POINTER)
         return [block]
