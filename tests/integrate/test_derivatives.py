@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from numpy.testing import assert_allclose
 
 import udkjax as udk
@@ -65,6 +66,25 @@ def differences(f, x, h):
 @pytest.fixture(scope="module")
 def slopes():
     return {f: jax.jit(jax.jacfwd(f)) for f in AT}
+
+
+@pytest.mark.parametrize("count", [2, 11])
+def test_directions_side_by_side(count):
+    """Many directions of one run at once are what each of them is alone: with outputs, and with lanes that stay empty."""
+    names = [n for n in LINKAGE.parameters() if n.endswith(("mass", "inertia", "gravity", "link1.points", "angular_velocity"))]
+    values = {n: LINKAGE.parameters()[n] for n in names}
+    flat, back = ravel_pytree(values)
+
+    def states(x):
+        solution = udk.simulate(LINKAGE.with_parameters(back(x)), TS, linkage_at(-0.9 + 0.1 * x[0]), throw=False)
+        return jnp.concatenate([solution.q.ravel(), solution.v.ravel()])
+
+    directions = jnp.asarray(np.random.default_rng(1).standard_normal((count, len(flat))))
+    along = partial(jax.jvp, states, (flat,))
+    together = jax.jit(jax.vmap(lambda d: along((d,))[1]))(directions)
+    alone = jax.jit(lambda d: along((d,))[1])
+    for d, found in zip(directions, together, strict=True):
+        assert_allclose(found, alone(d), rtol=1e-10, atol=1e-12 * np.abs(found).max())
 
 
 @BOTH

@@ -20,7 +20,6 @@ from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
 from udkjax.integrate.derivatives import differentiable
-from udkjax.integrate.events.simulate_events import Choices, simulate_events
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_engine import known, reason_for_diffrax, rows_kept
 from udkjax.integrate.outcome import Run, counts, outcome
@@ -150,6 +149,8 @@ def simulate(
                 else "progress"
             )
             raise ValueError(f"a run with events takes a Mechanism, JAX's own derivatives and no progress meter: not {what}")
+        from udkjax.integrate.events.simulate_events import Choices, simulate_events  # a dozen modules that other runs do without
+
         assert analysis is not None  # a mechanism has one
         more = (SMALLEST_STEP, isinstance(stabilization, Projection), solver, max_steps, max_events, engine)
         baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
