@@ -1,4 +1,7 @@
-"""How long one waits for the first result: import, --help, the first trajectory without and with a warm compilation cache."""
+"""How long one waits for the first result: import, --help, the first trajectory, and what JAX's transformations of one take.
+
+Processes from start to end, with what they compile: nothing is cached, but where a name says so.
+"""
 
 import os
 import statistics
@@ -17,6 +20,35 @@ import numpy as np
 import udkjax as udk
 udk.simulate(udk.library.parallelogram(), np.linspace(0.0, 20.0, 401))
 """
+# A run of 101 states of a scene, changed by two of its masses, under each of JAX's transformations.
+TRANSFORMED = """
+import jax, jax.numpy as jnp, numpy as np
+import udkjax as udk
+mechanism, ts = udk.library.{scene}, np.linspace(0.0, {end}, 101)
+names = [name for name in mechanism.parameters() if name.endswith(".mass")][:2]
+masses = [float(mechanism.parameters()[name]) for name in names]
+def states(*values):
+    return udk.simulate(mechanism.with_parameters(dict(zip(names, values))), ts, throw=False).q
+def angle(*values):
+    return states(*values)[-1, 0, 2]
+np.asarray(jax.tree.leaves({run})[0])
+"""
+SCENES = {
+    "parallelogram()": 5.0,
+    "excavator()": 5.0,
+    "planetary_gear()": 5.0,
+    "scissor_lift()": 5.0,
+    "n_four_bar(5)": 5.0,
+    "andrews_squeezer()": 0.03,
+    "n_four_bar(40)": 5.0,
+}
+RUNS = {
+    "first": "udk.simulate(mechanism, ts).q",
+    "jit": "jax.jit(states)(*masses)",
+    "vmap over 256": "jax.jit(jax.vmap(states))(*(jnp.linspace(0.9, 1.1, 256) * x for x in masses))",
+    "jacfwd of two": "jax.jit(jax.jacfwd(states, argnums=(0, 1)))(*masses)",
+    "grad of two": "jax.jit(jax.grad(angle, argnums=(0, 1)))(*masses)",
+}
 PROGRAMS = {
     "python": "pass",
     "import jax": "import jax",
@@ -44,6 +76,22 @@ def waited(code: str, cache: Path, bytecode: Path) -> dict[str, float]:
     return {"seconds": time.perf_counter() - start, "cpu_seconds": cpu}
 
 
+def transformed(bytecode: Path) -> list[dict[str, Any]]:
+    """Print how long each scene waits for each transformation, the least of two."""
+    print(f"\n{'s, nothing cached':28} {' '.join(f'{name:>13}' for name in RUNS)}")
+    figures = []
+    for scene, end in SCENES.items():
+        for name, run in RUNS.items():
+            code, times = TRANSFORMED.format(scene=scene, end=end, run=run), []
+            for _ in range(2):
+                with tempfile.TemporaryDirectory() as cold:
+                    times.append(waited(code, Path(cold), bytecode)["seconds"])
+            figures.append({"name": f"{scene}, {name}", "scene": scene, "run": name, "seconds": min(times)})
+        waits = [row["seconds"] for row in figures[-len(RUNS) :]]
+        print(f"{scene:28} {' '.join(f'{seconds:13.2f}' for seconds in waits)}", flush=True)
+    return figures
+
+
 def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
     """Print the time from the start of Python to its end, medians."""
     about, figures = machine(), []
@@ -60,5 +108,7 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
             row = {"name": name, **{key: statistics.median(run[key] for run in runs) for key in runs[0]}}
             figures.append(row)
             print(f"{name:28} {row['seconds']:7.2f} {row['cpu_seconds']:7.2f}")
+        if not smoke:
+            figures += transformed(Path(bytecode))
     report(about, figures, out)
     return figures

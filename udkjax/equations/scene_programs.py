@@ -153,6 +153,9 @@ class EliminationPrograms(ScenePrograms):
         psi, psi_dot = ([residual[i] for i in self.independent_rows] for residual in (e.psi, e.psi_dot))
         self._outputs["newton_q"] = [*self._correct(e.q, psi), self._safe(self._factors_dropping)]
         self._outputs["newton_v_and_psi"] = [*self._correct(e.v, psi_dot), *e.psi]
+        closed = self._outputs["newton_q"][:n]
+        there = graph.substitute([*psi_dot, *e.psi], dict(zip((x.index for x in e.q), closed, strict=True)))
+        self._outputs["project"] = [*closed, *self._correct(e.v, there[: len(psi_dot)]), *there[len(psi_dot) :]]
         v = self._correct(e.v, psi_dot, dropping=False)
         projected = dict(zip((x.index for x in e.v), v, strict=True))
         loads = graph.substitute([*e.free, *(self.b(i) for i in self.independent_rows)], projected)
@@ -178,6 +181,14 @@ class EliminationPrograms(ScenePrograms):
     def newton_v_and_psi(self) -> ScalarProgram:
         """v after the Newton step to Psi_dot = 0, without dependent rows; and Psi of all rows."""
         return self._program("newton_v_and_psi")
+
+    @cached_property
+    def project(self) -> ScalarProgram:
+        """q and v after a Newton step to Psi = 0 and Psi_dot = 0 with the factors of D at the q before it; Psi of all rows there.
+
+        Where the step in q is small, what it turns D by is a small part of the step in v, which is as small.
+        """
+        return self._program("project")
 
     @cached_property
     def project_and_accelerate(self) -> ScalarProgram:

@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
+from udkjax.equations.scene_programs import EliminationPrograms
 from udkjax.native.ir import DOUBLE, INT, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
-from udkjax.native.steps import FAR, NEWTON_STEPS, OUTPUT_STEPS, USELESS
+from udkjax.native.steps import FAR, NEAR, NEWTON_STEPS, OUTPUT_STEPS, USELESS
 
 
 def newton(t: Module, f: Function, s: Lane, steps: int, which: str = "judged"):
@@ -67,9 +68,19 @@ def project_output(t: Module, f: Function, s: Lane, which: str):
         if not t.doubts:
             threshold = None
 
-        def close():
+        def iterate():
             newton(t, f, s, OUTPUT_STEPS, which)
             t.invoke(f, "newton_v_and_psi")
+
+        def close():
+            if not isinstance(t.code, EliminationPrograms):
+                iterate()
+                return
+            t.invoke(f, "project")
+            mask = getattr(s, which) > 0.5
+            change = take_newton_step(t, f, mask)
+            with f.if_(f.any_of(mask & ~(change <= NEAR))):
+                iterate()
 
         close() if threshold is None else with_threshold(t, f, s, threshold, close)
     else:

@@ -15,7 +15,16 @@ from udkjax.native.program import Place, numbered, write
 from udkjax.native.steps import POINTS
 
 # Once a run, beside singularities, or where a piece may end.
-RARE = ("leave", "finish_members", "begin", "arrive_carefully", "accelerate_carefully", "equation_terms", "psi_dot")
+RARE = (
+    "leave",
+    "finish_members",
+    "begin",
+    "arrive_carefully",
+    "accelerate_carefully",
+    "equation_terms",
+    "psi_dot",
+    "newton_v_and_psi",
+)
 
 
 class Module:
@@ -113,6 +122,7 @@ class Module:
                 *safe,
             ],
             "tangent_part": [*self.work_places("O dq", n), *self.work_places("O dv", n), *self.work_places("distance", 1)],
+            "project": [*self.work_places("C", n), *self.work_places("O v", n), *self.work_places("psi", self.m)],
             "newton_v_and_psi": [*self.work_places("O v", n), *self.work_places("psi", self.m)],
             "psi": self.work_places("psi", self.m),
             "equation_terms": self.work_places("R", code.term_count),
@@ -159,6 +169,8 @@ class Module:
             else:
                 wanted["end_of_step"] = code.end_of_step
             wanted["newton_v_and_psi"] = code.newton_v_and_psi
+            if isinstance(code, EliminationPrograms):
+                wanted["project"] = code.project
         if self.cares and isinstance(code, ScenePrograms):
             wanted["psi_dot"] = code.psi_dot
         return wanted
@@ -245,7 +257,8 @@ class Module:
 
     def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work", count: int | None = None):
         """The coordinates of lane k to an address, or the first numbers of another array."""
-        with f.each(self.n if count is None else count) as i:
+        count = self.n if count is None else count
+        with f.each(count) as i:
             place = i * self.layout(pointer).width + k + self.start(name, pointer)
             f.store(f.load(f.given[pointer], place), to, i + start)
 

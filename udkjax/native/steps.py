@@ -67,3 +67,5 @@ NEWTON_STEPS = 3  # in a projection, at most: the last of which usually finds no
 # Of the characteristic length, and rad: a Newton step that moves q by less leaves rounding errors, since it converges
 # quadratically.
 FAR = 1e-8
+# An output that lies nearer to the manifold takes one Newton step in q and v alike: what that leaves is the square.
+NEAR = 1e-7
