@@ -212,7 +212,7 @@ def _gains(baumgarte: Any) -> list[Any]:
 def jvp(problem: Any, moving: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is moving."""
     kind, n = _kind(problem, _moving(problem, moving), "forward"), len(problem.q)
-    along = _vector(_moved(*(_numbers_of(x) for x in (problem, moving, change)), kind.moving or ()), jnp)
+    along = _vector(_moved(_numbers_of(problem), _numbers_of(moving), _numbers_of(change), kind.moving or ()), jnp)
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     *found, dys, dend = native_p.bind(
         *_inputs(problem, kind.code), *(x[None, None] for x in (along, dq, dv)), kind=kind, times=len(problem.ts)

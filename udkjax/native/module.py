@@ -257,8 +257,7 @@ class Module:
 
     def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work", count: int | None = None):
         """The coordinates of lane k to an address, or the first numbers of another array."""
-        count = self.n if count is None else count
-        with f.each(count) as i:
+        with f.each(self.n if count is None else count) as i:
             place = i * self.layout(pointer).width + k + self.start(name, pointer)
             f.store(f.load(f.given[pointer], place), to, i + start)
 
