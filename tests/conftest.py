@@ -65,9 +65,9 @@ def compilations():
 
     def during(run) -> list[float]:
         seen.clear()
-        before = operation.compiled.cache_info().misses
+        before = operation.machine_code.cache_info().misses
         run()
-        return [*seen, *[0.0] * (operation.compiled.cache_info().misses - before)]
+        return [*seen, *[0.0] * (operation.machine_code.cache_info().misses - before)]
 
     return during
 

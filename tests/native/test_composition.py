@@ -158,7 +158,7 @@ def test_a_file_that_is_not_whole_is_made_again(folder, spoil):
 
 
 def test_the_folder_stays_bounded(folder, monkeypatch):
-    monkeypatch.setattr(machine, "KEPT_FILES", 3)
+    monkeypatch.setattr(machine, "MAX_FILES", 3)
     for k in range(5):
         assert answer(TEXT.replace("4.2e1", f"{k}.0")) == k
     assert len(list(folder.iterdir())) == 3

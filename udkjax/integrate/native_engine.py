@@ -19,9 +19,9 @@ from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.solvers import is_explicit, method_of
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS, SETTINGS
-from udkjax.native.operation import Kind, Tableau, compiled, native_p, shapes_of, written
+from udkjax.native.operation import Kind, Tableau, generate, machine_code, native_p, shapes_of
 from udkjax.native.program import UnsupportedError
-from udkjax.native.steps import DONE, WITH_CARE
+from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
 from udkjax.native.tableau import EULER
 from udkjax.pinv import Auto, Elimination
 from udkjax.pinv.rank_policy import RankPolicy
@@ -35,7 +35,7 @@ def closes(mechanism: Mechanism) -> bool:
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     try:
-        written(_closing(mechanism), 1)
+        generate(_closing(mechanism), 1)
     except UnsupportedError:
         return False
     return True
@@ -49,7 +49,7 @@ def closed(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: An
 def closed_at_once(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any) -> tuple[Any, Any, Any, Any, Any]:
     """As `closed`, of known numbers, without tracing anything."""
     kind, inputs = _closing(mechanism), _guess(mechanism, scales, tol, t, q, v, np)
-    return _parts(compiled(kind, 1)(inputs, shapes_of(inputs, kind, 2)), len(q))
+    return _parts(machine_code(kind, 1)(inputs, shapes_of(inputs, kind, 2)), len(q))
 
 
 def _parts(found: Sequence[Any], n: int) -> tuple[Any, Any, Any, Any, Any]:
@@ -62,7 +62,7 @@ def closed_along(guess: Any, moving: Any, change: Any) -> tuple[Array, Array]:
     """The changes of q and v along a `change` of what is moving of (mechanism, scales, tol, t, q, v)."""
     (mechanism, *_, q, _), (*_, dq, dv) = guess, change
     n, kind = len(q), _closing(mechanism, _moving_of_closing(mechanism, moving[0]), "closing forward")
-    numbers = _vector(_moved(mechanism, moving[0], change[0], kind.moving or ()), jnp)
+    numbers = _vector(_moved(mechanism, moving[0], change[0], kind.active or ()), jnp)
     along = [numbers, *(jnp.zeros(n) if dx is None else dx for dx in (dq, dv))]
     dstate = native_p.bind(*_guess(*guess), *(x[None, None] for x in along), kind=kind, times=2)[-1][0, 0]
     return dstate[:n], dstate[n:]
@@ -74,7 +74,7 @@ def closed_back(guess: Any, moving: Any, qbar: Array, vbar: Array) -> Any:
     kind = _closing(mechanism, _moving_of_closing(mechanism, moving[0]), "closing reverse")
     bars = jnp.concatenate([qbar, vbar])[None]
     numbers, *states = (x[0] for x in native_p.bind(*_guess(*guess), bars, kind=kind, times=2)[-3:])
-    found = _taken_apart(numbers, mechanism, moving[0], kind.moving or ())
+    found = _taken_apart(numbers, mechanism, moving[0], kind.active or ())
     return found, *(x if m is True else None for x, m in zip(states, moving[-2:], strict=True))
 
 
@@ -120,7 +120,7 @@ def _leaves(tree: Any) -> list[Any]:
 
 
 def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: Any, xp: Any = jnp) -> list[Any]:
-    settings = {"length": scales.length, "care": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
+    settings = {"length": scales.length, "fallback_tol": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
     given = {
         "numbers": _vector([*jax.tree.leaves(mechanism), tol**2 if is_large(mechanism) else 0.0, 0.0], xp),
         "ts": _vector([t, t], xp),
@@ -164,7 +164,7 @@ def reason_for_diffrax(problem: Problem, adjoint: Any = None, meter: Any = None)
     if not jax.config.jax_enable_x64:
         return "it computes in float64, which JAX is told not to"
     try:
-        written(_kind(problem), 1)
+        generate(_kind(problem), 1)
     except UnsupportedError as error:
         return f"the scene takes {error}, which is no arithmetic on numbers"
     return ""
@@ -173,7 +173,7 @@ def reason_for_diffrax(problem: Problem, adjoint: Any = None, meter: Any = None)
 def known(problem: Problem) -> IntegratorOutput:
     """Integrate a problem whose numbers are all known, without tracing anything: `IntegratorOutput` of NumPy's arrays."""
     kind, inputs = _kind(problem), _inputs(problem, xp=np)
-    return _raw(compiled(kind, 1)(inputs, shapes_of(inputs, kind, len(problem.ts))))
+    return _raw(machine_code(kind, 1)(inputs, shapes_of(inputs, kind, len(problem.ts))))
 
 
 def solve(problem: Problem) -> IntegratorOutput:
@@ -188,7 +188,7 @@ def recorded(problem: Any, moving: Any) -> IntegratorOutput:
     return _raw(native_p.bind(*_inputs(problem, kind.code), *none, kind=kind, times=times)[: len(OUTPUTS)])
 
 
-def rows_kept(problem: Any) -> int:
+def independent_row_count(problem: Any) -> int:
     """How many rows elimination takes."""
     equations = problem.equations
     return len(equations.scales.rows) - len(equations.redundant or ())
@@ -212,7 +212,7 @@ def _gains(baumgarte: Any) -> list[Any]:
 def jvp(problem: Any, moving: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is moving."""
     kind, n = _kind(problem, _moving(problem, moving), "forward"), len(problem.q)
-    along = _vector(_moved(_numbers_of(problem), _numbers_of(moving), _numbers_of(change), kind.moving or ()), jnp)
+    along = _vector(_moved(_numbers_of(problem), _numbers_of(moving), _numbers_of(change), kind.active or ()), jnp)
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     *found, dys, dend = native_p.bind(
         *_inputs(problem, kind.code), *(x[None, None] for x in (along, dq, dv)), kind=kind, times=len(problem.ts)
@@ -226,7 +226,7 @@ def vjp(problem: Any, moving: Any, ys: Array, end: Array) -> Problem:
     bars = [ys[None], end[None]]
     numbersbar, qbar, vbar = native_p.bind(*_inputs(problem, kind.code), *bars, kind=kind, times=len(problem.ts))[len(OUTPUTS) :]
     none = jax.tree.map(lambda m: None, moving, is_leaf=lambda x: x is None)
-    numbers = _taken_apart(numbersbar[0], _numbers_of(problem), _numbers_of(moving), kind.moving or ())
+    numbers = _taken_apart(numbersbar[0], _numbers_of(problem), _numbers_of(moving), kind.active or ())
     q, v = qbar[0] if moving.q is True else None, vbar[0] if moving.v is True else None
     return eqx.tree_at(lambda p: (*_numbers_of(p), p.q, p.v), none, (*numbers, q, v), is_leaf=lambda x: x is None)
 
@@ -265,10 +265,19 @@ def _inputs(problem: Any, code: Any = None, xp: Any = jnp) -> list[Any]:
     rank_tol = method.rank_tol
     safe_tol = method.branch_tol if isinstance(method, Auto) else rank_tol**2
     programs = _programs(problem) if code is None else code
-    drop_tol = (WITH_CARE * rank_tol) ** 2 if programs.policy is RankPolicy.FALL_BACK else safe_tol
+    drop_tol = (FALLBACK_RANK_SHARE * rank_tol) ** 2 if programs.policy is RankPolicy.FALL_BACK else safe_tol
     first = 0.0 if problem.h is None else problem.h
-    care = WITH_CARE * rank_tol
-    settings = [problem.rtol, problem.atol, problem.smallest, first, problem.length, problem.rate, care, problem.max_steps]
+    fallback_tol = FALLBACK_RANK_SHARE * rank_tol
+    settings = [
+        problem.rtol,
+        problem.atol,
+        problem.smallest,
+        first,
+        problem.length,
+        problem.rate,
+        fallback_tol,
+        problem.max_steps,
+    ]
     given = {
         "numbers": _vector([*jax.tree.leaves(equations.mechanism), *_gains(equations.baumgarte), drop_tol, safe_tol], xp),
         "ts": problem.ts,

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
-from udkjax.native.steps import AHEAD, DONE, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.native.steps import DONE, LOOK_AHEAD, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
 
 
 class Run(eqx.Module):
@@ -39,10 +39,10 @@ def outcome(run: Run, xp: ModuleType = jnp) -> tuple[Array, Array, Bool[Array, "
 def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Array, y: Array) -> Array:
     """Return the status of a run that ended in (t, y): `NOT_FINITE` where its step became too small beside what is not finite.
 
-    That may be in (t, y) itself or up to `AHEAD` of the span later.
+    That may be in (t, y) itself or up to `LOOK_AHEAD` of the span later.
     """
     q, v = jnp.split(y, 2)
-    times = t + jnp.array([0.0, AHEAD]) * span
+    times = t + jnp.array([0.0, LOOK_AHEAD]) * span
 
     def finite(_: Array) -> Array:
         return jnp.all(jax.lax.map(lambda later: equations.is_finite(later, q + (later - t) * v, v), times))

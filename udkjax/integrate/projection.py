@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.native.steps import TAKEN_BACK
+from udkjax.native.steps import NORMAL_ERROR_WEIGHT
 
 
 class Projection(eqx.Module):
@@ -23,10 +23,10 @@ def project(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, 
 def error_after_projection(
     equations: AbstractSystem, t: Float[ArrayLike, ""], q: Array, v: Array, dq: Array, dv: Array
 ) -> TangentPart:
-    """Return the errors dq and dv of a step that ends in q and v; what projection takes back counts by `TAKEN_BACK`."""
+    """Return the errors dq and dv of a step that ends in q and v; what projection takes back counts by `NORMAL_ERROR_WEIGHT`."""
     equations, t, q, v, dq, dv = stop_gradients((equations, t, q, v, dq, dv))
     left = equations.tangent_part(t, q, v, dq, dv)
-    return TangentPart(left.dq + TAKEN_BACK * (dq - left.dq), left.dv + TAKEN_BACK * (dv - left.dv))
+    return TangentPart(left.dq + NORMAL_ERROR_WEIGHT * (dq - left.dq), left.dv + NORMAL_ERROR_WEIGHT * (dv - left.dv))
 
 
 def violation(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, ""]:

@@ -31,8 +31,8 @@ class Reverse(Differentiated):
     inputs = ("ysbar", "endbar")
     outputs = ("numbersbar", "qbar", "vbar")
 
-    def __init__(self, plan: Plan, moving: tuple[bool, ...]):
-        super().__init__(plan, moving)
+    def __init__(self, plan: Plan, active: tuple[bool, ...]):
+        super().__init__(plan, active)
         p, n = self.places, self.n
         for name in ("record", "capacity", "points", "at", "before", "ready", "any"):
             p.add(name)
@@ -50,24 +50,24 @@ class Reverse(Differentiated):
         self.row = HEAD + 3 * n
 
     def write_derivatives(self):
-        for each in self._linearized:
+        for each in self._linearizations:
             each.reverse()
         if self.count:
-            write_prologue_reverse(self, self.numbers_moving, self.moving)
-        self._transposed_differences()
-        self._step_back()
-        self._walk()
+            write_prologue_reverse(self, self.active_numbers, self.active)
+        self._write_transposed_differences()
+        self._write_step_back()
+        self._write_backpropagate()
 
     # --- the record
 
     def record_step(self, f: Function, s: Lane, accept: Value):
-        with f.if_(self._walks(f)):
-            for k in self._each_marked(f, accept):
-                self._note(f, s, k)
+        with f.if_(self._backpropagates(f)):
+            for k in self._each_lane(f, accept):
+                self._store_point(f, s, k)
 
     def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
         del member, constants
-        with f.if_(self._walks(f)):
+        with f.if_(self._backpropagates(f)):
             self._new_record(f, lane)
 
     def _new_record(self, f: Function, lane: Value):
@@ -76,7 +76,7 @@ class Reverse(Differentiated):
         self._put_lane(f, "record", lane, record, POINTER)
         self._put_lane(f, "capacity", lane, f.const(float(FIRST)))
         self._put_lane(f, "points", lane, f.const(0.0))
-        self._note(f, s, lane)
+        self._store_point(f, s, lane)
 
     def _put_lane(self, f: Function, name: str, k: Value, x: Value, base: str = DOUBLE):
         f.store(x, f.given["work"], k + self.places[name] * f.width, base=base)
@@ -84,7 +84,7 @@ class Reverse(Differentiated):
     def _lane(self, f: Function, name: str, k: Value, base: str = DOUBLE) -> Value:
         return f.load(f.given["work"], k + self.places[name] * f.width, base=base)
 
-    def _note(self, f: Function, s: Lane, k: Value):
+    def _store_point(self, f: Function, s: Lane, k: Value):
         """One more point, that of P3."""
         points, capacity = self._lane(f, "points", k), self._lane(f, "capacity", k)
         with f.if_(points >= capacity):
@@ -101,7 +101,7 @@ class Reverse(Differentiated):
             self.copy_lane(f, row, HEAD + j * self.n, f"P3 {x}", k)
         self._put_lane(f, "points", k, points + 1.0)
 
-    def _recalled(self, f: Function, k: Value, number: Value, point: str):
+    def _load_point(self, f: Function, k: Value, number: Value, point: str):
         """A point of lane k from its record; before the first one there is the first."""
         row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, f.max(number, 0.0)) * self.row)
         self._put_lane(f, f"T{point[1:]}", k, f.load(row, 0))
@@ -112,35 +112,35 @@ class Reverse(Differentiated):
 
     # --- the way back
 
-    def _each_marked(self, f: Function, mask: Value):
+    def _each_lane(self, f: Function, mask: Value):
         marked = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
         with f.each(f.width) as k, f.if_(f.lane(marked, k) > 0.5):
             yield k
 
-    def _added(self, f: Function, mask: Value):
+    def _accumulate_constants(self, f: Function, mask: Value):
         """The cotangents of the constants that a program has found, to those of lanes in question."""
         with f.each(self.count) as i:
             total = f.load(f.given["work"], i * f.width + self.start("cbar", "work"), f.width)
             more = f.load(f.given["work"], i * f.width + self.start("G c", "work"), f.width)
             f.store(f.select(mask, total + more, total), f.given["work"], i * f.width + self.start("cbar", "work"), f.width)
 
-    def _projected_back(self, f: Function, mask: Value):
+    def _pull_projection(self, f: Function, mask: Value):
         """Y through the projection that led to the state in X: G q and G v."""
         if self.of_projection:
             self._evaluate_end(f)
             f.call("reverse_projection", f.given["work"], self.address(f, "KP"))
-            self._added(f, mask)
+            self._accumulate_constants(f, mask)
         else:
             with f.each(self.rowcount) as r:
                 for x in "qv":
                     self.put(f, f"G {x}", r, self.vector(f, f"Y {x}", r))
 
-    def _accelerated_back(self, f: Function, kept: str, bar: str, mask: Value):
+    def _pull_accelerations(self, f: Function, stored: str, bar: str, mask: Value):
         """The cotangents of accelerations, through the equations at the state in X: G q and G v."""
-        f.call("reverse", f.given["work"], self.address(f, kept), self.address(f, bar))
-        self._added(f, mask)
+        f.call("reverse", f.given["work"], self.address(f, stored), self.address(f, bar))
+        self._accumulate_constants(f, mask)
 
-    def _transposed_differences(self):
+    def _write_transposed_differences(self):
         """From cotangents of divided differences (M) to those of the points (B): `differences`, transposed; M is cleared."""
         f, s = self.function("differences_back")
         active = s.at > 0.5
@@ -150,7 +150,7 @@ class Reverse(Differentiated):
         for i in range(POINTS):
             for j in range(i + 1, POINTS):
                 d = times[j] - times[i]
-                inverse[i, j] = self.spread(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
+                inverse[i, j] = self.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
         sofar = None
         for k in range(1, POINTS - 1):
             near = (times[k] - times[k + 1]) * STRETCH >= step
@@ -186,12 +186,12 @@ class Reverse(Differentiated):
                     old = self.vector(f, name, r)
                     self.put(f, name, r, f.select(active, old + bars[x][k], old))
 
-    def _step_back(self):
+    def _write_step_back(self):
         """From the cotangents of P3 to those of P2, of lanes that are not yet back (`at`)."""
         f, s = self.function("step_back")
         active = s.at > 0.5
         step = f.select((s.begin > 0.5) | ~active, 0.0, s.T3 - s.T2)
-        h, last = self.spread(f, step), self.last
+        h, last = self.broadcast(f, step), self.last
         stages = range(1, last)
         for i in stages:
             stage_state(self, f, s, i, "P2", step)
@@ -201,21 +201,21 @@ class Reverse(Differentiated):
             for x in "qv":
                 self.put(f, f"X {x}", r, self.vector(f, f"P3 {x}", r))
         f.call("evaluation", f.given["work"], self.address(f, "C"), self.address(f, f"K{last}"))
-        self._accelerated_back(f, f"K{last}", "B3 a", active)
+        self._pull_accelerations(f, f"K{last}", "B3 a", active)
         with f.each(self.rowcount) as r:
             for x in "qv":
                 self.put(f, f"Y {x}", r, self.vector(f, f"B3 {x}", r) + self.vector(f, f"G {x}", r))
-        self._projected_back(f, active)
-        self._collected(f, h, last, range(last), active, first=True)
+        self._pull_projection(f, active)
+        self._accumulate_stage(f, h, last, range(last), active, first=True)
         for i in reversed(stages):
             stage_state(self, f, s, i, "P2", step)
-            self._accelerated_back(f, f"K{i}", f"S{i}", active)
-            self._collected(f, h, i, range(i), active)
+            self._pull_accelerations(f, f"K{i}", f"S{i}", active)
+            self._accumulate_stage(f, h, i, range(i), active)
         with f.each(self.rowcount) as r:
             old = self.vector(f, "B2 a", r)
             self.put(f, "B2 a", r, f.select(active, old + self.vector(f, "S0", r), old))
 
-    def _collected(self, f: Function, h: Value, i: int, stages: Sequence[int], active: Value, first: bool = False):
+    def _accumulate_stage(self, f: Function, h: Value, i: int, stages: Sequence[int], active: Value, first: bool = False):
         """The cotangents G of the state of stage i, to those of the point before and of the stages that it is made of."""
         method, zero = self.method, f.const(0.0, DOUBLE, self.plan.vector)
         with f.each(self.rowcount) as r:
@@ -233,7 +233,7 @@ class Reverse(Differentiated):
                 if first or a2 or a:
                     self.put(f, f"S{j}", r, total)
 
-    def _walk(self):
+    def _write_backpropagate(self):
         """Walk back all members that are `ready`, and write the cotangents of what they began with."""
         f, s = self.function("walk", [(POINTER, "work"), (POINTER, "call")])
         n, call, yes = self.n, f.given["call"], f.const(1.0, DOUBLE, f.width)
@@ -258,13 +258,13 @@ class Reverse(Differentiated):
                     total = f.load(f.given["work"], place) + f.load(bars, i + offset)
                     f.store(total, f.given["work"], place)
 
-        for k in self._each_marked(f, s.ready > 0.5):
+        for k in self._each_lane(f, s.ready > 0.5):
             more(k, self.member_address(f, call, "endbar", self._lane(f, "member", k)), "B3")
             with f.if_(self._lane(f, "code", k).is_(float(DONE))):
                 given(k, times - 1, "B3")
             for j in range(POINTS):
-                self._recalled(f, k, self._lane(f, "at", k) - float(POINTS - 1 - j), f"P{j}")
-            self._head(f, k)
+                self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1 - j), f"P{j}")
+            self._load_head(f, k)
 
         def due() -> Value:
             s.due = f.select((s.at > 0.5) & (s.written > s.before), yes, 0.0)
@@ -278,7 +278,7 @@ class Reverse(Differentiated):
                     for x in "qv":
                         place = i * f.width + self.start(f"Y {x}", "work")
                         f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], place, f.width)
-                for k in self._each_marked(f, s.due > 0.5):
+                for k in self._each_lane(f, s.due > 0.5):
                     number, member = self.to_int(f, self._lane(f, "written", k)), self._lane(f, "member", k)
                     self._put_lane(f, "next", k, self.input_number(f, call, "ts", member, number))
                     given(k, number, "Y")
@@ -290,8 +290,8 @@ class Reverse(Differentiated):
                             f.store(f.load(state, i), f.given["work"], place)
                 setattr(s, "X t", s.next)
                 mask = s.due > 0.5
-                self._projected_back(f, mask)
-                ahead = [self.spread(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
+                self._pull_projection(f, mask)
+                ahead = [self.broadcast(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
                 with f.each(self.rowcount) as r:
                     of_q, of_v = (self.vector(f, f"G {x}", r) for x in "qv")
                     # q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the products pi_k of differences of times.
@@ -318,12 +318,12 @@ class Reverse(Differentiated):
             for k in reversed(range(1, POINTS)):
                 s.where(active, **{f"T{k}": getattr(s, f"T{k - 1}")})
             s.where(active, at=s.at - 1.0)
-            for k in self._each_marked(f, active):
-                self._recalled(f, k, self._lane(f, "at", k) - float(POINTS - 1), "P0")
-                self._head(f, k)
+            for k in self._each_lane(f, active):
+                self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1), "P0")
+                self._load_head(f, k)
         # What is left is that of the first state as it was given, which is the first output, too.
         constants, bars = (Value(f, f.reserve(DOUBLE, max(c, 1)), POINTER) for c in (self.constants, self.count))
-        for k in self._each_marked(f, s.ready > 0.5):
+        for k in self._each_lane(f, s.ready > 0.5):
             given(k, f.const(0, INT), "B3")
             for x in "qv":
                 self.copy_lane(f, self._result(f, call, f"{x}bar", k, n), 0, f"B3 {x}", k)
@@ -331,7 +331,7 @@ class Reverse(Differentiated):
                 self.copy_lane(f, constants, 0, "constants", k, count=self.constants)
                 self.copy_lane(f, bars, 0, "cbar", k, count=self.count)
                 numbers = self.member_address(f, call, "numbers", self._lane(f, "member", k))
-                to = self._result(f, call, "numbersbar", k, sum(self.numbers_moving))
+                to = self._result(f, call, "numbersbar", k, sum(self.active_numbers))
                 f.call(REVERSE, numbers, constants, bars, to)
             f.line(f"call void @free(ptr {self._lane(f, 'record', k, POINTER).name})")
         s.ready = f.const(0.0, DOUBLE, f.width)
@@ -341,7 +341,7 @@ class Reverse(Differentiated):
         number = self.to_int(f, self._lane(f, "member", k))
         return f.at(f.load(call, self.call_fields.index(name), base=POINTER), number * length)
 
-    def _head(self, f: Function, k: Value):
+    def _load_head(self, f: Function, k: Value):
         """What is noted of the step that led to the point where lane k is."""
         row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, self._lane(f, "at", k)) * self.row)
         self._put_lane(f, "before", k, f.load(row, 1))
@@ -352,9 +352,9 @@ class Reverse(Differentiated):
 
     def take_next(self, f: Function, s: Lane, fill):
         with f.if_(~f.any_of(s.active > 0.5)):
-            with f.if_(self._walks(f)):
+            with f.if_(self._backpropagates(f)):
                 f.call("walk", f.given["work"], f.given["call"])
             fill()
 
-    def _walks(self, f: Function) -> Value:
+    def _backpropagates(self, f: Function) -> Value:
         return f.load(self.call_record(f), self.call_fields.index("directions"), base=INT) > 0

@@ -39,7 +39,7 @@ def aim(t: Module, f: Function, s: Lane):
         s.lands = where(reaches & (end <= crossing), yes, 0.0)
     t1 = where(begin, s.behind if t.plan.breaks else s.T3, t1)
     s.t1 = t1
-    s.step = where((s.judged > 0.5) & ~begin, t1 - s.T3, 0.0)
+    s.step = where((s.stepping > 0.5) & ~begin, t1 - s.T3, 0.0)
     s.begin = where(begin, yes, 0.0)
     s.last = where(last, yes, 0.0)
 

@@ -36,16 +36,16 @@ class Closing(Trajectory):
     def text(self) -> str:
         """LLVM's text of the whole module."""
         self.write_programs()
-        self._solver()
+        self._write_solver()
         write_begin(self)
         self._close()
         write_run(self)
-        return self.joined()
+        return self.module_text()
 
     def program_names(self, code: ScenePrograms) -> dict[str, Any]:
         return {"equation_terms": code.equation_terms, "psi": code.psi, "psi_dot": code.psi_dot}
 
-    def _solver(self):
+    def _write_solver(self):
         """The functions of D^+."""
         self.functions.append(least_norm())
         write_solve(self)
@@ -100,16 +100,16 @@ class Closing(Trajectory):
                 with f.if_(better.value > 0.5):
                     taken = scale.value * 2.0
                     limited = f.select(longest.value > LONGEST_STEP, f.const(1.0), 0.0)
-                    self._before(f, "q", lambda: self._taken(f, POSITION, taken, limited))
-        self._taken(f, POSITION, f.const(1.0), f.const(0.0))
+                    self._at_previous_state(f, "q", lambda: self._record_correction(f, POSITION, taken, limited))
+        self._record_correction(f, POSITION, f.const(1.0), f.const(0.0))
         for _ in range(VELOCITIES):
-            self._taken(f, VELOCITY, f.const(1.0), f.const(0.0))
+            self._record_correction(f, VELOCITY, f.const(1.0), f.const(0.0))
             self._correction(f, s, VELOCITY, "X dv")
             with f.each(n) as i:
                 f.store(f.load(work, i + p["X v"]) + f.load(work, i + p["X dv"]), work, i + p["X v"])
-        self._written(f, s)
+        self._write_result(f, s)
 
-    def _written(self, f: Function, s: Lane):
+    def _write_result(self, f: Function, s: Lane):
         """The state, Psi and Psi_dot there, and the rank of D."""
         member, work = self.to_int(f, s.member), f.given["work"]
 
@@ -123,11 +123,11 @@ class Closing(Trajectory):
             self.invoke(f, name)
             with f.each(self.m) as i:
                 f.store(f.load(work, i + self.places["psi"]), residuals, i + offset)
-        self._ranked(f)
+        self._set_rank(f)
         f.store(s.rank, address("rank", 1))
-        self._ended_closing(f, member)
+        self._finish_closing(f, member)
 
-    def _ranked(self, f: Function):
+    def _set_rank(self, f: Function):
         """Leave the rank of D in `rank`: `solve` does."""
 
     def _correction(self, f: Function, s: Lane, kind: int, to: str):
@@ -138,20 +138,20 @@ class Closing(Trajectory):
         self.invoke(f, "equation_terms")
         with f.each(m) as i:
             f.store(f.load(work, i + p["psi"]), right, i)
-        f.call("solve", work, f.const(0, INT), right, x, s.care)
+        f.call("solve", work, f.const(0, INT), right, x, s.fallback_tol)
         with f.each(n) as i:
             root = f.load(work, i + (p["R"] + self.code.pattern.value_count + m + n))
             f.store(-(root * f.load(x, i)), work, i + p[to])
 
     # What closing with derivatives does besides (closing_derivatives.py).
 
-    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
+    def _record_correction(self, f: Function, kind: int, scale: Value, limited: Value):
         """What it does with a correction of the state in X: so much of it was taken, less where it was limited."""
 
-    def _ended_closing(self, f: Function, member: Value):
+    def _finish_closing(self, f: Function, member: Value):
         """What it does with a member that is closed."""
 
-    def _before(self, f: Function, x: str, do: Callable[[], None]):
+    def _at_previous_state(self, f: Function, x: str, do: Callable[[], None]):
         """What is done with the state before a step, in C, instead of that in X."""
         p, work = self.places, f.given["work"]
         with f.each(self.n) as i:

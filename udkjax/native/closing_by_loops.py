@@ -8,10 +8,10 @@ from typing import Any
 
 from udkjax.equations.loop_programs import LoopPrograms
 from udkjax.native.closing import POSITION, VELOCITY, Closing
-from udkjax.native.closing_derivatives import Along, Back
+from udkjax.native.closing_derivatives import ForwardMode, ReverseMode
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane
-from udkjax.native.linearized import ByLoops
+from udkjax.native.linearization import ByLoops
 from udkjax.native.prologue import write_prologue_forward, write_prologue_reverse
 
 KINDS = {"position": (POSITION, "q"), "velocity": (VELOCITY, "v")}
@@ -24,12 +24,12 @@ class ClosingByLoops(Closing):
         super().__init__(code, vector)
         self.count = len(code.constants)
         self.corrections = {name: ByLoops(self, name) for name in KINDS}
-        self.places.add("K", max(x.kept for x in self.corrections.values()))
+        self.places.add("K", max(x.stored for x in self.corrections.values()))
 
     def program_names(self, code: LoopPrograms) -> dict[str, Any]:
         return {"psi": code.psi, "psi_dot": code.psi_dot, "rank": code.rank}
 
-    def _solver(self):
+    def _write_solver(self):
         for correction in self.corrections.values():
             correction.evaluation()
 
@@ -50,7 +50,7 @@ class ClosingByLoops(Closing):
         with f.each(self.n) as i:
             f.store(self._change(f, name, i), f.given["work"], i + self.places[to])
 
-    def _ranked(self, f: Function):
+    def _set_rank(self, f: Function):
         self._evaluate(f, "position")
         with f.each(self.code.scratch["factors"]) as i:
             x = f.load(f.given["work"], i + (self.places["K"] + self.corrections["position"].place("factors")))
@@ -68,17 +68,17 @@ class ClosingByLoops(Closing):
         return longest.value, which.value
 
 
-class ForwardByLoops(ClosingByLoops, Along):
+class ForwardByLoops(ClosingByLoops, ForwardMode):
     """Closing along directions."""
 
-    def __init__(self, code: Any, moving: tuple[bool, ...], vector: int):
+    def __init__(self, code: Any, active: tuple[bool, ...], vector: int):
         super().__init__(code, vector)
-        self.numbers_moving = sum(moving)
-        self._add_ways()
+        self.active_numbers = sum(active)
+        self._add_tangents()
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
-        everything = [True] * self.numbers_moving
+        everything = [True] * self.active_numbers
         write_prologue_forward(self, everything, everything)
         for name, correction in self.corrections.items():
             correction.forward()
@@ -91,32 +91,32 @@ class ForwardByLoops(ClosingByLoops, Along):
         self._evaluate(f, name)
         longest, which = self._longest(f, name)
         limits = (f.given["limited"] > 0.5) & (longest > 0.0)
-        with self._each_way(f):
-            f.call(f"forward_{name}", f.given["work"], self.address(f, "K"), f.given["way"], f.given["way"])
+        with self._each_tangent(f):
+            f.call(f"forward_{name}", f.given["work"], self.address(f, "K"), f.given["tangent"], f.given["tangent"])
             change = f.variable(0.0)  # of the longest step, over its length
             with f.each(self.n) as i:
-                step = self._at(f, f"O {x}", i, "way") - self._at(f, f"X {x}", i, "way")
-                self._set(f, f"O {x}", i, step, "way")
+                step = self._at(f, f"O {x}", i, "tangent") - self._at(f, f"X {x}", i, "tangent")
+                self._set(f, f"O {x}", i, step, "tangent")
                 change.value = f.select(i.is_(which), step / self._change(f, name, i), change.value)
             share = f.select(limits, change.value, 0.0)
             with f.each(self.n) as i:
-                step = self._at(f, f"O {x}", i, "way") - share * self._change(f, name, i)
-                self._more(f, f"X {x}", i, f.given["scale"] * step, "way")
+                step = self._at(f, f"O {x}", i, "tangent") - share * self._change(f, name, i)
+                self._increase(f, f"X {x}", i, f.given["scale"] * step, "tangent")
 
 
-class ReverseByLoops(ClosingByLoops, Back):
+class ReverseByLoops(ClosingByLoops, ReverseMode):
     """Closing and back."""
 
-    def __init__(self, code: Any, moving: tuple[bool, ...], vector: int):
+    def __init__(self, code: Any, active: tuple[bool, ...], vector: int):
         super().__init__(code, vector)
-        self.numbers_moving = sum(moving)
+        self.active_numbers = sum(active)
         self._add_record(code.prologue_input_count)
         for name in ("Y q", "Y v"):
             self.places.add(name, self.n)
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
-        everything = [True] * self.numbers_moving
+        everything = [True] * self.active_numbers
         write_prologue_reverse(self, everything, everything)
         for name, correction in self.corrections.items():
             correction.reverse()
@@ -134,8 +134,8 @@ class ReverseByLoops(ClosingByLoops, Back):
             along.value = f.fma(bar, self._change(f, name, i), along.value)
             self._set(f, f"Y {x}", i, bar)
         with f.if_((f.given["limited"] > 0.5) & (longest > 0.0)):
-            self._more(f, f"Y {x}", which, -(along.value / self._change(f, name, which)))
+            self._increase(f, f"Y {x}", which, -(along.value / self._change(f, name, which)))
         with f.each(self.n) as i:
-            self._more(f, f"B {x}", i, -self._at(f, f"Y {x}", i))
+            self._increase(f, f"B {x}", i, -self._at(f, f"Y {x}", i))
         f.call(f"reverse_{name}", f.given["work"], self.address(f, "K"))
-        self._pulled(f)
+        self._accumulate(f)

@@ -31,25 +31,25 @@ from udkjax.native.least_norm import LEAST_NORM
 from udkjax.native.prologue import FORWARD, REVERSE, write_prologue_forward, write_prologue_reverse
 
 
-class _Moving(Closing):
-    """What derivatives of any closing have in common. `moving` says which numbers of the scene move."""
+class _ClosingDerivative(Closing):
+    """What derivatives of any closing have in common. `active` says which numbers of the scene move."""
 
-    numbers_moving: int
+    active_numbers: int
 
     def _at(self, f: Function, name: str, i: Value | int, pointer: str = "work") -> Value:
-        places = self.places if pointer == "work" else self.ways
+        places = self.places if pointer == "work" else self.tangents
         return f.load(f.given[pointer], f.like(i, INT, 1) + places[name])
 
     def _set(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
-        places = self.places if pointer == "work" else self.ways
+        places = self.places if pointer == "work" else self.tangents
         f.store(x, f.given[pointer], f.like(i, INT, 1) + places[name])
 
-    def _more(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
+    def _increase(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
         self._set(f, name, i, self._at(f, name, i, pointer) + x, pointer)
 
 
-class Along(_Moving):
-    """Closing along directions, each with memory of its own: a `way`.
+class ForwardMode(_ClosingDerivative):
+    """Closing along directions, each with memory of its own: a `tangent`.
 
     It calls `push_position` and `push_velocity` (work, scale, limited): the change of the state by a correction of it, so much of
     it in positions, and whether it was limited.
@@ -59,55 +59,55 @@ class Along(_Moving):
     outputs = ("dstate",)
     directions_in = 1
 
-    def _add_ways(self):
-        """The memory of a way."""
-        self.ways = w = Layout(1, self.plan.vector)
-        w.add("numbers", self.numbers_moving)
+    def _add_tangents(self):
+        """The memory of a tangent."""
+        self.tangents = w = Layout(1, self.plan.vector)
+        w.add("numbers", self.active_numbers)
         w.add("constants", self.constants)
         for name in ("X q", "X v", "O q", "O v"):
             w.add(name, self.n)
 
     @contextmanager
-    def _each_way(self, f: Function) -> Iterator[Value]:
+    def _each_tangent(self, f: Function) -> Iterator[Value]:
         call = f.load(f.given["work"], self.places["call"], base=POINTER)
-        first = f.load(f.given["work"], self.places["ways"], base=POINTER)
+        first = f.load(f.given["work"], self.places["tangents"], base=POINTER)
         with f.each(f.load(call, self.call_fields.index("directions"), base=INT)) as p:
-            f.given["way"] = f.at(first, p * self.ways.size)
+            f.given["tangent"] = f.at(first, p * self.tangents.size)
             yield p
 
-    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
+    def _record_correction(self, f: Function, kind: int, scale: Value, limited: Value):
         f.call("push_velocity" if kind == VELOCITY else "push_position", f.given["work"], scale, limited)
 
     def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
         del lane
         call = self.call_record(f)
-        with self._each_way(f) as p:
-            for name, to, count in (("dnumbers", "numbers", self.numbers_moving), ("dq", "X q", self.n), ("dv", "X v", self.n)):
+        with self._each_tangent(f) as p:
+            for name, to, count in (("dnumbers", "numbers", self.active_numbers), ("dq", "X q", self.n), ("dv", "X v", self.n)):
                 start = self.member_address(f, call, name, member)
                 with f.each(count) as i:
-                    self._set(f, to, i, f.load(start, p * count + i), "way")
-            dnumbers, dconstants = (f.at(f.given["way"], self.ways[x]) for x in ("numbers", "constants"))
+                    self._set(f, to, i, f.load(start, p * count + i), "tangent")
+            dnumbers, dconstants = (f.at(f.given["tangent"], self.tangents[x]) for x in ("numbers", "constants"))
             f.call(FORWARD, self.member_address(f, call, "numbers", member), constants, dnumbers, dconstants)
 
-    def _ended_closing(self, f: Function, member: Value):
+    def _finish_closing(self, f: Function, member: Value):
         call = self.call_record(f)
         directions = f.load(call, self.call_fields.index("directions"), base=INT)
-        with self._each_way(f) as p:
+        with self._each_tangent(f) as p:
             to = f.at(f.load(call, self.call_fields.index("dstate"), base=POINTER), (member * directions + p) * (2 * self.n))
             for k, x in enumerate("qv"):
                 with f.each(self.n) as i:
-                    f.store(self._at(f, f"X {x}", i, "way"), to, i + k * self.n)
+                    f.store(self._at(f, f"X {x}", i, "tangent"), to, i + k * self.n)
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
-        size = f.load(call, self.call_fields.index("directions"), base=INT) * self.ways.size
+        size = f.load(call, self.call_fields.index("directions"), base=INT) * self.tangents.size
         block, start = self.allocate(f, size)
         with f.each(size) as i:
             f.store(0.0, start, i)
-        f.store(start, f.given["work"], self.places["ways"], base=POINTER)
+        f.store(start, f.given["work"], self.places["tangents"], base=POINTER)
         return [block]
 
 
-class Back(_Moving):
+class ReverseMode(_ClosingDerivative):
     """Closing, and back: its corrections are recorded and walked back from a cotangent of the state.
 
     It calls `pull_position` and `pull_velocity` (work, scale, limited): from the cotangent B of the state behind a correction to
@@ -127,15 +127,15 @@ class Back(_Moving):
         for name in ("B q", "B v", "G q", "G v"):
             p.add(name, n)
 
-    def _pulled(self, f: Function):
+    def _accumulate(self, f: Function):
         """Add what a correction's derivative has found in G."""
         with f.each(self.constants) as i:
-            self._more(f, "cbar", i, self._at(f, "G c", i))
+            self._increase(f, "cbar", i, self._at(f, "G c", i))
         with f.each(self.n) as i:
             for x in "qv":
-                self._more(f, f"B {x}", i, self._at(f, f"G {x}", i))
+                self._increase(f, f"B {x}", i, self._at(f, f"G {x}", i))
 
-    def _taken(self, f: Function, kind: int, scale: Value, limited: Value):
+    def _record_correction(self, f: Function, kind: int, scale: Value, limited: Value):
         number = self.to_int(f, self._at(f, "records", 0))
         row = f.at(f.given["work"], number * self.row + self.places["record"])
         for k, x in enumerate((f.const(float(kind)), scale, limited)):
@@ -154,7 +154,7 @@ class Back(_Moving):
             with f.each(self.n) as i:
                 self._set(f, f"B {x}", i, f.load(bars, i + k * self.n))
 
-    def _ended_closing(self, f: Function, member: Value):
+    def _finish_closing(self, f: Function, member: Value):
         call = self.call_record(f)
 
         def left() -> Value:
@@ -174,7 +174,7 @@ class Back(_Moving):
         constants, bars, to = (self.address(f, x) for x in ("constants", "cbar", "numbersbar"))
         f.call(REVERSE, self.member_address(f, call, "numbers", member), constants, bars, to)
         for name, place, count in (
-            ("numbersbar", "numbersbar", self.numbers_moving),
+            ("numbersbar", "numbersbar", self.active_numbers),
             ("qbar", "B q", self.n),
             ("vbar", "B v", self.n),
         ):
@@ -183,22 +183,22 @@ class Back(_Moving):
                 f.store(self._at(f, place, i), to, i)
 
 
-class _WrittenOut(_Moving):
+class _StraightLine(_ClosingDerivative):
     """What both modes have in common: the change of the rows, and (A^+)^T."""
 
-    def __init__(self, code: ScenePrograms, moving: tuple[bool, ...], vector: int):
+    def __init__(self, code: ScenePrograms, active: tuple[bool, ...], vector: int):
         super().__init__(code, vector)
         graph, e = code.graph, code.equations
         self.value_count = code.pattern.value_count
         self.changed = [*code.entries, *e.psi, *e.psi_dot, *code.root]
-        self.moving, self.numbers_moving = moving, sum(moving)
+        self.active, self.active_numbers = active, sum(active)
         self.given = [*code.constants, e.t, *e.q, *e.v]
         self.state = [*code.constants, *e.q, *e.v]
         self.graph = graph
         for name, count in (("Y", self.m), ("x", self.n), ("r", self.m), ("g", self.n)):
             self.places.add(name, count)
 
-    def _shared(self):
+    def _write_transposed(self):
         """`transposed`: y = (A^+)^T x of what is in x, into Y; A is that of R."""
         n, m = self.n, self.m
         f, s = self.function("transposed", [(POINTER, "work"), (POINTER, "x"), (POINTER, "y")])
@@ -210,7 +210,7 @@ class _WrittenOut(_Moving):
         for row, column, slot, sign in entries(self, f):
             f.store(self._entry(f, row, slot, sign), A, column * m + row)
         rank = Value(f, f.reserve(DOUBLE), POINTER)
-        f.call(LEAST_NORM, A, b, f.given["y"], f.const(n, INT), f.const(m, INT), s.care, rank)
+        f.call(LEAST_NORM, A, b, f.given["y"], f.const(n, INT), f.const(m, INT), s.fallback_tol, rank)
 
     def _weight(self, f: Function, row: Value) -> Value:
         return Lane(f, self.places).length / self._at(f, "rows", row)
@@ -222,14 +222,14 @@ class _WrittenOut(_Moving):
     def _root(self, f: Function, i: Value) -> Value:
         return self._at(f, "R", i + (self.value_count + self.m + self.n))
 
-    def _corrected(self, f: Function, kind: int):
+    def _solve_correction(self, f: Function, kind: int):
         """x and y of the correction at the state in X, with A in R."""
         self.invoke(f, "equation_terms")
         self.invoke(f, "psi_dot" if kind == VELOCITY else "psi")
         s = Lane(f, self.places)
         with f.each(self.m) as i:
             self._set(f, "r", i, self._at(f, "psi", i))
-        f.call("solve", f.given["work"], f.const(0, INT), self.address(f, "r"), self.address(f, "x"), s.care)
+        f.call("solve", f.given["work"], f.const(0, INT), self.address(f, "r"), self.address(f, "x"), s.fallback_tol)
         f.call("transposed", f.given["work"], self.address(f, "x"), self.address(f, "Y"))
 
     def _longest(self, f: Function) -> tuple[Value, Value]:
@@ -242,13 +242,13 @@ class _WrittenOut(_Moving):
         return longest.value, which.value
 
 
-class ClosingForward(_WrittenOut, Along):
+class ClosingForward(_StraightLine, ForwardMode):
     """Closing along directions, with its programs written out."""
 
-    def __init__(self, code: ScenePrograms, moving: tuple[bool, ...], vector: int):
-        super().__init__(code, moving, vector)
-        self._add_ways()
-        w = self.ways
+    def __init__(self, code: ScenePrograms, active: tuple[bool, ...], vector: int):
+        super().__init__(code, active, vector)
+        self._add_tangents()
+        w = self.tangents
         for name in ("g", "dx"):
             w.add(name, self.n)
         w.add("changes", len(self.changed))
@@ -259,58 +259,58 @@ class ClosingForward(_WrittenOut, Along):
         graph = self.graph
         seeds = {s: graph.input(("closing", s.index), "tangent") for s in self.state}
         changes = tangents(graph, self.changed, seeds)
-        w = self.ways
-        inputs = [*self.state_places(), *(("way", w["constants"] + k) for k in range(self.constants))]
-        inputs += [("way", w[f"X {x}"] + k) for x in "qv" for k in range(self.n)]
+        w = self.tangents
+        inputs = [*self.state_places(), *(("tangent", w["constants"] + k) for k in range(self.constants))]
+        inputs += [("tangent", w[f"X {x}"] + k) for x in "qv" for k in range(self.n)]
         program = ScalarProgram(graph, [*self.given, *seeds.values()], changes)
-        places = [("way", w["changes"] + k) for k in range(len(changes))]
-        self.write_program(program, "changes", ("work", "way"), inputs, places)
-        write_prologue_forward(self, self.moving, [True] * self.constants)
-        self._shared()
+        places = [("tangent", w["changes"] + k) for k in range(len(changes))]
+        self.write_program(program, "changes", ("work", "tangent"), inputs, places)
+        write_prologue_forward(self, self.active, [True] * self.constants)
+        self._write_transposed()
         for name, kind in (("push_position", POSITION), ("push_velocity", VELOCITY)):
             self._push(name, kind)
         return super().text()
 
     def _push(self, name: str, kind: int):
         f, s = self.function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
-        self._corrected(f, kind)
+        self._solve_correction(f, kind)
         longest, which = self._longest(f)
         residual, root = self.value_count + (self.m if kind == VELOCITY else 0), self.value_count + 2 * self.m
         scale = f.given["scale"]
-        with self._each_way(f):
-            f.call("changes", f.given["work"], f.given["way"])
+        with self._each_tangent(f):
+            f.call("changes", f.given["work"], f.given["tangent"])
             with f.each(self.n) as i:
-                self._set(f, "g", i, f.const(0.0), "way")
+                self._set(f, "g", i, f.const(0.0), "tangent")
             with f.each(self.m) as i:
-                self._set(f, "right", i, self._at(f, "changes", i + residual, "way"), "way")
+                self._set(f, "right", i, self._at(f, "changes", i + residual, "tangent"), "tangent")
             for row, column, slot, sign in entries(self, f):
-                change = self._at(f, "changes", slot, "way") * sign
-                self._more(f, "g", column, change * self._weight(f, row) * self._at(f, "Y", row), "way")
-                self._more(f, "right", row, -(change * self._at(f, "x", column)), "way")
+                change = self._at(f, "changes", slot, "tangent") * sign
+                self._increase(f, "g", column, change * self._weight(f, row) * self._at(f, "Y", row), "tangent")
+                self._increase(f, "right", row, -(change * self._at(f, "x", column)), "tangent")
             for row, column, slot, sign in entries(self, f):
-                self._more(f, "right", row, -(self._at(f, "R", slot) * sign * self._at(f, "g", column, "way")), "way")
-            right, dx = (f.at(f.given["way"], self.ways[x]) for x in ("right", "dx"))
-            f.call("solve", f.given["work"], f.const(0, INT), right, dx, s.care)
+                self._increase(f, "right", row, -(self._at(f, "R", slot) * sign * self._at(f, "g", column, "tangent")), "tangent")
+            right, dx = (f.at(f.given["tangent"], self.tangents[x]) for x in ("right", "dx"))
+            f.call("solve", f.given["work"], f.const(0, INT), right, dx, s.fallback_tol)
             change = f.variable(0.0)  # of the longest step, over its length
             with f.each(self.n) as i:
                 x, root_i = self._at(f, "x", i), self._root(f, i)
-                step = f.fma(root_i, self._at(f, "dx", i, "way") + self._at(f, "g", i, "way"), 0.0)
-                step = f.fma(self._at(f, "changes", i + root, "way"), x, step)
-                self._set(f, "dx", i, step, "way")
+                step = f.fma(root_i, self._at(f, "dx", i, "tangent") + self._at(f, "g", i, "tangent"), 0.0)
+                step = f.fma(self._at(f, "changes", i + root, "tangent"), x, step)
+                self._set(f, "dx", i, step, "tangent")
                 change.value = f.select(i.is_(which), step / (root_i * x), change.value)
             change.value = f.select((f.given["limited"] > 0.5) & (longest > 0.0), change.value, 0.0)
             to = "X v" if kind == VELOCITY else "X q"
             with f.each(self.n) as i:
-                step, whole = self._at(f, "dx", i, "way"), self._root(f, i) * self._at(f, "x", i)
-                self._more(f, to, i, -(scale * (step - change.value * whole)), "way")
+                step, whole = self._at(f, "dx", i, "tangent"), self._root(f, i) * self._at(f, "x", i)
+                self._increase(f, to, i, -(scale * (step - change.value * whole)), "tangent")
 
 
-class ClosingReverse(_WrittenOut, Back):
+class ClosingReverse(_StraightLine, ReverseMode):
     """Closing and back, with its programs written out."""
 
-    def __init__(self, code: ScenePrograms, moving: tuple[bool, ...], vector: int):
-        super().__init__(code, moving, vector)
-        self._add_record(self.numbers_moving)
+    def __init__(self, code: ScenePrograms, active: tuple[bool, ...], vector: int):
+        super().__init__(code, active, vector)
+        self._add_record(self.active_numbers)
         for name, count in {"bars": len(self.changed), "w": self.n, "u": self.m}.items():
             self.places.add(name, count)
 
@@ -322,15 +322,15 @@ class ClosingReverse(_WrittenOut, Back):
         inputs = [*self.state_places(), *self.work_places("bars", len(seeds))]
         found = [*self.work_places("G c", self.constants), *self.work_places("G q", n), *self.work_places("G v", n)]
         self.write_program(program, "pull_rows", ("work",), inputs, found)
-        write_prologue_reverse(self, self.moving, [True] * self.constants)
-        self._shared()
+        write_prologue_reverse(self, self.active, [True] * self.constants)
+        self._write_transposed()
         for name, kind in (("pull_position", POSITION), ("pull_velocity", VELOCITY)):
             self._pull(name, kind)
         return super().text()
 
     def _pull(self, name: str, kind: int):
         f, _ = self.function(name, [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
-        self._corrected(f, kind)
+        self._solve_correction(f, kind)
         longest, which = self._longest(f)
         residual, root = self.value_count + (self.m if kind == VELOCITY else 0), self.value_count + 2 * self.m
         to = "B v" if kind == VELOCITY else "B q"
@@ -344,7 +344,7 @@ class ClosingReverse(_WrittenOut, Back):
         limits = (f.given["limited"] > 0.5) & (longest > 0.0)
         with f.if_(limits):
             length = self._root(f, which) * self._at(f, "x", which)
-            self._more(f, "w", which, -(along.value / length))
+            self._increase(f, "w", which, -(along.value / length))
         with f.each(self.n) as i:
             bar = self._at(f, "w", i)
             self._set(f, "bars", i + root, bar * self._at(f, "x", i))
@@ -352,11 +352,11 @@ class ClosingReverse(_WrittenOut, Back):
             self._set(f, "g", i, bar * self._root(f, i))
         f.call("transposed", f.given["work"], self.address(f, "w"), self.address(f, "u"))
         for row, column, slot, sign in entries(self, f):
-            self._more(f, "g", column, -(self._entry(f, row, slot, sign) * self._at(f, "u", row)))
+            self._increase(f, "g", column, -(self._entry(f, row, slot, sign) * self._at(f, "u", row)))
         for row, column, slot, sign in entries(self, f):
             bar = f.fma(self._at(f, "Y", row), self._at(f, "g", column), -(self._at(f, "u", row) * self._at(f, "x", column)))
-            self._more(f, "bars", slot, bar * sign * self._weight(f, row))
+            self._increase(f, "bars", slot, bar * sign * self._weight(f, row))
         with f.each(self.m) as i:
             self._set(f, "bars", i + residual, self._weight(f, i) * self._at(f, "u", i))
         f.call("pull_rows", f.given["work"])
-        self._pulled(f)
+        self._accumulate(f)

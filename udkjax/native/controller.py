@@ -11,13 +11,13 @@ from udkjax.native.module import Module
 from udkjax.native.power import power
 from udkjax.native.singular import is_clear, step_around, time_to_singularity
 from udkjax.native.steps import (
-    CAUTIOUS,
     DONE,
     EXPECTED,
     GAP,
     GROW,
-    NEAREST,
+    NEAREST_STAGE,
     POINTS,
+    RESTART_FACTOR,
     RETRIES,
     RUNNING,
     SAFETY,
@@ -29,37 +29,37 @@ from udkjax.native.steps import (
 
 
 def write_decide(t: Module):
-    """Accept or reject the step of lanes that are `judged`, and choose the next one; `until`: outputs up to there are due."""
+    """Accept or reject the step of lanes that are `stepping`, and choose the next one; `until`: outputs up to there are due."""
     f, s = t.function("decide")
     where, yes = f.select, f.const(1.0, DOUBLE, f.width)
     inf = f.const(np.inf, DOUBLE, f.width)
-    judged, careful, error = s.judged > 0.5, s.careful > 0.5, s.error
+    stepping, fallback, error = s.stepping > 0.5, s.fallback > 0.5, s.error
     begin = s.begin > 0.5
-    bad = judged & ~(error < np.inf)
-    # --- doubt, and steps a little shorter instead
-    if t.doubts:
-        doubt = bad & ~careful
+    bad = stepping & ~(error < np.inf)
+    # --- pivots too small to be trusted, and steps a little shorter instead
+    if t.checks_pivots:
+        fallback_due = bad & ~fallback
         far_from_here = is_clear(t, f, s, s.distance2)
-        beside = judged & ~careful & (error < 1.0) & ~is_clear(t, f, s, s.distance) & (s.last < 0.5)
+        beside = stepping & ~fallback & (error < 1.0) & ~is_clear(t, f, s, s.distance) & (s.last < 0.5)
         left = time_to_singularity(t, f, s)
         past = (left > 0.0) & (left < s.h * SURE) & (s.distance * left > s.distance2 * EXPECTED * (s.h - left))
-        beside = beside & ~(past & (s.distance > NEAREST))
-        dodge = (doubt | beside) & far_from_here & (s.retries < float(RETRIES)) & ~begin
-        s.where(judged, retries=where(dodge, s.retries + 1.0, where(error < 1.0, 0.0, s.retries)))
-        doubt = doubt & ~dodge
-        s.doubt = where(doubt, yes, 0.0)
-        judged = judged & ~doubt
+        beside = beside & ~(past & (s.distance > NEAREST_STAGE))
+        dodge = (fallback_due | beside) & far_from_here & (s.retries < float(RETRIES)) & ~begin
+        s.where(stepping, retries=where(dodge, s.retries + 1.0, where(error < 1.0, 0.0, s.retries)))
+        fallback_due = fallback_due & ~dodge
+        s.fallback_due = where(fallback_due, yes, 0.0)
+        stepping = stepping & ~fallback_due
     else:
-        s.doubt = f.const(0.0, DOUBLE, f.width)
+        s.fallback_due = f.const(0.0, DOUBLE, f.width)
         dodge = f.const(False, BOOL, f.width)
-    tried = where(judged, s.tried + 1.0, s.tried)
+    tried = where(stepping, s.tried + 1.0, s.tried)
     again = f.const(False, BOOL, f.width)
     if t.pieces:
-        s.again = where(judged, yes, 0.0)
+        s.again = where(stepping, yes, 0.0)
         f.call("leave", f.given["work"])
         again = s.again > 0.5
-    accept = judged & (error < 1.0) & ~dodge & ~again
-    stepped, begun = ~begin, judged & begin
+    accept = stepping & (error < 1.0) & ~dodge & ~again
+    stepped, begun = ~begin, stepping & begin
     # --- the next step
     order, step = t.method.order, s.t1 - s.T3
     size = where(f.is_finite(error), f.max(error, 1e-30), 1e30)
@@ -70,18 +70,18 @@ def write_decide(t: Module):
     factor = power(f, aim, -1.0 / order) * SAFETY
     factor = f.max(factor, where(accept & ~steep, yes, SHRINK))
     factor = f.min(factor, where(accept, f.const(GROW, DOUBLE, f.width), SAFETY))
-    h = where(judged, step * where(dodge, f.const(SAFETY, DOUBLE, f.width), factor), s.h)
+    h = where(stepping, step * where(dodge, f.const(SAFETY, DOUBLE, f.width), factor), s.h)
     h = where(again, s.h, h)
-    failed = judged & ~accept & stepped & ~again
-    if t.doubts:
+    failed = stepping & ~accept & stepped & ~again
+    if t.checks_pivots:
         h = where(failed, step_around(t, f, s, left, step, h), h)
     s.behind = h
     with f.if_(f.any_of(begun)):
         s.behind = where(begun, first_step(t, f, s), s.behind)
     h = s.behind
-    code = where(judged & (h < s.smallest), f.const(STEP_TOO_SMALL, DOUBLE, f.width), s.code)
-    code = where(code.is_(float(RUNNING)) & judged & (tried >= s.max_steps), STEP_LIMIT, code)
-    code = where(judged & bad & begin & ~accept, where(code.is_(float(RUNNING)), STEP_TOO_SMALL, code), code)
+    code = where(stepping & (h < s.smallest), f.const(STEP_TOO_SMALL, DOUBLE, f.width), s.code)
+    code = where(code.is_(float(RUNNING)) & stepping & (tried >= s.max_steps), STEP_LIMIT, code)
+    code = where(stepping & bad & begin & ~accept, where(code.is_(float(RUNNING)), STEP_TOO_SMALL, code), code)
     code = where(accept & (s.last > 0.5), DONE, code)
     # --- where it stands
     with f.if_(f.any_of(accept)):
@@ -100,14 +100,14 @@ def write_decide(t: Module):
     first = s.tried < 0.0
     if t.plan.breaks:
         h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
-        h = where(begun & (tried > 0.0), s.h * CAUTIOUS, h)
+        h = where(begun & (tried > 0.0), s.h * RESTART_FACTOR, h)
         s.where(begun, rate=inf, distance0=inf, distance1=inf)
-        s.where(judged, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
+        s.where(stepping, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
         s.where(accept & (s.lands > 0.5), steps=-1.0)
     del first
     cost = where(begin, f.const(1.0, DOUBLE, f.width), float(t.method.stages))
-    cost = where(careful, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
-    s.where(judged, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
+    cost = where(fallback, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
+    s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
     # --- outputs
     ready = accept & ((s.accepted > 0.0) | (stepped & (s.last > 0.5)))
     until = where(ready, s.t1, -np.inf)
@@ -120,7 +120,7 @@ def write_decide(t: Module):
 
 def first_step(t: Module, f: Function, s: Lane) -> Value:
     """As given, or one over which the state changes by a small part of itself (first_step.py)."""
-    rtol = t.spread(f, s.rtol)
+    rtol = t.broadcast(f, s.rtol)
 
     def relative(of_q: str, of_v: str) -> Any:
         def both(r: Value) -> list[Value]:

@@ -17,7 +17,7 @@ def write_differences(t: Module, name: str = "differences", to: tuple[str, Layou
     for i in range(POINTS):
         for j in range(i + 1, POINTS):
             d = times[j] - times[i]
-            inverse[i, j] = t.spread(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
+            inverse[i, j] = t.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
     used: list[Value | None] = [None, None]
     sofar: Value | None = None
     for k in range(1, POINTS - 1):
@@ -43,7 +43,7 @@ def write_between(t: Module, name: str = "between", to: tuple[str, Layout] | Non
     """The polynomial at the time `next`."""
     pointer = to[0] if to else "work"
     f, s = t.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
-    ahead = [t.spread(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
+    ahead = [t.broadcast(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
     if not to:
         setattr(s, "X t", s.next)
     with f.each(t.registers(pointer)) as r:

@@ -1,4 +1,4 @@
-"""Steps with care: where elimination must not trust a pivot, a rank-revealing method on all rows takes its place."""
+"""Fallback steps: where elimination must not trust a pivot, a rank-revealing method on all rows takes its place."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.least_norm import LEAST_NORM
 from udkjax.native.manifold import iterate_newton, with_threshold
 from udkjax.native.module import Module
-from udkjax.native.steps import NOTHING_LEFT
+from udkjax.native.steps import ROUNDING_PIVOT
 
 
 def entries(t: Module, f: Function) -> Any:
@@ -40,7 +40,7 @@ def write_solve(t: Module):
 
 
 def write_fallback(t: Module):
-    """What a rank-revealing method on all rows finds, of lanes that want care, one after the other."""
+    """What a rank-revealing method on all rows finds, of lanes that fall back on it, one after the other."""
     code, p, n, m, width = t.code, t.places, t.n, t.m, t.plan.width
     slots, number, one = code.pattern.value_count, t.lane_number, lambda f: f.const(1.0, DOUBLE, width)
 
@@ -57,78 +57,78 @@ def write_fallback(t: Module):
         """`x` of a lane, with D and what else is in R of the state in X."""
         with f.each(m) as i:
             f.store(number(f, name, k, i + start), right, i)
-        f.call("solve", f.given["work"], k, right, x, number(f, "care", k, 0))
+        f.call("solve", f.given["work"], k, right, x, number(f, "fallback_tol", k, 0))
 
     def root(f: Function, k: Value, i: Value) -> Value:
         return number(f, "R", k, i + (slots + m + n))
 
     # The accelerations of lanes whose pivots were not safe.
-    f, s = t.function("accelerate_carefully", [(POINTER, "work"), (POINTER, "out")])
+    f, s = t.function("accelerate_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     t.invoke(f, "equation_terms")
-    for k, right, x in each_lane(f, (s.judged > 0.5) & (s.careful > 0.5) & (s.safe < 0.5)):
+    for k, right, x in each_lane(f, (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5)):
         solved(f, k, right, x, "R", slots)
         with f.each(n) as i:
             a = f.fma(root(f, k, i), f.load(x, i), number(f, "R", k, i + (slots + m)))
             f.store(a, f.given["out"], i * width + k)
-    # The end of a step taken with care: Newton's method in position, velocities and accelerations there where the pivots are
+    # The end of a fallback step: Newton's method in position, velocities and accelerations there where the pivots are
     # not safe; and, whether they are or not, what projection leaves of the errors.
-    f, s = t.function("arrive_carefully", [(POINTER, "work"), (POINTER, "out")])
-    careful = (s.judged > 0.5) & (s.careful > 0.5)
+    f, s = t.function("finish_by_fallback", [(POINTER, "work"), (POINTER, "out")])
+    fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
 
-    def closer(moving: Value):
+    def closer(active: Value):
         t.invoke(f, "equation_terms")
         t.invoke(f, "psi")
         with f.each(t.rowcount) as r:
             t.put(f, "C", r, t.vector(f, "X q", r))
-        for k, right, x in each_lane(f, moving):
+        for k, right, x in each_lane(f, active):
             solved(f, k, right, x, "psi")
             with f.each(n) as i:
                 put(f, "C", k, i, number(f, "X q", k, i) - root(f, k, i) * f.load(x, i))
 
-    iterate_newton(t, f, s, careful & (s.ok < 0.5), closer)
+    iterate_newton(t, f, s, fallback & (s.ok < 0.5), closer)
     t.invoke(f, "equation_terms")
-    doubtful = careful & (s.ok < 0.5)
-    with f.if_(f.any_of(doubtful)):
+    due_for_fallback = fallback & (s.ok < 0.5)
+    with f.if_(f.any_of(due_for_fallback)):
         t.invoke(f, "psi_dot")
-        for k, right, x in each_lane(f, doubtful):
+        for k, right, x in each_lane(f, due_for_fallback):
             solved(f, k, right, x, "psi")
             with f.each(n) as i:
                 put(f, "O v", k, i, number(f, "X v", k, i) - root(f, k, i) * f.load(x, i))
         with f.each(t.rowcount) as r:
-            t.put(f, "X v", r, f.select(doubtful, t.vector(f, "O v", r), t.vector(f, "X v", r)))
+            t.put(f, "X v", r, f.select(due_for_fallback, t.vector(f, "O v", r), t.vector(f, "X v", r)))
         t.invoke(f, "accelerations", "C")
         with f.each(t.rowcount) as r:
-            t.put(f, "O a", r, f.select(doubtful, t.vector(f, "C", r), t.vector(f, "O a", r)))
-        with f.if_(f.any_of(doubtful & (s.safe < 0.5))):
-            f.call("accelerate_carefully", f.given["work"], t.address(f, "O a"))
-    for k, right, x in each_lane(f, careful):
+            t.put(f, "O a", r, f.select(due_for_fallback, t.vector(f, "C", r), t.vector(f, "O a", r)))
+        with f.if_(f.any_of(due_for_fallback & (s.safe < 0.5))):
+            f.call("accelerate_by_fallback", f.given["work"], t.address(f, "O a"))
+    for k, right, x in each_lane(f, fallback):
         for d in ("dq", "dv"):
             with f.each(m) as i:
                 f.store(0.0, right, i)
             for row, column, slot, sign in entries(t, f):
                 part = number(f, "R", k, slot) * sign * number(f, f"X {d}", k, column) / root(f, k, column)
                 f.store(f.load(right, row) + part, right, row)
-            f.call("solve", f.given["work"], k, right, x, f.const(np.sqrt(NOTHING_LEFT)))
+            f.call("solve", f.given["work"], k, right, x, f.const(np.sqrt(ROUNDING_PIVOT)))
             with f.each(n) as i:
                 put(f, f"O {d}", k, i, number(f, f"X {d}", k, i) - root(f, k, i) * f.load(x, i))
 
 
 def write_fallback_by_loops(t: Module):
     """As `_care`, of a large scene: by elimination of all rows, without those whose pivots are small."""
-    f, s = t.function("accelerate_carefully", [(POINTER, "work"), (POINTER, "out")])
-    t.invoke(f, "careful_accelerations")
-    take_lanes(t, f, (s.judged > 0.5) & (s.careful > 0.5) & (s.safe < 0.5), "careful a", "out")
-    f, s = t.function("arrive_carefully", [(POINTER, "work"), (POINTER, "out")])
-    careful, doubtful = (s.judged > 0.5) & (s.careful > 0.5), s.ok < 0.5
-    iterate_newton(t, f, s, careful & doubtful, lambda moving: t.invoke(f, "careful_newton_q"))
-    with f.if_(f.any_of(careful & doubtful)):
-        t.invoke(f, "careful_project_and_accelerate")
+    f, s = t.function("accelerate_by_fallback", [(POINTER, "work"), (POINTER, "out")])
+    t.invoke(f, "fallback_accelerations")
+    select_lanes(t, f, (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5), "fallback a", "out")
+    f, s = t.function("finish_by_fallback", [(POINTER, "work"), (POINTER, "out")])
+    fallback, due_for_fallback = (s.stepping > 0.5) & (s.fallback > 0.5), s.ok < 0.5
+    iterate_newton(t, f, s, fallback & due_for_fallback, lambda active: t.invoke(f, "fallback_newton_q"))
+    with f.if_(f.any_of(fallback & due_for_fallback)):
+        t.invoke(f, "fallback_project_and_accelerate")
         for x in "va":
-            take_lanes(t, f, careful & doubtful, f"careful {x}", f"O {x}")
-    with_threshold(t, f, s, f.const(NOTHING_LEFT, DOUBLE, f.width), lambda: t.invoke(f, "careful_tangent_part"))
+            select_lanes(t, f, fallback & due_for_fallback, f"fallback {x}", f"O {x}")
+    with_threshold(t, f, s, f.const(ROUNDING_PIVOT, DOUBLE, f.width), lambda: t.invoke(f, "fallback_tangent_part"))
 
 
-def take_lanes(t: Module, f: Function, mask: Value, source: str, to: str):
+def select_lanes(t: Module, f: Function, mask: Value, source: str, to: str):
     """An array of coordinates from another, in some lanes."""
     start = 0 if to == "out" else t.places[to] * f.width
     pointer = f.given["out" if to == "out" else "work"]

@@ -22,7 +22,7 @@ VERSION = (0, 1)
 
 def handler(trajectory: Trajectory, name: str) -> Function:
     """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions."""
-    f, fields = Function(name, [(POINTER, "frame")], returns="ptr", rare=True), trajectory.call_fields
+    f, fields = Function(name, [(POINTER, "frame")], returns="ptr", cold=True), trajectory.call_fields
     inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
     frame = f.given["frame"]
 

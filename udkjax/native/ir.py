@@ -39,7 +39,7 @@ class Value:
 
     @property
     def type(self) -> str:
-        return typed(self.base, self.width)
+        return llvm_type(self.base, self.width)
 
     def __add__(self, other):
         return self.f.arithmetic("add", self, other)
@@ -107,11 +107,11 @@ class Variable:
 
     def __init__(self, f: "Function", base: str, width: int):
         self.f, self.base, self.width = f, base, width
-        self.place = f.reserve(typed(base, width))
+        self.place = f.reserve(llvm_type(base, width))
 
     @property
     def value(self) -> Value:
-        return self.f.op(f"load {typed(self.base, self.width)}, ptr {self.place}", self.base, self.width)
+        return self.f.op(f"load {llvm_type(self.base, self.width)}, ptr {self.place}", self.base, self.width)
 
     @value.setter
     def value(self, new: Operand):
@@ -126,14 +126,14 @@ class Variable:
 class Function:
     """A function. `name` and `arguments` (pairs of base type and name) are those of its definition.
 
-    One that runs `rare`ly is left as it is written: LLVM's optimizations would take longer than it ever runs.
+    One that is `cold` is left as it is written: LLVM's optimizations would take longer than it ever runs.
     """
 
     def __init__(
-        self, name: str, arguments: Sequence[tuple[str, str]], width: int = 1, returns: str = "void", rare: bool = False
+        self, name: str, arguments: Sequence[tuple[str, str]], width: int = 1, returns: str = "void", cold: bool = False
     ):
-        self.name, self.width, self.returns, self.rare = name, width, returns, rare
-        self.apart = False  # whether it is to be called, and never put in place of its call
+        self.name, self.width, self.returns, self.cold = name, width, returns, cold
+        self.noinline = False  # whether it is to be called, and never put in place of its call
         self._arguments, self._lines, self._reserved = list(arguments), [], []
         self._count, self.declared = 0, set()
         self.given = {n: Value(self, f"%{n}", base) for base, n in arguments}
@@ -161,8 +161,8 @@ class Function:
         arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{n}" for base, n in self._arguments)
         end = "ret void" if self.returns == "void" else None
         body = "\n  ".join([*self._reserved, *self._lines, *([end] if end else [])])
-        rare = " cold noinline optnone" if self.rare else " noinline" if self.apart else ""
-        return f"define {self.returns} @{self.name}({arguments}){rare} {{\n  {body}\n}}\n"
+        cold = " cold noinline optnone" if self.cold else " noinline" if self.noinline else ""
+        return f"define {self.returns} @{self.name}({arguments}){cold} {{\n  {body}\n}}\n"
 
     # --- values
 
@@ -175,10 +175,10 @@ class Function:
         if not isinstance(x, Value):
             return self.const(x, base, width)
         if x.base == INT and base == DOUBLE:
-            x = self.op(f"sitofp {x.type} {x.name} to {typed(DOUBLE, x.width)}", DOUBLE, x.width)
+            x = self.op(f"sitofp {x.type} {x.name} to {llvm_type(DOUBLE, x.width)}", DOUBLE, x.width)
         if x.base == BOOL and base != BOOL:
             to = "uitofp" if base == DOUBLE else "zext"
-            x = self.op(f"{to} {x.type} {x.name} to {typed(base, x.width)}", base, x.width)
+            x = self.op(f"{to} {x.type} {x.name} to {llvm_type(base, x.width)}", base, x.width)
         if x.base != base:
             raise TypeError(f"{x.base} for {base}")
         return x if x.width == width else self.repeat(x, width)
@@ -187,7 +187,7 @@ class Function:
         """The same number in all lanes."""
         if x.width != 1:
             raise TypeError(f"{x.width} lanes for {width}")
-        kind = typed(x.base, width)
+        kind = llvm_type(x.base, width)
         one = self.op(f"insertelement {kind} poison, {x.base} {x.name}, i64 0", x.base, width)
         return self.op(f"shufflevector {kind} {one.name}, {kind} poison, <{width} x i32> zeroinitializer", x.base, width)
 
@@ -224,7 +224,7 @@ class Function:
         """An intrinsic function of LLVM on numbers, lane by lane: fma, sqrt, fabs, maximum, minimum, floor, exp, log, pow, ..."""
         width = max((x.width for x in arguments if isinstance(x, Value)), default=1)
         values = [self.like(x, DOUBLE, width) for x in arguments]
-        kind = typed(DOUBLE, width)
+        kind = llvm_type(DOUBLE, width)
         full = f"llvm.{name}.{'f64' if width == 1 else f'v{width}f64'}"
         self.declared.add(f"declare {kind} @{full}({', '.join([kind] * len(values))})")
         return self.op(f"call {kind} @{full}({', '.join(f'{kind} {v.name}' for v in values)})", DOUBLE, width)
@@ -248,7 +248,7 @@ class Function:
     def is_finite(self, a: Value) -> Value:
         return self.abs(a) < float("inf")
 
-    def reduced(self, name: str, x: Value) -> Value:
+    def reduce(self, name: str, x: Value) -> Value:
         """All lanes together: `or` and `and` of conditions, `fmax` of numbers."""
         if x.width == 1:
             return x
@@ -257,10 +257,10 @@ class Function:
         return self.op(f"call {x.base} @{full}({x.type} {x.name})", x.base)
 
     def any_of(self, mask: Value) -> Value:
-        return self.reduced("or", mask)
+        return self.reduce("or", mask)
 
     def all_of(self, mask: Value) -> Value:
-        return self.reduced("and", mask)
+        return self.reduce("and", mask)
 
     def lane(self, x: Value, k: Value) -> Value:
         """The number in one lane."""
@@ -285,7 +285,7 @@ class Function:
 
     def load(self, pointer: Value, k: Operand = 0, width: int = 1, base: str = DOUBLE) -> Value:
         place = self.at(pointer, k, base)
-        return self.op(f"load {typed(base, width)}, ptr {place.name}, align 8", base, width)
+        return self.op(f"load {llvm_type(base, width)}, ptr {place.name}, align 8", base, width)
 
     def store(self, x: Operand, pointer: Value, k: Operand = 0, width: int = 1, base: str = DOUBLE):
         x = self.like(x, base, width)
@@ -348,6 +348,6 @@ class Function:
             k.value = k.value + 1
 
 
-def typed(base: str, width: int) -> str:
+def llvm_type(base: str, width: int) -> str:
     """The type of so many lanes."""
     return base if width == 1 else f"<{width} x {base}>"

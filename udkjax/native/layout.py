@@ -7,7 +7,7 @@ from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.steps import POINTS
 from udkjax.native.tableau import Method
 
-SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "care", "max_steps")
+SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_tol", "max_steps")
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")
 INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the last q and v
@@ -45,31 +45,52 @@ class Layout:
         return self.places[name]
 
 
-LANE_NUMBERS = (  # numbers of each lane; `call` and `ways` are addresses
-    *("call", "ways"),
-    *(
-        "t1",
-        "step",
-        "error",
-        "distance",
-        "last",
-        "lands",
-        "h",
-        "rate",
-        "code",
-        "doubt",
-        "retries",
-        "tried",
-        "accepted",
-        "evaluations",
-    ),
-    *("written", "steps", "member", "active", "judged", "begin", "careful", "ok", "until", "due", "next", "tolerance", "moving"),
-    *(f"T{k}" for k in range(POINTS)),
-    *(f"distance{k}" for k in range(POINTS - 1)),
-    *SETTINGS,
-    *("start", "end", "safe", "behind", "violated", "rank"),
-    *("crossing", "aim", "tries", "share", "low", "again"),
-)
+LANE_NUMBERS = {  # numbers of each lane, and what they are
+    "call": "address of the record that `run` is called with",
+    "tangents": "address of the memory of directions",
+    "member": "number of the member in the lane",
+    "active": "whether there is one",
+    "stepping": "whether it takes part in this attempt at a step",
+    "code": "how it ended, or that it runs",
+    **dict.fromkeys(SETTINGS, "settings of the member"),
+    "start": "first time (s)",
+    "end": "last time (s)",
+    **{f"T{k}": "time of an accepted state (s), the last is the latest" for k in range(POINTS)},
+    "h": "step that the controller wants (s)",
+    "t1": "end of this attempt (s)",
+    "step": "its length (s); 0 where a run begins",
+    "begin": "whether a run begins here: at the start, or behind a breakpoint",
+    "last": "whether the attempt ends at the end of the run",
+    "lands": "whether it ends at a breakpoint",
+    "behind": "time behind the breakpoints at the current time (s)",
+    "steps": "accepted steps since the run began anew",
+    "error": "of the attempt, relative to the tolerance",
+    "rate": "error of the step before over its length to the power of the order",
+    "ok": "whether all pivots of the attempt were safe",
+    "safe": "whether those of the latest program were",
+    "fallback": "whether the attempt is by the fallback",
+    "fallback_due": "whether the next one must be",
+    "retries": "attempts that were shortened for the sake of a pivot, in a row",
+    "distance": "from singular configurations: the smallest pivot relative to its diagonal, as a root",
+    **{f"distance{k}": "the same of the accepted states before" for k in range(POINTS - 1)},
+    "tolerance": "what the fastest velocity may err, in its unit",
+    "rank": "of D, as the fallback found it",
+    "iterating": "whether Newton's method goes on",
+    "violated": "the largest violation of Psi at an output, over the row's scale",
+    "next": "next output time (s)",
+    "until": "outputs up to here are due (s)",
+    "due": "lanes that are concerned, of what is called",
+    "tried": "attempts so far",
+    "accepted": "accepted steps so far",
+    "evaluations": "accelerations so far",
+    "written": "outputs so far",
+    "crossing": "where a piece of the state is expected to end (s)",
+    "aim": "where the attempt is to end: before that, beyond it, or across",
+    "tries": "attempts to end there, in a row",
+    "share": "of the attempt: upper bound of where the piece ends",
+    "low": "lower bound of that",
+    "again": "whether the attempt is taken again, to end there",
+}
 
 
 class Lane:

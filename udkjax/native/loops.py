@@ -6,7 +6,7 @@ import numpy as np
 
 from udkjax.expressions.loop_program import ADD, MINIMUM, Address, Kernel, LoopProgram, Reset
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.program import Place, Writer, as_stored
+from udkjax.native.program import Place, Writer, from_memory
 
 
 class LoopWriter:
@@ -47,13 +47,13 @@ class LoopWriter:
         key = kernel, columns, width
         if key not in self._kernels:
             self._kernels[key] = name = f"loop{len(self._kernels)}"
-            self.functions.append(self._written(kernel, columns, width, name))
+            self.functions.append(self._write_result(kernel, columns, width, name))
         return self._kernels[key]
 
-    def _written(self, kernel: Kernel, columns: int, width: int, name: str) -> Function:
+    def _write_result(self, kernel: Kernel, columns: int, width: int, name: str) -> Function:
         """`name(arrays..., table, count)`, of a table with so many columns."""
         f = Function(name, [*((POINTER, a) for a in kernel.arrays), (POINTER, "table"), (INT, "count")], width)
-        f.apart = True  # copies of kernels in each of their programs would take as often as long to compile
+        f.noinline = True  # copies of kernels in each of their programs would take as often as long to compile
         with f.each(f.given["count"]) as i:
             row = f.at(f.given["table"], i * columns, "i32")
             bases: dict[tuple[str, int], Value] = {}
@@ -70,7 +70,7 @@ class LoopWriter:
             writer = Writer(f, kernel.program)
             for s, slot in zip(kernel.program.inputs, kernel.inputs, strict=True):
                 if kernel.program.uses(s):
-                    writer.known[s.index] = as_stored(f, f.load(*address(slot), width), s.node.dtype)
+                    writer.known[s.index] = from_memory(f, f.load(*address(slot), width), s.node.dtype)
             for value, slot in zip(writer.run(), kernel.outputs, strict=True):
                 new = f.like(value, DOUBLE, width)
                 if slot.update == ADD:

@@ -1,6 +1,6 @@
-"""Machine code for this processor from LLVM's text, and where it is kept on disk.
+"""Machine code for this processor from LLVM's text, and its cache on disk.
 
-What is kept is object code as the compiler leaves it, under a digest of the text, the processor and the compiler: plain bytes. A
+The cache holds object code as the compiler leaves it, under a digest of the text, the processor and the compiler: plain bytes. A
 file that is not whole is made again; the oldest go when there are too many.
 """
 
@@ -21,7 +21,7 @@ LEVEL = 1  # of code generation: 2 takes a fifth longer, and runs take as long
 # Optimizations of the text before that. Programs come without common subexpressions and dead code: all that LLVM's own selection
 # of level 1 adds is two percent of a run's time, for half of the time of compiling.
 PASSES = ("sroa", "simplify_cfg")
-KEPT_FILES = 2_000  # object files: some 100 MB
+MAX_FILES = 2_000  # object files: some 100 MB
 _MAGIC = b"udkjax object 1\n"
 
 
@@ -95,13 +95,13 @@ def library(text: str, names: Sequence[str]) -> Library:
     folder = cache_folder()
     code = _read(folder / name) if folder else None
     if code is None:
-        code = compiled(text)
+        code = compile_module(text)
         if folder:
             _write(folder / name, code)
     return Library(code, names)
 
 
-def compiled(text: str) -> bytes:
+def compile_module(text: str) -> bytes:
     """Object code of a module."""
     llvm, machine = _llvm(), target_machine()
     module = llvm.parse_assembly(text)
@@ -115,14 +115,14 @@ def compiled(text: str) -> bytes:
 
 
 def cache_folder() -> Path | None:
-    """Where code is kept: in the user's cache folder, or where `UDKJAX_CACHE` says; None where that is 0."""
+    """Where code is stored: in the user's cache folder, or where `UDKJAX_CACHE` says; None where that is 0."""
     choice = os.environ.get("UDKJAX_CACHE", "").strip()
     if choice == "0":
         return None
     return Path(choice).expanduser() if choice else platformdirs.user_cache_path("udkjax")
 
 
-def kept() -> list[tuple[float, int, Path]]:
+def cached_files() -> list[tuple[float, int, Path]]:
     """When each file of code was last used or made, its size in bytes, and where it is."""
     folder, found = cache_folder(), []
     try:
@@ -154,8 +154,8 @@ def _write(path: Path, code: bytes):
             file.write(_MAGIC + hashlib.sha256(code).digest() + code)
         os.replace(temporary, path)
         files = [p for p in path.parent.iterdir() if p.is_file()]
-        if len(files) > KEPT_FILES:
-            for old in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) - KEPT_FILES]:
+        if len(files) > MAX_FILES:
+            for old in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) - MAX_FILES]:
                 old.unlink(missing_ok=True)
     except OSError:  # nowhere to write: it runs all the same
         return

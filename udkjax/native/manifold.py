@@ -7,37 +7,37 @@ from udkjax.equations.scene_programs import EliminationPrograms
 from udkjax.native.ir import DOUBLE, INT, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
-from udkjax.native.steps import FAR, NEAR, NEWTON_STEPS, OUTPUT_STEPS, USELESS
+from udkjax.native.steps import NEWTON_STEPS, NEWTON_TOL, OUTPUT_PIVOT_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
 
 
-def newton(t: Module, f: Function, s: Lane, steps: int, which: str = "judged"):
-    """Newton's method to Psi = 0 of lanes that are `judged`, until it moves nothing but rounding errors."""
+def newton(t: Module, f: Function, s: Lane, steps: int, which: str = "stepping"):
+    """Newton's method to Psi = 0 of lanes that are `stepping`, until it moves nothing but rounding errors."""
 
-    def closer(moving: Value):
+    def closer(active: Value):
         t.invoke(f, "newton_q")
-        s.where(moving & (s.safe < 0.5), ok=0.0)
+        s.where(active & (s.safe < 0.5), ok=0.0)
 
     iterate_newton(t, f, s, getattr(s, which) > 0.5, closer, steps)
 
 
 def iterate_newton(t: Module, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):
     """Newton's method of some lanes: `closer` leaves X q nearer to the manifold in C."""
-    s.moving = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+    s.iterating = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
     k = f.variable(0, INT, 1)
-    with f.while_(lambda: f.any_of(s.moving > 0.5) & (k.value < steps)):
-        moving = s.moving > 0.5
-        closer(moving)
-        change = take_newton_step(t, f, moving)
-        s.moving = f.select(moving & ~(change <= FAR), f.const(1.0, DOUBLE, f.width), 0.0)
+    with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < steps)):
+        active = s.iterating > 0.5
+        closer(active)
+        change = take_newton_step(t, f, active)
+        s.iterating = f.select(active & ~(change <= NEWTON_TOL), f.const(1.0, DOUBLE, f.width), 0.0)
         k.value = k.value + 1
 
 
-def take_newton_step(t: Module, f: Function, moving: Value) -> Value:
+def take_newton_step(t: Module, f: Function, active: Value) -> Value:
     """Take X q from C in lanes that move; return the largest change, in the scene's own units."""
 
     def change(r: Value) -> list[Value]:
         old, new = t.vector(f, "X q", r), t.vector(f, "C", r)
-        t.put(f, "X q", r, f.select(moving, new, old))
+        t.put(f, "X q", r, f.select(active, new, old))
         return [f.abs(new - old) * t.vector(f, "inverse unit", r)]
 
     return t.largest(f, change)
@@ -64,8 +64,8 @@ def velocity_tolerance(t: Module, f: Function, s: Lane, name: str) -> Value:
 def project_output(t: Module, f: Function, s: Lane, which: str):
     """Return X q and X v to the manifold, as X q and O v; `violated` is how far they are from it."""
     if t.plan.projected:
-        threshold = f.const(USELESS, DOUBLE, f.width)
-        if not t.doubts:
+        threshold = f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width)
+        if not t.checks_pivots:
             threshold = None
 
         def iterate():
@@ -79,7 +79,7 @@ def project_output(t: Module, f: Function, s: Lane, which: str):
             t.invoke(f, "project")
             mask = getattr(s, which) > 0.5
             change = take_newton_step(t, f, mask)
-            with f.if_(f.any_of(mask & ~(change <= NEAR))):
+            with f.if_(f.any_of(mask & ~(change <= SINGLE_STEP_TOL))):
                 iterate()
 
         close() if threshold is None else with_threshold(t, f, s, threshold, close)

@@ -3,7 +3,7 @@
 A step predicts by the Taylor polynomial of q(s) to the third order, from q', q'' and the change of q'', and corrects twice by
 Newton's method with elimination. All lanes take the same steps: nothing depends on how one of them fares. What is to be relied
 on is counted: as long as each position is closed to rounding, lies near its prediction, the tangent has turned little since the
-one before, and no row is near dependence. From there on, whoever asked goes on with care.
+one before, and no row is near dependence. From there on, the caller goes on by singular values.
 """
 
 from typing import Any
@@ -43,7 +43,7 @@ class Marching(Trajectory):
         write_begin(self)
         self._march()
         write_run(self)
-        return self.joined()
+        return self.module_text()
 
     def program_names(self, code: Any) -> dict[str, Any]:
         return {"newton_q": code.newton_q}
@@ -87,8 +87,8 @@ class Marching(Trajectory):
             self.invoke(f, "value_derivatives")
             off, largest = f.variable(0.0), f.variable(1.0)
             along, one, other = f.variable(0.0), f.variable(0.0), f.variable(0.0)
-            apart = h.is_not(0.0)
-            per_h = f.select(apart, wide(1.0) / f.select(apart, h, wide(1.0)), wide(0.0))
+            noinline = h.is_not(0.0)
+            per_h = f.select(noinline, wide(1.0) / f.select(noinline, h, wide(1.0)), wide(0.0))
             with f.each(self.n) as i:
                 unit, q = get("inverse unit", i), get("X q", i)
                 largest.value = f.max(f.abs(q) * unit, largest.value)

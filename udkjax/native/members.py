@@ -8,7 +8,7 @@ from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.manifold import project_output
 from udkjax.native.module import Module
-from udkjax.native.steps import AHEAD, DONE, NOT_FINITE, POINTS, STEP_LIMIT
+from udkjax.native.steps import DONE, LOOK_AHEAD, NOT_FINITE, POINTS, STEP_LIMIT
 
 
 def write_begin(t: Module):
@@ -22,7 +22,7 @@ def write_begin(t: Module):
         f.store(value, work, f.like(i, INT, 1) * width + p[name] * width + k)
 
     for name in LANE_NUMBERS:
-        if name not in SETTINGS and name not in ("judged", "call", "ways"):
+        if name not in SETTINGS and name not in ("stepping", "call", "tangents"):
             put(name, 0.0)
     given = t.member_address(f, call, "settings", member)
     settings = {name: f.load(given, j) for j, name in enumerate(SETTINGS)}
@@ -72,12 +72,12 @@ def write_finish(t: Module):
     # Why the step size fell to nothing: a number that is not finite, at the end or right ahead, or something else.
     stopped = s.due.is_(1.0) & s.code.is_not(float(DONE)) & s.code.is_not(float(STEP_LIMIT))
     with f.if_(f.any_of(stopped)):
-        for share in (0.0, AHEAD):
+        for share in (0.0, LOOK_AHEAD):
             later = (s.end - s.start) * share
             setattr(s, "X t", s.T3 + later)
             with f.each(t.rowcount) as r:
                 v = t.vector(f, "P3 v", r)
-                t.put(f, "X q", r, f.fma(t.spread(f, later), v, t.vector(f, "P3 q", r)))
+                t.put(f, "X q", r, f.fma(t.broadcast(f, later), v, t.vector(f, "P3 q", r)))
                 t.put(f, "X v", r, v)
             t.invoke(f, "equation_terms")
             total = f.variable(0.0)

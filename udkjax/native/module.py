@@ -11,16 +11,16 @@ from udkjax.expressions import ScalarProgram
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import INPUTS, LANE_NUMBERS, OUTPUTS, Lane, Layout, Plan
 from udkjax.native.loops import LoopWriter
-from udkjax.native.program import Place, numbered, write
+from udkjax.native.program import Place, consecutive, write
 from udkjax.native.steps import POINTS
 
 # Once a run, beside singularities, or where a piece may end.
-RARE = (
+COLD = (
     "leave",
     "finish_members",
     "begin",
-    "arrive_carefully",
-    "accelerate_carefully",
+    "finish_by_fallback",
+    "accelerate_by_fallback",
     "equation_terms",
     "psi_dot",
     "newton_v_and_psi",
@@ -75,32 +75,32 @@ class Module:
         if isinstance(code, LoopPrograms):
             for name, count in code.scratch.items():
                 p.add(name, count)
-            if self.cares:
+            if self.falls_back:
                 for name, count in code.with_all_rows.scratch.items():
-                    p.add(f"careful {name}", count)
-                for name in ("careful v", "careful a"):
+                    p.add(f"fallback {name}", count)
+                for name in ("fallback v", "fallback a"):
                     p.add(name, n)
-        self.ways = self.places  # of one direction of a derivative
+        self.tangents = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
         self.loops = LoopWriter(plan.width)
         self.stage_accelerations = ["P3 a", *(f"A{i}" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
         self.drop = code.drop_tol_index
 
-    def joined(self) -> str:
+    def module_text(self) -> str:
         functions = [*self.functions, *self.loops.functions]
         declared = sorted(set().union(*(f.declared for f in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
         return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
 
     @property
-    def doubts(self) -> bool:
+    def checks_pivots(self) -> bool:
         """Whether pivots may be too small to be trusted."""
         return isinstance(self.code, EliminationPrograms | LoopPrograms) and self.code.policy.reports
 
     @property
-    def cares(self) -> bool:
-        """Whether steps may be taken again with care."""
-        return self.doubts and self.m > 0
+    def falls_back(self) -> bool:
+        """Whether steps may be taken again by a rank-revealing method."""
+        return self.checks_pivots and self.m > 0
 
     def write_programs(self):
         code, n = self.code, self.n
@@ -113,7 +113,7 @@ class Module:
             self.work_places("safe", 1),
         )
         outputs = {
-            "accelerations": [*numbered("out", n), *safe],
+            "accelerations": [*consecutive("out", n), *safe],
             "newton_q": [*self.work_places("C", n), *safe],
             "project_and_accelerate": [*self.work_places("O v", n), *self.work_places("O a", n), *safe],
             "end_of_step": [
@@ -132,8 +132,8 @@ class Module:
         for name, program in self.program_names(code).items():
             inputs = [*state, *changes] if name in ("tangent_part", "end_of_step") else state
             self.write_program(program, name, ("work", "out"), inputs, outputs[name])
-        inputs = numbered("work", len(code.prologue.inputs))
-        self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, numbered("out", self.constants)))
+        inputs = consecutive("work", len(code.prologue.inputs))
+        self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, consecutive("out", self.constants)))
 
     def write_loop_programs(self, code: LoopPrograms):
         found = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
@@ -142,18 +142,18 @@ class Module:
         at = {x: ("work", self.places[found.get(x, x)]) for x in (*results, *code.scratch)}
         for name, program in self.program_names(code).items():
             self.loops.write(program, name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {}))
-        if self.cares:
+        if self.falls_back:
             every = code.with_all_rows
-            places = {x: f"careful {x}" for x in every.scratch}
-            places |= {"v1": "careful v", "a": "careful a", "safe": "rank", "distance": "rank"}
-            careful = at | {x: ("work", self.places[place]) for x, place in places.items()}
+            places = {x: f"fallback {x}" for x in every.scratch}
+            places |= {"v1": "fallback v", "a": "fallback a", "safe": "rank", "distance": "rank"}
+            fallback = at | {x: ("work", self.places[place]) for x, place in places.items()}
             for name, program in {
                 "accelerations": every.accelerations,
                 "newton_q": every.newton_q,
                 "project_and_accelerate": every.project_and_accelerate,
                 "tangent_part": every.tangent_part,
             }.items():
-                self.loops.write(program, f"careful_{name}", ("work", "out"), careful)
+                self.loops.write(program, f"fallback_{name}", ("work", "out"), fallback)
         at = {"numbers": ("work", 0), "constants": ("out", 0)}
         self.loops.write(code.prologue, "prologue", ("work", "out"), at, width=1)
 
@@ -171,15 +171,15 @@ class Module:
             wanted["newton_v_and_psi"] = code.newton_v_and_psi
             if isinstance(code, EliminationPrograms):
                 wanted["project"] = code.project
-        if self.cares and isinstance(code, ScenePrograms):
+        if self.falls_back and isinstance(code, ScenePrograms):
             wanted["psi_dot"] = code.psi_dot
         return wanted
 
     def write_program(
         self, program: ScalarProgram, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]
     ):
-        lanes = {x: self.ways.width for x in ("way", "out") if "way" in pointers}
-        self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs, name in RARE, lanes))
+        lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers}
+        self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs, name in COLD, lanes))
 
     def work_places(self, name: str, count: int) -> list[Place]:
         return [("work", self.places[name] + k) for k in range(count)]
@@ -190,13 +190,13 @@ class Module:
         return [place for name, count in counts.items() for place in self.work_places(name, count)]
 
     def function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
-        f = Function(name, arguments, self.plan.width, rare=name in RARE)
+        f = Function(name, arguments, self.plan.width, cold=name in COLD)
         self.functions.append(f)
         return f, Lane(f, self.places)
 
     def layout(self, pointer: str) -> Layout:
         """How the memory at a pointer is laid out."""
-        return self.places if pointer == "work" else self.ways
+        return self.places if pointer == "work" else self.tangents
 
     def start(self, name: str, pointer: str) -> int:
         """Where an array is, in numbers from a pointer."""
@@ -214,7 +214,7 @@ class Module:
     def put(self, f: Function, name: str, r: Value, x: Value, pointer: str = "work"):
         f.store(x, f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
 
-    def spread(self, f: Function, x: Value) -> Value:
+    def broadcast(self, f: Function, x: Value) -> Value:
         """A number of each lane, to go with registers of coordinates."""
         return x if x.width == self.plan.vector else f.repeat(x, self.plan.vector)
 
@@ -225,7 +225,7 @@ class Module:
             for x in values(r):
                 worst.value = f.max(x, worst.value)
         found = worst.value
-        return found if self.plan.width > 1 else f.reduced("fmax", found)
+        return found if self.plan.width > 1 else f.reduce("fmax", found)
 
     def total(self, f: Function, x: Value) -> Value:
         name = f"llvm.vector.reduce.fadd.v{x.width}f64"

@@ -40,7 +40,7 @@ class Kind(NamedTuple):
     method: "Tableau"
     projected: bool
     breaks: bool
-    moving: tuple[bool, ...] | None = None  # of a run with derivatives: of which constants
+    active: tuple[bool, ...] | None = None  # of a run with derivatives: of which constants
     mode: str = "run"  # or "forward", "reverse", "closing" and its derivatives, "marching"
 
 
@@ -63,7 +63,7 @@ CLOSING_BY_LOOPS: dict[str, Any] = {"closing forward": ForwardByLoops, "closing 
 
 
 @lru_cache(maxsize=256)
-def written(kind: Kind, width: int, several: bool = False) -> Trajectory:
+def generate(kind: Kind, width: int, several: bool = False) -> Trajectory:
     """A kind of trajectory in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it.
 
     `several`: whether there may be more than one direction of a single member, which then are side by side.
@@ -74,14 +74,14 @@ def written(kind: Kind, width: int, several: bool = False) -> Trajectory:
     elif kind.mode == "closing":
         trajectory = (ClosingByLoops if loops else Closing)(kind.code, machine.lanes())
     elif kind.mode in CLOSING:
-        trajectory = (CLOSING_BY_LOOPS if loops else CLOSING)[kind.mode](kind.code, kind.moving, machine.lanes())
+        trajectory = (CLOSING_BY_LOOPS if loops else CLOSING)[kind.mode](kind.code, kind.active, machine.lanes())
     else:
         plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
         if kind.mode == "forward":
-            assert kind.moving is not None
-            trajectory = Forward(plan, kind.moving, machine.lanes() if several else width)
+            assert kind.active is not None
+            trajectory = Forward(plan, kind.active, machine.lanes() if several else width)
         else:
-            trajectory = Reverse(plan, kind.moving) if kind.moving is not None else Trajectory(plan)
+            trajectory = Reverse(plan, kind.active) if kind.active is not None else Trajectory(plan)
     main = handler(trajectory, "call_frame")
     trajectory.module = "\n".join([trajectory.text(), *sorted(main.declared), main.text()])
     return trajectory
@@ -91,8 +91,8 @@ class Compiled:
     """The machine code of one kind of trajectory, in so many lanes."""
 
     def __init__(self, kind: Kind, width: int, several: bool = False):
-        self.trajectory = written(kind, width, several)
-        self.name, self._run = loaded(self.trajectory.module)
+        self.trajectory = generate(kind, width, several)
+        self.name, self._run = load(self.trajectory.module)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Outputs of these shapes, on as many threads as there are cores."""
@@ -121,7 +121,7 @@ _LOADED: dict[str, tuple[machine.Library, Any]] = {}
 _LOADING = Lock()
 
 
-def loaded(text: str) -> tuple[str, Any]:
+def load(text: str) -> tuple[str, Any]:
     """Load the code of a module; return the name that XLA knows it by, and `run`.
 
     XLA takes one address for a name, and programs that it has compiled call that whenever they run: what was loaded once stays,
@@ -138,7 +138,7 @@ def loaded(text: str) -> tuple[str, Any]:
 
 
 @lru_cache(maxsize=256)
-def compiled(kind: Kind, width: int, several: bool = False) -> Compiled:
+def machine_code(kind: Kind, width: int, several: bool = False) -> Compiled:
     """The machine code of a kind of trajectory."""
     return Compiled(kind, width, several)
 
@@ -158,47 +158,47 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
         if kind.mode == "closing forward":
             shapes += [(members, inputs[-1].shape[1], 2 * n)]
         if kind.mode == "closing reverse":
-            assert kind.moving is not None
-            shapes += [(members, sum(kind.moving)), (members, n), (members, n)]
+            assert kind.active is not None
+            shapes += [(members, sum(kind.active)), (members, n), (members, n)]
         return shapes
     shapes = [(members, times, n), (members, times, n), (members, times), (members, len(INFO) + 2 * n)]
     if kind.mode == "forward":
         directions = inputs[-1].shape[1]
         shapes += [(members, directions, times, 2 * n), (members, directions, 2 * n)]
     if kind.mode == "reverse":
-        assert kind.moving is not None
-        shapes += [(members, sum(kind.moving)), (members, n), (members, n)]
+        assert kind.active is not None
+        shapes += [(members, sum(kind.active)), (members, n), (members, n)]
     return shapes
 
 
-def _code(inputs: Sequence[Any], kind: Kind) -> Compiled:
+def _select_code(inputs: Sequence[Any], kind: Kind) -> Compiled:
     few = kind.mode.startswith("closing") or max(x.shape[0] for x in inputs) <= FEW
     several = kind.mode == "forward" and few and inputs[-1].shape[1] > 1 and not isinstance(kind.code, LoopPrograms)
-    return compiled(kind, 1 if few else machine.lanes(), several)
+    return machine_code(kind, 1 if few else machine.lanes(), several)
 
 
-def _at_once(*inputs: Any, kind: Kind, times: int) -> list[Array]:
-    found = _code(inputs, kind)([np.asarray(x) for x in inputs], shapes_of(inputs, kind, times))
+def _call(*inputs: Any, kind: Kind, times: int) -> list[Array]:
+    found = _select_code(inputs, kind)([np.asarray(x) for x in inputs], shapes_of(inputs, kind, times))
     return [jnp.asarray(x) for x in found]
 
 
-def _compiled_into(*inputs: Any, kind: Kind, times: int) -> Sequence[Array]:
+def _lower(*inputs: Any, kind: Kind, times: int) -> Sequence[Array]:
     results = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes_of(inputs, kind, times)]
-    return jax.ffi.ffi_call(_code(inputs, kind).name, results)(*inputs)
+    return jax.ffi.ffi_call(_select_code(inputs, kind).name, results)(*inputs)
 
 
-def _abstract(*inputs: Any, kind: Kind, times: int) -> list[Any]:
+def _abstract_eval(*inputs: Any, kind: Kind, times: int) -> list[Any]:
     return [ShapedArray(shape, np.dtype(float)) for shape in shapes_of(inputs, kind, times)]
 
 
-def _batched(inputs: Sequence[Any], axes: Sequence[int | None], kind: Kind, times: int) -> tuple[list[Any], list[int | None]]:
+def _batch(inputs: Sequence[Any], axes: Sequence[int | None], kind: Kind, times: int) -> tuple[list[Any], list[int | None]]:
     """A batch is more members; but one of directions alone, more directions."""
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
-    ways = 3 if kind.mode.endswith("forward") else 0  # the last inputs, which have directions
+    tangents = 3 if kind.mode.endswith("forward") else 0  # the last inputs, which have directions
     results = len(Closing.results if kind.mode.startswith("closing") else OUTPUTS)  # the first outputs, which have none
-    shared = len(inputs) - ways
-    if ways and all(axis is None for axis in axes[:shared]):
+    shared = len(inputs) - tangents
+    if tangents and all(axis is None for axis in axes[:shared]):
 
         def directions(x: Any, axis: int | None) -> Any:
             x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else x
@@ -223,7 +223,7 @@ def _batched(inputs: Sequence[Any], axes: Sequence[int | None], kind: Kind, time
 
 native_p = Primitive("native_trajectory")
 native_p.multiple_results = True
-native_p.def_impl(_at_once)
-native_p.def_abstract_eval(_abstract)
-batching.primitive_batchers[native_p] = _batched
-mlir.register_lowering(native_p, mlir.lower_fun(_compiled_into), platform="cpu")
+native_p.def_impl(_call)
+native_p.def_abstract_eval(_abstract_eval)
+batching.primitive_batchers[native_p] = _batch
+mlir.register_lowering(native_p, mlir.lower_fun(_lower), platform="cpu")

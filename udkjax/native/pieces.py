@@ -6,7 +6,7 @@ import numpy as np
 
 from udkjax.native.ir import BOOL, DOUBLE, Function, Value
 from udkjax.native.module import Module
-from udkjax.native.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, EXACT, HALVINGS, TRIES
+from udkjax.native.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, HALVINGS, NEAR_END, TRIES
 
 
 def write_leave(t: Module):
@@ -43,8 +43,8 @@ def write_leave(t: Module):
             f.width,
         )
     find_pieces(s.t1, lambda r: (t.vector(f, "C", r), t.vector(f, "O v", r)))
-    judged, step = s.again > 0.5, s.t1 - s.T3
-    leaves = judged & (s.begin < 0.5) & moved() & f.is_finite(s.error)
+    stepping, step = s.again > 0.5, s.t1 - s.T3
+    leaves = stepping & (s.begin < 0.5) & moved() & f.is_finite(s.error)
     s.share, s.low = yes, f.const(0.0, DOUBLE, f.width)
     with f.if_(f.any_of(leaves)), f.each(HALVINGS):
         middle = (s.low + s.share) * 0.5
@@ -59,24 +59,24 @@ def write_leave(t: Module):
         t.put(f, "X v", r, t.vector(f, "O v", r))
     share, aim, good = s.share, s.aim, s.error < 1.0
     again = leaves & aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
-    exact = f.min(share, yes - share) <= EXACT
+    exact = f.min(share, yes - share) <= NEAR_END
     s.where(leaves & ~again, lands=1.0)
     short = (s.t1 < s.crossing - s.smallest) & (s.lands < 0.5)
-    reached = judged & good & ~leaves & ~short & aim.is_(float(AIM_BEFORE))
+    reached = stepping & good & ~leaves & ~short & aim.is_(float(AIM_BEFORE))
     across = reached | (again & (share <= EDGE))
     before, beyond = (f.const(float(x), DOUBLE, f.width) for x in (AIM_BEFORE, AIM_BEYOND))
     aim = where(again, where(exact, before, beyond), where(short, aim, beyond))
-    expected = f.fma(where(exact, share - EDGE / 2, share + EXACT / 2), step, s.T3)
+    expected = f.fma(where(exact, share - EDGE / 2, share + NEAR_END / 2), step, s.T3)
     crossing = where(again, expected, where(short, s.crossing, inf))
     crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.T3)), crossing)
     tries = where(again, s.tries + 1.0, where(good, 0.0, s.tries))
-    s.where(judged, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
+    s.where(stepping, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
     s.again = where(again, yes, 0.0)
 
 
 def interpolate_step(t: Module, f: Function, share: Value, step: Value, r: Value) -> tuple[Value, Value]:
     """q and v a share of the step ahead, on the polynomial through its two ends (one register)."""
-    x, h = t.spread(f, share), t.spread(f, step)
+    x, h = t.broadcast(f, share), t.broadcast(f, step)
 
     def along(*coefficients: float) -> Value:
         total = f.const(coefficients[-1], DOUBLE, t.plan.vector)

@@ -2,7 +2,7 @@
 
 import math
 
-from udkjax.native.ir import DOUBLE, INT, Function, Value, typed
+from udkjax.native.ir import DOUBLE, INT, Function, Value, llvm_type
 
 TERMS = 10  # of both series: to 1e-9 and better
 BIAS, FRACTION = 1023, 52  # of float64
@@ -26,7 +26,7 @@ def _whole(f: Function, x: Value, n: int) -> Value:
 
 def _log2(f: Function, x: Value) -> Value:
     """By the exponent, and of the fraction m in [1, 2): log m = log sqrt(2) + 2 artanh((m - sqrt 2) / (m + sqrt 2))."""
-    whole, T = typed(INT, x.width), x.type
+    whole, T = llvm_type(INT, x.width), x.type
     bits = f.op(f"bitcast {T} {x.name} to {whole}", INT, x.width)
     shift = f.const(FRACTION, INT, x.width)
     exponent = f.op(f"lshr {whole} {bits.name}, {shift.name}", INT, x.width)
@@ -41,7 +41,7 @@ def _log2(f: Function, x: Value) -> Value:
 
 def _exp2(f: Function, x: Value) -> Value:
     """By the whole part, and a series of what is left. Of numbers far below the largest exponent."""
-    whole, T = typed(INT, x.width), x.type
+    whole, T = llvm_type(INT, x.width), x.type
     large = 1.5 * 2.0**52
     shifted = f.op(f"fadd {T} {x.name}, {f.const(large, DOUBLE, x.width).name}", DOUBLE, x.width)
     nearest = f.op(f"fsub {T} {shifted.name}, {f.const(large, DOUBLE, x.width).name}", DOUBLE, x.width)
@@ -57,11 +57,11 @@ def _exp2(f: Function, x: Value) -> Value:
 
 def _as_double(f: Function, k: Value) -> Value:
     """A small whole number, not negative, as a number: by its digits."""
-    whole, T = typed(INT, k.width), typed(DOUBLE, k.width)
+    whole, T = llvm_type(INT, k.width), llvm_type(DOUBLE, k.width)
     magic = 2.0**52
     import struct
 
     bits = struct.unpack("<q", struct.pack("<d", magic))[0]
-    joined = f.logic("or", k, bits)
-    number = f.op(f"bitcast {whole} {joined.name} to {T}", DOUBLE, k.width)
+    module_text = f.logic("or", k, bits)
+    number = f.op(f"bitcast {whole} {module_text.name} to {T}", DOUBLE, k.width)
     return f.op(f"fsub {T} {number.name}, {f.const(magic, DOUBLE, k.width).name}", DOUBLE, k.width)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.expressions import ScalarProgram
-from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, typed
+from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, llvm_type
 
 SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
 COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
@@ -31,7 +31,7 @@ class UnsupportedError(ValueError):
 Place = tuple[str, int]  # which pointer, and the how manieth number from there
 
 
-def numbered(pointer: str, count: int) -> list[Place]:
+def consecutive(pointer: str, count: int) -> list[Place]:
     """So many numbers from a pointer on."""
     return [(pointer, k) for k in range(count)]
 
@@ -43,29 +43,29 @@ def write(
     pointers: Sequence[str],
     inputs: Sequence[Place],
     outputs: Sequence[Place],
-    rare: bool = False,
+    cold: bool = False,
     lanes: Mapping[str, int] | None = None,
 ) -> Function:
     """A function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs.
 
     `lanes` are those of pointers to numbers of another width: what depends on single numbers alone is computed once for all.
     """
-    f = Function(name, [(POINTER, x) for x in pointers], width, rare=rare)
+    f = Function(name, [(POINTER, x) for x in pointers], width, cold=cold)
     writer, lanes = Writer(f, program), dict.fromkeys(pointers, width) | dict(lanes or {})
     for s, (pointer, place) in zip(program.inputs, inputs, strict=True):
         if program.uses(s):
             x = f.load(f.given[pointer], place * lanes[pointer], lanes[pointer])
-            writer.known[s.index] = as_stored(f, x, s.node.dtype)
+            writer.known[s.index] = from_memory(f, x, s.node.dtype)
     for value, (pointer, place) in zip(writer.run(), outputs, strict=True):
         f.store(value, f.given[pointer], place * lanes[pointer], lanes[pointer])
     return f
 
 
-def as_stored(f: Function, x: Value, dtype: Any) -> Value:
+def from_memory(f: Function, x: Value, dtype: Any) -> Value:
     """A number from memory as what it is in the graph."""
     if dtype.kind == "b":
         return x.is_not(0.0)
-    return f.op(f"fptosi {x.type} {x.name} to {typed(INT, x.width)}", INT, x.width) if dtype.kind in "iu" else x
+    return f.op(f"fptosi {x.type} {x.name} to {llvm_type(INT, x.width)}", INT, x.width) if dtype.kind in "iu" else x
 
 
 class Writer:
@@ -80,9 +80,9 @@ class Writer:
         """Write all operations; return the outputs."""
         for index in self.program.order:
             self.known[index] = self._operation(self.program.graph.nodes[index])
-        return [self._signed(s) for s in self.program.outputs]
+        return [self._with_sign(s) for s in self.program.outputs]
 
-    def _signed(self, s: Any) -> Value:
+    def _with_sign(self, s: Any) -> Value:
         if s.sign > 0:
             return self.known[s.index]
         if s.index not in self._negative:
@@ -96,7 +96,7 @@ class Writer:
             return f.const(node.detail, base, f.width)
         if node.kind in ("call", "pick"):
             raise UnsupportedError(f"{node.detail} of arrays")
-        a = [self._signed(s) for s in node.arguments]
+        a = [self._with_sign(s) for s in node.arguments]
         if node.kind in ("add", "sub", "mul", "div"):
             return f.arithmetic(node.kind, *a)
         name = node.kind if node.kind != "apply" else node.detail.primitive.name
@@ -147,7 +147,7 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
         case "is_finite":
             return f.is_finite(a[0])
         case "convert_element_type":
-            return _converted(f, a[0], parameters["new_dtype"])
+            return _convert(f, a[0], parameters["new_dtype"])
         case "copy" | "copy_p" | "stop_gradient":
             return a[0]
         case _ if name in _COMPARED:
@@ -158,7 +158,7 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
             raise UnsupportedError(name)
 
 
-def _converted(f: Function, a: Value, dtype: Any) -> Value:
+def _convert(f: Function, a: Value, dtype: Any) -> Value:
     kind = np.dtype(dtype).kind
     if kind == "f":
         return f.like(a, DOUBLE, a.width)
@@ -200,7 +200,7 @@ def integer_power(a: Value, n: int) -> Value:
 
 def sincos(f: Function, a: Value) -> tuple[Value, Value]:
     """Sine and cosine to rounding, by one reduction to within a quarter of pi and two polynomials: no call of a library."""
-    width, T, whole = a.width, a.type, typed(INT, a.width)
+    width, T, whole = a.width, a.type, llvm_type(INT, a.width)
     shifted = f.fma(a, 2 / math.pi, ROUND)
     turns = f.op(f"fsub {T} {shifted.name}, {f.const(ROUND, DOUBLE, width).name}", DOUBLE, width)
     x = f.fma(turns, -HALF_PI[0], a)

@@ -6,17 +6,17 @@ from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.manifold import newton, with_threshold
 from udkjax.native.module import Module
-from udkjax.native.steps import NEWTON_STEPS, NOTHING_LEFT, TAKEN_BACK
+from udkjax.native.steps import NEWTON_STEPS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT
 
 
 def write_attempt(t: Module):
-    """From P3 by `step` to `t1`: the state there in X q, O v, O a; its `error` and `distance`, of lanes that are `judged`."""
+    """From P3 by `step` to `t1`: the state there in X q, O v, O a; its `error` and `distance`, of lanes that are `stepping`."""
     f, s = t.function("attempt")
     method, stages = t.method, t.method.stages
     one = lambda: f.const(1.0, DOUBLE, f.width)  # noqa: E731
     s.ok = one()
     s.distance = f.const(np.inf, DOUBLE, f.width)
-    begins = f.all_of((s.begin > 0.5) | (s.judged < 0.5))
+    begins = f.all_of((s.begin > 0.5) | (s.stepping < 0.5))
 
     def take_stages():
         for i in range(1, stages):
@@ -48,20 +48,20 @@ def write_attempt(t: Module):
             estimate_errors(t, f, s, None, "X dq", "X dv")
         newton(t, f, s, NEWTON_STEPS)
         t.invoke(f, "project_and_accelerate" if method.ends else "end_of_step")
-        unsafe = (s.judged > 0.5) & (s.safe < 0.5)
-        if t.cares:
+        unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
+        if t.falls_back:
             s.where(unsafe, ok=0.0)
         if method.ends:
             estimate_errors(t, f, s, "O a", "X dq", "X dv")
-            with_threshold(t, f, s, f.const(NOTHING_LEFT, DOUBLE, f.width), lambda: t.invoke(f, "tangent_part"))
-        if t.cares:
-            again = (s.judged > 0.5) & (s.careful > 0.5)
+            with_threshold(t, f, s, f.const(ROUNDING_PIVOT, DOUBLE, f.width), lambda: t.invoke(f, "tangent_part"))
+        if t.falls_back:
+            again = (s.stepping > 0.5) & (s.fallback > 0.5)
             with f.if_(f.any_of(again)):
-                t.invoke(f, "arrive_carefully")
+                t.invoke(f, "finish_by_fallback")
                 s.where(again, ok=1.0)
     q0, v0, q1, v1 = "P3 q", "P3 v", "X q", "O v"
-    rtol = t.spread(f, s.rtol)
-    taken = TAKEN_BACK if t.plan.projected else 0.0
+    rtol = t.broadcast(f, s.rtol)
+    taken = NORMAL_ERROR_WEIGHT if t.plan.projected else 0.0
 
     def relative(r: Value) -> list[Value]:
         found = []
@@ -87,7 +87,7 @@ def write_attempt(t: Module):
 def stage_state(t: Module, f: Function, s: Lane, i: int, start: str = "P3", step: Value | None = None):
     """t, q and v of stage i in X, of the step from a point."""
     step = s.step if step is None else step
-    method, h, names = t.method, t.spread(f, step), [f"{start} a", *t.stage_accelerations[1:]]
+    method, h, names = t.method, t.broadcast(f, step), [f"{start} a", *t.stage_accelerations[1:]]
     setattr(s, "X t", f.fma(step, float(method.nodes[i]), getattr(s, f"T{start[1:]}")))
     with f.each(t.rowcount) as r:
         q, v = t.vector(f, f"{start} q", r), t.vector(f, f"{start} v", r)
@@ -99,27 +99,27 @@ def stage_state(t: Module, f: Function, s: Lane, i: int, start: str = "P3", step
 
 def check_pivots(t: Module, f: Function, s: Lane, name: str):
     """What becomes of accelerations whose pivots are too small to be trusted."""
-    if not t.cares:
+    if not t.falls_back:
         return
-    unsafe = (s.judged > 0.5) & (s.safe < 0.5)
+    unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
     with f.if_(f.any_of(unsafe)):
         f.choose(
-            f.any_of(unsafe & (s.careful > 0.5)),
-            lambda: t.invoke(f, "accelerate_carefully", name),
+            f.any_of(unsafe & (s.fallback > 0.5)),
+            lambda: t.invoke(f, "accelerate_by_fallback", name),
             lambda: s.where(unsafe, ok=0.0),
         )
 
 
 def estimate_errors(t: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):
     """Of q and v, from the accelerations of all stages; `end`: those at the end, where they are the last stage's."""
-    h = t.spread(f, s.step)
+    h = t.broadcast(f, s.step)
     names = list(t.stage_accelerations)
     if t.method.ends and end:
         names[-1] = end
-    kept, t.stage_accelerations = t.stage_accelerations, names
+    saved, t.stage_accelerations = t.stage_accelerations, names
     with f.each(t.rowcount) as r:
         error_q, error_v = t.weighted_sum(f, t.method.error_q, r), t.weighted_sum(f, t.method.error_v, r)
         zero = f.const(0.0, DOUBLE, t.plan.vector)
         t.put(f, to_q, r, zero if error_q is None else h * (h * error_q))
         t.put(f, to_v, r, zero if error_v is None else h * error_v)
-    t.stage_accelerations = kept
+    t.stage_accelerations = saved

@@ -3,12 +3,12 @@
 from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
-from udkjax.native.steps import BEFORE, NEAREST, SAFETY, SHRINK
+from udkjax.native.steps import NEAREST_STAGE, ROUNDING_GROWTH, SAFETY, SHRINK
 
 
 def is_clear(t: Module, f: Function, s: Lane, distance: Value) -> Value:
     """Whether a step as long as the one that is tried may begin so far away from singular configurations."""
-    return (distance > NEAREST) & (distance * distance * distance * s.tolerance > s.h * s.omega * BEFORE)
+    return (distance > NEAREST_STAGE) & (distance * distance * distance * s.tolerance > s.h * s.omega * ROUNDING_GROWTH)
 
 
 def time_to_singularity(t: Module, f: Function, s: Lane) -> Value:

@@ -6,15 +6,15 @@
 SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
 # Of the step before a breakpoint: the first behind it. Its outputs have states on one side alone, and so larger errors: with
 # SAFETY in its place rates across the knots of a cam are off by 34 times the tolerance instead of ten.
-CAUTIOUS = 0.5
+RESTART_FACTOR = 0.5
 
 # Steps near singular configurations. Distances are the smallest pivot of D D^T relative to its diagonal, as a root.
-RETRIES = 3  # of a step that meets a pivot which elimination must not trust, before it is taken with care
+RETRIES = 3  # of a step that meets a pivot which elimination must not trust, before the fallback takes it
 # Elimination trusts no pivot that is closer than 1e-3 (`BRANCH_TOL`); from here on a step has no stage where it does.
-NEAREST = 1.5e-3
+NEAREST_STAGE = 1.5e-3
 # Rounding errors of accelerations are about a unit of rounding over the third power of the distance, in the scene's own units;
 # what a step's velocity has of them must be less than the tolerance.
-BEFORE = 3e-14
+ROUNDING_GROWTH = 3e-14
 # Of a step: a configuration that is expected by then lies behind its end, though it is expected a little too early, by up to
 # a tenth of a step. Where it is far away, it may be expected by three tenths too early, and just be ahead of the end: less than
 # this much of the distance that the end should have by then.
@@ -30,7 +30,7 @@ GAP = ENDS_BEFORE + BEGINS_BEHIND
 # Pieces of the state.
 EDGE = 1e-7  # of a step: how long the one across is. What another piece does to a step is the square of the part that is there
 # Of a step: where a piece ends so close to either of its ends, these tell when to rounding.
-EXACT = 0.01
+NEAR_END = 0.01
 # A step that is taken again ends a little beyond the piece; or, once it is known when that ends, just before; or it leads across.
 AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
 HALVINGS = 40
@@ -40,32 +40,32 @@ POINTS = 4  # states that an interpolating polynomial goes through: with three, 
 STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 
 # What a run may be. `NOT_FINITE`: its step became too small because of a number that is not finite.
-RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, DOUBTED, NOT_FINITE = range(6)
+RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, UNSAFE_PIVOT, NOT_FINITE = range(6)
 
-AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one looks for what is not finite
+LOOK_AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one looks for what is not finite
 
 # How much of an error counts that projection takes back. What lasts of it is what it does to the rest while the step is taken.
 # Close to singular configurations it is the stages' distance from the manifold over a small singular value: for its sake alone,
 # steps were up to six times as many at tolerances of 1e-11. A hundredth keeps some of these; with none of it, runs that cross are
 # less exact than their tolerance says.
-TAKEN_BACK = 1e-3
+NORMAL_ERROR_WEIGHT = 1e-3
 
 # A pivot, relative to its row's diagonal entry of D D^T: below the first is rounding; rows of outputs whose pivots are below the
 # second, the root of a unit of rounding, stay as they were interpolated: rounding errors would turn their velocities.
-NOTHING_LEFT, USELESS = 1e-14, 1e-8
+ROUNDING_PIVOT, OUTPUT_PIVOT_TOL = 1e-14, 1e-8
 
-# Of the rank threshold: what steps with care take for theirs. They begin on the constraint manifold, unless states are not
+# Of the rank threshold: what fallback steps take for theirs. They begin on the constraint manifold, unless states are not
 # projected, and only those beside singular configurations take it. Rows that count as redundant there and are not leave what they
 # hold back in velocities, as large as the threshold, and rounding errors are as large as a unit over its square: both are least
 # at some third root of a unit. With three times more, linkages that turn back in singular configurations take up to a quarter
 # less steps, but Peaucellier's may cross with errors of 1e-5 in its energy, at any tolerance; with three times less they take up
 # to two fifths more.
-WITH_CARE = 0.2
+FALLBACK_RANK_SHARE = 0.2
 
 OUTPUT_STEPS = 7  # of Newton's method to an output: where two branches of the manifold meet, it halves the distance in each
 NEWTON_STEPS = 3  # in a projection, at most: the last of which usually finds nothing to do
 # Of the characteristic length, and rad: a Newton step that moves q by less leaves rounding errors, since it converges
 # quadratically.
-FAR = 1e-8
+NEWTON_TOL = 1e-8
 # An output that lies nearer to the manifold takes one Newton step in q and v alike: what that leaves is the square.
-NEAR = 1e-7
+SINGLE_STEP_TOL = 1e-7

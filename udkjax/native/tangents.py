@@ -1,7 +1,7 @@
 """Derivatives of a trajectory in forward mode: along P directions, in the same code, step by step.
 
 Where a run goes is a function of the constants of a scene and of the initial state. Steps are taken as they are: no derivative is
-taken of their sizes. Along a direction the states of the stages change by the same sums as they are made of,
+taken of their sizes. ForwardMode a direction the states of the stages change by the same sums as they are made of,
 
     dq_i = dq + h c_i dv + h^2 sum_j (A A)_ij da_j,        dv_i = dv + h sum_j A_ij da_j,
 
@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from udkjax.native.dense_output import write_between, write_differences
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Layout, Plan
-from udkjax.native.linearized import Linearized, linearized
-from udkjax.native.prologue import FORWARD, moving_constants, write_prologue_forward
+from udkjax.native.linearization import Linearized, linearization
+from udkjax.native.prologue import FORWARD, active_constants, write_prologue_forward
 from udkjax.native.steps import POINTS
 from udkjax.native.trajectory import Trajectory
 
@@ -24,30 +24,30 @@ from udkjax.native.trajectory import Trajectory
 class Differentiated(Trajectory):
     """What both modes have in common: programs of derivatives, and memory for what they know of a state.
 
-    `moving` says which numbers of the scene have derivatives, and so which constants of the code; positions and velocities do.
+    `active` says which numbers of the scene have derivatives, and so which constants of the code; positions and velocities do.
     """
 
-    def __init__(self, plan: Plan, moving: tuple[bool, ...]):
+    def __init__(self, plan: Plan, active: tuple[bool, ...]):
         super().__init__(plan)
-        self.numbers_moving, self.moving = moving, moving_constants(self, moving)
-        self.count, self.last = sum(self.moving), plan.method.stages
-        self.of_accelerations = linearized(self, "accelerations")
-        self.of_projection = linearized(self, "projection") if plan.projected else None
+        self.active_numbers, self.active = active, active_constants(self, active)
+        self.count, self.last = sum(self.active), plan.method.stages
+        self.of_accelerations = linearization(self, "accelerations")
+        self.of_projection = linearization(self, "projection") if plan.projected else None
         for i in range(1, self.last + 1):  # the last: of the end
-            self.places.add(f"K{i}", self.of_accelerations.kept)
+            self.places.add(f"K{i}", self.of_accelerations.stored)
         if self.of_projection:
-            self.places.add("KP", self.of_projection.kept)
+            self.places.add("KP", self.of_projection.stored)
 
     def accelerate_stage(self, f: Function, i: int):
         f.call("evaluation", f.given["work"], self.address(f, f"A{i}"), self.address(f, f"K{i}"))
 
     def write_programs(self):
         super().write_programs()
-        for each in self._linearized:
+        for each in self._linearizations:
             each.evaluation()
 
     @property
-    def _linearized(self) -> list[Linearized]:
+    def _linearizations(self) -> list[Linearized]:
         """What has derivatives."""
         return [x for x in (self.of_accelerations, self.of_projection) if x]
 
@@ -60,7 +60,7 @@ class Differentiated(Trajectory):
 class Forward(Differentiated):
     """A trajectory with its changes along directions.
 
-    Directions come in groups, each with memory of its own, a `way`: one direction for all members, or, of a single member, as
+    Directions come in groups, each with memory of its own, a `tangent`: one direction for all members, or, of a single member, as
     many directions side by side as there are lanes.
     """
 
@@ -68,10 +68,10 @@ class Forward(Differentiated):
     outputs = ("dys", "dend")
     directions_in = 1
 
-    def __init__(self, plan: Plan, moving: tuple[bool, ...], lanes: int):
-        super().__init__(plan, moving)
-        self.ways = w = Layout(lanes, plan.vector)
-        self.group = lanes // plan.width  # directions of a way
+    def __init__(self, plan: Plan, active: tuple[bool, ...], lanes: int):
+        super().__init__(plan, active)
+        self.tangents = w = Layout(lanes, plan.vector)
+        self.group = lanes // plan.width  # directions of a tangent
         w.add("constants", self.count)
         for name in ("X q", "X v", "O q", "O v"):
             w.add(name, self.n)
@@ -84,25 +84,25 @@ class Forward(Differentiated):
             w.add(f"N{k}", self.n)
 
     def write_derivatives(self):
-        for each in self._linearized:
+        for each in self._linearizations:
             each.forward()
         if self.count:
-            write_prologue_forward(self, self.numbers_moving, self.moving)
-        w = self.ways
-        write_differences(self, "tangent_differences", ("way", w))
-        write_between(self, "tangent_between", ("way", w))
+            write_prologue_forward(self, self.active_numbers, self.active)
+        w = self.tangents
+        write_differences(self, "tangent_differences", ("tangent", w))
+        write_between(self, "tangent_between", ("tangent", w))
 
     @contextmanager
-    def _each_way(self, f: Function) -> Iterator[Value]:
-        """What is done for every group of directions, with `way` where its memory is."""
-        first = f.load(f.given["work"], self.places["ways"] * f.width, base=POINTER)
+    def _each_tangent(self, f: Function) -> Iterator[Value]:
+        """What is done for every group of directions, with `tangent` where its memory is."""
+        first = f.load(f.given["work"], self.places["tangents"] * f.width, base=POINTER)
         with f.each(self._groups(f, self.call_record(f))) as p:
-            f.given["way"] = f.at(first, p * (self.ways.size * self.ways.width))
+            f.given["tangent"] = f.at(first, p * (self.tangents.size * self.tangents.width))
             yield p
 
     @contextmanager
     def _each_direction(self, f: Function, p: Value, lane: Value) -> Iterator[tuple[Value, Value]]:
-        """What is done for every direction of a group, of the member in a lane: its number, and its lane in a way."""
+        """What is done for every direction of a group, of the member in a lane: its number, and its lane in a tangent."""
         with f.each(self.group) as j:
             direction = p * self.group + j
             with f.if_(direction < self._directions(f, self.call_record(f))):
@@ -114,78 +114,78 @@ class Forward(Differentiated):
     def _groups(self, f: Function, call: Value) -> Value:
         return f.arithmetic("div", self._directions(f, call) + (self.group - 1), self.group)
 
-    def _along(self, f: Function, name: str, kept: str, out: Value | None = None):
-        way = f.given["way"]
-        f.call(name, f.given["work"], self.address(f, kept), way, out or way)
+    def _along(self, f: Function, name: str, stored: str, out: Value | None = None):
+        tangent = f.given["tangent"]
+        f.call(name, f.given["work"], self.address(f, stored), tangent, out or tangent)
 
-    def _arrived(self, f: Function):
-        """O q and O v of a way: X q and X v once projected, at the state in X, which is on the manifold."""
+    def _project_tangent(self, f: Function):
+        """O q and O v of a tangent: X q and X v once projected, at the state in X, which is on the manifold."""
         if self.of_projection:
             self._along(f, "forward_projection", "KP")
         else:
-            with f.each(self.registers("way")) as r:
+            with f.each(self.registers("tangent")) as r:
                 for x in "qv":
-                    self.put(f, f"O {x}", r, self.vector(f, f"X {x}", r, "way"), "way")
+                    self.put(f, f"O {x}", r, self.vector(f, f"X {x}", r, "tangent"), "tangent")
 
     def record_stage(self, f: Function, s: Lane, i: int):
         """The changes of the stage's accelerations."""
-        h = self.spread(f, s.step)
-        with self._each_way(f):
+        h = self.broadcast(f, s.step)
+        with self._each_tangent(f):
             self._change_stage(f, i, h, "P3")
-            self._along(f, "forward", f"K{i}", self._way_address(f, f"A{i}"))
+            self._along(f, "forward", f"K{i}", self._tangent_address(f, f"A{i}"))
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         """The changes of the state in P3, from those in P2, where the step began."""
         step = f.select(s.begin > 0.5, 0.0, s.t1 - s.T2)
-        h, begin = self.spread(f, step), s.begin > 0.5
-        with self._each_way(f), f.each(self.registers("way")) as r:
+        h, begin = self.broadcast(f, step), s.begin > 0.5
+        with self._each_tangent(f), f.each(self.registers("tangent")) as r:
             for k in range(POINTS - 1):
                 for x in "qva":
-                    mine, other = (self.vector(f, f"P{j} {x}", r, "way") for j in (k, k + 1))
-                    self.put(f, f"P{k} {x}", r, f.select(accept, other, mine), "way")
+                    mine, other = (self.vector(f, f"P{j} {x}", r, "tangent") for j in (k, k + 1))
+                    self.put(f, f"P{k} {x}", r, f.select(accept, other, mine), "tangent")
         setattr(s, "X t", s.T3)
         with f.each(self.rowcount) as r:
             for x in "qv":
                 self.put(f, f"X {x}", r, self.vector(f, f"P3 {x}", r))
         self._evaluate_end(f)
         f.call("evaluation", f.given["work"], self.address(f, "C"), self.address(f, f"K{self.last}"))
-        with self._each_way(f):
+        with self._each_tangent(f):
             self._change_stage(f, self.last, h, "P2")
-            with f.each(self.registers("way")) as r:
+            with f.each(self.registers("tangent")) as r:
                 for x in "qv":
-                    new = f.select(begin, self.vector(f, f"P2 {x}", r, "way"), self.vector(f, f"X {x}", r, "way"))
-                    self.put(f, f"X {x}", r, new, "way")
-            self._arrived(f)
-            with f.each(self.registers("way")) as r:
+                    new = f.select(begin, self.vector(f, f"P2 {x}", r, "tangent"), self.vector(f, f"X {x}", r, "tangent"))
+                    self.put(f, f"X {x}", r, new, "tangent")
+            self._project_tangent(f)
+            with f.each(self.registers("tangent")) as r:
                 for x in "qv":
-                    self.put(f, f"X {x}", r, self.vector(f, f"O {x}", r, "way"), "way")
-            self._along(f, "forward", f"K{self.last}", self._way_address(f, "N0"))
-            with f.each(self.registers("way")) as r:
+                    self.put(f, f"X {x}", r, self.vector(f, f"O {x}", r, "tangent"), "tangent")
+            self._along(f, "forward", f"K{self.last}", self._tangent_address(f, "N0"))
+            with f.each(self.registers("tangent")) as r:
                 for name, x in (("O q", "q"), ("O v", "v"), ("N0", "a")):
-                    old, new = self.vector(f, f"P3 {x}", r, "way"), self.vector(f, name, r, "way")
-                    self.put(f, f"P3 {x}", r, f.select(accept, new, old), "way")
+                    old, new = self.vector(f, f"P3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
+                    self.put(f, f"P3 {x}", r, f.select(accept, new, old), "tangent")
 
     def _change_stage(self, f: Function, i: int, h: Value, start: str):
-        """The change of the state of stage i, in X of a way, of the step from a point."""
+        """The change of the state of stage i, in X of a tangent, of the step from a point."""
         node, names = float(self.method.nodes[i]), [f"{start} a", *self.stage_accelerations[1:]]
-        with f.each(self.registers("way")) as r:
-            q, v = self.vector(f, f"{start} q", r, "way"), self.vector(f, f"{start} v", r, "way")
-            sum_q, sum_v = (self.weighted_sum(f, row[i], r, names, "way") for row in (self.method.q, self.method.v))
+        with f.each(self.registers("tangent")) as r:
+            q, v = self.vector(f, f"{start} q", r, "tangent"), self.vector(f, f"{start} v", r, "tangent")
+            sum_q, sum_v = (self.weighted_sum(f, row[i], r, names, "tangent") for row in (self.method.q, self.method.v))
             slope = v * node if sum_q is None else f.fma(h, sum_q, v * node)
-            self.put(f, "X q", r, f.fma(h, slope, q), "way")
-            self.put(f, "X v", r, v if sum_v is None else f.fma(h, sum_v, v), "way")
+            self.put(f, "X q", r, f.fma(h, slope, q), "tangent")
+            self.put(f, "X v", r, v if sum_v is None else f.fma(h, sum_v, v), "tangent")
 
-    def _way_address(self, f: Function, name: str) -> Value:
-        return f.at(f.given["way"], self.start(name, "way"))
+    def _tangent_address(self, f: Function, name: str) -> Value:
+        return f.at(f.given["tangent"], self.start(name, "tangent"))
 
     def record_output(self, f: Function, s: Lane):
         with f.each(self.rowcount) as r:
             self.put(f, "X v", r, self.vector(f, "O v", r))  # the programs look for states there
         self._evaluate_end(f)
-        with self._each_way(f) as p:
-            f.call("tangent_differences", f.given["work"], f.given["way"])
-            f.call("tangent_between", f.given["work"], f.given["way"])
-            self._arrived(f)
+        with self._each_tangent(f) as p:
+            f.call("tangent_differences", f.given["work"], f.given["tangent"])
+            f.call("tangent_between", f.given["work"], f.given["tangent"])
+            self._project_tangent(f)
             with f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
                 self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "O q", "O v")
 
@@ -196,53 +196,53 @@ class Forward(Differentiated):
         with self._each_direction(f, p, k) as (direction, lane):
             row = (member * self._directions(f, call) + direction) * times + number
             to = f.at(f.load(call, self.call_fields.index("dys"), base=POINTER), row * (2 * self.n))
-            self.copy_lane(f, to, 0, q, lane, "way")
-            self.copy_lane(f, to, self.n, v, lane, "way")
+            self.copy_lane(f, to, 0, q, lane, "tangent")
+            self.copy_lane(f, to, self.n, v, lane, "tangent")
 
     def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
         call = self.call_record(f)
         dconstants = Value(f, f.reserve(DOUBLE, max(self.count, 1)), POINTER)
-        with self._each_way(f) as p, self._each_direction(f, p, lane) as (direction, place):
+        with self._each_tangent(f) as p, self._each_direction(f, p, lane) as (direction, place):
             if self.count:
-                dnumbers = f.at(self.member_address(f, call, "dnumbers", member), direction * sum(self.numbers_moving))
+                dnumbers = f.at(self.member_address(f, call, "dnumbers", member), direction * sum(self.active_numbers))
                 f.call(FORWARD, self.member_address(f, call, "numbers", member), constants, dnumbers, dconstants)
             with f.each(self.count) as i:
-                f.store(f.load(dconstants, i), f.given["way"], (i + self.ways["constants"]) * self.ways.width + place)
+                f.store(f.load(dconstants, i), f.given["tangent"], (i + self.tangents["constants"]) * self.tangents.width + place)
             for x in "qv":
                 self._read_state(f, f"d{x}", member, direction, place, [f"P{k} {x}" for k in range(POINTS)])
             with f.each(self.n) as i:
                 for name in (*(f"P{k} a" for k in range(POINTS)), *(f"A{j}" for j in range(1, self.last))):
-                    f.store(0.0, f.given["way"], (i + self.ways[name]) * self.ways.width + place)
+                    f.store(0.0, f.given["tangent"], (i + self.tangents[name]) * self.tangents.width + place)
 
     def _read_state(self, f: Function, name: str, member: Value, direction: Value, place: Value, to: Sequence[str]):
-        """The change of q or v that is given of a member along a direction, into a lane of a way."""
+        """The change of q or v that is given of a member along a direction, into a lane of a tangent."""
         start = self.member_address(f, self.call_record(f), name, member)
         with f.each(self.n) as i:
             x = f.load(start, direction * self.n + i)
             for array in to:
-                f.store(x, f.given["way"], (i + self.ways[array]) * self.ways.width + place)
+                f.store(x, f.given["tangent"], (i + self.tangents[array]) * self.tangents.width + place)
 
     def end_members(self, f: Function, s: Lane):
         """The changes of the first state, which is taken as it is given, and of the last."""
         call = self.call_record(f)
         times = f.load(call, self.call_fields.index("times"), base=INT)
-        with self._each_way(f) as p, f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
+        with self._each_tangent(f) as p, f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
             member = self.to_int(f, f.lane(s.member, k))
             with self._each_direction(f, p, k) as (direction, lane):
                 for x in "qv":
                     self._read_state(f, f"d{x}", member, direction, lane, [f"X {x}"])
                 row = (member * self._directions(f, call) + direction) * (2 * self.n)
                 to = f.at(f.load(call, self.call_fields.index("dend"), base=POINTER), row)
-                self.copy_lane(f, to, 0, "P3 q", lane, "way")
-                self.copy_lane(f, to, self.n, "P3 v", lane, "way")
+                self.copy_lane(f, to, 0, "P3 q", lane, "tangent")
+                self.copy_lane(f, to, self.n, "P3 v", lane, "tangent")
             self._write_change(f, s, k, p, f.const(0, INT), "X q", "X v")
             self._write_change(f, s, k, p, times - 1, "P3 q", "P3 v")
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
         """Memory for all directions."""
-        size = self._groups(f, call) * (self.ways.size * self.ways.width)
+        size = self._groups(f, call) * (self.tangents.size * self.tangents.width)
         block, start = self.allocate(f, size)
         with f.each(size) as i:
             f.store(0.0, start, i)
-        f.store(start, f.given["work"], self.places["ways"] * f.width, base=POINTER)
+        f.store(start, f.given["work"], self.places["tangents"] * f.width, base=POINTER)
         return [block]

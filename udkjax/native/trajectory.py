@@ -10,7 +10,7 @@ cost no evaluation), and are returned to the manifold, too. Where the motion is 
 
 W members run side by side in the lanes of vectors, each with a time, a step and a result of its own. A lane whose member is done
 takes the next one. Where elimination meets a pivot that it must not trust, a step is taken a little shorter; where that does not
-help it is taken again with care: by a rank-revealing method on all rows (least_norm.py), lane by lane.
+help it is taken again by a fallback: a rank-revealing method on all rows (least_norm.py), lane by lane.
 
 The functions of one module, all of them on one piece of memory (`Places`): `run` takes members and calls `attempt` (one step),
 `decide` (whether it counts, and the next), `outputs` (states between steps).
@@ -30,7 +30,7 @@ from udkjax.native.members import write_begin, write_finish, write_run
 from udkjax.native.module import Module
 from udkjax.native.pieces import write_leave
 from udkjax.native.runge_kutta import write_attempt
-from udkjax.native.steps import DOUBTED, RUNNING
+from udkjax.native.steps import RUNNING, UNSAFE_PIVOT
 
 
 class Trajectory(Module):
@@ -46,7 +46,7 @@ class Trajectory(Module):
         write_differences(self)
         write_between(self)
         write_outputs(self)
-        if self.cares:
+        if self.falls_back:
             if isinstance(self.code, LoopPrograms):
                 write_fallback_by_loops(self)
             else:
@@ -57,28 +57,28 @@ class Trajectory(Module):
         write_finish(self)
         self.write_derivatives()
         write_run(self)
-        return self.joined()
+        return self.module_text()
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
         """One step of all lanes, and what becomes of those that are done."""
         work, call, width = f.given["work"], f.given["call"], self.plan.width
         yes = f.const(1.0, DOUBLE, width)
-        doubtful = s.doubt > 0.5
-        careful = f.any_of(doubtful)
-        if self.cares:
-            s.careful = f.select(careful, f.const(1.0, DOUBLE, width), 0.0)
-            s.judged = f.select(careful, f.select(doubtful, yes, 0.0), s.active)
+        due_for_fallback = s.fallback_due > 0.5
+        fallback = f.any_of(due_for_fallback)
+        if self.falls_back:
+            s.fallback = f.select(fallback, f.const(1.0, DOUBLE, width), 0.0)
+            s.stepping = f.select(fallback, f.select(due_for_fallback, yes, 0.0), s.active)
         else:
-            s.judged = s.active
+            s.stepping = s.active
         aim(self, f, s)
         f.call("attempt", work)
         f.call("decide", work)
-        if not self.cares and self.doubts:
-            s.where(s.doubt > 0.5, code=DOUBTED)
+        if not self.falls_back and self.checks_pivots:
+            s.where(s.fallback_due > 0.5, code=UNSAFE_PIVOT)
         f.call("outputs", work, call)
         ended = (s.active > 0.5) & s.code.is_not(float(RUNNING))
         with f.if_(f.any_of(ended)):
             s.due = f.select(ended, yes, 0.0)
             f.call("finish_members", work, call)
-            s.where(ended, active=0.0, doubt=0.0)
+            s.where(ended, active=0.0, fallback_due=0.0)
             self.take_next(f, s, fill)

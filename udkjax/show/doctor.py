@@ -22,7 +22,7 @@ FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 
 def facts() -> dict[str, Any]:
     """Return versions, devices, precision, engine, cache and what could be better, by names that scripts can rely on."""
-    folder, sizes = machine.cache_folder(), [size for _, size, _ in machine.kept()]
+    folder, sizes = machine.cache_folder(), [size for _, size, _ in machine.cached_files()]
     engine, reason = engine_here()
     return {
         "versions": versions(),

@@ -153,7 +153,9 @@ def _run(arrays: Given, static: Given) -> tuple[EventRun, tuple[str, ...]]:
         raise ValueError(f'engine="native" cannot: {next(filter(None, reasons))}. engine="auto" takes diffrax instead')
     code = jnp.where(closed, Result.successful, Result.could_not_assemble)
     if not reasons[0] and closure is not None:  # the closed state may take rows that the analysis says are redundant
-        code = jnp.where(closed & (closure.rank > native_engine.rows_kept(hybrid.problem_of_guess(0))), Result.drift, code)
+        code = jnp.where(
+            closed & (closure.rank > native_engine.independent_row_count(hybrid.problem_of_guess(0))), Result.drift, code
+        )
     return run_events(hybrid, RunInput(ts, q, v, code, choices.drift_tol), choices.max_events), reasons
 
 
