@@ -136,7 +136,7 @@ def _guess(mechanism: Mechanism, scales: Scales, tol: Any, t: Any, q: Any, v: An
 
 def _closing(mechanism: Mechanism, moving: tuple[bool, ...] | None = None, mode: str = "closing") -> Kind:
     programs = loop_programs(mechanism) if is_large(mechanism) else scene_programs(mechanism)
-    return Kind(programs, Tableau(EULER), projected=False, breaks=False, moving=moving, mode=mode)
+    return Kind(programs, Tableau(EULER), projected=False, breaks=False, active=moving, mode=mode)
 
 
 # --- problems
