@@ -63,36 +63,42 @@ def velocity_tolerance(t: Module, f: Function, s: Lane, name: str) -> Value:
 
 def project_output(t: Module, f: Function, s: Lane, which: str):
     """Return X q and X v to the manifold, as X q and O v; `violated` is how far they are from it."""
+    mask = getattr(s, which) > 0.5
+
+    def iterate(lanes: Value):
+        iterate_newton(t, f, s, lanes, lambda _: t.invoke(f, "newton_q"), OUTPUT_STEPS)
+        t.invoke(f, "newton_v_and_psi")
+
+    def project():
+        if not isinstance(t.code, EliminationPrograms):
+            iterate(mask)
+            s.violated = largest_violation(t, f)
+            return
+        t.invoke(f, "project")
+        s.violated = largest_violation(t, f)
+        far = mask & ~(take_newton_step(t, f, mask) <= SINGLE_STEP_TOL)
+        with f.if_(f.any_of(far)):
+            with f.each(t.rowcount) as r:  # no lane depends on its neighbours: others keep what they have
+                t.put(f, "O dv", r, t.vector(f, "O v", r))
+            iterate(far)
+            with f.each(t.rowcount) as r:
+                t.put(f, "O v", r, f.select(far, t.vector(f, "O v", r), t.vector(f, "O dv", r)))
+            s.where(far, violated=largest_violation(t, f))
+
     if t.plan.projected:
-        threshold = f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width)
-        if not t.checks_pivots:
-            threshold = None
+        with_threshold(t, f, s, f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width), project) if t.checks_pivots else project()
+        return
+    t.invoke(f, "psi")
+    with f.each(t.rowcount) as r:
+        t.put(f, "O v", r, t.vector(f, "X v", r))
+    s.violated = largest_violation(t, f)
 
-        def iterate():
-            newton(t, f, s, OUTPUT_STEPS, which)
-            t.invoke(f, "newton_v_and_psi")
 
-        def close():
-            if not isinstance(t.code, EliminationPrograms):
-                iterate()
-                return
-            t.invoke(f, "project")
-            mask = getattr(s, which) > 0.5
-            change = take_newton_step(t, f, mask)
-            with f.if_(f.any_of(mask & ~(change <= SINGLE_STEP_TOL))):
-                iterate()
-
-        close() if threshold is None else with_threshold(t, f, s, threshold, close)
-    else:
-        t.invoke(f, "psi")
-        with f.each(t.rowcount) as r:
-            t.put(f, "O v", r, t.vector(f, "X v", r))
+def largest_violation(t: Module, f: Function) -> Value:
+    """The largest of Psi, each row over its scale; not a number where a row is none."""
     worst = f.variable(0.0)
-    if t.m:
-        with f.each(t.m) as i:
-            place = i * f.width + t.places["psi"] * f.width
-            psi = f.load(f.given["work"], place, f.width)
-            scale = f.load(f.given["work"], i * f.width + t.places["rows"] * f.width, f.width)
-            x = f.abs(psi) / scale
-            worst.value = f.select((x > worst.value) | x.is_not(x), x, worst.value)  # what is none stays
-    s.violated = worst.value
+    with f.each(t.m) as i:
+        psi = f.load(f.given["work"], i * f.width + t.places["psi"] * f.width, f.width)
+        x = f.abs(psi) / f.load(f.given["work"], i * f.width + t.places["rows"] * f.width, f.width)
+        worst.value = f.select((x > worst.value) | x.is_not(x), x, worst.value)
+    return worst.value

@@ -6,7 +6,7 @@ import numpy as np
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
-from udkjax.native.manifold import project_output
+from udkjax.native.manifold import largest_violation, project_output
 from udkjax.native.module import Module
 from udkjax.native.steps import DONE, LOOK_AHEAD, NOT_FINITE, POINTS, STEP_LIMIT
 
@@ -109,13 +109,7 @@ def write_finish(t: Module):
     with f.each(t.rowcount) as r:
         t.put(f, "X v", r, t.vector(f, "O v", r))
     t.invoke(f, "psi")
-    worst = f.variable(0.0)
-    if t.m:
-        with f.each(t.m) as i:
-            psi = f.load(work, (i + p["psi"]) * width, width)
-            x = f.abs(psi) / f.load(work, (i + p["rows"]) * width, width)
-            worst.value = f.select((x > worst.value) | x.is_not(x), x, worst.value)
-    s.violated = worst.value
+    s.violated = largest_violation(t, f)
     with f.each(width) as k, f.if_(f.lane(s.due, k) > 0.5):
         t.write_state(f, s, call, k, f.const(0, INT), "X q", "O v")
     t.end_members(f, s)
