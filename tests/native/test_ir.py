@@ -119,7 +119,7 @@ def test_lanes_are_told_apart_and_taken_together(code, width):
     one = f.const(1.0)
     for k, mask in enumerate((f.any_of(x > 2.0), f.all_of(x > 2.0))):
         f.store(f.select(mask, one, 0.0), out, k)
-    f.store(f.reduced("fmax", x), out, 2)
+    f.store(f.reduce("fmax", x), out, 2)
     with f.each(width) as k:
         f.store(f.lane(x, k), out, k + 3)
         f.store(f.select(f.only(k), x, 0.0), out, k * width + (3 + width), width)
