@@ -23,7 +23,7 @@ FINER = 10 ** -np.arange(3.0, 12.01, 0.5)  # tolerances of the yardstick: its ca
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 FOR_NOT_STIFF = {
     "Adams": udk.Adams(),
-    "Adams, iterated": udk.Adams("iteration"),
+    "Adams, iterated": udk.Adams(corrector="iteration"),
     "Verner65": udk.Verner65(),
     "Dopri8": diffrax.Dopri8(),
     "BDF": udk.BDF(),

@@ -191,9 +191,9 @@ def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
         moving.append(active)
         return acceleration_derivative(programs, active)
 
-    monkeypatch.setattr("udkjax.native.linearized.acceleration_derivative", derivative)
-    operation.written.cache_clear()  # what another test has had written or compiled would not be derived again
-    operation.compiled.cache_clear()
+    monkeypatch.setattr("udkjax.native.linearization.acceleration_derivative", derivative)
+    operation.generate.cache_clear()  # what another test has had written or compiled would not be derived again
+    operation.machine_code.cache_clear()
     linkage = udk.library.parallelogram(np.deg2rad(-45))
 
     def angle(mass):

@@ -1,5 +1,7 @@
 """Events: times and states against closed forms, jumps against their identities, derivatives against closed forms."""
 
+# pyright: reportOptionalMemberAccess=false
+# All of these runs have events.
 import jax
 import jax.numpy as jnp
 import numpy as np

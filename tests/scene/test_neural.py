@@ -1,6 +1,7 @@
 """Fields of a user's class that hold functions and names, and a force law that is a neural network."""
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -89,5 +90,5 @@ def test_what_is_no_number_is_static_by_itself():
     q = turning.q0.at[1].set(jnp.array([1.5, 0.0, 0.3]))
     for mechanism, expected in ((turning, np.sin(0.3)), (other, np.sin(1.5))):
         still = udk.State(q, jnp.zeros_like(q))
-        at = type("At", (), {"ts": jnp.zeros(1), "q": still.q[None], "v": still.v[None]})
+        at = SimpleNamespace(ts=jnp.zeros(1), q=still.q[None], v=still.v[None])
         assert_allclose(udk.violation(mechanism, at), [[expected]], rtol=1e-14)
