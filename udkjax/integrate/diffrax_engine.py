@@ -5,6 +5,7 @@ from typing import Any
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Float
 
@@ -35,7 +36,7 @@ def integrate_by_diffrax(
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], controller_state=True),
         stepsize_controller=CountingController(_controller(problem)),
         adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
-        max_steps=problem.max_steps,
+        max_steps=int(np.asarray(problem.max_steps)),  # diffrax makes its loops of a known number
         progress_meter=meter or diffrax.NoProgressMeter(),
         throw=False,
     )

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.gradients import stop_gradients
@@ -30,7 +30,7 @@ class Problem(eqx.Module):
     rate: Float[Array, ""]  # of the system and the run (1/s)
     solver: "diffrax.AbstractSolver | None" = eqx.field(static=True)
     projected: bool = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    max_steps: Int[ArrayLike, ""]
     breakpoints: Float[Array, "k"] | None = None  # the times where the motion is not smooth, in any order; None: it is
 
     def units(self) -> tuple[Float[Array, "n"], Float[Array, "n"]]:

@@ -98,11 +98,13 @@ class Curve(eqx.Module):
 
     def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
         """Whether the residual is what rounding leaves of it."""
-        size = jnp.max(jnp.abs(self.residual(X) / (self.weights * self.rows)))
+        size = jnp.max(jnp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
         return size <= ROUNDING_UNITS * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
 
     def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
         """Return the nearest point of the curve; `fixed`: of the same value. And whether there is one."""
+        if not len(self.rows):  # nothing binds the coordinates
+            return X, jnp.asarray(True)
 
         def body(state: _Correction) -> _Correction:
             X, k, _ = state
