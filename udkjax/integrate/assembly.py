@@ -27,7 +27,7 @@ from udkjax.equations.position_closure import CLOSED_TOL, is_closed
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large
-from udkjax.integrate import native_engine
+from udkjax.integrate import native_closing
 from udkjax.integrate.closure import close_by_jax, close_by_machine_code
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -134,8 +134,8 @@ def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, 
     """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D, of known numbers."""
     if not is_large(mechanism):  # for which it takes longer to compile anything
         return DenseRows(mechanism, scales).assemble(t, q, v)
-    if native_engine.closes(mechanism):
-        return native_engine.closed_at_once(mechanism, scales, rank_tolerance(mechanism), t, q, v)
+    if native_closing.can_close(mechanism):
+        return native_closing.close_known(mechanism, scales, rank_tolerance(mechanism), t, q, v)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 
     return SparseRows(mechanism).assemble(t, q, v)
@@ -145,7 +145,7 @@ def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, 
 def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State | None) -> Closure:
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
-    close = close_by_machine_code if native_engine.closes(mechanism) else close_by_jax
+    close = close_by_machine_code if native_closing.can_close(mechanism) else close_by_jax
     q, v, psi, psi_dot, rank = close(mechanism, analysis, number(t), q, v)
     return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales)
 

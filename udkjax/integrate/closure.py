@@ -11,7 +11,7 @@ from udkjax.equations.analysis import Analysis
 from udkjax.equations.position_closure import CLOSURE_ITERATIONS, Assembly, TracedRows, close_position, damped_step
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.textbook import prepare
-from udkjax.integrate import native_engine
+from udkjax.integrate import native_closing
 from udkjax.integrate.derivatives import Function, Linear, Mask, select
 from udkjax.integrate.gradients import TreeDef
 from udkjax.pinv import SVD
@@ -64,13 +64,13 @@ class AssemblyFunction(Function):
             return super().forward(xs, has_tangent, vs, run)
         rest = iter(vs)
         change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in has_tangent])
-        return list(native_engine.closed_along(guess, _native_inputs(which), _native_inputs(change)))
+        return list(native_closing.close_jvp(guess, _native_inputs(which), _native_inputs(change)))
 
     def backward(self, xs: list[Array], has_tangent: Mask, ws: list[Array], run: PyTree) -> list[Array]:
         guess, which = self._native(xs, has_tangent)
         if guess is None:
             return super().backward(xs, has_tangent, ws, run)
-        found = native_engine.closed_back(guess, _native_inputs(which), *ws)
+        found = native_closing.close_vjp(guess, _native_inputs(which), *ws)
         pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_native_inputs(which), found)), strict=True)
         return [bar for m, bar in pairs if m is True]
 
@@ -79,7 +79,7 @@ class AssemblyFunction(Function):
         which = jax.tree.unflatten(self.tree, has_tangent)
         mechanism, analysis, t, q, v = self.guess(xs)
         others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
-        if self.is_plain or others or not native_engine.closes(mechanism):
+        if self.is_plain or others or not native_closing.can_close(mechanism):
             return None, None
         return (mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v), which
 
@@ -93,7 +93,7 @@ def _native_inputs(tree: PyTree) -> PyTree:
 @eqx.filter_custom_jvp
 def _close_by_code(function: AssemblyFunction, xs: list[Array]) -> Closed:
     mechanism, analysis, t, q, v = function.guess(xs)
-    return native_engine.closed(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
+    return native_closing.close(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
 
 
 @_close_by_code.def_jvp
@@ -101,7 +101,7 @@ def _(primals, tangents):
     function, xs = primals
     found = _close_by_code(function, xs)
     has_tangent = tuple(dx is not None for dx in tangents[1])
-    linear = Linear(function=function, xs=xs, run=(), moving=has_tangent)
+    linear = Linear(function=function, xs=xs, run=(), active=has_tangent)
     return found, (*linear.applied(select(tangents[1], has_tangent)), None, None, None)
 
 

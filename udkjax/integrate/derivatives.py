@@ -53,25 +53,25 @@ def _run(function: "Run", xs: list[Array]) -> IntegratorOutput:
 
 @_run.def_jvp
 def _(primals, tangents):
-    moving = tuple(dx is not None for dx in tangents[1])
-    if not any(moving):
+    active = tuple(dx is not None for dx in tangents[1])
+    if not any(active):
         return _run(*primals), IntegratorOutput._make([None] * len(IntegratorOutput._fields))
     shapes = eqx.filter_eval_shape(_run, *primals)
 
     def in_parts(at: Any, *directions: list[Array]) -> tuple[list[Any], ...]:
         """The run, and linear maps of the directions."""
-        raw = at[0].recorded(stop_gradients(at[1]), moving)
-        linear = Linear(function=at[0], xs=at[1], run=raw, moving=moving)
+        raw = at[0].recorded(stop_gradients(at[1]), active)
+        linear = Linear(function=at[0], xs=at[1], run=raw, active=active)
         return list(_as_run(*at, raw)), *(linear.applied(direction) for direction in directions)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
         """Both by forward mode."""
         function, xs = at
-        raw, change = function.run_and_jvp(xs, moving, direction)
+        raw, change = function.run_and_jvp(xs, active, direction)
         return list(raw), change
 
     known = list(shapes), [shapes[k] for k in SMOOTH]
-    raw, change = split_jvp(in_parts, at_once, primals, select(tangents[1], moving), None, known)
+    raw, change = split_jvp(in_parts, at_once, primals, select(tangents[1], active), None, known)
     return IntegratorOutput(*raw), IntegratorOutput._make(
         change[SMOOTH.index(k)] if k in SMOOTH else None for k in range(len(raw))
     )
@@ -102,27 +102,27 @@ class Function(eqx.Module):
     def __call__(self, xs: list[Array]) -> list[Array]:
         """f(x)."""
 
-    def pull(self, xs: list[Array], moving: Mask, ws: list[Array]) -> list[Array]:
-        """J^T w, of those of x that are moving: w^T J e for each unit vector e. Forward mode of it is JAX's, too."""
-        some = select(xs, moving)
+    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
+        """J^T w, of those of x that are active: w^T J e for each unit vector e. Forward mode of it is JAX's, too."""
+        some = select(xs, active)
         units = jnp.eye(sum(x.size for x in some))
         shapes = [x.shape for x in some]
-        row = lambda e: jnp.vdot(_flat(ws), _flat(_change(self, xs, moving, _split(e, shapes))[1]))  # noqa: E731
+        row = lambda e: jnp.vdot(_flat(ws), _flat(_change(self, xs, active, _split(e, shapes))[1]))  # noqa: E731
         return _split(jax.vmap(row)(units), shapes)
 
     @abstractmethod
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
         """Those of f(x)."""
 
-    def forward(self, xs: list[Array], moving: Mask, vs: list[Array], run: Any) -> list[Array]:
+    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
         """J v. `run` is what evaluating f at x has left for its first derivatives, if anything."""
         del run
-        return _change(self, xs, moving, vs)[1]
+        return _change(self, xs, active, vs)[1]
 
-    def backward(self, xs: list[Array], moving: Mask, ws: list[Array], run: Any) -> list[Array]:
-        """J^T w, of those of x that are moving, in the same way."""
+    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
+        """J^T w, of those of x that are active, in the same way."""
         del run
-        return self.pull(xs, moving, ws)
+        return self.pull(xs, active, ws)
 
     @property
     def plain(self) -> "Function":
@@ -150,45 +150,45 @@ class Run(Function):
     def fast(self, xs: list[Array]) -> IntegratorOutput:
         """By machine code, which has no derivatives, if that serves."""
         problem = self.problem(xs)
-        return native_engine.solve(problem) if self.native else _integrate_by_diffrax(problem)
+        return native_engine.integrate(problem) if self.native else _integrate_by_diffrax(problem)
 
-    def forward(self, xs: list[Array], moving: Mask, vs: list[Array], run: Any) -> list[Array]:
-        return super().forward(xs, moving, vs, run) if run is None else self.run_and_jvp(xs, moving, vs)[1]
+    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
+        return super().forward(xs, active, vs, run) if run is None else self.run_and_jvp(xs, active, vs)[1]
 
-    def backward(self, xs: list[Array], moving: Mask, ws: list[Array], run: Any) -> list[Array]:
+    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
         if run is None:
-            return self.pull(xs, moving, ws)
-        problem, which = self.problem(xs), jax.tree.unflatten(self.tree, moving)
-        if self._is_native(xs, moving):
+            return self.pull(xs, active, ws)
+        problem, which = self.problem(xs), jax.tree.unflatten(self.tree, active)
+        if self._is_native(xs, active):
             q, v, y = ws
             found = native_engine.vjp(problem, which, jnp.concatenate([q, v], axis=1), y)
             pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
             return [bar for m, bar in pairs if m is True]
 
         def function(some: list[Array]) -> list[Array]:
-            raw = _integrate_by_diffrax(self.problem(replaced(xs, moving, some)), "RecursiveCheckpointAdjoint")
+            raw = _integrate_by_diffrax(self.problem(replaced(xs, active, some)), "RecursiveCheckpointAdjoint")
             return [raw[k] for k in SMOOTH]
 
-        return jax.vjp(function, select(xs, moving))[1](ws)[0]
+        return jax.vjp(function, select(xs, active))[1](ws)[0]
 
-    def run_and_jvp(self, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
-        """The run, and the change of its states along v, of those of x that are moving: by machine code, if that serves."""
-        if self._is_native(xs, moving):
-            rest, which = iter(vs), jax.tree.unflatten(self.tree, moving)
-            change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in moving])
+    def run_and_jvp(self, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
+        """The run, and the change of its states along v, of those of x that are active: by machine code, if that serves."""
+        if self._is_native(xs, active):
+            rest, which = iter(vs), jax.tree.unflatten(self.tree, active)
+            change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in active])
             raw, found = native_engine.jvp(self.problem(xs), which, change)
             return raw, list(found)
-        raw, change = _change(lambda xs: _integrate_by_diffrax(self.problem(xs)), xs, moving, vs)
+        raw, change = _change(lambda xs: _integrate_by_diffrax(self.problem(xs)), xs, active, vs)
         return raw, [change[k] for k in SMOOTH]
 
-    def recorded(self, xs: list[Array], moving: Mask) -> IntegratorOutput:
+    def recorded(self, xs: list[Array], active: Mask) -> IntegratorOutput:
         """The run, by the machine code of its reverse mode, if that serves: no other is compiled."""
-        if self._is_native(xs, moving):
-            return native_engine.recorded(self.problem(xs), jax.tree.unflatten(self.tree, moving))
+        if self._is_native(xs, active):
+            return native_engine.integrate_for_vjp(self.problem(xs), jax.tree.unflatten(self.tree, active))
         return _integrate_by_diffrax(self.problem(xs))
 
-    def _is_native(self, xs: list[Array], moving: Mask) -> bool:
-        return self.native and native_engine.serves_derivatives(jax.tree.unflatten(self.tree, moving))
+    def _is_native(self, xs: list[Array], active: Mask) -> bool:
+        return self.native and native_engine.serves_derivatives(jax.tree.unflatten(self.tree, active))
 
     def __call__(self, xs: list[Array]) -> list[Array]:
         raw = _integrate_by_diffrax(self.problem(xs))
@@ -201,67 +201,67 @@ class Run(Function):
 
 
 class Along(Function):
-    """g(x, v) = J(x) v, with v of those of x that are moving."""
+    """g(x, v) = J(x) v, with v of those of x that are active."""
 
     of: Function
-    moving: Mask = eqx.field(static=True)
+    active: Mask = eqx.field(static=True)
 
     def __call__(self, xs: list[Array]) -> list[Array]:
         xs, vs = self.parts(xs)
-        return _change(self.of, xs, self.moving, vs)[1]
+        return _change(self.of, xs, self.active, vs)[1]
 
-    def pull(self, xs: list[Array], moving: Mask, ws: list[Array]) -> list[Array]:
+    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
         xs, vs = self.parts(xs)
-        of_x, of_v = moving[: len(xs)], moving[len(xs) :]
-        either = tuple(a or b for a, b in zip(of_x, self.moving, strict=True))
-        found, change = _change(lambda xs: self.of.pull(xs, either, ws), xs, self.moving, vs)
+        of_x, of_v = active[: len(xs)], active[len(xs) :]
+        either = tuple(a or b for a, b in zip(of_x, self.active, strict=True))
+        found, change = _change(lambda xs: self.of.pull(xs, either, ws), xs, self.active, vs)
         change = select(change, tuple(x for x, e in zip(of_x, either, strict=True) if e))
-        found = select(found, tuple(m for m, e in zip(self.moving, either, strict=True) if e))
+        found = select(found, tuple(m for m, e in zip(self.active, either, strict=True) if e))
         return [*change, *select(found, of_v)]
 
     def parts(self, xs: list[Array]) -> tuple[list[Array], list[Array]]:
-        return xs[: len(self.moving)], xs[len(self.moving) :]
+        return xs[: len(self.active)], xs[len(self.active) :]
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
         return self.of.shapes(self.parts(xs)[0])
 
 
 class Back(Along):
-    """h(x, w) = J(x)^T w, of those of x that are moving."""
+    """h(x, w) = J(x)^T w, of those of x that are active."""
 
     def __call__(self, xs: list[Array]) -> list[Array]:
         xs, ws = self.parts(xs)
-        return self.of.pull(xs, self.moving, ws)
+        return self.of.pull(xs, self.active, ws)
 
-    def pull(self, xs: list[Array], moving: Mask, ws: list[Array]) -> list[Array]:
+    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
         (xs, bars), directions = self.parts(xs), ws
-        of_x, of_w = moving[: len(xs)], moving[len(xs) :]
+        of_x, of_w = active[: len(xs)], active[len(xs) :]
         found = []
         if any(of_x):
-            found += _change(lambda xs: self.of.pull(xs, of_x, bars), xs, self.moving, directions)[1]
+            found += _change(lambda xs: self.of.pull(xs, of_x, bars), xs, self.active, directions)[1]
         if any(of_w):
-            found += select(_change(self.of, xs, self.moving, directions)[1], of_w)
+            found += select(_change(self.of, xs, self.active, directions)[1], of_w)
         return found
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        return [x.shape for x in select(self.parts(xs)[0], self.moving)]
+        return [x.shape for x in select(self.parts(xs)[0], self.active)]
 
 
-def _change(function: Callable, xs: list[Array], moving: Mask, vs: list[Array]) -> tuple[Any, Any]:
-    """f(x), and its change along v, of those of x that are moving, by forward mode."""
-    return jax.jvp(lambda *some: function(replaced(xs, moving, some)), select(xs, moving), vs)
+def _change(function: Callable, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[Any, Any]:
+    """f(x), and its change along v, of those of x that are active, by forward mode."""
+    return jax.jvp(lambda *some: function(replaced(xs, active, some)), select(xs, active), vs)
 
 
 # --- the linear map
 
 
 class Linear(eqx.Module):
-    """v -> J(x) v, or transposed w -> J(x)^T w, of those of x that are moving."""
+    """v -> J(x) v, or transposed w -> J(x)^T w, of those of x that are active."""
 
     function: Function
     xs: list[Array]
     run: Any  # what evaluating it has left for its first derivatives; None: nothing
-    moving: Mask = eqx.field(static=True)
+    active: Mask = eqx.field(static=True)
     transposed: bool = eqx.field(static=True, default=False)
 
     @property
@@ -271,7 +271,7 @@ class Linear(eqx.Module):
     @property
     def inputs(self) -> list[tuple[int, ...]]:
         """The shapes of what it is applied to."""
-        return self.function.shapes(self.xs) if self.transposed else [x.shape for x in select(self.xs, self.moving)]
+        return self.function.shapes(self.xs) if self.transposed else [x.shape for x in select(self.xs, self.active)]
 
     def applied(self, vs: list[Array]) -> list[Array]:
         return _split(_bind(self, _flat(vs)), self.T.inputs)
@@ -280,7 +280,7 @@ class Linear(eqx.Module):
 def _apply(linear: Linear, vector: Array) -> Array:
     function, vs = linear.function, _split(vector, linear.inputs)
     apply = function.backward if linear.transposed else function.forward
-    return _flat(apply(linear.xs, linear.moving, vs, linear.run))
+    return _flat(apply(linear.xs, linear.active, vs, linear.run))
 
 
 @eqxi.filter_primitive_def
@@ -298,9 +298,9 @@ def _derivative(primals, tangents):
     kind, function = Back if linear.transposed else Along, linear.function
     parts = [None] * len(linear.inputs) if change is None else _split(change, linear.inputs)
     dxs = [*at.xs, *parts]
-    moving = tuple(dx is not None for dx in dxs)
-    further = Linear(kind(function.plain, linear.moving), [*linear.xs, *_split(vector, linear.inputs)], None, moving)
-    return found, _bind(further, _flat(select(dxs, moving)))
+    active = tuple(dx is not None for dx in dxs)
+    further = Linear(kind(function.plain, linear.active), [*linear.xs, *_split(vector, linear.inputs)], None, active)
+    return found, _bind(further, _flat(select(dxs, active)))
 
 
 @eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
@@ -321,10 +321,10 @@ def select(xs: Sequence[Any], which: Mask) -> list[Any]:
     return [x for x, m in zip(xs, which, strict=True) if m]
 
 
-def replaced(xs: Sequence[Array], moving: Mask, some: Sequence[Array]) -> list[Array]:
-    """The same, with others in place of those that are moving."""
+def replaced(xs: Sequence[Array], active: Mask, some: Sequence[Array]) -> list[Array]:
+    """The same, with others in place of those that are active."""
     rest = iter(some)
-    return [next(rest) if m else x for x, m in zip(xs, moving, strict=True)]
+    return [next(rest) if m else x for x, m in zip(xs, active, strict=True)]
 
 
 def _flat(xs: Sequence[Any]) -> Array:

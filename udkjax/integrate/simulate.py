@@ -21,7 +21,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.native_engine import independent_row_count, known, reason_for_diffrax
+from udkjax.integrate.native_engine import independent_row_count, integrate_known, reason_for_diffrax
 from udkjax.integrate.outcome import Run, counts, outcome
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
@@ -240,7 +240,7 @@ def _simulate(
     if adjoint is not None or meter is not None:
         raw = integrate_by_diffrax(problem, adjoint, meter)
     else:
-        raw = known(problem) if xp is np else differentiable(problem, native=not why)
+        raw = integrate_known(problem) if xp is np else differentiable(problem, native=not why)
     missed = xp.array(False) if why or closure is None else closed & (closure.rank > independent_row_count(problem))
     later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
     q, v = xp.where(later, raw.q, q), xp.where(later, raw.v, v)

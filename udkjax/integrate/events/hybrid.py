@@ -155,7 +155,7 @@ class Hybrid(eqx.Module):
             native = not self._reason_for_diffrax(problem)
             if derivatives or not native:
                 return differentiable(problem, native)
-            return native_engine.solve(problem)
+            return native_engine.integrate(problem)
 
         return self.in_phase(state.phase, of_phase, ts, state.q, state.v, state.added)
 
