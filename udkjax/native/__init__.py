@@ -9,7 +9,8 @@ How the code of a run is made, and where to look:
 4. `trajectory` adds the algorithm: `runge_kutta` (stages and errors of a step), `manifold` (projection), `controller` (accept or
    reject, and the next step), `singular` and `fallback` (steps near singular configurations), `breakpoints` and `pieces` (where
    the motion is not smooth), `dense_output` (states between steps), `members` (which member runs in which lane).
-5. `tangents` (forward mode) and `walk` (reverse mode) add derivatives; `closing*` are modules that assemble a mechanism instead.
+5. `tangents` (forward mode) and `backpropagation` (reverse mode) add derivatives, with the programs of `linearization` and
+   `prologue`; `closing*` are modules that assemble a mechanism instead, `marching` one that follows its positions.
 6. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operation` makes it a primitive
    of JAX with its batching rule. `udkjax.integrate` calls that and knows the rules of differentiation.
 """
