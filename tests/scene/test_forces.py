@@ -75,7 +75,7 @@ def test_forces_in_either_frame(everything, at):
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     force, (x, y) = np.array([1.0, 2.0]), everything.forces["follow"].point
     follow = [*turn @ force, x * force[1] - y * force[0]]
-    assert_allclose(total_loads(everything, "follow", at, everything.q0, V)["a"], follow, rtol=1e-13)
+    assert_allclose(total_loads(everything, "follow", at, everything.q0, V)["a"], follow, rtol=1e-14)
     x, y = turn @ np.asarray(everything.forces["push"].point)
     push = [*force, x * force[1] - y * force[0]]
-    assert_allclose(total_loads(everything, "push", at, everything.q0, V)["a"], push, rtol=1e-13)
+    assert_allclose(total_loads(everything, "push", at, everything.q0, V)["a"], push, rtol=1e-14)

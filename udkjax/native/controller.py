@@ -97,14 +97,12 @@ def write_decide(t: Module):
             s.where(accept, tolerance=velocity_tolerance(t, f, s, "P3 v"))
         t.record_step(f, s, accept)
     s.where(accept & stepped, rate=rate)
-    first = s.tried < 0.0
     if t.plan.breaks:
         h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
         h = where(begun & (tried > 0.0), s.h * RESTART_FACTOR, h)
         s.where(begun, rate=inf, distance0=inf, distance1=inf)
         s.where(stepping, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
         s.where(accept & (s.lands > 0.5), steps=-1.0)
-    del first
     cost = where(begin, f.const(1.0, DOUBLE, f.width), float(t.method.stages))
     cost = where(fallback, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
     s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)

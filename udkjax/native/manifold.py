@@ -10,14 +10,14 @@ from udkjax.native.module import Module
 from udkjax.native.steps import NEWTON_STEPS, NEWTON_TOL, OUTPUT_PIVOT_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
 
 
-def newton(t: Module, f: Function, s: Lane, steps: int, which: str = "stepping"):
+def newton(t: Module, f: Function, s: Lane):
     """Newton's method to Psi = 0 of lanes that are `stepping`, until it moves nothing but rounding errors."""
 
     def closer(active: Value):
         t.invoke(f, "newton_q")
         s.where(active & (s.safe < 0.5), ok=0.0)
 
-    iterate_newton(t, f, s, getattr(s, which) > 0.5, closer, steps)
+    iterate_newton(t, f, s, s.stepping > 0.5, closer)
 
 
 def iterate_newton(t: Module, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):

@@ -40,7 +40,7 @@ class Kind(NamedTuple):
     method: "Tableau"
     projected: bool
     breaks: bool
-    active: tuple[bool, ...] | None = None  # of a run with derivatives: of which constants
+    active: tuple[bool, ...] | None = None  # of a run with derivatives: along which numbers of the scene
     mode: str = "run"  # or "forward", "reverse", "closing" and its derivatives, "marching"
 
 

@@ -6,7 +6,7 @@ from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.manifold import newton, with_threshold
 from udkjax.native.module import Module
-from udkjax.native.steps import NEWTON_STEPS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT
+from udkjax.native.steps import NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT
 
 
 def write_attempt(t: Module):
@@ -46,7 +46,7 @@ def write_attempt(t: Module):
     else:
         if not method.ends:
             estimate_errors(t, f, s, None, "X dq", "X dv")
-        newton(t, f, s, NEWTON_STEPS)
+        newton(t, f, s)
         t.invoke(f, "project_and_accelerate" if method.ends else "end_of_step")
         unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
         if t.falls_back:
