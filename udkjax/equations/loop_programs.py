@@ -9,9 +9,7 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from udkjax.equations.loop_elimination import BlockElimination
 from udkjax.equations.loop_layout import BODY_COORDINATES, DROP_TOL, LoopLayout, abstract_mechanism
@@ -258,11 +256,8 @@ class LoopPrograms:
         """The entries of D: their rows, columns, places in the array `D` (with a one behind it), and factors."""
         return self._layout.d_entries
 
-    def constants_of(self, numbers: Array) -> Array:
-        """The constants as a function of the numbers of the scene and the gains."""
-        return self._constants_by_arrays(numbers, jnp)
-
-    def _constants_by_arrays(self, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
+    def constants_of(self, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
+        """Return the constants as a function of the numbers of the scene and the gains."""
         arrays = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(self.constants))}
         return evaluate_loops(self.prologue, arrays, xp)["constants"]
 
@@ -298,7 +293,7 @@ class LoopPrograms:
         self, program: LoopProgram, numbers: AnyArray, xp: ArrayLibrary
     ) -> StateFunction[AnyArray, dict[str, AnyArray]]:
         """Run a program in which no round of a loop takes anything from another, by NumPy or JAX."""
-        constants = self._constants_by_arrays(numbers, xp)
+        constants = self.constants_of(numbers, xp)
         sizes = self.scratch | {"psi": self.row_count, "psi_dot": self.row_count, "terms": self.term_count}
         results = {"psi", "psi_dot", "terms", "D"}
         blank = {x: xp.zeros(size) for x, size in sizes.items() if x in program.arrays | results}
