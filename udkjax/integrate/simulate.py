@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 MAX_STEPS = 100_000
 MAX_EVENTS = 64
 GEOMETRY_TRACED = (
-    "the geometry of the mechanism is traced: its redundant rows are not known, and the run takes singular values, by diffrax, a "
-    "hundred times slower. Make the mechanism of plain numbers and change them by with_parameters, or pass analysis=analyse(...)"
+    "the geometry of the mechanism is traced: its redundant rows are not known, and the run takes singular values, by diffrax, "
+    "hundreds of times slower. Make it of plain numbers and change them by with_parameters, or pass analysis=analyse(...)"
 )
 # Of the rows' scales. Projection leaves rounding errors, unless the rows that it does not see drift. Without it drift is what one
 # looks at, up to where a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
