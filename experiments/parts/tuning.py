@@ -85,7 +85,7 @@ class Drift:
         self.unit = 1.0
         self.unit = float(self(np.log([REFERENCE]))[0])
 
-    def evaluate(self, z: Any, tol: tuple[float, float], horizon: float | None = None) -> Residuals:
+    def evaluate(self, z: np.ndarray) -> Residuals:
         """Residuals, in root mean squares of those with the reference's gains, of gains exp(z), z (B, 2)."""
         self.calls += len(z)
         lanes = np.concatenate([z, np.repeat(z[-1:], LANES - len(z), axis=0)])
@@ -96,12 +96,12 @@ class Drift:
     def __call__(self, z: Any) -> Float[np.ndarray, "B"]:
         """Root mean squares of Psi (m, rad) with gains exp(z)."""
         chunks = np.split(z, range(LANES, len(z), LANES))
-        return self.unit * np.concatenate([np.linalg.norm(self.evaluate(chunk, (0.0, 0.0)).r, axis=1) for chunk in chunks])
+        return self.unit * np.concatenate([np.linalg.norm(self.evaluate(chunk).r, axis=1) for chunk in chunks])
 
     def tuned(self) -> Fit:
         """Fits from all guesses."""
         self.calls = 0
-        return minimize_squares(self, np.log(GUESSES), (0.0, 0.0), settled=SETTLED)
+        return minimize_squares(self.evaluate, np.log(GUESSES), settled=SETTLED)
 
     def last(self, z: Any) -> tuple[np.ndarray, np.ndarray]:
         """The length of Psi (B, 2) at the end of the run, and its derivative by the logarithm of both gains."""

@@ -9,7 +9,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.study.identify.estimate import Estimate, format_value
-from udkjax.study.identify.least_squares import squares
+from udkjax.study.identify.optimizer import squares
 from udkjax.study.identify.records import Record, labels
 
 

@@ -1,5 +1,6 @@
 """Fits by optimizers of optax: the minimum of least squares, and those of other losses."""
 
+from functools import partial
 from typing import Any, cast
 
 import jax.numpy as jnp
@@ -22,6 +23,10 @@ def problem_of(angle: np.ndarray) -> Problem:
     return Problem(first, unknowns_of(first, NAMES), [Record(TS, {ANGLE: angle}, noise=NOISE)])
 
 
+def objective(problem: Problem):
+    return partial(problem.evaluate, tol=TOL)
+
+
 @pytest.fixture(scope="module")
 def noisy(measured):
     return measured[1] + NOISE * np.random.default_rng(1).standard_normal(len(TS))
@@ -30,7 +35,7 @@ def noisy(measured):
 @pytest.mark.slow
 def test_lbfgs_ends_where_least_squares_do(noisy):
     problem = problem_of(noisy)
-    fit = minimize_by_gradient(GradientMethod(optax.lbfgs()), problem, np.zeros((1, 2)), TOL, steps=100)
+    fit = minimize_by_gradient(GradientMethod(optax.lbfgs()), objective(problem), np.zeros((1, 2)), steps=100)
     squares = Minimizer().minimize(problem, np.zeros((1, 2)), TOL)
     assert fit.settled[0] and len(fit.history) < 40
     assert np.abs(fit.z - squares.z).max() < 1e-5
@@ -47,7 +52,7 @@ OTHERS = {
 @pytest.mark.parametrize(("optimizer", "settled", "within"), OTHERS.values(), ids=list(OTHERS))
 def test_other_optimizers_end_there_too(noisy, optimizer, settled, within):
     problem = problem_of(noisy)
-    fit = minimize_by_gradient(GradientMethod(optimizer), problem, np.zeros((1, 2)), TOL, steps=600, settled=settled)
+    fit = minimize_by_gradient(GradientMethod(optimizer), objective(problem), np.zeros((1, 2)), steps=600, settled=settled)
     squares = Minimizer().minimize(problem, np.zeros((1, 2)), TOL)
     assert fit.settled[0] and np.abs(fit.z - squares.z).max() < within
     costs = [cost for cost, _ in fit.history]
@@ -60,7 +65,7 @@ def test_a_loss_of_the_users_own(noisy):
     noisy[5::10] += 0.1
     problem = problem_of(noisy)
     method = GradientMethod(None, lambda r: jnp.sum(jnp.sqrt(1.0 + r**2)))
-    fit = minimize_by_gradient(method, problem, np.zeros((1, 2)), TOL, steps=200)
+    fit = minimize_by_gradient(method, objective(problem), np.zeros((1, 2)), steps=200)
     squares = Minimizer().minimize(problem, np.zeros((1, 2)), TOL)
     truth = problem.unknowns.z_of(np.array([0.375, 0.2]))
     assert fit.settled[0] and np.abs(fit.z[0] - truth).max() < 0.02

@@ -10,9 +10,8 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 from udkjax.study.identify.estimate import profiles_dataset
-from udkjax.study.identify.least_squares import squares
 from udkjax.study.identify.problem import Residuals
-from udkjax.study.identify.profile_likelihood import WithFixedParameter, profile_likelihood, trace_profile
+from udkjax.study.identify.profile_likelihood import fix_unknown, profile_likelihood, trace_profile
 
 
 def linear(J, r0):
@@ -149,8 +148,7 @@ class Linear:
             dx_dz=lambda z: SCALE[:P],
         )
 
-    def evaluate(self, z, tol, horizon=None):
-        assert tol == (1e-9, 1e-9) and horizon is None
+    def evaluate(self, z):
         return Residuals(self.r0 + z @ self.J.T, np.tile(self.J, (len(z), 1, 1)), np.zeros(len(z), int))
 
 
@@ -161,16 +159,13 @@ def fitted(problem, noise=()):
     errors = np.sqrt(np.diag(np.linalg.inv(problem.J.T @ problem.J)))[:2] * SCALE[: len(z)] * s
     known: Any = SimpleNamespace(standard_errors=errors, noise=np.array(noise), degrees_of_freedom=37)
     values = dict(zip(problem.unknowns.names, problem.unknowns.values(z[:2]), strict=True))
-    return known, values, partial(profile_likelihood, problem, problem.unknowns, z, (1e-9, 1e-9), squares, known)
+    return known, values, partial(profile_likelihood, problem.evaluate, problem.unknowns, z, known)
 
 
 def test_one_unknown_is_fixed():
     problem = Linear()
-    fixed = WithFixedParameter(problem, 1, 0.7)
-    z = np.array([[1.0, -1.0], [0.0, 2.0]])
-    assert_allclose(fixed.insert(z), [[1.0, 0.7, -1.0], [0.0, 0.7, 2.0]])
-    found = fixed.evaluate(z, (1e-9, 1e-9))
-    assert_allclose(found.r, problem.r0 + fixed.insert(z) @ problem.J.T)
+    found = fix_unknown(problem.evaluate, 1, 0.7)(np.array([[1.0, -1.0], [0.0, 2.0]]))
+    assert_allclose(found.r, problem.r0 + np.array([[1.0, 0.7, -1.0], [0.0, 0.7, 2.0]]) @ problem.J.T)
     assert_allclose(found.J[1], problem.J[:, [0, 2]])
 
 

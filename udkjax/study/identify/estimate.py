@@ -20,9 +20,9 @@ from udkjax.integrate.solution import scene_text, versions
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
-from udkjax.study.identify.least_squares import Loss
+from udkjax.study.identify.optimizer import Loss
 from udkjax.study.identify.prediction import Tolerances
-from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.problem import Problem, Residuals
 from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikelihood, estimated_noise, profile_likelihood, quantile
 from udkjax.study.identify.records import IdentificationError, labels
 from udkjax.study.identify.uncertainty import Uncertainty, Whiteness
@@ -152,7 +152,11 @@ class Estimate:
         """
         if name not in self.names:
             raise IdentificationError([f"{quote(name)} was not identified{suggestion(name, self.names)}"])
-        return profile_likelihood(self.problem, self.problem.unknowns, self.z, self.tol, self.loss, self.uncertainty, name, level)
+
+        def evaluate(z: np.ndarray) -> Residuals:
+            return self.loss(self.problem.evaluate(z, self.tol))
+
+        return profile_likelihood(evaluate, self.problem.unknowns, self.z, self.uncertainty, name, level)
 
     def check_gradients(self) -> GradientCheck:
         """Compare the derivatives at the estimate with differences: see `udkjax.check_gradients`."""

@@ -14,8 +14,8 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.build_problem import build_problem
 from udkjax.study.identify.directions import UnknownValues
 from udkjax.study.identify.estimate import Estimate
-from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History, Loss, squares
-from udkjax.study.identify.optimizer import Minimizer, Optimizer, UserLoss, choose_method, named_loss
+from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History
+from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import LOOSE, TIGHT, Tolerances
 from udkjax.study.identify.problem import Problem

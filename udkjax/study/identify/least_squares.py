@@ -7,7 +7,7 @@ same sums of squares, gradients and steps.
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.study.identify.directions import INVISIBLE
-from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Residuals
 from udkjax.study.identify.unknowns import FAR
 
@@ -41,20 +40,9 @@ SHORT_STEP = 0.3  # of an unknown: where the first Gauss-Newton step is no longe
 GOOD_DECREASE, DAMPING_FACTOR = 0.75, 10.0  # part of the decrease promised from which on the damping falls, and by how much
 MOST_REFUSED = 8  # steps one after another, before a fit is given up
 
-Loss: TypeAlias = Callable[[Residuals], Residuals]  # residuals whose squares are minimized, of plain ones
+Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
 Report: TypeAlias = Callable[[str], None]  # is called with a text after each step
 History: TypeAlias = list[tuple[float, float]]  # cost, and largest change of an unknown by the next step: after each step
-
-
-class LeastSquares(Protocol):
-    """What is minimized: residuals and their Jacobian at B sets of K unknowns."""
-
-    def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals: ...
-
-
-def squares(found: Residuals) -> Residuals:
-    """Return plain residuals: the loss of least squares."""
-    return found
 
 
 class Fit(NamedTuple):
@@ -67,30 +55,18 @@ class Fit(NamedTuple):
 
 
 def minimize_squares(
-    problem: LeastSquares,
+    evaluate: Objective,
     z: Float[np.ndarray, "B K"],
-    tol: Tolerances,
-    horizon: float | None = None,
     steps: int = STEPS,
     settled: float = EXACT_STEP,
     undamped: bool = False,
     method: "optimistix.AbstractLeastSquaresSolver | None" = None,
-    loss: Loss = squares,
     report: Report = lambda text: None,
 ) -> Fit:
     """Minimize r.r / 2 by Levenberg-Marquardt, or another `method`, from several first guesses.
 
-    Args:
-        problem: what is minimized.
-        z: B first guesses.
-        tol: tolerances of the integration.
-        horizon: the part of each record that is fitted; None: all of it.
-        steps: how many at most.
-        settled: a fit has settled where its Gauss-Newton step is below this (dimensionless).
-        undamped: whether the guesses are at a minimum, up to the tolerance of the integration.
-        method: a least-squares solver of optimistix; by default Levenberg-Marquardt.
-        loss: transforms residuals and Jacobian into those whose squares are minimized.
-        report: is called with a text after each step.
+    A fit has settled where its Gauss-Newton step is below `settled` (dimensionless); `undamped` says that the guesses are at a
+    minimum already, up to the tolerance of the integration.
     """
     sets, K = z.shape
     start, step = _compiled_step(method, K, sets)
@@ -105,7 +81,7 @@ def minimize_squares(
         asked = active[np.abs(trial[active]).max(1, initial=0.0) < FAR]
         costs, triangles = np.full(sets, np.inf), np.zeros((sets, K + 1, K + 1))
         if len(asked):
-            found = loss(problem.evaluate(trial[asked], tol, horizon))
+            found = evaluate(trial[asked])
             for k, r, J, ok in zip(asked, found.r, found.J, found.ok, strict=True):
                 if ok:
                     costs[k], triangles[k] = 0.5 * r @ r, _triangular_factor(r, J)

@@ -18,14 +18,12 @@ from udkjax.study.identify.least_squares import (
     STEPS,
     Fit,
     History,
-    LeastSquares,
-    Loss,
+    Objective,
     Report,
     minimize_squares,
-    squares,
 )
 from udkjax.study.identify.prediction import Tolerances
-from udkjax.study.identify.problem import Residuals
+from udkjax.study.identify.problem import Problem, Residuals
 from udkjax.study.identify.records import IdentificationError
 
 if TYPE_CHECKING:  # imported where a fit begins: it takes a second
@@ -36,6 +34,7 @@ GRADIENT_STEPS = 2000  # at most, of an optimizer that knows no curvature
 FAILED_COST = 100.0  # times the first cost: what is taken for the cost where nothing can be computed
 HUBER = 1.345  # standard deviations: of noise that is Gaussian after all, estimates lose a twentieth of their precision
 
+Loss: TypeAlias = Callable[[Residuals], Residuals]  # residuals whose squares are minimized, of plain ones
 UserLoss: TypeAlias = Callable[[Array], Array]
 Optimizer: TypeAlias = Union["optimistix.AbstractLeastSquaresSolver", "optax.GradientTransformation", None]
 
@@ -66,43 +65,12 @@ def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> Method:
     return GradientMethod(None, own_loss)
 
 
-@dataclass(frozen=True)
-class Minimizer:
-    """How all fits of an identification are made.
-
-    Attributes:
-        method: a least-squares solver of optimistix, or an optimizer by gradients; None: Levenberg-Marquardt.
-        loss: transforms residuals and Jacobian into those whose squares are minimized.
-        report: is called with a text after each step.
-    """
-
-    method: Method = None
-    loss: Loss = squares
-    report: Report = lambda text: None
-
-    def minimize(
-        self,
-        problem: LeastSquares,
-        z: Float[np.ndarray, "B K"],
-        tol: Tolerances,
-        horizon: float | None = None,
-        steps: int = STEPS,
-        settled: float = EXACT_STEP,
-        undamped: bool = False,
-    ) -> Fit:
-        """Minimize from several first guesses: see `minimize_squares`, whose arguments these are."""
-        if isinstance(self.method, GradientMethod):
-            return minimize_by_gradient(
-                self.method, problem, z, tol, horizon, settled=settled, transform=self.loss, report=self.report
-            )
-        return minimize_squares(problem, z, tol, horizon, steps, settled, undamped, self.method, self.loss, self.report)
-
-    def with_label(self, what: str) -> "Minimizer":
-        """Return the same one, with reports that begin with what is fitted."""
-        return replace(self, report=lambda text: self.report(f"{what}: {text}"))
-
-
 # --- losses
+
+
+def squares(found: Residuals) -> Residuals:
+    """Return plain residuals: the loss of least squares."""
+    return found
 
 
 def named_loss(name: str, residuals: int) -> Loss:
@@ -132,6 +100,41 @@ def huber(found: Residuals, residuals: int, c: float = HUBER) -> Residuals:
     )
 
 
+# --- fits
+
+
+@dataclass(frozen=True)
+class Minimizer:
+    """How all fits of an identification are made: by Levenberg-Marquardt (None), or another `method`."""
+
+    method: Method = None
+    loss: Loss = squares
+    report: Report = lambda text: None
+
+    def minimize(
+        self,
+        problem: Problem,
+        z: Float[np.ndarray, "B K"],
+        tol: Tolerances,
+        horizon: float | None = None,
+        steps: int = STEPS,
+        settled: float = EXACT_STEP,
+        undamped: bool = False,
+    ) -> Fit:
+        """Fit the part `horizon` of each record (None: all of it) from several first guesses: see `minimize_squares`."""
+
+        def evaluate(z: np.ndarray) -> Residuals:
+            return self.loss(problem.evaluate(z, tol, horizon))
+
+        if isinstance(self.method, GradientMethod):
+            return minimize_by_gradient(self.method, evaluate, z, settled=settled, report=self.report)
+        return minimize_squares(evaluate, z, steps, settled, undamped, self.method, self.report)
+
+    def with_label(self, what: str) -> "Minimizer":
+        """Return the same one, with reports that begin with what is fitted."""
+        return replace(self, report=lambda text: self.report(f"{what}: {text}"))
+
+
 # --- gradients
 
 
@@ -145,33 +148,19 @@ class _LossPoint(NamedTuple):
 
 def minimize_by_gradient(
     method: GradientMethod,
-    problem: LeastSquares,
+    evaluate: Objective,
     z: Float[np.ndarray, "B K"],
-    tol: Tolerances,
-    horizon: float | None = None,
     steps: int = GRADIENT_STEPS,
     settled: float = FINE_STEP,
-    transform: Loss = squares,
     report: Report = lambda text: None,
 ) -> Fit:
     """Minimize a loss rho(r) by an optimizer that knows its gradient J^T d rho / dr, from guesses one after another.
 
     A fit has settled where (J^T J)^-1 J^T d rho / dr is small, but no smaller than first-order methods come. Derivatives are
     taken forward here too: in reverse mode a gradient costs a fifth of it with 20 unknowns, but takes 20 to 40 s to compile.
-
-    Args:
-        method: the optimizer and the loss.
-        problem: whose residuals they are of.
-        z: B first guesses.
-        tol: tolerances of the integration.
-        horizon: the part of each record that is fitted; None: all of it.
-        steps: how many at most.
-        settled: a fit has settled where its Gauss-Newton step is below this (dimensionless).
-        transform: residuals that the loss is of, of plain ones.
-        report: is called with a text after each step.
     """
     settled = max(settled, FINE_STEP)
-    walks = [_LossAlongWalk(problem, tol, horizon, method.loss or _half_square, transform, settled, report) for _ in z]
+    walks = [_LossAlongWalk(evaluate, method.loss or _half_square, settled, report) for _ in z]
     step_on = _walk_by_scipy if method.optimizer is None else partial(_walk_by_optax, method.optimizer)
     for first, walk in zip(z, walks, strict=True):
         step_on(walk, first, steps)
@@ -221,18 +210,8 @@ def _walk_by_optax(given: "optax.GradientTransformation", walk: "_LossAlongWalk"
 class _LossAlongWalk:
     """A loss and its gradient at the points of one walk: it stores the best, and the last few, for line searches that repeat."""
 
-    def __init__(
-        self,
-        problem: LeastSquares,
-        tol: Tolerances,
-        horizon: float | None,
-        rho: UserLoss,
-        transform: Loss,
-        settled: float,
-        report: Report,
-    ):
-        self.problem, self.tol, self.horizon, self.transform = problem, tol, horizon, transform
-        self.settled, self.report = settled, report
+    def __init__(self, evaluate: Objective, rho: UserLoss, settled: float, report: Report):
+        self.evaluate, self.settled, self.report = evaluate, settled, report
         self.value_and_slope = jax.value_and_grad(rho)
         self.worst = np.inf
         self.best, self.best_z = _LossPoint(np.inf, np.zeros(0), np.inf), np.zeros(0)
@@ -264,7 +243,7 @@ class _LossAlongWalk:
 
     @jax.disable_jit(False)
     def _compute(self, z: tuple[float, ...]) -> _LossPoint:
-        found = self.transform(self.problem.evaluate(np.array([z]), self.tol, self.horizon))
+        found = self.evaluate(np.array([z]))
         if not found.ok[0]:
             return _LossPoint(self.worst, np.zeros(len(z)), np.inf)
         value, slope = self.value_and_slope(jnp.asarray(found.r[0]))

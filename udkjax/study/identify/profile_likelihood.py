@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri, fdtri
 
-from udkjax.study.identify.least_squares import FINE_STEP, LeastSquares, Loss, minimize_squares
-from udkjax.study.identify.prediction import Tolerances
+from udkjax.study.identify.least_squares import FINE_STEP, Objective, minimize_squares
 from udkjax.study.identify.problem import Residuals
 from udkjax.study.identify.uncertainty import Uncertainty
 from udkjax.study.identify.unknowns import FAR, Unknowns
@@ -58,80 +57,50 @@ class _Side(NamedTuple):
     open: str
 
 
-class WithFixedParameter:
-    """A problem in all unknowns but one, which has a value."""
+def fix_unknown(evaluate: Objective, index: int, value: float) -> Objective:
+    """Return residuals as a function of all unknowns but one, which has a value."""
 
-    def __init__(self, problem: LeastSquares, index: int, value: float):
-        self.problem, self.index, self.value = problem, index, value
+    def evaluate_others(z: Float[np.ndarray, "B K-1"]) -> Residuals:
+        found = evaluate(np.insert(z, index, value, axis=-1))
+        return found._replace(J=np.delete(found.J, index, axis=2))
 
-    def insert(self, z: Float[np.ndarray, "... K-1"]) -> Float[np.ndarray, "... K"]:
-        """Return all unknowns."""
-        return np.insert(z, self.index, self.value, axis=-1)
-
-    def evaluate(self, z: Float[np.ndarray, "B K-1"], tol: Tolerances, horizon: float | None = None) -> Residuals:
-        """Compute residuals, and their Jacobian by the others."""
-        found = self.problem.evaluate(self.insert(z), tol, horizon)
-        return found._replace(J=np.delete(found.J, self.index, axis=2))
+    return evaluate_others
 
 
 def profile_likelihood(
-    problem: LeastSquares,
+    evaluate: Objective,
     unknowns: Unknowns,
     z: Float[np.ndarray, "K"],
-    tol: Tolerances,
-    loss: Loss,
     uncertainty: Uncertainty,
     name: str,
     level: float = CONFIDENCE,
 ) -> ProfileLikelihood:
-    """Compute the profile likelihood of a parameter at an estimate z of a problem: the others are fitted anew beside it.
-
-    Args:
-        problem: that was fitted.
-        unknowns: its parameters.
-        z: the estimate.
-        tol: tolerances of the integration.
-        loss: that was minimized.
-        uncertainty: of the estimate.
-        name: of the parameter.
-        level: of confidence.
-    """
+    """Compute the profile likelihood of a parameter at an estimate z: the others are fitted anew beside it."""
     k, P = unknowns.names.index(name), len(unknowns.names)
 
     def fit(index: int, fixed: float, z0: np.ndarray) -> tuple[np.ndarray, float]:
-        rest = WithFixedParameter(problem, index, fixed)
         others = np.delete(z0, index)
-        if others.size:
-            found = minimize_squares(rest, others[None], tol, settled=FINE_STEP, loss=loss)
-            return rest.insert(found.z[0]), float(found.cost[0])
-        residuals = rest.evaluate(others[None], tol)
-        return z0, cost_of(residuals, loss) if residuals.ok[0] else np.inf
+        if not others.size:
+            return z0, _cost(evaluate(z0[None]))
+        found = minimize_squares(fix_unknown(evaluate, index, fixed), others[None], settled=FINE_STEP)
+        return np.insert(found.z[0], index, fixed), float(found.cost[0])
 
     def value(fixed: float) -> float:
         every = z[:P].copy()
         every[k] = fixed
         return float(unknowns.values(every)[k])
 
+    error = float(uncertainty.standard_errors[k] / abs(unknowns.dx_dz(z[:P])[k]))
     noise, freedom = estimated_noise(uncertainty)
+    least, units = _cost(evaluate(z[None])), unknowns.units[k]
     return trace_profile(
-        fit,
-        k,
-        z,
-        cost_of(problem.evaluate(z[None], tol), loss),
-        float(uncertainty.standard_errors[k] / abs(unknowns.dx_dz(z[:P])[k])),
-        level=level,
-        noise=noise,
-        degrees_of_freedom=freedom,
-        value=value,
-        name=name,
-        units=unknowns.units[k],
+        fit, k, z, least, error, level=level, noise=noise, degrees_of_freedom=freedom, value=value, name=name, units=units
     )
 
 
-def cost_of(found: Residuals, loss: Loss) -> float:
-    """Return r.r / 2 of the first set of unknowns."""
-    r = loss(found).r[0]
-    return float(0.5 * r @ r)
+def _cost(found: Residuals) -> float:
+    """Return r.r / 2 of the first set of unknowns; infinite where it cannot be computed."""
+    return float(0.5 * found.r[0] @ found.r[0]) if found.ok[0] else np.inf
 
 
 def estimated_noise(uncertainty: Uncertainty) -> tuple[float, float | None]:

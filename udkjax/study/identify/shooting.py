@@ -21,7 +21,16 @@ from jaxtyping import Float
 
 from udkjax.integrate.assembly import State
 from udkjax.study.identify.initial_states import InitialStateUnknowns, state_unknowns, with_conditions
-from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, FINE_STEP, SOME_STEPS, STEPS, Fit, minimize_squares
+from udkjax.study.identify.least_squares import (
+    COARSE_STEP,
+    FEW_STEPS,
+    FINE_STEP,
+    SOME_STEPS,
+    STEPS,
+    Fit,
+    Objective,
+    minimize_squares,
+)
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import Prediction, Predictor, Tolerances
 from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals, Runs
@@ -111,18 +120,37 @@ class MultipleShooting(Problem):
         found, moved = np.concatenate([z, np.zeros(self.K - len(z))]), []
         ends = np.zeros((2, 2, 0))
         for p, piece in enumerate(self.pieces):
-            state, columns = _InitialStateOfPiece(self, p, x), self.columns[p]
+            columns = self.columns[p]
             if piece.first:
                 self._begin_at(p, ends[1], x)  # the piece before is of the same record
-                fit = minimize_squares(state, np.zeros((1, self.S)), tol, None, FEW_STEPS, COARSE_STEP)
+                fit = minimize_squares(self._residuals_of_piece(p, x, tol), np.zeros((1, self.S)), FEW_STEPS, COARSE_STEP)
                 found[columns] = np.where(np.isfinite(fit.cost[0]), fit.z[0], 0.0)
-            ends = np.asarray(state.predict(np.where(columns < 0, 0.0, found[columns])[None], tol).ends)[0]
+            ends = np.asarray(self._predict_piece(p, x, np.where(columns < 0, 0.0, found[columns])[None], tol).ends)[0]
             if not np.isfinite(ends).all():
                 raise PieceFailed
             if piece.first:
                 moved.append(self.inverse[p] @ (ends[1] - ends[0]).ravel())
         size = np.sqrt(np.mean(np.square(moved), axis=0)) if moved else np.ones(self.S)
         return found, np.maximum(size, LEAST_MOTION * size.max(initial=0.0))
+
+    def _predict_piece(self, p: int, x: np.ndarray, shift: Float[np.ndarray, "B S"], tol: Tolerances) -> Prediction:
+        """Predict a piece with parameters x, from B initial states."""
+        return self.predictor(self.members_of(np.full(len(shift), p), np.tile(x, (len(shift), 1)), shift), tol)
+
+    def _residuals_of_piece(self, p: int, x: np.ndarray, tol: Tolerances) -> Objective:
+        """Return residuals of a piece as a function of its initial state, held near to where the piece before leads to."""
+        rows, S, damping = np.flatnonzero(self.run == p), self.S, None
+        at, sigma, measured = (self.time[rows], self.index[rows, 2]), self.sigma[rows], self.y[self.present][rows]
+
+        def evaluate(shift: Float[np.ndarray, "B S"]) -> Residuals:
+            nonlocal damping
+            found = self._predict_piece(p, x, shift, tol)
+            r, J = (found.y[:, *at] - measured) / sigma, found.dy[:, *at, len(x) :] / sigma[:, None]
+            damping = float(CONTINUED * np.linalg.norm(J[0], 2)) if damping is None else damping
+            damped = np.broadcast_to(damping * np.eye(S), (len(shift), S, S))
+            return Residuals(np.concatenate([r, damping * shift], 1), np.concatenate([J, damped], 1), found.code)
+
+        return evaluate
 
     def further_rows(self, found: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Iterate over the residuals of priors, and those of continuity, (F_p - s_{p+1}) / scale * weight."""
@@ -154,32 +182,6 @@ class PieceFailed(Exception):
     """A piece could not be computed with the first guess: it says nothing of where the next begins."""
 
 
-class _InitialStateOfPiece:
-    """The initial state of one piece as a problem: what was measured in it, and being near to where the piece before leads to."""
-
-    def __init__(self, shooting: MultipleShooting, p: int, x: np.ndarray):
-        self.shooting, self.p, self.x = shooting, p, x
-        self.damping: float | None = None
-        self.rows = np.flatnonzero(shooting.run == p)
-
-    def predict(self, shift: Float[np.ndarray, "B S"], tol: Tolerances) -> Prediction:
-        """Predict the piece."""
-        members = self.shooting.members_of(np.full(len(shift), self.p), np.tile(self.x, (len(shift), 1)), shift)
-        return self.shooting.predictor(members, tol)
-
-    def evaluate(self, z: Float[np.ndarray, "B S"], tol: Tolerances, horizon: float | None = None) -> Residuals:
-        """Compute residuals and their Jacobian."""
-        shooting, rows, P, S = self.shooting, self.rows, len(self.x), self.shooting.S
-        found = self.predict(z, tol)
-        at, sigma = (shooting.time[rows], shooting.index[rows, 2]), shooting.sigma[rows]
-        r = (found.y[:, *at] - shooting.y[shooting.present][rows]) / sigma
-        J = found.dy[:, *at, P:] / sigma[:, None]
-        if self.damping is None:
-            self.damping = float(CONTINUED * np.linalg.norm(J[0], 2))
-        damped = np.broadcast_to(self.damping * np.eye(S), (len(z), S, S))
-        return Residuals(np.concatenate([r, self.damping * z], 1), np.concatenate([J, damped], 1), found.code)
-
-
 def fit_pieces(
     problem: Problem,
     z: Float[np.ndarray, "K"],
@@ -187,20 +189,10 @@ def fit_pieces(
     minimizer: Minimizer,
     samples: float = RESIDUALS_PER_UNKNOWN,
 ) -> tuple[MultipleShooting, Fit]:
-    """Fit the records in pieces, from unknowns z of the problem.
+    """Fit the records in pieces, from unknowns z of the problem; return the problem in pieces, and the fit of its unknowns.
 
-    Args:
-        problem: the whole problem.
-        z: first guess (K,).
-        tol: tolerances of the integration.
-        minimizer: how each fit is made.
-        samples: residuals of a piece at least, per unknown of its initial state.
-
-    Returns:
-        The problem in pieces, and the fit of its unknowns.
-
-    Raises:
-        PieceFailed: along the first guess.
+    A piece has at least as many `samples` as that for each unknown of its initial state. Where one cannot be computed along the
+    first guess, `PieceFailed` is raised.
     """
     shooting = MultipleShooting(problem, z, tol, samples)
     fit, history = Fit(shooting.guess[None], np.full(1, np.inf), np.zeros(1, bool), []), []
