@@ -143,5 +143,8 @@ if ! { works uv && uv pip install --quiet --python "$venv/bin/python" -c constra
     "$venv/bin/python" -m pip --disable-pip-version-check install --quiet -c constraints.txt -e "$target" ||
         die 1 "pip could not install; the reason stands above"
 fi
+# The first run, with bytecode of all that it imports: uv writes none, and where PYTHONDONTWRITEBYTECODE is set nobody would.
+first='import numpy, udkjax.cli; udkjax.simulate(udkjax.library.parallelogram(), numpy.linspace(0.0, 1.0, 11))'
+env -u PYTHONDONTWRITEBYTECODE "$venv/bin/python" -c "$first" || die 1 "installed, but a first run fails; the reason stands above"
 "$venv/bin/udkjax" --help >/dev/null || die 1 "installed, but the command does not run"
 say "ready: $venv/bin/udkjax --help"

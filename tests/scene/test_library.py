@@ -1,3 +1,4 @@
+import inspect
 import json
 from pathlib import Path
 
@@ -30,6 +31,7 @@ MECHANISMS = {
     "excavator": (12, 12, {}),
     "andrews_squeezer": (20, 20, {}),
 }
+GEOMETRY = ("angle", "angles", "length", "lengths", "position", "crank", "rod", "arm", "side", "ground", "sun", "planet")
 AT_REST = ("andrews_squeezer",)  # by its publication
 
 
@@ -63,6 +65,33 @@ def test_numbers_may_be_traced():
     assert_allclose(start(0.3), library.parallelogram(0.3).q0, atol=1e-15)
     slope = jax.jacfwd(start)(0.3)
     assert_allclose(slope[3], [-np.sin(0.3), np.cos(0.3), 0.0], atol=1e-15)
+
+
+def _positions_are_traced(name, key, default):
+    """Whether a mechanism of the library has traced positions where the number `key` is traced."""
+    found = []
+
+    def build(value):
+        found.append(isinstance(getattr(library, name)(**{key: value}).q0, jax.core.Tracer))
+
+    jax.eval_shape(build, jax.tree.map(float, default))
+    return found[0]
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_what_a_traced_number_does_not_reach_stays_known(name):
+    for key, parameter in inspect.signature(getattr(library, name)).parameters.items():
+        if not isinstance(parameter.default, int) and parameter.default is not None:
+            assert _positions_are_traced(name, key, parameter.default) == (key in GEOMETRY), key
+
+
+@pytest.mark.parametrize("name", ["excavator", "slider_crank", "peaucellier"])
+def test_traced_geometry_gives_the_same_numbers_by_jax_instead_of_numpy(name):
+    build = getattr(library, name)
+    key = next(key for key in inspect.signature(build).parameters if key in GEOMETRY)
+    default = jax.tree.map(float, inspect.signature(build).parameters[key].default)
+    for each, value in jax.jit(lambda x: build(**{key: x}).parameters())(default).items():
+        assert_allclose(value, build().parameters()[each], rtol=1e-14, atol=1e-14, err_msg=each)
 
 
 def test_slider_crank_starts_as_in_the_reference():

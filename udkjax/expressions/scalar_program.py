@@ -7,6 +7,7 @@ floats it is evaluated at once, which is how a scene is analysed without compili
 import math
 import operator
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from types import ModuleType
 from typing import Any, TypeAlias
 
@@ -64,7 +65,7 @@ class ScalarProgram:
     def __call__(self, values: Sequence[Value]) -> list[Value]:
         if all(isinstance(v, float | int) for v in values):
             try:
-                return self._run(values)
+                return self._run_on_floats(values)
             except (ArithmeticError, ValueError):  # 1/0, an overflow, sin(inf): in JAX no errors, but values that are not finite
                 with np.errstate(all="ignore"):
                     return self._run([np.float64(v) for v in values])
@@ -94,8 +95,35 @@ class ScalarProgram:
     def _run(self, values: Sequence[Value]) -> list[Value]:
         known: dict[int, Value] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
         for index in self.order:
-            known[index] = _evaluate(self.graph.nodes[index], known)
+            node = self.graph.nodes[index]
+            known[index] = _evaluate(node, [_signed(known, a) for a in node.arguments])
         return [_signed(known, s) for s in self.outputs]
+
+    def _run_on_floats(self, values: Sequence[float]) -> list[Value]:
+        steps, outputs = self._steps_on_floats
+        known: list[Value] = [*values]
+        for function, places in steps:
+            known.append(function(*[known[k] for k in places]))
+        return [known[k] for k in outputs]
+
+    @cached_property
+    def _steps_on_floats(self) -> tuple[list[tuple[Callable, list[int]]], list[int]]:
+        """Each step's function and where its arguments are among the inputs and the steps' results; where the outputs are."""
+        places, steps = {(s.index, 1): k for k, s in enumerate(self.inputs)}, []
+
+        def append(key: tuple[int, int], function: Callable, arguments: list[int]) -> None:
+            places[key] = len(self.inputs) + len(steps)
+            steps.append((function, arguments))
+
+        def find(scalar: Scalar) -> int:
+            if (scalar.index, scalar.sign) not in places:
+                append((scalar.index, scalar.sign), operator.neg, [places[scalar.index, 1]])
+            return places[scalar.index, scalar.sign]
+
+        for index in self.order:
+            node = self.graph.nodes[index]
+            append((index, 1), _function_of_floats(node), [find(a) for a in node.arguments])
+        return steps, [find(s) for s in self.outputs]
 
     def count(self) -> dict[str, int]:
         """Count the operations of each kind; the sine and cosine of one angle are one."""
@@ -160,15 +188,13 @@ def _negative(value: Value) -> Value:
     return jax.lax.neg(value) if isinstance(value, jax.Array) else -value
 
 
-def _evaluate(node: Node, known: dict[int, Value]) -> Value:
-    if node.kind == "constant":
-        return node.detail
-    if node.kind == "pick":
-        output, flat = node.detail
-        array = known[node.arguments[0].index][output]
-        return array.reshape(-1)[flat]
-    values = [_signed(known, a) for a in node.arguments]
+def _evaluate(node: Node, values: list[Value]) -> Value:
     match node.kind:
+        case "constant":
+            return node.detail
+        case "pick":
+            output, flat = node.detail
+            return values[0][output].reshape(-1)[flat]
         case "add" | "sub" | "mul" | "div":
             on_floats, traced = _OPERATORS[node.kind]
             if not any(isinstance(v, jax.Array) for v in values):
@@ -182,6 +208,21 @@ def _evaluate(node: Node, known: dict[int, Value]) -> Value:
         case "call":
             return _call(node.detail, node.arguments, values)
     raise AssertionError(node.kind)
+
+
+def _function_of_floats(node: Node) -> Callable:
+    """Return what computes a node of Python's floats: chosen once, since many programs run thousands of times."""
+    if node.kind in _OPERATORS:
+        return _OPERATORS[node.kind][0]
+    if node.kind == "sqrt":
+        return math.sqrt
+    name = node.detail.primitive.name if node.kind == "apply" else ""
+    if name == "integer_pow":
+        exponent = node.detail.parameters["y"]
+        return lambda x: x**exponent
+    if name in _LIBRARY_FUNCTIONS:
+        return getattr(math, name)
+    return _NUMBER_FUNCTIONS.get(name) or (lambda *values: _evaluate(node, list(values)))
 
 
 def _library(x: Value) -> ModuleType:

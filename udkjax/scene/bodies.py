@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.scene.fields import POSITIVE, Number, number
+from udkjax.scene.fields import POSITIVE, Number, array_namespace, number
 
 GROUND = "ground"
 COORDINATES = ("x", "y", "angle")  # of a body, in the order in which q and v hold them
@@ -29,7 +28,8 @@ class Body(eqx.Module):
 
     def frame(self) -> "Frame":
         """Return the body's frame at its initial guess."""
-        return Frame(self.position[0], self.position[1], self.angle, jnp.cos(self.angle), jnp.sin(self.angle))
+        xp = array_namespace(self.angle)
+        return Frame(self.position[0], self.position[1], self.angle, xp.cos(self.angle), xp.sin(self.angle))
 
 
 class Point(NamedTuple):
@@ -45,8 +45,8 @@ class Point(NamedTuple):
     def norm(self) -> Array:
         """Return the vector's length; at the zero vector, where it has a kink, the derivative is taken as zero."""
         square = self.dot(self)
-        nonzero = square > 0
-        return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, square, 1.0)), 0.0)
+        xp, nonzero = array_namespace(square), square > 0
+        return xp.where(nonzero, xp.sqrt(xp.where(nonzero, square, 1.0)), 0.0)
 
 
 class Frame(NamedTuple):

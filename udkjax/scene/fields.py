@@ -5,6 +5,7 @@ shape, and the metadata below state what else must hold. Files and Python are ch
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
 from typing import Literal, NamedTuple, TypeAlias, TypedDict
 
 import jax
@@ -18,16 +19,21 @@ Numbers: TypeAlias = ArrayLike | Sequence[object]  # a number, an array, or nest
 Table: TypeAlias = Mapping[str, object]  # {key: value} of one element, as in a scene file
 
 
+def array_namespace(*numbers: ArrayLike | Sequence[ArrayLike]) -> ModuleType:
+    """Return NumPy, or JAX's if one of the numbers is an array of JAX."""
+    return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(numbers)) else np
+
+
 def number(value: Numbers) -> Float[Array, "..."]:
     """Make an array leaf of a number: a Python float as a field would be static, and each new value would compile anew."""
     dtype = jnp.result_type(float)
     if all(isinstance(x, float | int | np.number | np.ndarray) for x in jax.tree.leaves(value)):
-        value = np.asarray(value, dtype)  # JAX would compile a program to convert it
-        found = jnp.asarray(value)
+        value = np.asarray(value, dtype)
+        found = jax.device_put(value)  # jnp.asarray would compile a program for each shape
         if not isinstance(found, Tracer):
             return found
         with jax.ensure_compile_time_eval():  # what is known stays known while something else is traced
-            return jnp.asarray(value)
+            return jax.device_put(value)
     return jnp.asarray(value, dtype=dtype)
 
 

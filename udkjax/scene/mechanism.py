@@ -213,10 +213,14 @@ def _check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> d
 def _complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstraint:
     if type(constraint).complete is Constraint.complete:  # most joints: spares the sines and cosines of every body
         return constraint
-    placed = [(bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND]
-    known = not any(isinstance(x, Tracer) for x in jax.tree.leaves((constraint, placed)))
+    joined = {name: bodies[name] for name in constraint.frame_names if name != GROUND}
+    known = not any(isinstance(x, Tracer) for x in jax.tree.leaves((constraint, joined)))
+    if known:  # NumPy has nothing to compile
+        constraint, joined = jax.tree.map(np.asarray, (constraint, joined))
+    frames = [joined[name].frame() if name in joined else GROUND_FRAME for name in constraint.frame_names]
     with jax.ensure_compile_time_eval() if known else nullcontext():  # known stays known while something else is traced
-        return constraint.complete(*(GROUND_FRAME if name == GROUND else bodies[name].frame() for name in constraint.frame_names))
+        completed = constraint.complete(*frames)
+        return jax.tree.map(number, completed) if known else completed
 
 
 def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:

@@ -3,15 +3,14 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import Numbers
 from udkjax.scene.forces import Spring, Torque
 from udkjax.scene.joints import Revolute
-from udkjax.scene.library.posed_bodies import bodies_on_pose, known_at_once
+from udkjax.scene.library.posed_bodies import bodies_on_pose, unit_vector, with_known_numbers
 from udkjax.scene.mechanism import Mechanism
 
 # Masses (kg) and inertias (kg m^2) of K1 to K7, then lengths (m), as the sources name them.
@@ -34,7 +33,7 @@ START: Mapping[str, float] = MappingProxyType(  # rad
 )
 
 
-@known_at_once
+@with_known_numbers
 def andrews_squeezer(
     torque: ArrayLike = 0.033, stiffness: ArrayLike = 4530.0, spring_length: ArrayLike = 0.07785, gravity: Numbers = (0.0, 0.0)
 ) -> Mechanism:
@@ -49,17 +48,17 @@ def andrews_squeezer(
 
     def pose(angles):
         beta, theta, gamma, phi, delta, omega, epsilon = angles
-        x = lambda s: jnp.stack([jnp.cos(s), jnp.sin(s)])  # noqa: E731
-        y = lambda s: jnp.stack([-jnp.sin(s), jnp.cos(s)])  # noqa: E731
+        x = unit_vector
+        y = lambda s: unit_vector(s)[::-1] * np.array([-1.0, 1.0])  # noqa: E731
         tip = RR * x(beta)
         return [
             (RA * x(beta), beta),
             (tip - DA * x(beta + theta), beta + theta),
-            (jnp.array(B) + SB * x(gamma) - SA * y(gamma), gamma),
-            (jnp.array(A) + ZT * x(delta) - (E - EA) * y(phi + delta), phi + delta),
-            (jnp.array(A) + TA * x(delta) + TB * y(delta), delta),
-            (jnp.array(A) - U * y(epsilon) + (ZF - FA) * x(omega + epsilon), omega + epsilon),
-            (jnp.array(A) - UB * x(epsilon) - UA * y(epsilon), epsilon),
+            (np.array(B) + SB * x(gamma) - SA * y(gamma), gamma),
+            (np.array(A) + ZT * x(delta) - (E - EA) * y(phi + delta), phi + delta),
+            (np.array(A) + TA * x(delta) + TB * y(delta), delta),
+            (np.array(A) - U * y(epsilon) + (ZF - FA) * x(omega + epsilon), omega + epsilon),
+            (np.array(A) - UB * x(epsilon) - UA * y(epsilon), epsilon),
         ]
 
     tip_of_k3 = (-SB, SA - SS)
@@ -81,4 +80,4 @@ def andrews_squeezer(
     }
     angles = np.array(list(START.values()))
     bodies = bodies_on_pose([f"K{i}" for i in range(1, 8)], list(zip(MASSES, INERTIAS, strict=True)), pose, angles, np.zeros(7))
-    return Mechanism(bodies, joints, forces=forces, gravity=number(gravity), name="Andrews' squeezing mechanism")
+    return Mechanism(bodies, joints, forces=forces, gravity=gravity, name="Andrews' squeezing mechanism")

@@ -2,17 +2,25 @@
 
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from udkjax.scene.bodies import GROUND, Frame, between
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, between
 from udkjax.scene.drivers import Driver, Sine
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import Numbers, array_namespace
 from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Revolute
-from udkjax.scene.library.posed_bodies import apex, bar_pose, bodies_on_pose, gravity_vector, known_at_once, uniform_rod
+from udkjax.scene.library.posed_bodies import (
+    apex,
+    as_array,
+    bar_pose,
+    bodies_on_pose,
+    derivative,
+    gravity_vector,
+    uniform_rod,
+    unit_vector,
+    with_known_numbers,
+)
 from udkjax.scene.mechanism import Mechanism
 
 # Points of a body in units of its length, from its first pin on, the x axis towards its last one.
@@ -23,7 +31,7 @@ BUCKET = {"centre": (0.45, 0.20), "bucket": (0.0, 0.0), "link": (-0.13, 0.28)}
 BASE = (0.13, -0.09)  # of the boom's cylinder on the ground, from the boom's foot, in units of the boom's length
 
 
-@known_at_once
+@with_known_numbers
 def excavator(
     angles: Sequence[ArrayLike] = (0.6, -1.1, -2.2),
     angular_velocities: Sequence[ArrayLike] = (-0.2, 0.3, 0.6),
@@ -47,39 +55,40 @@ def excavator(
     the cylinders, from rest, get longer by `strokes` / 2 (1 - cos(`frequencies` t)) (m, rad/s), and their forces are reactions.
     Neither motion meets a singular configuration within 20 s, with the default numbers.
     """
-    boom, stick, rocker, link, bucket = map(number, lengths)
+    boom, stick, rocker, link, bucket = lengths
     on_boom, on_stick, on_bucket = _points(BOOM, boom), _points(STICK, stick), _points(BUCKET, bucket)
-    on_rocker, on_link = ((number([-0.5 * k, 0.0]), number([0.5 * k, 0.0])) for k in (rocker, link))
+    on_rocker, on_link = ((k * np.array([-0.5, 0.0]), k * np.array([0.5, 0.0])) for k in (rocker, link))
     names = ("boom", "stick", "rocker", "link", "bucket")
     cylinders = {
-        "boom cylinder": ((GROUND, "boom"), (boom * number(BASE), on_boom["cylinder"])),
+        "boom cylinder": ((GROUND, "boom"), (boom * np.array(BASE), on_boom["cylinder"])),
         "stick cylinder": (("boom", "stick"), (on_boom["stick cylinder"], on_stick["cylinder"])),
         "bucket cylinder": (("stick", "rocker"), (on_stick["bucket cylinder"], on_rocker[1])),
     }
 
     def pose(s):
-        arm = _held(on_boom["foot"], number([0.0, 0.0]), s[0])
+        arm = _held(on_boom["foot"], np.zeros(2), s[0])
         fore = _held(on_stick["tip"], _spot(arm, on_boom["tip"]), s[1])
         shovel = _held(on_bucket["bucket"], _spot(fore, on_stick["bucket"]), s[2])
         start, end = _spot(fore, on_stick["rocker"]), _spot(shovel, on_bucket["link"])
         knee = apex(start, end, rocker, link)
         return [arm, fore, bar_pose(start, knee), bar_pose(knee, end), shovel]
 
-    def extents(s):
-        frames = {GROUND: _frame(number([0.0, 0.0]), 0.0)} | {n: _frame(*p) for n, p in zip(names, pose(s), strict=True)}
-        return jnp.stack([between(points, *(frames[n] for n in pair)).norm() for pair, points in cylinders.values()])
+    def extents_and_energy(s):
+        """Return the lengths of the cylinders (m) and the potential energy of the weights (J)."""
+        placed = pose(s)
+        frames = {GROUND: GROUND_FRAME} | {name: _frame(*place) for name, place in zip(names, placed, strict=True)}
+        ways = [between(points, *(frames[n] for n in pair)) for pair, points in cylinders.values()]
+        energy = gravity * sum(mass * position[1] for mass, (position, _) in zip(masses, placed, strict=True))
+        squares = as_array([way.dot(way) for way in ways])
+        return array_namespace(squares).sqrt(squares), energy
 
-    def weight(s):
-        return gravity * sum(mass * position[1] for mass, (position, _) in zip(masses, pose(s), strict=True))
-
-    def oil(s):
-        """How long the cylinders are, and by how much they are longer unloaded: principle of virtual work over the angles."""
-        shorter = jnp.linalg.solve(jax.jacfwd(extents)(s).T, jax.grad(weight)(s)) / number(stiffness)
-        return extents(s), shorter
-
-    start = number(angles)
-    length, shorter = jax.jit(oil)(start)
-    half = 0.5 * number(strokes)
+    # By how much the cylinders are longer unloaded: principle of virtual work over the three angles.
+    start = as_array(angles)
+    values, rates = zip(*(derivative(extents_and_energy, start, along) for along in np.eye(3)), strict=True)
+    length, virtual_work = values[0][0], as_array([energy for _, energy in rates])
+    arms = as_array([extents for extents, _ in rates])
+    shorter = array_namespace(arms, virtual_work).linalg.solve(arms, virtual_work) / as_array(stiffness)
+    half = 0.5 * as_array(strokes)
     drivers = {
         name: Driver(pair, "distance", Sine(half[k], frequencies[k], -np.pi / 2, length[k] + half[k]), points)
         for k, (name, (pair, points)) in enumerate(cylinders.items())
@@ -108,18 +117,18 @@ def excavator(
 
 def _points(places, length) -> dict[str, Numbers]:
     """Return points of a body of a length in its own frame, from its centre of mass."""
-    return {name: length * (number(place) - number(places["centre"])) for name, place in places.items()}
+    return {name: length * (np.array(place) - np.array(places["centre"])) for name, place in places.items()}
 
 
 def _frame(position, angle) -> Frame:
-    return Frame(position[0], position[1], angle, jnp.cos(angle), jnp.sin(angle))
+    return Frame(position[0], position[1], angle, *unit_vector(angle))
 
 
 def _spot(placed, local):
     """Return where a point of a body is."""
-    return jnp.stack(_frame(*placed).point(local))
+    return as_array(_frame(*placed).point(local))
 
 
 def _held(local, spot, angle):
     """Return position and angle of a body that is held at a point."""
-    return spot - jnp.stack(_frame(number([0.0, 0.0]), angle).vector(local)), angle
+    return spot - as_array(_frame(np.zeros(2), angle).vector(local)), angle

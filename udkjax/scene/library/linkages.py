@@ -2,20 +2,28 @@
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drivers import Driver, Polynomial
-from udkjax.scene.fields import number
+from udkjax.scene.fields import array_namespace
 from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Prismatic, Revolute, Slot
-from udkjax.scene.library.posed_bodies import ORIGINS, apex, bar_pose, bodies_on_pose, gravity_vector, known_at_once, uniform_rod
+from udkjax.scene.library.posed_bodies import (
+    ORIGINS,
+    apex,
+    bar_pose,
+    bodies_on_pose,
+    gravity_vector,
+    uniform_rod,
+    unit_vector,
+    with_known_numbers,
+)
 from udkjax.scene.mechanism import Mechanism
 
 
-@known_at_once
+@with_known_numbers
 def parallelogram(
     angle: ArrayLike = -np.pi / 4,
     angular_velocity: ArrayLike = 0.0,
@@ -34,9 +42,9 @@ def parallelogram(
     """
 
     def pose(s):
-        e = jnp.array([jnp.cos(s), jnp.sin(s)])
-        links = [(jnp.array([x, 0.0]) + 0.5 * length * e, s) for x in (0.0, 1.0, 2.0)]
-        return [*links, (jnp.array([1.0, 0.0]) + length * e, 0.0 * s)]
+        e = unit_vector(s)
+        links = [(np.array([x, 0.0]) + 0.5 * length * e, s) for x in (0.0, 1.0, 2.0)]
+        return [*links, (np.array([1.0, 0.0]) + length * e, 0.0 * s)]
 
     links = ("link1", "link2", "link3")
     physics = [(mass, inertia)] * 3 + [(coupler_mass, coupler_inertia)]
@@ -50,7 +58,7 @@ def parallelogram(
     )
 
 
-@known_at_once
+@with_known_numbers
 def n_four_bar(
     n: int = 2, angle: ArrayLike = np.pi / 2, angular_velocity: ArrayLike = -1.0, gravity: ArrayLike = 9.81
 ) -> Mechanism:
@@ -61,9 +69,9 @@ def n_four_bar(
     """
 
     def pose(s):
-        e = jnp.array([jnp.cos(s), jnp.sin(s)])
-        links = [(jnp.array([float(i), 0.0]) + 0.5 * e, s) for i in range(n + 1)]
-        return links + [(jnp.array([i + 0.5, 0.0]) + e, 0.0 * s) for i in range(n)]
+        e = unit_vector(s)
+        links = [(np.array([float(i), 0.0]) + 0.5 * e, s) for i in range(n + 1)]
+        return links + [(np.array([i + 0.5, 0.0]) + e, 0.0 * s) for i in range(n)]
 
     names = [f"link{i}" for i in range(n + 1)] + [f"coupler{i}" for i in range(n)]
     joints = {f"A{i}": Revolute((GROUND, f"link{i}"), [(float(i), 0.0), (-0.5, 0.0)]) for i in range(n + 1)}
@@ -74,7 +82,7 @@ def n_four_bar(
     return Mechanism(bodies, joints, gravity=gravity_vector(gravity), name=f"{n}-four-bar")
 
 
-@known_at_once
+@with_known_numbers
 def four_bar(
     angle: ArrayLike = np.pi / 3,
     angular_velocity: ArrayLike = 0.0,
@@ -87,29 +95,29 @@ def four_bar(
 
     The crank turns on the origin at `angle`, the rocker on (`ground`, 0); the coupler's far pin is above their line.
     """
-    a, b, c = map(number, lengths)
+    a, b, c = lengths
 
     def pose(s):
-        start, end = a * jnp.array([jnp.cos(s), jnp.sin(s)]), jnp.stack([number(ground), number(0.0)])
+        start, end = a * unit_vector(s), ground * np.array([1.0, 0.0])
         pin = apex(start, end, b, c)
-        return [bar_pose(number([0.0, 0.0]), start), bar_pose(start, pin), bar_pose(end, pin)]
+        return [bar_pose(np.zeros(2), start), bar_pose(start, pin), bar_pose(end, pin)]
 
     return Mechanism(
         bodies_on_pose(
             ("crank", "coupler", "rocker"), [uniform_rod(density * k, k) for k in (a, b, c)], pose, angle, angular_velocity
         ),
         {
-            "A": Revolute((GROUND, "crank"), [(0.0, 0.0), (-a / 2, 0.0)]),
-            "B": Revolute(("crank", "coupler"), [(a / 2, 0.0), (-b / 2, 0.0)]),
-            "C": Revolute(("coupler", "rocker"), [(b / 2, 0.0), (c / 2, 0.0)]),
-            "D": Revolute((GROUND, "rocker"), [(ground, 0.0), (-c / 2, 0.0)]),
+            "A": Revolute((GROUND, "crank"), [(0.0, 0.0), (-0.5 * a, 0.0)]),
+            "B": Revolute(("crank", "coupler"), [(0.5 * a, 0.0), (-0.5 * b, 0.0)]),
+            "C": Revolute(("coupler", "rocker"), [(0.5 * b, 0.0), (0.5 * c, 0.0)]),
+            "D": Revolute((GROUND, "rocker"), [(ground, 0.0), (-0.5 * c, 0.0)]),
         },
         gravity=gravity_vector(gravity),
         name="four-bar",
     )
 
 
-@known_at_once
+@with_known_numbers
 def slider_crank(
     angle: ArrayLike = 0.0,
     angular_velocity: ArrayLike = 4.0,
@@ -129,13 +137,14 @@ def slider_crank(
     """
 
     def pose(s):
-        e, tilt = jnp.array([jnp.cos(s), jnp.sin(s)]), -jnp.arcsin(crank * jnp.sin(s) / rod)
-        pin, along = crank * e, rod * jnp.array([jnp.cos(tilt), jnp.sin(tilt)])
+        xp = array_namespace(s, crank, rod)
+        tilt = -xp.arcsin(crank * xp.sin(s) / rod)
+        pin, along = crank * unit_vector(s), rod * unit_vector(tilt)
         return [(0.5 * pin, s), (pin + 0.5 * along, tilt), (pin + along, 0.0 * s)]
 
     physics = [uniform_rod(masses[0], crank), uniform_rod(masses[1], rod), (masses[2], slider_inertia)]
     motor = Driver((GROUND, "crank"), "angle", Polynomial([angle, angular_velocity]))
-    a, b = 0.5 * number(crank), 0.5 * number(rod)
+    a, b = 0.5 * crank, 0.5 * rod
     return Mechanism(
         bodies_on_pose(("crank", "rod", "slider"), physics, pose, angle, angular_velocity),
         {
@@ -151,7 +160,7 @@ def slider_crank(
     )
 
 
-@known_at_once
+@with_known_numbers
 def elliptic_trammel(
     angle: ArrayLike = np.pi / 4,
     angular_velocity: ArrayLike = 0.0,
@@ -163,10 +172,10 @@ def elliptic_trammel(
 
     The centre of mass is at length / 2 (cos `angle`, sin `angle`); the rod's own angle is minus that.
     """
-    half = 0.5 * number(length)
+    half = 0.5 * length
 
     def pose(s):
-        return [(half * jnp.array([jnp.cos(s), jnp.sin(s)]), -s)]
+        return [(half * unit_vector(s), -s)]
 
     return Mechanism(
         bodies_on_pose(("rod",), [uniform_rod(mass, length)], pose, angle, angular_velocity),

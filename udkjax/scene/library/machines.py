@@ -2,12 +2,10 @@
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import number
 from udkjax.scene.joints import Gear, Joint, Prismatic, Revolute, Slot
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
@@ -15,14 +13,15 @@ from udkjax.scene.library.posed_bodies import (
     bar_pose,
     bodies_on_pose,
     gravity_vector,
-    known_at_once,
     uniform_disc,
     uniform_rod,
+    unit_vector,
+    with_known_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
 
 
-@known_at_once
+@with_known_numbers
 def scissor_lift(
     stages: int = 2,
     angle: ArrayLike = np.pi / 6,
@@ -36,15 +35,15 @@ def scissor_lift(
 
     The bars rising0, falling0, ... cross at their middles, pinned, at `angle` to the horizontal; left ends stay on the y axis.
     """
-    half = 0.5 * number(length)
+    half = 0.5 * length
 
     def pose(s):
-        width, height = 2 * half * jnp.cos(s), 2 * half * jnp.sin(s)
+        reach = length * unit_vector(s)
         bars = []
         for i in range(stages):
-            middle = jnp.stack([0.5 * width, (i + 0.5) * height])
+            middle = np.array([0.5, i + 0.5]) * reach
             bars += [(middle, s), (middle, -s)]
-        return [*bars, (jnp.stack([half, stages * height]), 0.0 * s)]
+        return [*bars, (half * np.array([1.0, 0.0]) + np.array([0.0, stages]) * reach, 0.0 * s)]
 
     names = [f"{kind}{i}" for i in range(stages) for kind in ("rising", "falling")]
     left, right = (-half, 0.0), (half, 0.0)
@@ -65,7 +64,7 @@ def scissor_lift(
     return Mechanism(bodies, joints, gravity=gravity_vector(gravity), name="scissor lift")
 
 
-@known_at_once
+@with_known_numbers
 def peaucellier(
     angle: ArrayLike = np.pi / 6,
     angular_velocity: ArrayLike = 0.0,
@@ -82,11 +81,11 @@ def peaucellier(
     bars are two revolutes. Uniform bars, `density` in kg/m; `gravity` pulls along +x, in which it hangs. Arms and sides fall
     in line, a singular configuration, at |angle| = 2 acos((arm - side) / (2 crank)): 96 degrees by default.
     """
-    r, a, b = number(crank), number(arm), number(side)
+    r, a, b = crank, arm, side
 
     def pose(s):
-        o, q = number([0.0, 0.0]), jnp.stack([r, number(0.0)])
-        c = q + r * jnp.array([jnp.cos(s), jnp.sin(s)])
+        o, q = np.zeros(2), r * np.array([1.0, 0.0])
+        c = q + r * unit_vector(s)
         upper, lower = apex(o, c, a, b), apex(c, o, b, a)
         d = upper + lower - c
         return [bar_pose(*ends) for ends in ((q, c), (o, upper), (o, lower), (c, upper), (c, lower), (upper, d), (lower, d))]
@@ -111,10 +110,10 @@ def peaucellier(
         "D": pin("AD", 1, "BD", 1),
     }
     bodies = bodies_on_pose(names, [uniform_rod(density * k, k) for k in lengths], pose, angle, angular_velocity)
-    return Mechanism(bodies, joints, gravity=jnp.stack([number(gravity), number(0.0)]), name="Peaucellier-Lipkin linkage")
+    return Mechanism(bodies, joints, gravity=[gravity, 0.0], name="Peaucellier-Lipkin linkage")
 
 
-@known_at_once
+@with_known_numbers
 def planetary_gear(
     planets: int = 3,
     angular_velocity: ArrayLike = 1.0,
@@ -129,15 +128,15 @@ def planetary_gear(
     (discs) and carrier (a disc that reaches the planets' centres). One degree of freedom; rows: 4 + 4 planets, redundant by
     planets - 1. Flat by default: no `gravity`.
     """
-    r, p = number(sun), number(planet)
+    r, p = sun, planet
     ring, reach = r + 2 * p, r + p
     spots = [2 * np.pi * i / planets for i in range(planets)]
 
     def pose(s):
         turned = s * r / (r + ring)  # the carrier
         spin = turned - (s - turned) * r / p
-        centres = [(reach * jnp.stack([jnp.cos(turned + spot), jnp.sin(turned + spot)]), spin) for spot in spots]
-        return [(number([0.0, 0.0]), s), *centres, (number([0.0, 0.0]), turned)]
+        centres = [(reach * unit_vector(turned + spot), spin) for spot in spots]
+        return [(np.zeros(2), s), *centres, (np.zeros(2), turned)]
 
     joints: dict[str, Joint] = {
         "sun axle": Revolute((GROUND, "sun"), ORIGINS),
@@ -146,8 +145,8 @@ def planetary_gear(
     for i, spot in enumerate(spots):
         name = f"planet{i + 1}"
         joints[f"axle{i + 1}"] = Revolute(("carrier", name), [(reach * np.cos(spot), reach * np.sin(spot)), (0.0, 0.0)])
-        joints[f"sun mesh{i + 1}"] = Gear(("sun", name), jnp.stack([r, p]), carrier="carrier")
-        joints[f"ring mesh{i + 1}"] = Gear((GROUND, name), jnp.stack([ring, p]), internal=True, carrier="carrier")
+        joints[f"sun mesh{i + 1}"] = Gear(("sun", name), [r, p], carrier="carrier")
+        joints[f"ring mesh{i + 1}"] = Gear((GROUND, name), [ring, p], internal=True, carrier="carrier")
     physics = [uniform_disc(masses[0], r), *[uniform_disc(masses[1], p)] * planets, uniform_disc(masses[2], reach)]
     names = ("sun", *(f"planet{i + 1}" for i in range(planets)), "carrier")
     return Mechanism(

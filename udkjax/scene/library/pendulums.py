@@ -2,26 +2,26 @@
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND, Body
 from udkjax.scene.drivers import Driver, Sine
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import Numbers
 from udkjax.scene.joints import Distance, Revolute
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     bodies_on_pose,
     gravity_vector,
     hanging_rod_pose,
-    known_at_once,
     uniform_rod,
+    unit_vector,
+    with_known_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
 
 
-@known_at_once
+@with_known_numbers
 def simple_pendulum(
     position: Numbers = (-1.0, 0.0),
     velocity: Numbers = (0.0, 0.0),
@@ -36,7 +36,7 @@ def simple_pendulum(
     return Mechanism(bodies, {"rod": Distance((GROUND, "bob"), ORIGINS)}, gravity=gravity_vector(gravity), name="simple pendulum")
 
 
-@known_at_once
+@with_known_numbers
 def compound_pendulum(
     angle: ArrayLike = np.pi / 3,
     angular_velocity: ArrayLike = 0.0,
@@ -47,17 +47,17 @@ def compound_pendulum(
     """Return a uniform rod pinned at one end; `angle` is measured from hanging straight down."""
 
     def pose(s):
-        return [hanging_rod_pose(number([0.0, 0.0]), length, s)]
+        return [hanging_rod_pose(np.zeros(2), length, s)]
 
     return Mechanism(
         bodies_on_pose(("rod",), [uniform_rod(mass, length)], pose, angle, angular_velocity),
-        {"pin": Revolute((GROUND, "rod"), [(0.0, 0.0), (-0.5 * number(length), 0.0)])},
+        {"pin": Revolute((GROUND, "rod"), [(0.0, 0.0), (-0.5 * length, 0.0)])},
         gravity=gravity_vector(gravity),
         name="compound pendulum",
     )
 
 
-@known_at_once
+@with_known_numbers
 def double_pendulum(
     angles: Sequence[ArrayLike] = (np.pi / 2, np.pi / 2),
     angular_velocities: Sequence[ArrayLike] = (0.0, 0.0),
@@ -66,11 +66,11 @@ def double_pendulum(
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
     """Return two uniform rods in a chain, chaotic; `angles` are measured from hanging straight down."""
-    a, b = (0.5 * number(length) for length in lengths)
+    a, b = (0.5 * length for length in lengths)
 
     def pose(s):
-        tip = 2 * a * jnp.array([jnp.sin(s[0]), -jnp.cos(s[0])])
-        return [hanging_rod_pose(number([0.0, 0.0]), 2 * a, s[0]), hanging_rod_pose(tip, 2 * b, s[1])]
+        tip = 2 * hanging_rod_pose(np.zeros(2), 2 * a, s[0])[0]
+        return [hanging_rod_pose(np.zeros(2), 2 * a, s[0]), hanging_rod_pose(tip, 2 * b, s[1])]
 
     physics = [uniform_rod(mass, length) for mass, length in zip(masses, lengths, strict=True)]
     return Mechanism(
@@ -84,7 +84,7 @@ def double_pendulum(
     )
 
 
-@known_at_once
+@with_known_numbers
 def driven_pendulum(
     amplitude: ArrayLike = 0.8,
     frequency: ArrayLike = 3.0,
@@ -93,13 +93,13 @@ def driven_pendulum(
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
     """Return a uniform rod pinned at one end and driven to the angle `amplitude` sin(`frequency` t) from the x axis."""
-    half = 0.5 * number(length)
+    half = 0.5 * length
 
     def pose(s):
-        return [(half * jnp.array([jnp.cos(s), jnp.sin(s)]), s)]
+        return [(half * unit_vector(s), s)]
 
     return Mechanism(
-        bodies_on_pose(("rod",), [uniform_rod(mass, length)], pose, 0.0, amplitude * number(frequency)),
+        bodies_on_pose(("rod",), [uniform_rod(mass, length)], pose, 0.0, amplitude * frequency),
         {"pin": Revolute((GROUND, "rod"), [(0.0, 0.0), (-half, 0.0)])},
         {"motor": Driver((GROUND, "rod"), "angle", Sine(amplitude, frequency))},
         gravity=gravity_vector(gravity),
@@ -107,7 +107,7 @@ def driven_pendulum(
     )
 
 
-@known_at_once
+@with_known_numbers
 def chain(
     n: int = 10,
     angle: ArrayLike = np.pi / 2,
@@ -120,17 +120,17 @@ def chain(
 
     Bodies link0, ... from the top, all at one `angle` from straight down; joints pin0 (on the ground), pin1, ...
     """
-    half = 0.5 * number(length) / n
+    half = 0.5 * length / n
 
     def pose(s):
-        along = jnp.stack([jnp.sin(s), -jnp.cos(s)])
-        return [((2 * i + 1) * half * along, s - np.pi / 2) for i in range(n)]
+        first, angle = hanging_rod_pose(np.zeros(2), 2 * half, s)
+        return [((2 * i + 1) * first, angle) for i in range(n)]
 
     names = [f"link{i}" for i in range(n)]
     ends = [((0.0, 0.0), (-half, 0.0))] + [((half, 0.0), (-half, 0.0))] * (n - 1)
     attached = zip([GROUND, *names[:-1]], names, strict=True)
     return Mechanism(
-        bodies_on_pose(names, [uniform_rod(number(mass) / n, 2 * half)] * n, pose, angle, angular_velocity),
+        bodies_on_pose(names, [uniform_rod(mass / n, 2 * half)] * n, pose, angle, angular_velocity),
         {f"pin{i}": Revolute(bodies, end) for i, (bodies, end) in enumerate(zip(attached, ends, strict=True))},
         gravity=gravity_vector(gravity),
         name=f"chain of {n} links",

@@ -1,81 +1,120 @@
 """Poses, and bodies that move with them, for the mechanisms of the library.
 
 Each mechanism starts closed, with velocities that its constraints allow: its pose q(s) is written over one coordinate s, and
-the velocity is the pose's derivative times the rate of s.
+the velocity is the pose's derivative times the rate of s. NumPy computes it, which has nothing to compile; where a number of
+the pose is traced, JAX does. So it is written in the functions of `array_namespace` of its numbers.
 """
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import ParamSpec
+from inspect import signature
+from typing import ParamSpec, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from udkjax.scene.bodies import Body
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import array_namespace, number
 from udkjax.scene.mechanism import Mechanism
 
 ORIGINS = ((0.0, 0.0), (0.0, 0.0))
 P = ParamSpec("P")
-COMPILED_BODIES = 32  # bodies whose motion is compiled as a whole
+Several: TypeAlias = ArrayLike | Sequence[ArrayLike]  # a number or several
+COMPLEX_STEP = 1e-100  # of the coordinate: its square is lost beside 1, and a rate times it is no denormal number
 
 
-def known_at_once(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
-    """Make a mechanism whose arguments are known of known numbers, also while something else is traced."""
+def with_known_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
+    """Give a function of the library all numbers that are not traced as NumPy's: what follows from them alone stays known."""
+    parameters = signature(build)
 
     @wraps(build)
-    def made(*arguments: P.args, **named: P.kwargs) -> Mechanism:
-        if any(isinstance(x, Tracer) for x in jax.tree.leaves((arguments, named))):
-            return build(*arguments, **named)
-        with jax.ensure_compile_time_eval():
-            return build(*arguments, **named)
+    def build_with_known_numbers(*arguments: P.args, **named: P.kwargs) -> Mechanism:
+        bound = parameters.bind(*arguments, **named)
+        bound.apply_defaults()
+        for name, value in bound.arguments.items():
+            if not isinstance(parameters.parameters[name].default, int):  # counts and switches stay what they are
+                bound.arguments[name] = jax.tree.map(_known, value)
+        return build(*bound.args, **bound.kwargs)
 
-    return made
+    return build_with_known_numbers
 
 
-def bodies_on_pose(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: Numbers, rate: Numbers) -> dict[str, Body]:
+def _known(value: ArrayLike) -> ArrayLike:
+    return value if isinstance(value, Tracer) else np.asarray(value, float)
+
+
+def derivative(function: Callable[..., PyTree], s: ArrayLike, rate: Several) -> tuple[PyTree, PyTree]:
+    """Return a function of s and its derivative along a rate of s, exact to rounding: JAX's, or by NumPy a complex step.
+
+    Source: Squire and Trapp, Using complex variables to estimate derivatives of real functions, SIAM Review 40, 1998.
+    """
+    value = function(s)
+    if array_namespace(s, value) is jnp:
+        return jax.jvp(function, (number(s),), (number(rate),))
+    axes = np.eye(np.size(s)).reshape(-1, *np.shape(s))
+    slopes = [jax.tree.map(np.imag, function(s + 1j * COMPLEX_STEP * axis)) for axis in axes]
+    rates = [r / COMPLEX_STEP for r in as_array(rate).ravel()]
+    return value, jax.tree.map(lambda *along: sum(slope * r for slope, r in zip(along, rates, strict=True)), *slopes)
+
+
+def bodies_on_pose(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: Several, rate: Several) -> dict[str, Body]:
     """Make the bodies of the (mass, inertia)s, at the [(position, angle), ...] of pose(s), moving as s does at its rate."""
-
-    def motion(s, rate):
-        return jax.jvp(pose, (s,), (rate,))
-
-    # By itself each operation is a program to compile, of which large mechanisms need no more than small ones.
-    places, rates = (jax.jit(motion) if len(names) <= COMPILED_BODIES else motion)(number(s), number(rate))
+    places, rates = derivative(pose, as_array(s), rate)
     bodies = zip(names, physics, places, rates, strict=True)
     return {name: Body(mass, inertia, *place, *speed) for name, (mass, inertia), place, speed in bodies}
 
 
-def uniform_rod(mass: ArrayLike, length: ArrayLike) -> tuple:
+def as_array(numbers: Several) -> Array | np.ndarray:
+    """Make an array of a number or several: JAX's where one is traced, else NumPy's."""
+    return array_namespace(numbers).asarray(numbers)
+
+
+def uniform_rod(mass, length) -> tuple:
     """Return mass and inertia of a uniform rod."""
-    return number(mass), number(mass * length**2 / 12)
+    return mass, mass * length**2 / 12
 
 
-def uniform_disc(mass: ArrayLike, radius: ArrayLike) -> tuple:
+def uniform_disc(mass, radius) -> tuple:
     """Return mass and inertia of a uniform disc."""
-    return number(mass), number(mass * radius**2 / 2)
+    return mass, mass * radius**2 / 2
+
+
+def unit_vector(angle):
+    """Return the unit vector at an angle to the x axis."""
+    xp = array_namespace(angle)
+    return as_array([xp.cos(angle), xp.sin(angle)])
 
 
 def bar_pose(start, end):
     """Return position and angle of a bar between two points."""
-    along = end - start
-    return 0.5 * (start + end), jnp.arctan2(along[1], along[0])
+    return 0.5 * (start + end), _angle_of(end - start)
+
+
+def _angle_of(vector):
+    x, y = vector
+    angle = array_namespace(x, y).arctan2(y.real, x.real)
+    if not isinstance(x, complex | np.complexfloating):
+        return angle
+    return angle + 1j * (x.real * y.imag - y.real * x.imag) / (x.real**2 + y.real**2)  # the arc tangent's derivative
 
 
 def hanging_rod_pose(pivot, length, angle):
     """Return position and angle of a rod that hangs from a point, at an angle from straight down."""
-    return pivot + 0.5 * length * jnp.array([jnp.sin(angle), -jnp.cos(angle)]), angle - np.pi / 2
+    xp = array_namespace(angle)
+    return pivot + 0.5 * length * as_array([xp.sin(angle), -xp.cos(angle)]), angle - np.pi / 2
 
 
 def apex(start, end, a, b):
     """Return the point at distances a from start and b from end, to the left of the way from start to end."""
+    xp = array_namespace(start, end, a, b)
     along = end - start
     square = along @ along
     x = (square + a**2 - b**2) / (2 * square)
-    y = jnp.sqrt(a**2 / square - x**2)
-    return start + x * along + y * jnp.stack([-along[1], along[0]])
+    y = xp.sqrt(a**2 / square - x**2)
+    return start + x * along + y * as_array([-along[1], along[0]])
 
 
 def gravity_vector(gravity: ArrayLike) -> Float[Array, "2"]:
