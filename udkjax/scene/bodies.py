@@ -28,8 +28,7 @@ class Body(eqx.Module):
 
     def frame(self) -> "Frame":
         """Return the body's frame at its initial guess."""
-        xp = array_namespace(self.angle)
-        return Frame(self.position[0], self.position[1], self.angle, xp.cos(self.angle), xp.sin(self.angle))
+        return Frame.at(self.position, self.angle)
 
 
 class Point(NamedTuple):
@@ -63,6 +62,12 @@ class Frame(NamedTuple):
     vx: Number = None  # pyright: ignore[reportAssignmentType]  # m/s
     vy: Number = None  # pyright: ignore[reportAssignmentType]  # m/s
     omega: Number = None  # pyright: ignore[reportAssignmentType]  # rad/s
+
+    @classmethod
+    def at(cls, position: Vector, angle: Number) -> "Frame":
+        """Return the frame of a body at a position (m) and an angle (rad), as joints see it."""
+        xp = array_namespace(angle)
+        return cls(position[0], position[1], angle, xp.cos(angle), xp.sin(angle))
 
     def vector(self, local: Vector) -> Point:
         """Turn a vector of the body's own frame into ground coordinates."""

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.deprecation import renamed_attributes
-from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
 from udkjax.scene.checks import SceneEntry, SceneError, check_hashable, problems_of
 from udkjax.scene.description import mechanism_html
 from udkjax.scene.drivers import Driver
@@ -213,11 +213,11 @@ def _check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> d
 def _complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstraint:
     if type(constraint).complete is Constraint.complete:  # most joints: spares the sines and cosines of every body
         return constraint
-    joined = {name: bodies[name] for name in constraint.frame_names if name != GROUND}
-    known = not any(isinstance(x, Tracer) for x in jax.tree.leaves((constraint, joined)))
+    places = {name: (bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND}
+    known = not any(isinstance(x, Tracer) for x in jax.tree.leaves((constraint, places)))
     if known:  # NumPy has nothing to compile
-        constraint, joined = jax.tree.map(np.asarray, (constraint, joined))
-    frames = [joined[name].frame() if name in joined else GROUND_FRAME for name in constraint.frame_names]
+        constraint, places = jax.tree.map(np.asarray, (constraint, places))
+    frames = [Frame.at(*places[name]) if name in places else GROUND_FRAME for name in constraint.frame_names]
     with jax.ensure_compile_time_eval() if known else nullcontext():  # known stays known while something else is traced
         completed = constraint.complete(*frames)
         return jax.tree.map(number, completed) if known else completed

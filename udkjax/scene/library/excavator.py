@@ -18,7 +18,6 @@ from udkjax.scene.library.posed_bodies import (
     derivative,
     gravity_vector,
     uniform_rod,
-    unit_vector,
     with_known_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
@@ -76,7 +75,7 @@ def excavator(
     def extents_and_energy(s):
         """Return the lengths of the cylinders (m) and the potential energy of the weights (J)."""
         placed = pose(s)
-        frames = {GROUND: GROUND_FRAME} | {name: _frame(*place) for name, place in zip(names, placed, strict=True)}
+        frames = {GROUND: GROUND_FRAME} | {name: Frame.at(*place) for name, place in zip(names, placed, strict=True)}
         ways = [between(points, *(frames[n] for n in pair)) for pair, points in cylinders.values()]
         energy = gravity * sum(mass * position[1] for mass, (position, _) in zip(masses, placed, strict=True))
         squares = as_array([way.dot(way) for way in ways])
@@ -120,15 +119,11 @@ def _points(places, length) -> dict[str, Numbers]:
     return {name: length * (np.array(place) - np.array(places["centre"])) for name, place in places.items()}
 
 
-def _frame(position, angle) -> Frame:
-    return Frame(position[0], position[1], angle, *unit_vector(angle))
-
-
 def _spot(placed, local):
     """Return where a point of a body is."""
-    return as_array(_frame(*placed).point(local))
+    return as_array(Frame.at(*placed).point(local))
 
 
 def _held(local, spot, angle):
     """Return position and angle of a body that is held at a point."""
-    return spot - as_array(_frame(np.zeros(2), angle).vector(local)), angle
+    return spot - as_array(Frame.at((0.0, 0.0), angle).vector(local)), angle
