@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from udkjax.study.identify.directions import UnknownValues, describe
-from udkjax.study.identify.uncertainty import estimate_uncertainty, whiteness_of
+from udkjax.study.identify.uncertainty import UnknownValues, describe, estimate_uncertainty
 
 RNG = np.random.default_rng
 
@@ -180,75 +179,3 @@ def test_noise_that_is_not_as_given_is_noticed(noise, said):
     J, r = problem(R=200, noise=noise)
     texts = estimate_uncertainty(J, r, positive(*"abc")).messages
     assert bool(texts) == bool(said) and all(said in text and "197 degrees of freedom" in text for text in texts)
-
-
-# --- whiteness of residuals
-
-
-SEEDS = 300
-
-
-def left(kind, samples, unknowns, correlation, seed):
-    """Times, residuals of a fit of cosines to noise, and what the fit took away. `correlation` is that of regular neighbours."""
-    random = np.random.default_rng(seed)
-    t = np.sort(random.uniform(0.0, 10.0, samples)) if kind == "irregular" else np.linspace(0.0, 10.0, samples)
-    if kind == "gaps":
-        t = np.delete(t, [*range(samples // 3, samples // 2), *random.integers(0, samples // 3, samples // 20)])
-    e = random.standard_normal(len(t))
-    for i in range(1, len(t)):
-        a = correlation ** ((t[i] - t[i - 1]) / (10.0 / samples)) if correlation else 0.0
-        e[i] = a * e[i - 1] + np.sqrt(1.0 - a * a) * e[i]
-    U = np.linalg.qr(np.cos(np.pi * np.outer(t, np.arange(unknowns)) / 10.0))[0]
-    return t, e - U @ (U.T @ e), U
-
-
-@pytest.mark.parametrize("kind", ["regular", "gaps", "irregular"])
-def test_white_noise_is_told_as_often_as_it_should_be(kind):
-    p = np.array([whiteness_of(*left(kind, 100, 5, 0.0, seed)).p for seed in range(SEEDS)])
-    for level in (0.05, 0.3):
-        assert abs(np.mean(p < level) - level) < 3.0 * np.sqrt(level * (1 - level) / SEEDS)
-    assert np.mean(p < 1e-3) < 0.02
-
-
-def test_what_a_fit_takes_away_is_allowed_for():
-    """Ten unknowns make neighbours of white noise differ: without the hat matrix that looks like a correlation."""
-    with_it, without = [], []
-    for seed in range(SEEDS):
-        t, e, U = left("regular", 100, 10, 0.0, seed)
-        with_it.append(whiteness_of(t, e, U).p < 0.05)
-        without.append(whiteness_of(t, e).p < 0.05)
-    assert np.mean(without) > 0.2 and np.mean(with_it) < 0.09
-
-
-@pytest.mark.parametrize("kind", ["regular", "gaps", "irregular"])
-def test_coloured_noise_is_noticed(kind):
-    found = [whiteness_of(*left(kind, 300, 5, 0.6, seed)) for seed in range(50)]
-    assert np.mean([not w.white for w in found]) > 0.9
-    w = found[0]
-    assert 0.3 < w.lag1 < 0.75
-    text = w.text('"body.a.angle" in record "one"')
-    assert text.startswith('residuals of "body.a.angle" in record "one" are not noise: neighbours have the correlation 0.')
-    assert f"for {w.samples} samples" in text
-
-
-def test_the_correlation_of_neighbours():
-    t, e, _ = left("regular", 20000, 1, 0.6, 0)
-    assert abs(whiteness_of(t, e).lag1 - 0.6) < 0.02
-    # Neighbours on the two sides of a gap are no neighbours.
-    w = whiteness_of(np.concatenate([np.arange(50.0), 1000.0 + np.arange(50.0)]), np.repeat([1.0, -1.0], 50))
-    assert w.lag1 == pytest.approx(1.0) and not w.white
-
-
-def test_an_offset_and_a_wave_are_no_noise():
-    t, random = np.linspace(0.0, 5.0, 200), np.random.default_rng(5)
-    for more in (0.8, 0.8 * np.sin(3.0 * t)):
-        assert not whiteness_of(t, random.standard_normal(200) + more).white
-
-
-def test_few_samples_say_nothing():
-    for n in (0, 1, 2, 5, 15):
-        w = whiteness_of(np.arange(float(n)), np.ones(n))
-        assert np.isnan(w.p) and w.white and w.text("it") == "" and w.samples == n
-    values = np.where(np.arange(60) % 2, np.nan, 1.0)
-    assert whiteness_of(np.arange(60.0), values).samples == 30
-    assert np.isnan(whiteness_of(np.arange(60.0), np.zeros(60)).p)

@@ -1,11 +1,11 @@
 """Identification: parameters of mechanisms, found from measured motion.
 
 records, tables, record_reader                     measurements, whatever they come as
-parameters, unknowns, initial_states               what is to be found
+parameters, unknowns                               what is to be found
 prediction, problem, shooting                      what would be measured, and how far it is from what was
 build_problem, loop_consistency                    whether all of these fit together
 least_squares, optimizer, search                   minimization, from guesses that lead to the minimum
-uncertainty, directions, profile_likelihood        how well the parameters are known
+uncertainty, profile_likelihood                    how well the parameters are known
 gradient_check                                     whether derivatives are right
 identification, estimate, experiment_design        what users call, and what they get
 """

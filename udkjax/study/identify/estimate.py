@@ -25,8 +25,9 @@ from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Problem, Residuals
 from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikelihood, estimated_noise, profile_likelihood, quantile
 from udkjax.study.identify.records import IdentificationError, labels
-from udkjax.study.identify.uncertainty import Uncertainty, Whiteness
-from udkjax.study.identify.unknowns import apply_values
+from udkjax.study.identify.uncertainty import Uncertainty
+from udkjax.study.identify.unknowns import apply_values, with_conditions
+from udkjax.study.whiteness import Whiteness
 from udkjax.study.wording import join_names, plural, table_lines
 
 if TYPE_CHECKING:
@@ -117,9 +118,8 @@ class Estimate:
         problem, found = self.problem, []
         members = problem.members(self.z[None])
         for k, record in enumerate(problem.records):
-            own = self.mechanism.with_parameters(record.conditions) if record.conditions else self.mechanism
             guess = problem.predictor.guess(members, problem.beginnings[k])
-            found.append(assemble(own, record.t0, guess, throw=False))
+            found.append(assemble(with_conditions(self.mechanism, record), record.t0, guess, throw=False))
         return tuple(found)
 
     @property

@@ -12,7 +12,6 @@ from udkjax.deprecation import renamed_arguments
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.build_problem import build_problem
-from udkjax.study.identify.directions import UnknownValues
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History
 from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
@@ -22,8 +21,9 @@ from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
 from udkjax.study.identify.search import N_STARTS, SearchResult, Strategy, search
-from udkjax.study.identify.uncertainty import Whiteness, estimate_uncertainty, whiteness_of
+from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
 from udkjax.study.progress import ProgressOption, reporting
+from udkjax.study.whiteness import Whiteness, whiteness_of
 
 REWEIGHTED = 2  # fits, each with the noise that the one before left
 NOISE_FLOOR = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike

@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from udkjax.study.identify.directions import INVISIBLE
-from udkjax.study.identify.problem import Residuals
+from udkjax.study.identify.problem import INVISIBLE, Residuals
 from udkjax.study.identify.unknowns import FAR
 
 if TYPE_CHECKING:  # imported where a fit begins: it takes a second

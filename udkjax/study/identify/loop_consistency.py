@@ -24,7 +24,7 @@ from udkjax.equations.scales import known_scales
 from udkjax.scene.checks import quote
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.identify.directions import COEFFICIENT, connected_columns, echelon, null_space, row_space
+from udkjax.study.row_spaces import COEFFICIENT, connected_columns, echelon, null_space, row_space
 from udkjax.study.wording import join_names, ratio
 
 # Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions

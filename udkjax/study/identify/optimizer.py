@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.extras import OptionalImport
-from udkjax.study.identify.directions import INVISIBLE
 from udkjax.study.identify.least_squares import (
     EXACT_STEP,
     FINE_STEP,
@@ -23,7 +22,7 @@ from udkjax.study.identify.least_squares import (
     minimize_squares,
 )
 from udkjax.study.identify.prediction import Tolerances
-from udkjax.study.identify.problem import Problem, Residuals
+from udkjax.study.identify.problem import INVISIBLE, Problem, Residuals
 from udkjax.study.identify.records import IdentificationError
 
 if TYPE_CHECKING:  # imported where a fit begins: it takes a second

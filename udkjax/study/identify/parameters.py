@@ -144,7 +144,7 @@ def _unknown(mechanism: Mechanism, p: Parameter, name: str, part: _Part) -> Unkn
     if not scale > 0:
         raise ValueError(f"scale must be > 0, is {scale}")
     at_scene_value = part.same and guess == part.value
-    return Unknown(name, _units(mechanism, target), target, guess, kind, low, high, scale, mean, sigma, at_scene_value)
+    return Unknown(name, _units(mechanism, target), target, kind, at_scene_value, guess, low, high, scale, mean, sigma)
 
 
 def _units(mechanism: Mechanism, target: Target) -> str:

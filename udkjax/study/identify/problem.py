@@ -21,13 +21,15 @@ from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.study.channels import Quantity, channel_of
-from udkjax.study.identify.initial_states import initial_state_unknowns
 from udkjax.study.identify.prediction import Members, Prediction, Predictor, Tolerances
 from udkjax.study.identify.records import IdentificationError, Key, Record
-from udkjax.study.identify.unknowns import Unknowns
+from udkjax.study.identify.unknowns import Unknowns, initial_state_unknowns
 
 PADDING = 1e-9  # of the length of a record: the distance of the times that pad it; so short a step costs nothing
 STILL = 1e-12  # of the largest number in a channel: with a smaller deviation the channel does not move
+# Of the largest singular value of a Jacobian: directions below it do not show in what was measured. A change that leaves the
+# equations of motion as they are has 1e-16, whatever the tolerance; derivatives integrated at 1e-7 have errors of 1e-8.
+INVISIBLE = 1e-8
 RESIDUALS_PER_UNKNOWN = 3.0  # in the first part of a record that is fitted, and in a piece: fewer would follow the noise
 
 

@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.integrate.assembly import State
-from udkjax.study.identify.initial_states import InitialStateUnknowns, state_unknowns, with_conditions
 from udkjax.study.identify.least_squares import (
     COARSE_STEP,
     FEW_STEPS,
@@ -34,7 +33,7 @@ from udkjax.study.identify.least_squares import (
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import Prediction, Predictor, Tolerances
 from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals, Runs
-from udkjax.study.identify.unknowns import apply_values
+from udkjax.study.identify.unknowns import InitialStateUnknowns, apply_values, state_unknowns, with_conditions
 
 MOST_PIECES = 60  # of all records: the algebra is that of dense matrices
 CONTINUED = 1e-2  # of the largest singular value: what a piece shows less of its initial state stays as the piece before leads to

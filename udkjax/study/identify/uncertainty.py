@@ -1,4 +1,4 @@
-"""How well the unknowns are known from measured motion, which of them do not show in it at all, and whether residuals are noise.
+"""How well the unknowns are known from measured motion, and which of them do not show in it at all.
 
 With r the residuals (R,) divided by the standard deviations of the noise, and J = dr/dz (R, K), the Fisher information is J^T J,
 and the covariance of the unknowns z its inverse; both from the singular values of J = U S V^T. A direction of z whose singular
@@ -10,7 +10,7 @@ Where the noise of some residuals is not known, it is estimated from them, s^2 =
 unknowns that these residuals determine (MacKay, Neural Computation 4 (1992) 415): all K of them where there is nothing else.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,17 +18,44 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import chdtr, chdtrc
 
-from udkjax.study.identify.directions import INVISIBLE, Direction, UnknownValues, describe, null_space, simplest_basis
+from udkjax.study.identify.problem import INVISIBLE
+from udkjax.study.row_spaces import echelon, null_space
+from udkjax.study.whiteness import IMPROBABLE
 from udkjax.study.wording import join_names
 
 POOR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
 CORRELATED = 0.98  # of two parameters: their difference is known ten times worse than their sum
-IMPROBABLE = 1e-3  # probability of what was seen if noise is white and as given: below it, it is said not to be so
 LEAST_NOISE = 1e-15  # of what residuals were divided by: noise below it is rounding
 NOISE_ITERATIONS, EQUAL = 50, 1e-10  # of the noise and what is determined with such noise, in turn, until both stay
-LAGS = 5  # at most; a model that lacks something leaves long waves, which show at the first of them
-PAIRS_PER_LAG = 4  # at least: with fewer there is nothing to be said
-NO_GAP = 1.5  # times the usual distance in time of k samples: pairs farther apart have a gap between them
+# Of the largest coefficient of a direction: unknowns with less of it take no part. Directions are that exact where their singular
+# value is that much above the errors of the Jacobian.
+PART = 1e-3
+COMMON = 1e-2  # relative: by how much factors may differ that are called a common one
+
+
+class UnknownValues(NamedTuple):
+    """The K unknowns at an estimate: parameters first, then those that nobody asked for.
+
+    `kinds` are "positive", "bounded" or "free", as in `parameters`; `dx_dz` are derivatives by the dimensionless unknowns.
+    """
+
+    names: Sequence[str]
+    units: Sequence[str]
+    x: Float[np.ndarray, "K"]
+    dx_dz: Float[np.ndarray, "K"]
+    kinds: Sequence[str]
+
+    def typical(self, k: int) -> float:
+        """Return what a standard error is compared with: the value; of a parameter of either sign, its scale."""
+        return float(abs(self.x[k]) or abs(self.dx_dz[k])) if self.kinds[k] == "bounded" else float(abs(self.dx_dz[k]))
+
+
+class Direction(NamedTuple):
+    """A change of unknowns that no measured quantity shows: the coefficients in z (N,), and the same in words."""
+
+    names: tuple[str, ...]
+    coefficients: Float[np.ndarray, "N"]
+    text: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +213,23 @@ def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray
     return np.maximum(np.sqrt(s2), LEAST_NOISE)
 
 
+def simplest_basis(
+    free: Float[np.ndarray, "D K"], x: Float[np.ndarray, "K"], dx_dz: Float[np.ndarray, "K"], kinds: Sequence[str]
+) -> Float[np.ndarray, "D K"]:
+    """Return rows of few unknowns each that span the same as the orthonormal rows `free`; a common factor first, if it is one."""
+    found = echelon(free, PART)
+    relative = np.array([kind != "free" for kind in kinds], bool) & (x != 0.0) & np.any(found != 0.0, axis=0)
+    if len(found) < 2 or not relative.any():
+        return found
+    factor = np.where(relative, x / dx_dz, 0.0)
+    outside = factor - free.T @ (free @ factor)
+    if np.linalg.norm(outside) > PART * np.linalg.norm(factor):
+        return found
+    # The factor takes the place of the direction that it is most of.
+    share = np.abs(np.linalg.lstsq(found.T, factor, rcond=None)[0]) * np.linalg.norm(found, axis=1)
+    return np.concatenate([factor[None], np.delete(found, int(np.argmax(share)), axis=0)])
+
+
 # --- words
 
 
@@ -228,72 +272,22 @@ def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
         )
 
 
-# --- whiteness
-
-
-class Whiteness(NamedTuple):
-    """Whether the residuals of a channel are white noise."""
-
-    lag1: float  # correlation of neighbours
-    statistic: float  # Q
-    lags: int
-    p: float  # probability that white noise has such a Q; not a number where there are too few residuals
-    samples: int
-
-    @property
-    def white(self) -> bool:
-        """Whether nothing speaks against white noise."""
-        return not self.p < IMPROBABLE
-
-    def text(self, channel: str) -> str:
-        """Return a sentence about the residuals; nothing where they are white."""
-        if self.white:
-            return ""
-        return (
-            f"residuals of {channel} are not noise: neighbours have the correlation {self.lag1:.2f} (probability {self.p:.1g} "
-            f"for {self.samples} samples of white noise): the model leaves something out, or the noise is "
-            "coloured; standard errors are too small"
-        )
-
-
-def whiteness_of(
-    times: Float[np.ndarray, "N"], residuals: Float[np.ndarray, "N"], projection: Float[np.ndarray, "N D"] | None = None
-) -> Whiteness:
-    """Test the residuals of one channel of one record for correlation in time.
-
-    For lags k = 1, 2, ... and residuals e, over pairs of samples without a gap between them,
-
-        z_k = sum (e_i e_(i+k) + s^2 H_(i, i+k)) / (sum e_i^2 e_(i+k)^2)^(1/2),        Q = sum z_k^2,
-
-    which white noise makes chi^2 with as many degrees of freedom as there are lags, with whatever variances and spacing.
-    H = U U^T is the hat matrix of the fit: -s^2 H is the covariance that fitting leaves in the residuals of white noise.
-
-    Args:
-        times: increasing, s; samples may be irregular and have gaps.
-        residuals: not a number where nothing was measured.
-        projection: the rows of U of these residuals: see `Uncertainty`.
-
-    Source: Lobato, Nankervis & Savin, International Economic Review 42 (2001) 187.
-    """
-    there = np.isfinite(residuals)
-    t, e = np.asarray(times, float)[there], np.asarray(residuals, float)[there]
-    U = np.zeros((len(e), 0)) if projection is None else np.asarray(projection, float)[there]
-    left = len(e) - float(np.sum(U**2))
-    square = float(e @ e)
-    if len(e) < 3 or left <= 0 or square == 0.0:
-        return Whiteness(np.nan, np.nan, 0, np.nan, len(e))
-    variance, usual = square / left, float(np.median(np.diff(t)))
-    z, lag1 = [], np.nan
-    for k in range(1, LAGS + 1):
-        pairs = np.flatnonzero(t[k:] - t[:-k] <= NO_GAP * k * usual)
-        if len(pairs) < PAIRS_PER_LAG * LAGS:
-            break
-        products = e[pairs] * e[pairs + k]
-        expected = -variance * np.sum(U[pairs] * U[pairs + k])
-        z.append((products.sum() - expected) / np.sqrt(np.sum(products**2)))
-        if k == 1:
-            lag1 = float(products.sum() / np.sqrt(np.sum(e[pairs] ** 2) * np.sum(e[pairs + 1] ** 2)))
-    if not z:
-        return Whiteness(lag1, np.nan, 0, np.nan, len(e))
-    Q = float(np.sum(np.square(z)))
-    return Whiteness(lag1, Q, len(z), float(chdtrc(len(z), Q)), len(e))
+def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Direction:
+    """Word a direction of z: as a common factor where it is one, else with one percent of the unknown that changes most."""
+    there = np.flatnonzero(coefficients).tolist()
+    x, change = (np.asarray(a, float)[there] for a in (values.x, values.dx_dz))
+    change = change * coefficients[there]
+    names, kinds = [values.names[k] for k in there], [values.kinds[k] for k in there]
+    relative = np.array([kind != "free" and value != 0.0 for kind, value in zip(kinds, x, strict=True)])
+    factors = np.where(relative, change / np.where(relative, x, 1.0), 0.0)
+    if len(there) > 1 and relative.all() and np.all(np.abs(factors / factors[0] - 1.0) < COMMON):
+        text = f"{join_names(names)} by a common factor"
+    else:
+        reference = factors if relative.any() else coefficients[there]
+        unit = 0.01 / reference[np.argmax(np.abs(reference))]
+        parts = [
+            f"{name} {100 * unit * f:+.3g} %" if percent else f"{name} {unit * dx:+.3g} {values.units[k]}".rstrip()
+            for name, percent, f, dx, k in zip(names, relative, factors, change, there, strict=True)
+        ]
+        text = parts[0] + (f" with {join_names(parts[1:])}" if len(parts) > 1 else "")
+    return Direction(tuple(names), coefficients[there] / np.abs(coefficients).max(), text)

@@ -1,18 +1,25 @@
-"""The unknowns of a fit that are parameters: values in a mechanism, and dimensionless numbers in place of them.
+"""The unknowns of a fit: parameters and initial states, as dimensionless numbers z that are zero at the first guess.
 
-An unknown z is dimensionless, zero at the first guess x0, and may be any number: a positive parameter is x = x0 exp(z), one
-between bounds is x = low + (high - low) / (1 + (1 / u0 - 1) exp(-z)) with u0 the place of x0 between them, and any other one is
-x = x0 + scale z.
+A parameter x with the first guess x0 is x0 exp(z) if it is positive; low + (high - low) / (1 + (1 / u0 - 1) exp(-z)) between
+bounds, with u0 the place of x0 between them; and any other one x0 + scale z. An initial state is closed beside the guess that
+coordinates and rates of some bodies are added to, as many as the mechanism has degrees of freedom.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
+from udkjax.equations.dense_rows import KinematicRows
+from udkjax.equations.scales import known_scales
+from udkjax.integrate.assembly import State, assemble
+from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.channels import RATES, UNITS
+from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
 from udkjax.study.quantities import parameter_value
 
 Transform = Literal["positive", "bounded", "free"]
@@ -21,6 +28,7 @@ AT_BOUND = 1e-3  # of the distance between the bounds: a value as near to one of
 FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
 GUESS_RADIUS = 0.5  # of a value: how far other guesses are from the first
 BOUND_MARGIN = 0.02  # of the distance between the bounds: no guess is nearer, since bounds themselves are infinitely far
+READABLE = 1e-3  # of the largest: how much of a free motion the coordinates that are taken as its unknowns must show at least
 STATE_RADIUS = 0.05  # of the scene's length, time and one radian: how far guesses of initial states are from the first
 
 
@@ -33,19 +41,19 @@ class Target(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """One parameter: what it is called, what its value is assigned to, its first guess, transform, and prior (nan: none)."""
+    """One parameter: what it is called, what its value is assigned to, its transform, first guess, bounds, and prior."""
 
     name: str
     units: str
     target: Target
-    guess: float
     kind: Transform
-    low: float
+    at_scene_value: bool  # whether the first guess is the scene's own
+    guess: float
+    low: float  # nan: no bounds
     high: float
     scale: float
-    mean: float
+    mean: float  # nan: no prior
     sigma: float
-    at_scene_value: bool  # whether the first guess is the scene's own
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,34 +63,20 @@ class Unknowns:
     names: tuple[str, ...]
     units: tuple[str, ...]
     targets: tuple[Target, ...]
-    guess: Float[np.ndarray, "P"]
     kinds: tuple[Transform, ...]
+    at_scene_values: bool  # whether all first guesses are
+    guess: Float[np.ndarray, "P"]
     low: Float[np.ndarray, "P"]
     high: Float[np.ndarray, "P"]
     scale: Float[np.ndarray, "P"]
     mean: Float[np.ndarray, "P"]
     sigma: Float[np.ndarray, "P"]
-    at_scene_values: bool = False  # whether all first guesses are
 
     @classmethod
     def of(cls, each: Sequence[Unknown]) -> "Unknowns":
         """Return some parameters as one."""
-        guess, low, high, scale, mean, sigma = np.array(
-            [[u.guess, u.low, u.high, u.scale, u.mean, u.sigma] for u in each], float
-        ).T
-        return cls(
-            tuple(u.name for u in each),
-            tuple(u.units for u in each),
-            tuple(u.target for u in each),
-            guess,
-            tuple(u.kind for u in each),
-            low,
-            high,
-            scale,
-            mean,
-            sigma,
-            all(u.at_scene_value for u in each),
-        )
+        names, units, targets, kinds, at_scene_value, *numbers = zip(*each, strict=True)
+        return cls(names, units, targets, kinds, all(at_scene_value), *np.array(numbers, float))
 
     def values(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
         """Return x(z)."""
@@ -153,3 +147,110 @@ def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int
     inside = BOUND_MARGIN + (1.0 - 2.0 * BOUND_MARGIN) * unit[:, :P]
     states = z[P:] + STATE_RADIUS * (2.0 * unit[:, P:] - 1.0)
     return np.concatenate([u.z_of(low + (high - low) * inside), states], axis=1)
+
+
+# --- initial states
+
+
+class InitialStateUnknowns(NamedTuple):
+    """The S unknowns of one initial state, which tied records share. They are dimensionless, over the scales of the scene.
+
+    `sizes` (S,) are changes of the named coordinates and rates by one of each, in `units`; `basis` those of all q and v (n,).
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    sizes: Float[np.ndarray, "S"]
+    basis: Float[np.ndarray, "2 n S"]
+
+
+def initial_state_unknowns(
+    mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record]
+) -> tuple[tuple[InitialStateUnknowns, ...], Int[np.ndarray, "records S"], Float[np.ndarray, "records 2 n S"]]:
+    """Return the unknowns of all initial states; where in z those of each record are (-1: none), and what they change."""
+    found: dict[Hashable, tuple[Start, int, InitialStateUnknowns]] = {}  # by the name of a start; if it has none, by the record
+    at, problems = len(unknowns.names), []
+    for k, record in enumerate(records):
+        start, key = record.start, record.start.name or k
+        if start.estimate == "nothing":
+            continue
+        if key in found:
+            if not _same(found[key][0], start):
+                problems.append(
+                    f"{record.place}start {quote(start.name)} is another one in an earlier record: give one Start to both"
+                )
+        else:
+            label = start.name or record.name or (f"record {k + 1}" if len(records) > 1 else "start")
+            try:
+                mech = apply_values(with_conditions(mechanism, record), unknowns.targets, unknowns.guess)
+                found[key] = start, at, state_unknowns(mech, record.t0, start.state, start.estimate, label)
+            except SceneError as problem:
+                raise IdentificationError([f"{record.place}{problem}"]) from None
+            at += len(found[key][2].names)
+    if problems:
+        raise IdentificationError(problems)
+    states = tuple(state for _, _, state in found.values())
+    S = max((len(state.names) for state in states), default=0)
+    columns, bases = np.full((len(records), S), -1), np.zeros((len(records), 2, 3 * len(mechanism.body_names), S))
+    for k, record in enumerate(records):
+        if record.start.estimate != "nothing":
+            _, first, state = found[record.start.name or k]
+            count = len(state.names)
+            columns[k, :count], bases[k, ..., :count] = first + np.arange(count), state.basis
+    return states, columns, bases
+
+
+def _same(one: Start, two: Start) -> bool:
+    a, b = one.state, two.state
+    equal = a is b or (a is not None and b is not None and np.array_equal(a.q, b.q) and np.array_equal(a.v, b.v))
+    return equal and one.estimate == two.estimate
+
+
+def with_conditions(mechanism: Mechanism, record: Record) -> Mechanism:
+    """Return the mechanism as it was in a record."""
+    return mechanism.with_parameters(record.conditions) if record.conditions else mechanism
+
+
+def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Estimated, label: str) -> InitialStateUnknowns:
+    """Choose coordinates that parametrize the closed states beside a guess (None: the scene's own): angles where they do.
+
+    The names of the unknowns begin with `label`.
+    """
+    rows, q = KinematicRows(mech), np.asarray(assemble(mech, t0, guess).q, float).ravel()
+    free = np.eye(len(q))
+    if rows.count:
+        position = rows.close(t0, q)
+        assert position is not None, "what has been assembled is closed"
+        free = rows.metric[:, None] * position.vt[position.rank :].T
+    chosen, scales = _independent_rows(free), known_scales(mech)
+    size = np.where(np.array(chosen) % 3 == 2, 1.0, float(scales.length))  # angles are in rad
+    rate = float(scales.rate) or 1.0  # of what rests without any load, in 1/s
+    basis = free @ np.linalg.inv(free[chosen]) * size
+    names: list[str] = []
+    units: list[str] = []
+    sizes, parts, nothing = [], [], np.zeros_like(basis)
+    kinds = ("position", COORDINATES, 1.0, (basis, nothing)), ("velocity", RATES, rate, (nothing, rate * basis))
+    for what, fields, factor, part in kinds:
+        if estimate in (what, "both"):
+            sizes.append(factor * size)
+            names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3]}" for k in chosen]
+            units += [UNITS[fields[k % 3]] for k in chosen]
+            parts.append(np.stack(part))
+    return InitialStateUnknowns(tuple(names), tuple(units), np.concatenate(sizes), np.concatenate(parts, axis=2))
+
+
+def _independent_rows(free: np.ndarray) -> list[int]:
+    """Choose as many rows as there are columns, far from dependent on each other: of angles alone if possible."""
+    for rows in (np.arange(2, len(free), 3), np.arange(len(free))):
+        left, chosen = free / np.linalg.norm(free, 2), []
+        for _ in range(free.shape[1]):
+            sizes = np.linalg.norm(left[rows], axis=1)
+            k = int(rows[np.argmax(sizes)])
+            if sizes.max() < READABLE:
+                break
+            chosen.append(k)
+            unit = left[k] / np.linalg.norm(left[k])
+            left = left - np.outer(left @ unit, unit)
+        else:
+            return sorted(chosen)
+    return sorted(chosen)

@@ -1,8 +1,8 @@
-"""Linear algebra on directions, and how they are said."""
+"""Spaces of rows, and how names and numbers stand in a sentence."""
 
 import numpy as np
 
-from udkjax.study.identify.directions import connected_columns, echelon, null_space, row_space
+from udkjax.study.row_spaces import connected_columns, echelon, null_space, row_space
 from udkjax.study.wording import join_names, ratio
 
 

@@ -1,0 +1,44 @@
+"""Spaces of vectors as the rows of matrices: null spaces, row spaces, and their simplest bases."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.sparse.csgraph import connected_components
+
+COEFFICIENT = 1e-5  # of the largest coefficient: zero, in directions found from differences that are good to 1e-8
+
+
+def null_space(matrix: Float[np.ndarray, "R K"], tol: float) -> Float[np.ndarray, "D K"]:
+    """Return an orthonormal basis, as rows, of what a matrix maps to zero; singular values up to `tol` count as zero."""
+    _, sigma, vt = np.linalg.svd(matrix)
+    return vt[int(np.sum(sigma > tol)) :]
+
+
+def row_space(matrix: Float[np.ndarray, "R K"], tol: float) -> Float[np.ndarray, "D K"]:
+    """Return the span of the rows of a matrix, in reduced echelon form."""
+    _, sigma, vt = np.linalg.svd(matrix, full_matrices=False)
+    return echelon(vt[: int(np.sum(sigma > tol))])
+
+
+def echelon(rows: Float[np.ndarray, "R K"], tol: float = COEFFICIENT) -> Float[np.ndarray, "D K"]:
+    """Return independent rows in reduced echelon form; what is below `tol`, relative to a row's largest entry, is made zero."""
+    rows, done = np.array(rows, float), 0
+    for column in range(rows.shape[1]):
+        if done == len(rows):
+            break
+        pivot = done + int(np.argmax(np.abs(rows[done:, column])))
+        if abs(rows[pivot, column]) <= tol:
+            continue
+        rows[[done, pivot]] = rows[[pivot, done]]
+        rows[done] /= rows[done, column]
+        others = np.arange(len(rows)) != done
+        rows[others] -= np.outer(rows[others, column], rows[done])
+        done += 1
+    rows = rows[:done]
+    return np.where(np.abs(rows) > tol * np.abs(rows).max(axis=1, keepdims=True, initial=0.0), rows, 0.0)
+
+
+def connected_columns(relations: Float[np.ndarray, "R K"]) -> list[list[int]]:
+    """Return the sets of columns that rows connect; columns of zeros are in none."""
+    there = np.asarray(relations) != 0.0
+    _, label = connected_components(there.T.astype(int) @ there, directed=False)
+    return [np.flatnonzero(label == k).tolist() for k in np.unique(label[there.any(0)])]
