@@ -1,40 +1,22 @@
 """Reads measurements into records, whatever they come as: every mistake is named with its file, row and column."""
 
-import csv
 import math
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from udkjax.extras import OptionalImport
 from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Channel, Quantity, channel_of
-from udkjax.study.identify.records import IdentificationError, Key, Noise, Record, key_of
-from udkjax.study.identify.tables import (
-    NOISE,
-    RECORD,
-    TIME,
-    Column,
-    Table,
-    read_csv,
-    read_dataset,
-    table_of_columns,
-    table_of_frame,
-)
+from udkjax.study.identify.records import ByChannel, IdentificationError, Key, Noise, Record, key_of
+from udkjax.study.identify.tables import NOISE, RECORD, TIME, Column, Table, TableData, quantities_by_name, read_tables
 from udkjax.study.units import conversion_factor
 
-if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tables
-    import pandas
-    import xarray
-
-OneTable: TypeAlias = "Record | Mapping[Any, Any] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]"
-Data: TypeAlias = "OneTable | Sequence[OneTable]"
+Data: TypeAlias = "Record | TableData | Sequence[Record | TableData]"
 MOST_SHOWN = 3  # mistakes of one kind in a column; the others are counted
-ByChannel: TypeAlias = dict[Key, np.ndarray]
+T = TypeVar("T")
 
 
 def records_of(
@@ -61,16 +43,17 @@ def records_of(
     Raises:
         IdentificationError: with every mistake, each with its file, line and column.
     """
-    reader = _DataReader(mechanism, tuple(ignore), _quantities(quantities))
+    reader = _DataReader(mechanism, tuple(ignore), quantities_by_name(quantities))
     found = [reader.with_usual_names(record) for record in reader.read(data, "data")]
     if not found and not reader.problems:
         reader.problems.append("data: there are no records")
-    given = reader.by_channel(noise, "noise") if isinstance(noise, Mapping) else noise
-    if isinstance(given, Mapping):
-        measured = {channel for record in found for channel in record.values}
-        reader.problems += [
-            f"noise: {quote(str(channel))} is measured in no record" for channel in given if channel not in measured
-        ]
+    measured = {channel for record in found for channel in record.values}
+    given: dict[Key, ArrayLike | None] = dict.fromkeys(measured)
+    if isinstance(noise, Mapping):
+        given = reader.by_channel(noise, "noise")
+    elif noise is not None:
+        given = dict.fromkeys(measured, noise)
+    reader.problems += [f"noise: {quote(str(c))} is measured in no record" for c in given if c not in measured]
     records = [reader.with_noise(record, given) for record in found]
     if reader.problems:
         raise IdentificationError(reader.problems)
@@ -176,7 +159,9 @@ class _TableReader:
         before = dict(zip(there[1:], own[:-1], strict=True)) if len(there) else {}
         self.add_each(time, there[late], lambda k: f"{times[k]:g} s does not exceed the one before, {before[k]:g} s")
 
-    def record(self, label: str, places: np.ndarray, times: np.ndarray, values: ByChannel, noise: ByChannel) -> Iterator[Record]:
+    def record(
+        self, label: str, places: np.ndarray, times: np.ndarray, values: dict[Key, np.ndarray], noise: dict[Key, np.ndarray]
+    ) -> Iterator[Record]:
         """Make a record of some rows, of those channels that were measured in it."""
         own = {name: x[places] for name, x in values.items()}
         own = {name: x for name, x in own.items() if not np.isnan(x).all()}
@@ -237,50 +222,18 @@ class _DataReader:
             for k, item in enumerate(data):
                 yield from self.read(item, f"{source}[{k}]")
         else:
-            for table in self.tables(data, source):
+            for table in read_tables(cast(TableData, data), self.mechanism.body_names, source, self.problems):
+                self.quantities |= table.quantities
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
-    def tables(self, data: Data, source: str) -> Iterator[Table]:
-        """Iterate over the tables of one file or object."""
-        bodies = self.mechanism.body_names
-        if isinstance(data, str | os.PathLike):
-            yield from self.file(Path(data))
-        elif hasattr(data, "data_vars"):
-            yield from read_dataset(cast("xarray.Dataset", data), bodies, source, self.problems)
-        elif hasattr(data, "columns") and hasattr(data, "index"):
-            frame = cast("pandas.DataFrame", data)
-            self.quantities |= _quantities(frame.columns)
-            yield table_of_frame(frame, source, self.problems)
-        elif isinstance(data, Mapping):
-            self.quantities |= _quantities(data)
-            yield table_of_columns(source, [(str(key), value) for key, value in data.items()], self.problems)
-        else:
-            what = "a Record, a mapping, a pandas DataFrame, an xarray Dataset, the path of a .csv or .nc file, or a list of such"
-            self.problems.append(f"{source}: must be {what}, is {type(data).__name__}")
-
-    def file(self, path: Path) -> Iterator[Table]:
-        """Iterate over the tables of a file."""
-        try:
-            if path.suffix.lower() == ".csv":
-                yield from read_csv(path, self.problems)
-            elif path.suffix.lower() == ".nc":
-                with OptionalImport():
-                    import xarray
-                data = xarray.load_dataset(path, decode_times=False)  # else xarray makes durations of seconds
-                yield from read_dataset(data, self.mechanism.body_names, str(path), self.problems, path.stem)
-            else:
-                self.problems.append(f"{path}: must be a .csv or a .nc file")
-        except (OSError, ValueError, csv.Error) as error:
-            self.problems.append(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})")
-
-    def channel(self, given: object) -> Channel | Quantity:
+    def channel(self, given: Key) -> Channel | Quantity:
         """Return the channel of a name, or the user's own. Raises ValueError."""
         own = given if isinstance(given, Quantity) else self.quantities.get(str(given))
         return channel_of(self.mechanism, str(given)) if own is None else own
 
-    def by_channel(self, given: Mapping[Any, Any], place: str) -> dict[Key, Any]:
+    def by_channel(self, given: ByChannel[T], place: str) -> dict[Key, T]:
         """Return the same values under the usual names of the channels; those of the user go by themselves."""
-        found: dict[Key, Any] = {}
+        found: dict[Key, T] = {}
         for text, value in given.items():
             try:
                 key = key_of(self.channel(text))
@@ -301,18 +254,13 @@ class _DataReader:
         noise = dict(zip(values, record.noise.values(), strict=True))
         return record.with_channels(values, noise)
 
-    def with_noise(self, record: Record, given: Noise) -> Record:
+    def with_noise(self, record: Record, given: dict[Key, ArrayLike | None]) -> Record:
         """Return the record with the `given` standard deviation for those channels that have none of their own."""
-        sigma = given if isinstance(given, Mapping) else dict.fromkeys(record.values, given)
-        if all(own is not None or sigma.get(channel) is None for channel, own in record.noise.items()):
+        if all(own is not None or given.get(channel) is None for channel, own in record.noise.items()):
             return record
-        noise = {channel: sigma.get(channel) if own is None else own for channel, own in record.noise.items()}
+        noise = {channel: given.get(channel) if own is None else own for channel, own in record.noise.items()}
         try:
             return record.with_channels(record.values, noise)
         except IdentificationError as error:
             self.problems += error.problems
             return record
-
-
-def _quantities(given: Iterable[Any]) -> dict[str, Quantity]:
-    return {quantity.name: quantity for quantity in given if isinstance(quantity, Quantity)}

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -11,11 +11,13 @@ from numpy.typing import ArrayLike
 from udkjax.deprecation import renamed_arguments
 from udkjax.integrate.assembly import State
 from udkjax.scene.checks import Mistakes, quote
-from udkjax.study.channels import Quantity
+from udkjax.study.channels import Channel, Quantity
 
 Estimated = Literal["nothing", "position", "velocity", "both"]
 Key: TypeAlias = str | Quantity  # channels go by their names, a user's own by itself
-Noise: TypeAlias = Mapping[Any, ArrayLike | None] | float | None  # standard deviations by channel, or of all channels
+T = TypeVar("T")
+ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[Key, T]
+Noise: TypeAlias = ByChannel[ArrayLike] | ByChannel[ArrayLike | None] | float | None  # standard deviations, or one for all
 
 
 class IdentificationError(Mistakes):
@@ -66,7 +68,7 @@ class Record:
     def __init__(
         self,
         times: ArrayLike | Sequence[float],
-        values: Mapping[Any, ArrayLike],
+        values: ByChannel[ArrayLike],
         noise: Noise = None,
         initial_state: Start | State | None = None,
         t0: float | None = None,
@@ -148,7 +150,7 @@ def labels(records: Sequence[Record]) -> list[str]:
     return [name if name and names.count(name) == 1 else f"{name or 'record'} {k + 1}" for k, name in enumerate(names)]
 
 
-def key_of(channel: object) -> Key:
+def key_of(channel: Key | Channel) -> Key:
     """Return what a channel goes by in a record: its name, or itself if it is the user's own."""
     return channel if isinstance(channel, Quantity) else str(getattr(channel, "name", channel))
 

@@ -1,24 +1,29 @@
-"""Tables of measurements from CSV files, pandas, xarray and mappings: columns under their headings, nothing interpreted.
+"""Tables of measurements from files, pandas, xarray and mappings: columns under their headings, nothing interpreted.
 
 Files are read by the standard library: messages name the line of each mistake, which `pandas.read_csv` does not.
 """
 
 import csv
+import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from udkjax.extras import OptionalImport
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import abbreviate, quote, suggestion
-from udkjax.study.channels import RATES
+from udkjax.study.channels import RATES, Quantity
+from udkjax.study.identify.records import ByChannel
 
 if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tables
     import pandas
     import xarray
 
+TableData: TypeAlias = "ByChannel[ArrayLike] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]"
 TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings, and what follows that of a channel
 _DELIMITERS = (";", "\t", ",")
 # Coordinates of what `Solution.to_xarray` writes, as channels of bodies.
@@ -28,7 +33,7 @@ _STATES = {"q": dict(zip(COORDINATES, COORDINATES, strict=True)), "v": dict(zip(
 class Column(NamedTuple):
     """The values under one heading, numbers or text, and their units if the heading names some."""
 
-    values: Sequence[Any] | np.ndarray
+    values: Sequence[str | float | None] | np.ndarray
     units: str | None
 
 
@@ -40,6 +45,44 @@ class Table(NamedTuple):
     rows: Sequence[str]
     name: str = ""  # of the record, where the table holds one
     padded: bool = False  # whether rows at the ends in which nothing was measured are there for longer records
+    quantities: Mapping[str, Quantity] = {}  # headings that were channels of the user's own, not text
+
+
+def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: list[str]) -> Iterator[Table]:
+    """Iterate over the tables of one file or object; what is wrong with it is added to `problems`."""
+    if isinstance(data, str | os.PathLike):
+        yield from _read_file(Path(data), bodies, problems)
+    elif hasattr(data, "data_vars"):
+        yield from read_dataset(cast("xarray.Dataset", data), bodies, source, problems)
+    elif hasattr(data, "columns") and hasattr(data, "index"):
+        frame = cast("pandas.DataFrame", data)
+        yield table_of_frame(frame, source, problems)._replace(quantities=quantities_by_name(frame.columns))
+    elif isinstance(data, Mapping):
+        table = table_of_columns(source, [(str(key), value) for key, value in data.items()], problems)
+        yield table._replace(quantities=quantities_by_name(data))
+    else:
+        what = "a Record, a mapping, a pandas DataFrame, an xarray Dataset, the path of a .csv or .nc file, or a list of such"
+        problems.append(f"{source}: must be {what}, is {type(data).__name__}")
+
+
+def quantities_by_name(given: Iterable[Hashable]) -> dict[str, Quantity]:
+    """Return those of some channels that are the user's own, by name."""
+    return {quantity.name: quantity for quantity in given if isinstance(quantity, Quantity)}
+
+
+def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterator[Table]:
+    try:
+        if path.suffix.lower() == ".csv":
+            yield from read_csv(path, problems)
+        elif path.suffix.lower() == ".nc":
+            with OptionalImport():
+                import xarray
+            data = xarray.load_dataset(path, decode_times=False)  # else xarray makes durations of seconds
+            yield from read_dataset(data, bodies, str(path), problems, path.stem)
+        else:
+            problems.append(f"{path}: must be a .csv or a .nc file")
+    except (OSError, ValueError, csv.Error) as error:
+        problems.append(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})")
 
 
 def read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
@@ -97,7 +140,7 @@ def _values(column: "pandas.Series") -> np.ndarray:
 
 
 def table_of_columns(
-    source: str, given: Sequence[tuple[str, Any]], problems: list[str], rows: Sequence[str] | None = None, name: str = ""
+    source: str, given: Sequence[tuple[str, ArrayLike]], problems: list[str], rows: Sequence[str] | None = None, name: str = ""
 ) -> Table:
     """Return the table of columns whose headings may name their units."""
     columns: dict[str, Column] = {}
@@ -107,7 +150,8 @@ def table_of_columns(
             what = f"there are two columns {quote(heading)}" if heading else "a column has no heading"
             problems.append(f"{source}: {what}")
         else:
-            columns[heading] = Column(np.asarray(values) if hasattr(values, "dtype") else values, units)
+            cells = np.asarray(values) if hasattr(values, "dtype") else cast("Sequence[str | float | None]", values)
+            columns[heading] = Column(cells, units)
     if rows is None:
         sizes = [len(c.values) for c in columns.values() if not _is_scalar(c.values)]
         rows = [f"entry {k}" for k in range(max(sizes, default=0))]
@@ -115,7 +159,7 @@ def table_of_columns(
     return Table(source, columns, rows, name)
 
 
-def _is_scalar(values: Any) -> bool:
+def _is_scalar(values: ArrayLike) -> bool:
     """Whether this is one value for all rows."""
     return isinstance(values, str) or not hasattr(values, "__len__") or getattr(values, "shape", None) == ()
 
