@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 STEP_RATIO = 4.0  # from one step of differences to the next
 DIFFERENCE_STEPS = 0.1 * STEP_RATIO ** -np.arange(10.0)  # of dimensionless unknowns: 0.1 to 4e-7
 RICHARDSON = STEP_RATIO**2
 NEXT_STEPS = 2  # smaller steps whose truncation does not count beside that of one; two, since one may be near by chance
+MOTION = 1e-2  # of what is seen: the least change that is more than that of a small step
 TOO_LARGE = 0.5  # of a difference: where smaller steps say otherwise by more, a step is too large
 
 
@@ -76,6 +77,19 @@ def _truncation(R: np.ndarray, noise: np.ndarray, series: Sequence[np.ndarray]) 
         found[k] = np.where(found[k] < found[k - 1] / STEP_RATIO**4, found[k - 1] / STEP_RATIO**4, found[k])
     whole = sizes(R, series)
     return np.where(found > TOO_LARGE * np.fmax(whole[:-1], whole[1:]), np.nan, found)
+
+
+def leave_out_far_steps(found: Differences, size: Float[np.ndarray, "S"], series: Sequence[np.ndarray]) -> Differences:
+    """Leave out the differences whose steps lead to quite another motion; `size` is that of the derivative in each series."""
+    h = found.steps[:, None]
+    far = (h * size > found.largest) & (h * sizes(found.values, series) > MOTION * found.largest)
+    return found._replace(truncation=np.where(far, np.nan, found.truncation))
+
+
+def best_steps(errors: Float[np.ndarray, "... H"]) -> Int[np.ndarray, "..."]:
+    """Return the number of the step with the least error; -1 where none is known."""
+    known = np.where(np.isfinite(errors), errors, np.inf)
+    return np.where(np.isfinite(known).any(-1), known.argmin(-1), -1)
 
 
 def sizes(values: Float[np.ndarray, "... R"], series: Sequence[np.ndarray]) -> Float[np.ndarray, "... S"]:

@@ -1,10 +1,12 @@
 """How counts, lists and tables are worded in texts for people."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 MOST_LISTED = 8  # names in one sentence
+MOST_DIGITS = 12  # of a number in a table
 
 
 def plural(count: int, noun: str) -> str:
@@ -28,3 +30,11 @@ def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:
     """Return the lines of a table, its columns below each other."""
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  " + "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip() for row in cells]
+
+
+def format_value(value: float, error: float) -> str:
+    """Return a value with as many digits as its standard error allows, and one more."""
+    if not (math.isfinite(error) and error > 0 and value):
+        return f"{value:.6g}"
+    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(error)) + 2
+    return f"{value:#.{min(max(digits, 2), MOST_DIGITS)}g}".rstrip(".")

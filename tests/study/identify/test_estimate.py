@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.study.identify.estimate import Estimate, format_value
+from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.optimizer import squares
 from udkjax.study.identify.records import Record, labels
+from udkjax.study.identify.uncertainty import Uncertainty
+from udkjax.study.wording import format_value
 
 
 @pytest.mark.parametrize(
@@ -66,6 +68,7 @@ def estimate() -> Estimate:
         chi2=39.5,
         degrees_of_freedom=35,
     )
+    known.notes = lambda name: Uncertainty.notes(known, name)
     found = Estimate(
         names=names,
         units=("kg", "kg", "m", "1"),

@@ -9,9 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from udkjax.study.identify.estimate import profiles_dataset
 from udkjax.study.identify.problem import Residuals
-from udkjax.study.identify.profile_likelihood import fix_unknown, profile_likelihood, trace_profile
+from udkjax.study.identify.profile_likelihood import fix_unknown, profile_likelihood, profiles_dataset, trace_profile
 
 
 def linear(J, r0):

@@ -15,26 +15,25 @@ from jaxtyping import Float
 from udkjax.deprecation import renamed_attributes
 from udkjax.extras import OptionalImport
 from udkjax.html import html_table
-from udkjax.integrate.assembly import State, assemble
+from udkjax.integrate.assembly import State
 from udkjax.integrate.solution import scene_text, versions
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
-from udkjax.study.identify.optimizer import Loss
+from udkjax.study.identify.optimizer import Loss, weighted_residuals
 from udkjax.study.identify.prediction import Tolerances
-from udkjax.study.identify.problem import Problem, Residuals
-from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikelihood, estimated_noise, profile_likelihood, quantile
-from udkjax.study.identify.records import IdentificationError, labels
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikelihood, profile_likelihood, profiles_dataset
+from udkjax.study.identify.records import IdentificationError, dataset_of_fit, label_prefixes
 from udkjax.study.identify.uncertainty import Uncertainty
-from udkjax.study.identify.unknowns import apply_values, with_conditions
+from udkjax.study.identify.unknowns import apply_values
 from udkjax.study.whiteness import Whiteness
-from udkjax.study.wording import join_names, plural, table_lines
+from udkjax.study.wording import format_value, join_names, plural, table_lines
 
 if TYPE_CHECKING:
     import xarray
 
 FORMAT = "udkjax identification 1"  # of the dataset
-MOST_DIGITS = 12  # of a number in a table
 
 
 class Row(NamedTuple):
@@ -115,12 +114,7 @@ class Estimate:
     @cached_property
     def initial_states(self) -> tuple[State, ...]:
         """The states that the records began with, closed."""
-        problem, found = self.problem, []
-        members = problem.members(self.z[None])
-        for k, record in enumerate(problem.records):
-            guess = problem.predictor.guess(members, problem.beginnings[k])
-            found.append(assemble(with_conditions(self.mechanism, record), record.t0, guess, throw=False))
-        return tuple(found)
+        return self.problem.first_states(self.mechanism, self.z)
 
     @property
     def success(self) -> bool:
@@ -130,8 +124,7 @@ class Estimate:
     @property
     def message(self) -> str:
         """What there is to say of the estimate, one sentence a line."""
-        records = self.problem.records
-        prefixes = [f"{label}, " for label in labels(records)] if len(records) > 1 else [""]
+        prefixes = label_prefixes(self.problem.records)
         lines = [] if self.converged else ["the fit has not settled: these are the best values that were found"]
         lines += self.uncertainty.messages
         lines += [f"{name} is at one of its bounds" for name in self.at_bounds]
@@ -152,10 +145,7 @@ class Estimate:
         """
         if name not in self.names:
             raise IdentificationError([f"{quote(name)} was not identified{suggestion(name, self.names)}"])
-
-        def evaluate(z: np.ndarray) -> Residuals:
-            return self.loss(self.problem.evaluate(z, self.tol))
-
+        evaluate = weighted_residuals(self.problem, self.tol, self.loss)
         return profile_likelihood(evaluate, self.problem.unknowns, self.z, self.uncertainty, name, level)
 
     def check_gradients(self) -> GradientCheck:
@@ -166,30 +156,15 @@ class Estimate:
 
     def rows(self) -> list[Row]:
         """Return what was found, in the order in which it was asked for; then what was found of initial states."""
-        found = [
-            Row(name, float(value), float(error), units, float(first), self._note(name))
-            for name, value, error, units, first in zip(
-                self.names, self.values, self.uncertainty.standard_errors, self.units, self.problem.unknowns.guess, strict=True
-            )
-        ]
+        known, guess = self.uncertainty, self.problem.unknowns.guess
+        notes = [", ".join([*known.notes(name), *["at a bound"] * (name in self.at_bounds)]) for name in self.names]
+        columns = self.names, self.values.tolist(), known.standard_errors.tolist(), self.units, guess.tolist(), notes
         units = dict(zip(self.problem.all_names, self.problem.all_units, strict=True))
-        for name, (change, error) in self.initial_state_values.items():
-            found.append(Row(name, change, error, units[name], 0.0, "added to the guess of the start"))
-        return found
-
-    def _note(self, name: str) -> str:
-        known, found = self.uncertainty, []
-        if name in known.dead:
-            found.append("shows in nothing that was measured")
-        if any(name in flat.names for flat in known.flat):
-            found.append(
-                "cannot be told from others" if any(len(f.names) > 1 for f in known.flat if name in f.names) else "unknown"
-            )
-        if name in known.poor:
-            found.append("poorly known")
-        if name in self.at_bounds:
-            found.append("at a bound")
-        return ", ".join(found)
+        states = [
+            Row(name, change, error, units[name], 0.0, "added to the guess of the start")
+            for name, (change, error) in self.initial_state_values.items()
+        ]
+        return [Row(*row) for row in zip(*columns, strict=True)] + states
 
     def _cells(self) -> list[tuple[str, ...]]:
         cells = [("parameter", "value", "standard error", "unit", "first guess", "")]
@@ -211,13 +186,12 @@ class Estimate:
         facts = {"fit": f"{ended} after {plural(self.evaluations, 'evaluation')} in {self.seconds:.1f} s{agreed}"}
         if problem.noise_given.any():
             facts["chi^2"] = f"{known.chi2:.4g} with {known.degrees_of_freedom} degrees of freedom"
-        if not problem.noise_given.all():
-            found = []
-            for c, channel in enumerate(problem.channels):
-                own = (problem.index[:, 2] == c) & ~problem.noise_given
-                if own.any():
-                    sigma = np.nanmedian(self.noise[int(problem.index[np.argmax(own), 0])][channel.name])
-                    found.append(f"{channel.name} {sigma:.3g} {channel.units}".rstrip())
+        estimated = problem.index[~problem.noise_given]
+        channels, first = np.unique(estimated[:, 2], return_index=True)
+        found = []
+        for channel, record in zip([problem.channels[c] for c in channels], estimated[first, 0], strict=True):
+            found.append(f"{channel.name} {np.nanmedian(self.noise[record][channel.name]):.3g} {channel.units}".rstrip())
+        if found:
             facts["noise, estimated"] = join_names(found)
         return facts
 
@@ -254,26 +228,12 @@ class Estimate:
         """
         with OptionalImport():
             import xarray
-        problem, known = self.problem, self.uncertainty
+        problem, known, P = self.problem, self.uncertainty, "parameter"
         records, names = problem.records, problem.channel_names
-        shape = len(records), max(len(record.times) for record in records), len(names)
-        time = np.full(shape[:2], np.nan)
-        parts = {name: np.full(shape, np.nan) for name in ("measured", "predicted", "residual", "noise")}
-        white = np.full((shape[0], shape[2]), np.nan)
-        for k, record in enumerate(records):
-            time[k, : len(record.times)] = record.times
-            for channel, predicted in self.predicted[k].items():
-                place = k, slice(len(record.times)), names.index(channel)
-                residual = self.residuals[k][channel]
-                columns = predicted + residual, predicted, residual, self.noise[k][channel]
-                for part, values in zip(parts.values(), columns, strict=True):
-                    part[place] = values
-                if (k, channel) in self.whiteness:
-                    white[k, place[2]] = self.whiteness[k, channel].p
+        found = dataset_of_fit(records, names, self.predicted, self.residuals, self.noise)
+        white = [[getattr(self.whiteness.get((k, name)), "p", np.nan) for name in names] for k in range(len(records))]
         cost, change = np.array(self.history, float).reshape(-1, 2).T
-        P = "parameter"
         data = {
-            **{name: (("record", "sample", "channel"), values) for name, values in parts.items()},
             "correlated": (("record", "channel"), white),
             "first_guess": (P, problem.unknowns.guess),
             "value": (P, self.values),
@@ -283,9 +243,6 @@ class Estimate:
             "change": ("trial", change),
         }
         coords = {
-            "record": labels(records),
-            "time": (("record", "sample"), time, {"units": "s"}),
-            "channel": list(names),
             "channel_units": ("channel", [channel.units for channel in problem.channels]),
             P: list(self.names),
             "parameter_units": (P, list(self.units)),
@@ -299,39 +256,28 @@ class Estimate:
             **{f"version_{name}": value for name, value in versions().items()},
             "scene": scene_text(self.mechanism),
         }
-        found = xarray.Dataset(data, coords, attributes)
+        found = found.merge(xarray.Dataset(data, coords)).assign_attrs(attributes)
         return found.merge(profiles_dataset(profiles, self.parameters, known, level)) if profiles else found
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as plain numbers and texts, as a JSON file has them."""
-        known = self.uncertainty
+        known, rows, P = self.uncertainty, self.rows(), len(self.names)
         return {
             "success": self.success,
             "converged": self.converged,
             "message": self.message,
             "parameters": {
-                name: {"value": value, "standard_error": _json_number(error), "units": units}
-                for name, value, error, units in zip(
-                    self.names, self.values.tolist(), known.standard_errors, self.units, strict=True
-                )
+                row.parameter: {"value": row.value, "standard_error": _finite(row.standard_error), "units": row.units}
+                for row in rows[:P]
             },
-            "correlation": [[_json_number(x) for x in row] for row in known.correlation],
+            "correlation": [[_finite(x) for x in row] for row in known.correlation],
             "unknown": {"dead": list(known.dead), "flat": [direction.text for direction in known.flat]},
             "at_bounds": list(self.at_bounds),
-            "starts": {
-                name: {"change": _json_number(x), "standard_error": _json_number(error)}
-                for name, (x, error) in self.initial_state_values.items()
-            },
+            "starts": {r.parameter: {"change": _finite(r.value), "standard_error": _finite(r.standard_error)} for r in rows[P:]},
             "chi2": known.chi2,
             "degrees_of_freedom": known.degrees_of_freedom,
-            "noise": [
-                {channel: _json_number(np.median(sigma[np.isfinite(sigma)])) for channel, sigma in table.items()}
-                for table in self.noise
-            ],
-            "whiteness": [
-                {"record": record, "channel": channel, "p": _json_number(found.p)}
-                for (record, channel), found in self.whiteness.items()
-            ],
+            "noise": [{channel: _finite(np.nanmedian(sigma)) for channel, sigma in table.items()} for table in self.noise],
+            "whiteness": [{"record": k, "channel": c, "p": _finite(w.p)} for (k, c), w in self.whiteness.items()],
             "guesses": self.guesses,
             "agreeing": self.agreeing,
             "ways": list(self.ways),
@@ -346,38 +292,6 @@ class Estimate:
         return json.dumps(self.to_dict(), indent=1)
 
 
-def profiles_dataset(
-    profiles: Sequence[ProfileLikelihood], values: Mapping[str, float], uncertainty: Uncertainty, level: float = CONFIDENCE
-) -> "xarray.Dataset":
-    """Return profile likelihoods of parameters with these values as a dataset: see `Estimate.to_xarray`."""
-    with OptionalImport():
-        import xarray
-    noise, freedom = estimated_noise(uncertainty)
-    parts = np.full((2, len(profiles), max(len(found.values) for found in profiles)), np.nan)
-    for k, found in enumerate(profiles):
-        own = np.argmin(np.abs(found.values - values[found.name]))
-        parts[:, k, : len(found.values)] = found.values, 2.0 * (found.costs - found.costs[own]) / noise**2
-    along = "profile", "point"
-    data = {
-        "profile_value": (along, parts[0]),
-        "rise": (along, parts[1]),
-        "interval": (
-            ("profile", "end"),
-            np.array([found.interval for found in profiles]),
-            {"level": level, "limit": quantile(level, freedom)},
-        ),
-    }
-    return xarray.Dataset(data, {"profile": [found.name for found in profiles], "end": ["low", "high"]})
-
-
-def format_value(value: float, error: float) -> str:
-    """Return a value with as many digits as its standard error allows, and one more."""
-    if not (math.isfinite(error) and error > 0 and value):
-        return f"{value:.6g}"
-    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(error)) + 2
-    return f"{value:#.{min(max(digits, 2), MOST_DIGITS)}g}".rstrip(".")
-
-
-def _json_number(x: float) -> float | None:
+def _finite(x: float) -> float | None:
     """A number as JSON knows it: what is not finite is null."""
     return float(x) if np.isfinite(x) else None

@@ -21,15 +21,14 @@ from jaxtyping import Bool, Float, Int
 from udkjax.deprecation import renamed_attributes
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.differences import DIFFERENCE_STEPS, Differences, differences, sizes
+from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, differences, leave_out_far_steps, sizes
 from udkjax.study.identify import prediction
 from udkjax.study.identify.build_problem import build_problem
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import TIGHT, Tolerances
 from udkjax.study.identify.problem import Problem, Residuals
 from udkjax.study.identify.record_reader import Data
-from udkjax.study.identify.records import IdentificationError
-from udkjax.study.identify.records import labels as record_labels
+from udkjax.study.identify.records import IdentificationError, label_prefixes
 from udkjax.study.wording import join_names, table_lines
 
 AGREEMENT = 3.0  # floors: a floor is a sum of sizes, each of which was measured once
@@ -37,7 +36,6 @@ USEFUL = 0.1  # of the derivative's size: where the floor is higher, agreement s
 RANDOM_DIRECTIONS = 3  # in which all unknowns move
 OTHER_TOL = 0.01, 10.0  # of the tolerance: where errors are measured; the second where runs fail at the first
 SMALLEST_TOL = 1e-14  # below it, step control follows rounding errors
-MOTION = 1e-2  # of what a channel shows: the least change that is more than that of a small step
 
 
 class Place(NamedTuple):
@@ -105,7 +103,7 @@ class GradientCheck:
     @cached_property
     def best(self) -> Int[np.ndarray, "D S"]:
         """The number of the step at which differences are best; -1 where there is none."""
-        return _smallest(self.noise + self.truncation)
+        return best_steps(self.noise + self.truncation)
 
     def at_best(self, values: Float[np.ndarray, "D S H"]) -> Float[np.ndarray, "D S"]:
         """Return of values by step those at the best step."""
@@ -115,7 +113,7 @@ class GradientCheck:
     @property
     def step(self) -> Float[np.ndarray, "D S"]:
         """The step at which differences are best."""
-        return np.where(self.best < 0, np.nan, self.steps[self.best])
+        return self.at_best(np.broadcast_to(self.steps, self.noise.shape))
 
     @property
     def floor(self) -> Float[np.ndarray, "D S"]:
@@ -182,9 +180,10 @@ def check_gradients(
 def compare_gradients(problem: Problem, z: Float[np.ndarray, "K"], tol: Tolerances, seed: int = 0) -> GradientCheck:
     """Compare the derivatives of a problem at z with differences, at tolerances of the integration."""
     rows, names = len(problem.index), problem.all_names[: problem.K - problem.constrained]
-    residuals = problem.evaluate(z[None], tol)
-    _require_run(residuals)
-    other, with_other = _evaluate_otherwise(problem, z, tol)
+    _, residuals = _evaluate_first(problem, z, [tol])
+    smaller, larger = ((max(factor * tol[0], SMALLEST_TOL), max(factor * tol[1], SMALLEST_TOL)) for factor in OTHER_TOL)
+    others = [smaller, larger] if smaller[0] < tol[0] and smaller[1] < tol[1] else [larger]
+    other, with_other = _evaluate_first(problem, z, others)
     series = problem.series()
     random = np.random.default_rng(seed).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
     directions = np.concatenate([np.eye(problem.K)[: len(names)], random / np.linalg.norm(random, axis=1, keepdims=True)])
@@ -194,10 +193,10 @@ def compare_gradients(problem: Problem, z: Float[np.ndarray, "K"], tol: Toleranc
     for d, slope in zip(directions, derivatives, strict=True):
         points = z + np.concatenate([DIFFERENCE_STEPS, -DIFFERENCE_STEPS])[:, None] * d
         y, y_other = (_predict(problem, points, by).reshape(2, len(DIFFERENCE_STEPS), rows).swapaxes(0, 1) for by in (tol, other))
-        found.append(_without_far_steps(differences(y, y - y_other, series), sizes(slope, series), series))
+        found.append(leave_out_far_steps(differences(y, y - y_other, series), sizes(slope, series), series))
         places.append(_places(problem, series, slope, found[-1]))
     keys = [(int(problem.index[p[0], 0]), problem.channels[problem.index[p[0], 2]]) for p in series]
-    prefixes = [f"{label}, " for label in record_labels(problem.records)] if len(problem.records) > 1 else [""]
+    prefixes = label_prefixes(problem.records)
     return GradientCheck(
         title=problem.mechanism.name or "mechanism",
         names=(*names, *(f"random direction {k + 1}" for k in range(len(random)))),
@@ -217,27 +216,15 @@ def compare_gradients(problem: Problem, z: Float[np.ndarray, "K"], tol: Toleranc
     )
 
 
-def _ran(found: Residuals) -> bool:
-    return bool(found.code[0] == Result.successful and np.isfinite(found.r[0]).all())
-
-
-def _require_run(found: Residuals) -> None:
-    if not _ran(found):
-        code = Result(int(found.code[0]))
-        cause = "some of its channels are not numbers" if code == Result.successful else CAUSES[code]
-        raise IdentificationError([f"there are no derivatives to be checked: {cause}"])
-
-
-def _evaluate_otherwise(problem: Problem, z: np.ndarray, tol: Tolerances) -> tuple[Tolerances, Residuals]:
-    """Return other tolerances at which runs come to their end, and the residuals with them."""
-    smaller, larger = ((max(factor * tol[0], SMALLEST_TOL), max(factor * tol[1], SMALLEST_TOL)) for factor in OTHER_TOL)
-    if smaller[0] < tol[0] and smaller[1] < tol[1]:
-        found = problem.evaluate(z[None], smaller)
-        if _ran(found):
-            return smaller, found
-    found = problem.evaluate(z[None], larger)
-    _require_run(found)
-    return larger, found
+def _evaluate_first(problem: Problem, z: np.ndarray, tols: Sequence[Tolerances]) -> tuple[Tolerances, Residuals]:
+    """Return the first of some tolerances at which runs come to their end, and the residuals with it."""
+    for tol in tols:
+        found = problem.evaluate(z[None], tol)
+        if found.code[0] == Result.successful and np.isfinite(found.r[0]).all():
+            return tol, found
+    code = Result(int(found.code[0]))
+    cause = "some of its channels are not numbers" if code == Result.successful else CAUSES[code]
+    raise IdentificationError([f"there are no derivatives to be checked: {cause}"])
 
 
 def _predict(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> Float[np.ndarray, "B R"]:
@@ -251,28 +238,15 @@ def _predict(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> 
     return np.where((code == Result.successful)[:, None], seen, np.nan)
 
 
-def _without_far_steps(found: Differences, size: Float[np.ndarray, "S"], series: Sequence[np.ndarray]) -> Differences:
-    """Leave out the differences whose steps lead to quite another motion."""
-    h = found.steps[:, None]
-    far = (h * size > found.largest) & (h * sizes(found.values, series) > MOTION * found.largest)
-    return found._replace(truncation=np.where(far, np.nan, found.truncation))
-
-
 def _places(problem: Problem, series: Sequence[np.ndarray], slope: np.ndarray, found: Differences) -> tuple[Place, ...]:
     places = []
-    for rows, best in zip(series, _smallest((found.noise + found.truncation).T), strict=True):
+    for rows, best in zip(series, best_steps((found.noise + found.truncation).T), strict=True):
         difference = found.values[best][rows]
         worst = int(np.argmax(np.abs(difference - slope[rows])))
         record, time, channel = problem.index[rows[worst]]
         name, t = problem.channel_names[channel], float(problem.ts[record, time])
         places.append(Place(int(record), name, t, float(slope[rows[worst]]), float(difference[worst])))
     return tuple(places)
-
-
-def _smallest(errors: Float[np.ndarray, "... H"]) -> Int[np.ndarray, "..."]:
-    """Return the number of the least error; -1 where none is known."""
-    known = np.where(np.isfinite(errors), errors, np.inf)
-    return np.where(np.isfinite(known).any(-1), known.argmin(-1), -1)
 
 
 # --- words
@@ -295,19 +269,16 @@ def _sentence(check: GradientCheck, d: int, s: int) -> str:
     if check.best[d, s] < 0:
         return "cannot be compared, since differences do not settle: the motion jumps, or is too sensitive"
     if not check.agrees[d, s]:
-        return _disagreement(check, d, s)
+        place, times = check.places[d][s], check.ratio[d, s]
+        of = f" of {check.labels[s]}" if len(check.series) > 1 else ""
+        values = f"the derivative is {place.derivative:.6g}, by differences {place.difference:.6g}"
+        apart = f": {times:.2g} times as far apart as errors of both explain" if np.isfinite(times) else ""
+        return f"at t = {place.time:.6g} s{of} {values}{apart}"
     if floor > size:
         return f"the derivative is below {floor:.1g} {check.units[s]}".rstrip() + ", which is all that differences tell of it"
     if floor > USEFUL * size:
         return f"differences tell the derivative to {floor / size:.0%}; with a smaller tolerance they tell more"
     return ""
-
-
-def _disagreement(check: GradientCheck, d: int, s: int) -> str:
-    place, times = check.places[d][s], check.ratio[d, s]
-    at = f"at t = {place.time:.6g} s" + (f" of {check.labels[s]}" if len(check.series) > 1 else "")
-    values = f"{at} the derivative is {place.derivative:.6g}, by differences {place.difference:.6g}"
-    return f"{values}: {times:.2g} times as far apart as errors of both explain" if np.isfinite(times) else values
 
 
 def _table(check: GradientCheck) -> str:

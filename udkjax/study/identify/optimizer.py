@@ -102,6 +102,11 @@ def huber(found: Residuals, residuals: int, c: float = HUBER) -> Residuals:
 # --- fits
 
 
+def weighted_residuals(problem: Problem, tol: Tolerances, loss: Loss, horizon: float | None = None) -> Objective:
+    """Return the residuals whose squares are minimized, of the part `horizon` of each record (None: all of it)."""
+    return lambda z: loss(problem.evaluate(z, tol, horizon))
+
+
 @dataclass(frozen=True)
 class Minimizer:
     """How all fits of an identification are made: by Levenberg-Marquardt (None), or another `method`."""
@@ -121,10 +126,7 @@ class Minimizer:
         undamped: bool = False,
     ) -> Fit:
         """Fit the part `horizon` of each record (None: all of it) from several first guesses: see `minimize_squares`."""
-
-        def evaluate(z: np.ndarray) -> Residuals:
-            return self.loss(problem.evaluate(z, tol, horizon))
-
+        evaluate = weighted_residuals(problem, tol, self.loss, horizon)
         if isinstance(self.method, GradientMethod):
             return minimize_by_gradient(self.method, evaluate, z, settled=settled, report=self.report)
         return minimize_squares(evaluate, z, steps, settled, undamped, self.method, self.report)

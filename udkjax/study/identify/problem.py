@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udkjax.equations.analysis import analyse
-from udkjax.integrate.assembly import State
+from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.solution import Result
 from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
@@ -23,7 +23,7 @@ from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.study.channels import Quantity, channel_of
 from udkjax.study.identify.prediction import Members, Prediction, Predictor, Tolerances
 from udkjax.study.identify.records import IdentificationError, Key, Record
-from udkjax.study.identify.unknowns import Unknowns, initial_state_unknowns
+from udkjax.study.identify.unknowns import Unknowns, initial_state_unknowns, with_conditions
 
 PADDING = 1e-9  # of the length of a record: the distance of the times that pad it; so short a step costs nothing
 STILL = 1e-12  # of the largest number in a channel: with a smaller deviation the channel does not move
@@ -172,6 +172,14 @@ class Problem:
         for more_r, more_J in self.further_rows(found, z):
             r, J = np.concatenate([r, more_r], axis=1), np.concatenate([J, more_J], axis=1)
         return Residuals(r, J, found.code.max(1))
+
+    def first_states(self, mechanism: Mechanism, z: Float[np.ndarray, "K"]) -> tuple[State, ...]:
+        """Return the states that the records begin with, closed, of a mechanism that has the parameters of z."""
+        members, found = self.members(z[None]), []
+        for record, run in zip(self.records, self.beginnings, strict=True):
+            guess = self.predictor.guess(members, int(run))
+            found.append(assemble(with_conditions(mechanism, record), record.t0, guess, throw=False))
+        return tuple(found)
 
     def further_rows(self, found: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Iterate over residuals, with Jacobians, that follow those of what was measured: of priors, (x - mean) / sigma."""

@@ -9,17 +9,21 @@ with one degree of freedom are a confidence interval that needs no linear model:
 (Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.)
 """
 
-from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri, fdtri
 
+from udkjax.extras import OptionalImport
 from udkjax.study.identify.least_squares import FINE_STEP, Objective, minimize_squares
 from udkjax.study.identify.problem import Residuals
 from udkjax.study.identify.uncertainty import Uncertainty
 from udkjax.study.identify.unknowns import FAR, Unknowns
+
+if TYPE_CHECKING:
+    import xarray
 
 CONFIDENCE = 0.95
 STEPS_TO_END = 4.0  # from the estimate to the end of the interval, where the curve is a straight line
@@ -110,6 +114,30 @@ def estimated_noise(uncertainty: Uncertainty) -> tuple[float, float | None]:
     """
     scales = uncertainty.noise
     return (float(scales.mean()), uncertainty.degrees_of_freedom) if scales.size else (1.0, None)
+
+
+def profiles_dataset(
+    profiles: Sequence[ProfileLikelihood], values: Mapping[str, float], uncertainty: Uncertainty, level: float = CONFIDENCE
+) -> "xarray.Dataset":
+    """Return profile likelihoods of parameters with these values as a dataset: see `Estimate.to_xarray`."""
+    with OptionalImport():
+        import xarray
+    noise, freedom = estimated_noise(uncertainty)
+    parts = np.full((2, len(profiles), max(len(found.values) for found in profiles)), np.nan)
+    for k, found in enumerate(profiles):
+        own = np.argmin(np.abs(found.values - values[found.name]))
+        parts[:, k, : len(found.values)] = found.values, 2.0 * (found.costs - found.costs[own]) / noise**2
+    along = "profile", "point"
+    data = {
+        "profile_value": (along, parts[0]),
+        "rise": (along, parts[1]),
+        "interval": (
+            ("profile", "end"),
+            np.array([found.interval for found in profiles]),
+            {"level": level, "limit": quantile(level, freedom)},
+        ),
+    }
+    return xarray.Dataset(data, {"profile": [found.name for found in profiles], "end": ["low", "high"]})
 
 
 # --- the curve

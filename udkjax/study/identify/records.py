@@ -2,16 +2,20 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, TypeVar, get_args
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from udkjax.deprecation import renamed_arguments
+from udkjax.extras import OptionalImport
 from udkjax.integrate.assembly import State
 from udkjax.scene.checks import Mistakes, quote
 from udkjax.study.channels import Channel, Quantity
+
+if TYPE_CHECKING:
+    import xarray
 
 Estimated = Literal["nothing", "position", "velocity", "both"]
 Key: TypeAlias = str | Quantity  # channels go by their names, a user's own by itself
@@ -148,6 +152,34 @@ def labels(records: Sequence[Record]) -> list[str]:
     """Return the names of records; those without a name, or with one that another has too, are numbered."""
     names = [record.name for record in records]
     return [name if name and names.count(name) == 1 else f"{name or 'record'} {k + 1}" for k, name in enumerate(names)]
+
+
+def label_prefixes(records: Sequence[Record]) -> list[str]:
+    """Return what names of channels begin with in messages: the name of their record, if there are several."""
+    return [f"{label}, " for label in labels(records)] if len(records) > 1 else [""]
+
+
+def dataset_of_fit(
+    records: Sequence[Record],
+    channels: Sequence[str],
+    predicted: Sequence[Mapping[str, np.ndarray]],
+    residuals: Sequence[Mapping[str, np.ndarray]],
+    noise: Sequence[Mapping[str, np.ndarray]],
+) -> "xarray.Dataset":
+    """Return what was measured and what a fit shows of it, along record, sample and channel; nan where nothing was measured."""
+    with OptionalImport():
+        import xarray
+    shape = len(records), max(len(record.times) for record in records), len(channels)
+    time, parts = np.full(shape[:2], np.nan), np.full((4, *shape), np.nan)
+    for k, record in enumerate(records):
+        count = len(record.times)
+        time[k, :count] = record.times
+        for channel, shown in predicted[k].items():
+            residual = residuals[k][channel]
+            parts[:, k, :count, channels.index(channel)] = shown + residual, shown, residual, noise[k][channel]
+    along = "record", "sample", "channel"
+    data = {name: (along, part) for name, part in zip(("measured", "predicted", "residual", "noise"), parts, strict=True)}
+    return xarray.Dataset(data, {"record": labels(records), "time": (along[:2], time, {"units": "s"}), "channel": list(channels)})
 
 
 def key_of(channel: Key | Channel) -> Key:

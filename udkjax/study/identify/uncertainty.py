@@ -108,6 +108,17 @@ class Uncertainty:
             pairs = np.argwhere(np.triu(np.abs(self.correlation) > CORRELATED, 1))
         return tuple((self.names[i], self.names[j], float(self.correlation[i, j])) for i, j in pairs)
 
+    def notes(self, name: str) -> list[str]:
+        """Return what is wrong with what is known of a parameter, a few words each."""
+        sizes = [len(flat.names) for flat in self.flat if name in flat.names]
+        notes = {
+            "shows in nothing that was measured": name in self.dead,
+            "cannot be told from others": max(sizes, default=0) > 1,
+            "unknown": max(sizes, default=0) == 1,
+            "poorly known": name in self.poor,
+        }
+        return [note for note, holds in notes.items() if holds]
+
     @property
     def messages(self) -> tuple[str, ...]:
         """What is to be known before the numbers are used, one sentence each; nothing where all is well."""
@@ -124,15 +135,9 @@ def estimate_uncertainty(
 ) -> Uncertainty:
     """Compute how well unknowns are known: covariance (J^T J)^-1, and the directions that J does not show.
 
-    Args:
-        J: derivatives of the weighted residuals by the unknowns z.
-        r: the weighted residuals.
-        values: the unknowns.
-        noise_group: for each residual the group (0, 1, ...) whose common noise is to be estimated, or -1 where it is known; by
-            default all noise is known.
-        parameters: how many of the unknowns, from the first on, are asked for; by default all.
-        priors: how many of the last rows are those of priors: what only they show is as known as they say, however much better
-            other directions are measured.
+    `noise_group` says for each residual whose common noise is to be estimated (0, 1, ...), or -1 where it is known (all by
+    default). The first `parameters` unknowns are asked for, by default all. The last rows are those of `priors`: what only they
+    show is as known as they say, however much better other directions are measured.
     """
     K = len(values.names)
     P = K if parameters is None else parameters
