@@ -103,8 +103,8 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.study.equilibrium import Equilibrium as Equilibrium
     from udkjax.study.equilibrium import equilibria as equilibria
     from udkjax.study.equilibrium import equilibrium as equilibrium
+    from udkjax.study.explain import explain as explain
     from udkjax.study.explanation import Explanation as Explanation
-    from udkjax.study.explanation import explain as explain
     from udkjax.study.identify import Candidate as Candidate
     from udkjax.study.identify import Design as Design
     from udkjax.study.identify import Estimate as Estimate
@@ -161,7 +161,8 @@ _NAMES = {
         unique_reactions uniqueness singular_values
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
     "udkjax.study.diagnosis": "diagnose Diagnosis",
-    "udkjax.study.explanation": "explain Explanation",
+    "udkjax.study.explain": "explain",
+    "udkjax.study.explanation": "Explanation",
     "udkjax.study.reaction_peaks": "reaction_peaks envelope",
     "udkjax.study.power_balance": "power_balance PowerBalance",
     "udkjax.study.identify": """

@@ -7,8 +7,12 @@ from udkjax.study.choices import choice
 
 def test_a_name_or_a_table_is_what_it_stands_for():
     assert isinstance(choice("method", "gram-schmidt"), udk.GramSchmidt)
-    assert float(choice("method", {"type": "svd", "rank_tol": 1e-5}).rank_tol) == 1e-5
-    assert float(choice("stabilization", {"type": "baumgarte", "beta": 7}).beta) == 7.0
+    svd, baumgarte = (
+        choice("method", {"type": "svd", "rank_tol": 1e-5}),
+        choice("stabilization", {"type": "baumgarte", "beta": 7}),
+    )
+    assert isinstance(svd, udk.SVD) and svd.rank_tol == 1e-5
+    assert isinstance(baumgarte, udk.Baumgarte) and float(baumgarte.beta) == 7.0
     assert choice("stabilization", "none") is None and choice("formulation", "udwadia-kalaba") is None
     assert isinstance(choice("solver", "tsit5"), diffrax.Tsit5) and isinstance(choice("solver", "adams"), udk.Adams)
 

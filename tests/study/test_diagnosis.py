@@ -3,6 +3,7 @@
 import json
 from fractions import Fraction
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
@@ -303,7 +304,8 @@ def test_a_trajectory_that_stays_clear_has_no_rank_change(linkage):
     """Swinging from -45 degrees the links come no nearer to in line than at the start; states of any origin will do."""
     ts = np.linspace(0.0, 3.0, 61)
     solution = udk.simulate(linkage, ts, rtol=1e-9, atol=1e-9)
-    line = udk.diagnose(linkage, solution=SimpleNamespace(ts=ts, q=solution.q, v=solution.v), fixes=False, walk=False).timeline
+    states: Any = SimpleNamespace(ts=ts, q=solution.q, v=solution.v)
+    line = udk.diagnose(linkage, solution=states, fixes=False, walk=False).timeline
     assert line is not None and line.changes == ()
     assert_allclose(line.closest[1], line.smallest[0], rtol=1e-3)
 

@@ -1,6 +1,7 @@
 """Peaks of reactions and their derivatives, envelopes, and the power balance."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -106,7 +107,7 @@ class Lamp(udk.ForceElement):
 COUNT = 42  # states in each of the calls below: what is compiled for one serves the next
 
 
-def still(state, v=None):
+def still(state, v=None) -> Any:
     """One state, so many times."""
     q, v = np.asarray(state.q), np.asarray(state.v if v is None else v)
     return SimpleNamespace(ts=np.zeros(COUNT), q=np.tile(q, (COUNT, 1, 1)), v=np.tile(v, (COUNT, 1, 1)))

@@ -1,7 +1,6 @@
 """All ways in which a mechanism can be put together for one value of its driver."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -45,15 +44,17 @@ def branches(
     driven = drive(mechanism, driver, 0.0, held)
     guesses = random_positions(mechanism, starts, seed)
     q, closed = _close(driven.mechanism, driven.analysis, number(value), guesses)
-    kept = np.asarray(q)[distinct(q, closed, driven.analysis.scales)]
-    kept[..., 2] = np.angle(np.exp(1j * kept[..., 2]))
-    order = np.lexsort(np.round(kept[..., 2], 6).T[::-1])
-    return jnp.asarray(kept[order])
+    found = np.asarray(q)[distinct(q, closed, driven.analysis.scales)]
+    found[..., 2] = np.angle(np.exp(1j * found[..., 2]))
+    order = np.lexsort(np.round(found[..., 2], 6).T[::-1])
+    return jnp.asarray(found[order])
 
 
 @eqx.filter_jit
-def _close(mechanism: Mechanism, analysis: Analysis, s: Any, guesses: Any) -> tuple[Array, Array]:
-    def one(q: Any) -> tuple[Array, Array]:
+def _close(
+    mechanism: Mechanism, analysis: Analysis, s: Float[Array, ""], guesses: Float[Array, "count bodies 3"]
+) -> tuple[Array, Array]:
+    def one(q: Float[Array, "bodies 3"]) -> tuple[Array, Array]:
         found = close(mechanism, s, State(q, jnp.zeros_like(q)), analysis=analysis)
         return found.state.q, jnp.asarray(found.is_closed)
 

@@ -1,17 +1,19 @@
 """Choices of a run by the names that files and the command line have for them."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import TypeAlias
 
 from udkjax.equations import Augmented, Baumgarte, CoordinatePartitioning, NullSpaceQR, NullSpaceSVD
+from udkjax.equations.formulations import Formulation
 from udkjax.integrate import Projection
-from udkjax.integrate.solvers import solver_named
-from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Varga
+from udkjax.integrate.solvers import Solver, solver_named
+from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
 from udkjax.scene.checks import abbreviate, quote, suggestion
 
-Table = dict[str, Callable[..., Any]]
+Choice: TypeAlias = "Pseudoinverse | Formulation | Projection | Baumgarte | Solver | None"
+Table = dict[str, Callable[..., Choice]]
 
 
 def _none() -> None:
@@ -42,13 +44,13 @@ SOLVERS: Table = {
 CHOICES = {"method": METHODS, "formulation": FORMULATIONS, "stabilization": STABILIZATIONS, "solver": SOLVERS}
 
 
-def choice(setting: str, given: Any) -> Any:
+def choice(setting: str, given: str | Mapping[str, str | float]) -> Choice:
     """Return what a name stands for in a setting ("method": "svd"), or a table of its `type` and its numbers.
 
     Raises ValueError, which says what there is.
     """
     known = CHOICES[setting]
-    table = given if isinstance(given, dict) else {"type": given}
+    table = given if isinstance(given, Mapping) else {"type": given}
     name, numbers = table.get("type"), {key: value for key, value in table.items() if key != "type"}
     if not isinstance(name, str) or name not in known:
         raise ValueError(f"no {setting} {abbreviate(name)}{suggestion(name, known) or '; one of ' + ', '.join(known)}")

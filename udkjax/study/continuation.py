@@ -3,12 +3,12 @@
 The curve is smooth also where the mechanism is at a toggle: there s turns back (ds/dsigma = 0 along the arc sigma), which is a
 simple root of a smooth function. With X = (q, s), each measured by its scale, and E = dPsi/dX of weighted rows,
 
-    tangent    tau = (I - E^+ E) tau_before, of unit length: the direction is kept, so that the curve is never turned around;
+    tangent    tau = (I - E^+ E) tau_before, of unit length: it keeps its direction, so that the curve is never turned around;
     predictor  X + h tau;        corrector  X <- X - E^+ Psi(X), the smallest change that removes the residual.
 
-A step counts if the corrector converges near the prediction and the tangent has turned little; else it is halved. So a branch is
-kept, or the curve is lost and says so. E^+ is truncated: redundant constraints do no harm, and where branches meet, which costs
-E rank, the old tangent leads across.
+A step counts if the corrector converges near the prediction and the tangent has turned little; else it is halved. So the branch
+stays the same, or the curve is lost and says so. E^+ is truncated: redundant constraints do no harm, and where branches meet,
+which costs E rank, the old tangent leads across.
 
 Source: Allgower, Georg, Introduction to Numerical Continuation Methods (2003), chapters 2 and 9.
 """
@@ -125,11 +125,6 @@ class Curve(eqx.Module):
         size = jnp.linalg.norm(tau)
         return tau / jnp.where(size > 0, size, 1.0)
 
-    def derivatives(self, X: Float[Array, "n+1"]) -> tuple[Array, Array, Array]:
-        """Return dq/ds and d2q/ds2, unscaled, and the rank of Psi_q."""
-        x = X * self.units
-        return derivatives(self, x[-1], x[:-1])
-
 
 def plus(E: Float[Array, "m n"]) -> Plus:
     """Return E^+, truncated."""
@@ -223,14 +218,11 @@ def _step(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
 
 def _record(curve: Curve, points: Points, k: Int[Array, ""], X: Float[Array, "n+1"], which: Bool[Array, ""]) -> Points:
     """Store a point of the curve as that of values[k], where `which` is true."""
-    dq, ddq, rank = curve.derivatives(X)
-    status = jnp.where(rank < len(X) - 1, Reached.singular, Reached.closed)
-    new = {"q": (X * curve.units)[:-1], "dq": dq, "ddq": ddq, "status": status}
-    return points._replace(**{name: _set(getattr(points, name), k, x, which) for name, x in new.items()})
-
-
-def _set(array: Array, k: Int[Array, ""], x: Array, which: Bool[Array, ""]) -> Array:
-    return array.at[k].set(jnp.where(which, x, array[k]))
+    x = X * curve.units
+    dq, ddq, rank = derivatives(curve, x[-1], x[:-1])
+    new = x[:-1], dq, ddq, jnp.where(rank < len(x) - 1, Reached.singular, Reached.closed)
+    q, dq, ddq, status = (x.at[k].set(jnp.where(which, y, x[k])) for x, y in zip(points[:4], new, strict=True))
+    return Points(q, dq, ddq, status, points.limit, points.limit_q)
 
 
 def _find_fold(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:

@@ -4,15 +4,15 @@ A mechanism whose driver prescribes `coordinate = t` has the coordinate's value 
 Psi_dot = 0 gives dq/ds, and Psi_q a = gamma gives d2q/ds2, by the equations that serve every other mechanism.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, cast, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
@@ -24,7 +24,8 @@ from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.study.channels import channel_of
 
-DRIVEN = ("angle", "x", "y", "distance")
+CoordinateName = Literal["angle", "x", "y", "distance"]
+DRIVEN = get_args(CoordinateName)
 STILL = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # the ground
 
 
@@ -35,7 +36,7 @@ class Coordinate(eqx.Module):
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
-    coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True, default="angle")
+    coordinate: CoordinateName = eqx.field(static=True, default="angle")
     points: Float[Array, "2 2"] | None = eqx.field(converter=optional_number, default=None)
 
 
@@ -47,7 +48,7 @@ class Value(Motion):
 
     origin: Float[Array, ""] = eqx.field(converter=number, default=0.0)
 
-    def __call__(self, t: Any) -> Any:
+    def __call__(self, t: ArrayLike) -> Float[Array, ""]:
         return self.origin + t
 
 
@@ -58,14 +59,14 @@ class Driven(NamedTuple):
     analysis: Analysis
     name: str  # of the driver; empty where s is time itself
     row: int  # of the driver in Psi; -1 where s is time itself
-    unit: Any  # what s is measured by: one radian, the scale of a length, the mechanism's own time
+    unit: Float[Array, ""]  # what s is measured by: one radian, the scale of a length, the mechanism's own time
 
     @property
     def is_angle(self) -> bool:
         """Whether s is an angle."""
         return bool(self.name) and self.mechanism.drivers[self.name].coordinate == "angle"
 
-    def value(self, q: Any) -> Any:
+    def value(self, q: Float[Array, "n"] | Float[Array, "bodies 3"]) -> Float[Array, ""]:
         """The value of the coordinate (rad, m) in a position."""
         return psi(self.mechanism, 0.0, q)[self.row]
 
@@ -81,7 +82,7 @@ def drive(mechanism: Mechanism, driver: Drive, t: ArrayLike = 0.0, held: Mapping
         return _drive(*given)
 
 
-def _drive(mechanism: Mechanism, driver: Drive, t: Any, held: Mapping[str, ArrayLike] | None) -> Driven:
+def _drive(mechanism: Mechanism, driver: Drive, t: ArrayLike, held: Mapping[str, ArrayLike] | None) -> Driven:
     if driver is None:
         analysis = analyse(mechanism)
         _require_determinate(mechanism, analysis, "all drivers")
@@ -97,12 +98,12 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Any, held: Mapping[str, Array
     return Driven(found.without_origin, analysis, name, row, analysis.scales.rows[row])
 
 
-def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Any], Any]:
+def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Array], Array]:
     """Return the function that gives the value (rad, m) of a driver's coordinate, or of another, of q (bodies, 3)."""
     element = element_of(mechanism, coordinate)
     places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
 
-    def value(q: Any) -> Any:
+    def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
         return coordinate_value(element, *(STILL if k is None else _frame(q[k]) for k in places))
 
     return value
@@ -115,14 +116,15 @@ def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | N
     return with_drivers(mechanism, {}, forces, origin)
 
 
-def _frame(q: Any) -> Frame:
+def _frame(q: Float[Array, "3"]) -> Frame:
     x, y, angle = q
     return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle))
 
 
-def coordinate_value(element: Any, *frames: Frame) -> Any:
-    """Return the value (rad, m) of a coordinate, of anything that has `bodies`, `coordinate` and `points`, from its frames."""
-    return Driver(element.bodies, element.coordinate, _constant(0.0), element.points).complete().residual(0.0, *frames)[0]
+def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:
+    """Return the value (rad, m) of a coordinate, from the frames of its bodies."""
+    driver = Driver(element.bodies, element.coordinate, _constant(0.0), element.points).complete()
+    return jnp.asarray(driver.residual(0.0, *frames)[0])
 
 
 def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
@@ -143,7 +145,7 @@ def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
         raise SceneError([f"{quote(text)} is neither a driver nor a coordinate: {problem}{cure}"], mechanism.name) from None
     if channel.quantity not in DRIVEN:
         raise SceneError([f"{quote(text)} cannot be driven: name an angle, x, y or a distance"], mechanism.name)
-    kind: Any = channel.quantity
+    kind = cast(CoordinateName, channel.quantity)
     with jax.ensure_compile_time_eval():
         if len(channel.bodies) == 2:
             return Coordinate(channel.bodies, kind, channel.points or None)
@@ -158,14 +160,14 @@ def _element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coord
     return choose_name("value", mechanism.constraints), element
 
 
-def choose_name(name: str, taken: Mapping[str, Any]) -> str:
+def choose_name(name: str, taken: Container[str]) -> str:
     """Return a name that is not taken."""
     while name in taken:
         name += "'"
     return name
 
 
-def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Any) -> Mechanism:
+def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: ArrayLike) -> Mechanism:
     """With one driver of this name along its value, and the others held."""
     known = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
@@ -218,7 +220,7 @@ def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
         return mechanism.with_parameters({f"driver.{name}.motion.origin": value})
 
 
-def _at_once(given: Any) -> AbstractContextManager:
+def _at_once(given: PyTree) -> AbstractContextManager:
     """What is known is computed at once, also while something else is traced."""
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given))
     return nullcontext() if traced else jax.ensure_compile_time_eval()
@@ -228,7 +230,7 @@ def _constant(value: Numbers) -> Polynomial:
     return Polynomial(jnp.stack([number(value)]))
 
 
-def _known(x: Any, otherwise: float) -> Any:
+def _known(x: ArrayLike, otherwise: float) -> ArrayLike:
     return otherwise if isinstance(x, Tracer) else x
 
 

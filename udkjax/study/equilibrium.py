@@ -1,6 +1,6 @@
 """Static equilibria: positions where the loads and the constraints' forces balance, F = Psi_q^T lambda, stable or not."""
 
-from typing import Any
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -24,6 +24,8 @@ from udkjax.study.sequential import sequential
 STEPS = 100
 BALANCED = 1e-9  # of the loads: what may be left of them along free directions; rounding leaves 1e-15
 NEUTRAL = 1e-10  # of the largest stiffness: one below it resists nothing
+
+Trial: TypeAlias = tuple[Array, Array, Array, Array]  # the part of a step, how many were tried, whether it is better, q
 
 
 class Equilibrium(eqx.Module):
@@ -86,8 +88,8 @@ def equilibria(
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)
     found = jax.vmap(lambda q: equilibrium(mechanism, State(q, jnp.zeros_like(q)), t, analysis=analysis))(guesses)
-    kept = [jax.tree.map(lambda x, k=k: x[k], found) for k in distinct(found.q, found.balanced, analysis.scales)]
-    return sorted(kept, key=lambda e: -float(jnp.min(e.omega2, initial=jnp.inf)))
+    different = [jax.tree.map(lambda x, k=k: x[k], found) for k in distinct(found.q, found.balanced, analysis.scales)]
+    return sorted(different, key=lambda e: -float(jnp.min(e.omega2, initial=jnp.inf)))
 
 
 def degrees_of_freedom(analysis: Analysis) -> int:
@@ -114,7 +116,9 @@ def omega2(at: Linearization) -> Float[Array, "f"]:
 
 
 @eqx.filter_jit
-def _equilibrium(curve: Curve, analysis: Analysis, t: Any, start: Any, free: int, stable: bool) -> Equilibrium:
+def _equilibrium(
+    curve: Curve, analysis: Analysis, t: Float[Array, ""], start: Float[Array, "n"], free: int, stable: bool
+) -> Equilibrium:
     q = sequential(_settle, *stop_gradients((curve, analysis, t, start)), free, stable)
     q = _resting(curve, analysis, t, q, free)
     at = linearize(curve.mechanism, analysis, free, t, q)
@@ -123,19 +127,21 @@ def _equilibrium(curve: Curve, analysis: Analysis, t: Any, start: Any, free: int
     return Equilibrium(q.reshape(-1, 3), at.multipliers, omega2(at), left, closed & (left <= BALANCED))
 
 
-def _left(mechanism: Any, at: Linearization, t: Any, q: Any) -> Any:
+def _left(mechanism: Mechanism, at: Linearization, t: Float[Array, ""], q: Float[Array, "n"]) -> Float[Array, ""]:
     """N^T F relative to F, each coordinate over the root of its mass: N is orthonormal in that metric."""
     size = jnp.linalg.norm(loads.force(mechanism, t, q, jnp.zeros_like(q)) / jnp.sqrt(loads.mass(mechanism)))
     return jnp.linalg.norm(at.force) / jnp.where(size > 0, size, 1.0)
 
 
-def _settle(curve: Curve, analysis: Analysis, t: Any, q: Any, free: int, stable: bool) -> Any:
+def _settle(
+    curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int, stable: bool
+) -> Float[Array, "n"]:
     """Newton steps until nothing gets better."""
 
-    def at(q: Any) -> Linearization:
+    def at(q: Float[Array, "n"]) -> Linearization:
         return linearize(curve.mechanism, analysis, free, t, q)
 
-    def body(state: Any) -> Any:
+    def body(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         q, k, _ = state
         here = at(q)
         step = here.directions @ _towards_rest(here, stable)
@@ -143,7 +149,7 @@ def _settle(curve: Curve, analysis: Analysis, t: Any, q: Any, free: int, stable:
         step = step * jnp.where(longest > LONGEST_STEP, LONGEST_STEP / jnp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
         size = jnp.linalg.norm(here.force)
 
-        def trial(state: Any) -> Any:
+        def trial(state: Trial) -> Trial:
             scale, j, *_ = state
             X, closed = curve.correct(jnp.append(q + scale * step, t) / curve.units, fixed=True)
             new = (X * curve.units)[:-1]
@@ -153,16 +159,16 @@ def _settle(curve: Curve, analysis: Analysis, t: Any, q: Any, free: int, stable:
             better = (work > 0 if stable else False) | (jnp.linalg.norm(at(new).force) < size)
             return 0.5 * scale, j + 1, closed & better, new
 
-        def worse(state: Any) -> Any:
+        def worse(state: Trial) -> Bool[Array, ""]:
             return (state[1] < STEP_HALVINGS) & ~state[2]
 
-        _, _, better, new = jax.lax.while_loop(worse, trial, (jnp.ones(()), 0, jnp.asarray(False), q))
+        _, _, better, new = jax.lax.while_loop(worse, trial, (jnp.ones(()), jnp.asarray(0), jnp.asarray(False), q))
         return jnp.where(better, new, q), k + 1, better & (size > 0)
 
-    return jax.lax.while_loop(lambda s: (s[1] < STEPS) & s[2], body, (q, 0, jnp.asarray(free > 0)))[0]
+    return jax.lax.while_loop(lambda s: (s[1] < STEPS) & s[2], body, (q, jnp.asarray(0), jnp.asarray(free > 0)))[0]
 
 
-def _towards_rest(here: Linearization, stable: bool) -> Any:
+def _towards_rest(here: Linearization, stable: bool) -> Float[Array, "f"]:
     """The step eta, of the linearization; only downhill, where the equilibrium is to be stable."""
     if not stable:
         return SVD(NEUTRAL).plus(here.stiffness) @ here.force
@@ -173,7 +179,7 @@ def _towards_rest(here: Linearization, stable: bool) -> Any:
 
 
 @eqx.filter_custom_jvp
-def _resting(curve: Curve, analysis: Analysis, t: Any, q: Any, free: int) -> Any:
+def _resting(curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int) -> Float[Array, "n"]:
     """A position of rest, with the derivatives of one Newton step there."""
     return q
 
@@ -183,7 +189,7 @@ def _(primals, tangents):
     curve, analysis, t, _, free = primals
     q = _resting(*primals)
 
-    def newton(curve: Curve, t: Any) -> Any:
+    def newton(curve: Curve, t: Float[Array, ""]) -> Float[Array, "n"]:
         X = jnp.append(q, t) / curve.units
         E = curve.slopes(X).at[:, -1].set(0.0)
         closed = ((X - plus(E) @ curve.residual(X)) * curve.units)[:-1]

@@ -1,28 +1,20 @@
-"""The derivation of the accelerations for one state, with the paper's symbols and numbers: `explain`.
+"""An explanation: every symbol of the derivation for one state, and the same as text that reads like the paper's section."""
 
-Everything comes from the textbook's functions (equations/constraints.py, loads.py, udwadia_kalaba.py), one symbol each, and each
-claim is checked beside it: the equations of motion, the constraints, Penrose's four conditions, and Gauss's principle.
-"""
-
+import html
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udkjax.equations import constraints, loads
-from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.determinacy import left_null_space, uniqueness
-from udkjax.equations.scales import rank_tolerance
-from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.assembly import State, assemble
-from udkjax.pinv import SVD
+from udkjax.equations.determinacy import unique_direction
+from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.explanation_texts import as_dict, as_html, as_text
+from udkjax.study.row_labels import row_label
+from udkjax.study.wording import plural
 
-RIVALS = 200  # feasible accelerations that a is compared with
+WIDE = 18  # columns of a matrix that fit beside each other
+TINY = 1e-12  # relative to the largest of an array: printed as 0
+SYMBOLS = ("psi", "psi_dot", "psi_q", "gamma", "mass", "force", "weights", "D", "singular_values", "D_plus", "a_F", "b", "a")
 
 
 class Gauss(NamedTuple):
@@ -82,116 +74,215 @@ class Explanation(NamedTuple):
         return as_html(self)
 
 
-def explain(
-    mechanism: Mechanism, t: float = 0.0, state: State | None = None, stabilization: Baumgarte | None = None
-) -> Explanation:
-    """Derive the accelerations and multipliers of one state, step by step, with numbers; print the result.
+# --- as text
 
-    Args:
-        mechanism: its numbers are known.
-        t: time (s), for drivers and loads.
-        state: the state; it is closed first. By default the initial guess.
-        stabilization: Baumgarte's terms in b, if any.
 
-    Returns:
-        The `Explanation`: Psi, Psi_q, M, gamma, F, D, D^+, a_F, b, a, lambda, and the checks.
+def as_text(e: Explanation) -> str:
+    """Lay out the derivation for a terminal."""
+    rows, columns = [row_label(e.mechanism, *name) for name in e.row_names], _columns(e.mechanism)
+    parts = [_state(e, columns)]
+    if rows:
+        parts += [_constraints(e, rows, columns), _rank(e, rows)]
+    parts += [_masses(e, columns)]
+    if rows:
+        parts += [_right_hand_side(e, rows), _pseudoinverse(e, rows, columns)]
+    parts += [_accelerations(e, columns)]
+    if rows:
+        parts += [_multipliers(e, rows)]
+    parts += [_gauss(e), _checks(e)]
+    return "\n\n".join(parts)
 
-    Raises:
-        AssemblyError: the state cannot be closed.
-        ValueError: numbers of the mechanism are traced.
 
-    Source:
-        D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005, section 3.
-    """
-    if not mechanism.is_concrete:
-        raise ValueError("explain takes known numbers; under jit and vmap take accelerations and uniqueness, which are pure")
-    state = assemble(mechanism, t, state)
-    analysis = analyse(mechanism)
-    q, v = jnp.ravel(state.q), jnp.ravel(state.v)
-    symbols = _symbols(mechanism.without_origin, analysis, float(t), q, v, stabilization, rank_tolerance(mechanism))
-    s = {name: np.asarray(value) for name, value in symbols.items()}
-    n = len(s["a"])
-    rank = int(s["rank"])
-    null_rows = s["null"][:, np.linalg.norm(s["null"], axis=0) > 0]
-    return Explanation(
-        mechanism=mechanism,
-        t=float(t),
-        q=np.asarray(q),
-        v=np.asarray(v),
-        row_names=analysis.row_names,
-        **{
-            key: s[key]
-            for key in ("psi", "psi_dot", "psi_q", "gamma", "mass", "force", "weights", "D", "D_plus", "a_F", "b", "a")
-        },
-        singular_values=s["sigma"],
-        rank=rank,
-        multipliers=s["multipliers"],
-        unique=s["unique"],
-        null_rows=null_rows,
-        constraint_force=-s["psi_q"].T @ s["multipliers"] if len(s["psi"]) else np.zeros(n),
-        gauss=_gauss(s, rank),
-        checks=_checks(s),
+def as_html(e: Explanation) -> str:
+    """The same text, as it stands."""
+    return f"<pre>{html.escape(as_text(e))}</pre>"
+
+
+def as_dict(e: Explanation) -> dict[str, Any]:
+    """Return an explanation as plain numbers, lists and texts."""
+    return {
+        "mechanism": e.mechanism.name,
+        "t": e.t,
+        "bodies": list(e.mechanism.body_names),
+        "rows": [row_label(e.mechanism, *name) for name in e.row_names],
+        "q": e.q.tolist(),
+        "v": e.v.tolist(),
+        **{name: getattr(e, name).tolist() for name in SYMBOLS},
+        "rank": e.rank,
+        "lambda": e.multipliers.tolist(),
+        "unique": e.unique.tolist(),
+        "constraint_force": e.constraint_force.tolist(),
+        "gauss": {**e.gauss._asdict(), "least_rival": e.gauss.least_rival if e.gauss.rivals else None},
+        "checks": e.checks,
+    }
+
+
+def _columns(mechanism: Mechanism) -> list[str]:
+    return [f"{letter}{k + 1}" for k in range(len(mechanism.body_names)) for letter in ("x", "y", "th")]
+
+
+def _title(number: int, text: str) -> str:
+    return f"{number}. {text}"
+
+
+def _state(e: Explanation, columns: list[str]) -> str:
+    bodies = ", ".join(f"{k + 1} {name}" for k, name in enumerate(e.mechanism.body_names))
+    head = f"{e.mechanism.name or 'mechanism'} at t = {e.t:g} s. Bodies: {bodies}; x, y (m) and th (rad) of each."
+    return "\n".join([head, "", _table(["q", "v"], columns, np.stack([e.q, e.v]))])
+
+
+def _constraints(e: Explanation, rows: list[str], columns: list[str]) -> str:
+    pattern = [
+        f"  {name:<{_width(rows)}}  " + " ".join("x" if abs(entry) > TINY * np.abs(e.psi_q).max() else "." for entry in row)
+        for name, row in zip(rows, e.psi_q, strict=True)
+    ]
+    values = np.stack([e.psi, e.psi_dot, e.gamma], axis=1)
+    return "\n".join(
+        [
+            _title(1, "Constraints Psi(t, q) = 0; along a motion Psi_dot = Psi_q v + Psi_t = 0, and Psi_q a = gamma"),
+            _table(rows, ["Psi", "Psi_dot", "gamma"], values),
+            "",
+            f"  The Jacobian Psi_q ({len(rows)} x {len(columns)}), which entries are there, and their values:",
+            *pattern,
+            "",
+            _table(rows, columns, e.psi_q),
+        ]
     )
 
 
-@jax.jit
-def _symbols(
-    mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, v: Any, baumgarte: Baumgarte | None, tol: Any
-) -> dict[str, Any]:
-    w, method = analysis.scales.weights, SVD(rank_tol=tol)
-    psi_q = constraints.psi_q(mechanism, t, q)
-    rows, columns = psi_q.shape
-    D, unique = uk.D(mechanism, t, q, w), uniqueness(mechanism, t, q, analysis)
-    null = left_null_space(mechanism, t, q, analysis).basis / analysis.scales.rows[:, None]
-    sigma = jnp.linalg.svd(D, compute_uv=False) if rows else jnp.zeros(0)
-    return {
-        "psi": constraints.psi(mechanism, t, q),
-        "psi_dot": constraints.psi_dot(mechanism, t, q, v),
-        "psi_q": psi_q,
-        "gamma": constraints.gamma(mechanism, t, q, v),
-        "mass": loads.mass(mechanism),
-        "force": loads.force(mechanism, t, q, v),
-        "weights": w,
-        "D": D,
-        "sigma": sigma,
-        "rank": method.rank(D) if rows else jnp.zeros((), int),
-        "D_plus": method(D) if rows else jnp.zeros((columns, 0)),
-        "a_F": uk.a_F(mechanism, t, q, v),
-        "b": uk.b(mechanism, t, q, v, baumgarte, w),
-        "a": uk.accelerations(mechanism, t, q, v, method, baumgarte, w),
-        "multipliers": uk.multipliers(mechanism, t, q, v, method, baumgarte, w),
-        "unique": unique.unique,
-        "null": null,
-    }
+def _rank(e: Explanation, rows: list[str]) -> str:
+    n = len(e.a)
+    free = f"{n} coordinates - {e.rank} = {plural(n - e.rank, 'degree')} of freedom"
+    lines = [_title(2, f"Rank of Psi_q: {e.rank} of {len(rows)} rows; {free}")]
+    if e.null_rows.shape[1]:
+        lines.append("  These combinations of rows vanish, so that lambda may be changed by any of them without an effect:")
+        for column in e.null_rows.T:
+            column = column / column[np.argmax(np.abs(column))]
+            terms = [f"{x:+.3g} {name}" for x, name in zip(column, rows, strict=True) if abs(x) > 1e-9]
+            lines.append("    " + " ".join(terms))
+    else:
+        lines.append("  All rows are independent.")
+    return "\n".join(lines)
 
 
-def _gauss(s: dict[str, np.ndarray], rank: int) -> Gauss:
-    root = np.sqrt(s["mass"])
-    deviation = root * (s["a"] - s["a_F"])  # M^(1/2) (a - a_F)
-    free = np.linalg.svd(s["D"])[2][rank:].T if len(s["D"]) else np.eye(len(root))  # M^(1/2) V
-    size = float(np.linalg.norm(deviation))
-    slope = float(np.abs(free.T @ deviation).max(initial=0.0)) / (size if size > 0 else 1.0)
-    spread = max(size, float(np.linalg.norm(root * s["a_F"])), np.finfo(float).tiny) / 10
-    steps = np.random.default_rng(0).standard_normal((RIVALS if free.shape[1] else 0, free.shape[1])) * spread
-    rivals = 0.5 * np.sum((deviation + steps @ free.T) ** 2, axis=1)
-    return Gauss(0.5 * size**2, free.shape[1], slope, float(rivals.min(initial=np.inf)), len(rivals))
+def _masses(e: Explanation, columns: list[str]) -> str:
+    return "\n".join(
+        [
+            _title(3, "Masses M (diagonal), loads F, and a_F = M^(-1) F: what the loads would do without the constraints"),
+            _table(["M", "F", "a_F"], columns, np.stack([e.mass, e.force, e.a_F])),
+        ]
+    )
 
 
-def _checks(s: dict[str, np.ndarray]) -> dict[str, float]:
-    """What must vanish, each relative to the largest number that it is the difference of."""
-    inertia, reaction = s["mass"] * s["a"], s["psi_q"].T @ s["multipliers"]
-    asked = s["b"] + s["D"] @ (np.sqrt(s["mass"]) * s["a_F"])  # of the rows of D, with Baumgarte's terms
-    D, plus = s["D"], s["D_plus"]
-    return {
-        "M a + Psi_q^T lambda - F": _relative(inertia + reaction - s["force"], inertia, reaction, s["force"]),
-        "Psi_q a - gamma": _relative(D @ (np.sqrt(s["mass"]) * s["a"]) - asked, asked, s["b"]),
-        "D D^+ D - D": _relative(D @ plus @ D - D, D),
-        "D^+ D D^+ - D^+": _relative(plus @ D @ plus - plus, plus),
-        "(D D^+)^T - D D^+": _relative((D @ plus).T - D @ plus, np.ones(1)),
-        "(D^+ D)^T - D^+ D": _relative((plus @ D).T - plus @ D, np.ones(1)),
-    }
+def _right_hand_side(e: Explanation, rows: list[str]) -> str:
+    done = e.psi_q @ e.a_F
+    lines = [
+        _title(4, "What the constraints still ask: b = gamma - Psi_q a_F"),
+        _table(rows, ["gamma", "Psi_q a_F", "b"], np.stack([e.gamma, done, e.b / e.weights], axis=1)),
+    ]
+    return "\n".join(lines)
 
 
-def _relative(difference: np.ndarray, *parts: np.ndarray) -> float:
-    size = max(float(np.abs(part).max(initial=0.0)) for part in parts)
-    return float(np.abs(difference).max(initial=0.0)) / (size if size > 0 else 1.0)
+def _pseudoinverse(e: Explanation, rows: list[str], columns: list[str]) -> str:
+    sigma = " ".join(_number(x, np.abs(e.singular_values).max(initial=0.0)) for x in e.singular_values)
+    weighted = not np.allclose(e.weights, 1.0)
+    note = "; rows in radians are multiplied by the characteristic length, b too" if weighted else ""
+    return "\n".join(
+        [
+            _title(5, f"D = Psi_q M^(-1/2){note}"),
+            _table(rows, columns, e.D),
+            f"  Singular values: {sigma}",
+            "",
+            f"  D^+, transposed (a row of it for each row of D), of rank {e.rank}:",
+            _table(rows, columns, e.D_plus.T),
+        ]
+    )
+
+
+def _accelerations(e: Explanation, columns: list[str]) -> str:
+    return "\n".join(
+        [
+            _title(6, "a = a_F + M^(-1/2) D^+ b: what the loads would do, and what the constraints add"),
+            _table(["a_F", "added", "a"], columns, np.stack([e.a_F, e.a - e.a_F, e.a])),
+        ]
+    )
+
+
+def _multipliers(e: Explanation, rows: list[str]) -> str:
+    shown = _table(rows, ["lambda"], e.multipliers[:, None]).split("\n")
+    marks = ["", *("unique" if unique else "not unique: the share of least norm" for unique in e.unique)]
+    return "\n".join(
+        [
+            _title(7, "lambda = -(D^+)^T D^+ b (N, N m), with which M a + Psi_q^T lambda = F"),
+            *(f"{line}   {mark}".rstrip() for line, mark in zip(shown, marks, strict=True)),
+            *(f"  {name}: its force is unique only along {np.rad2deg(angle):.4g} degrees" for name, angle in _directions(e)),
+            "",
+            "  The constraints' forces on the bodies, -Psi_q^T lambda = M (a - a_F), are unique:",
+            _table(["force"], _columns(e.mechanism), e.constraint_force[None]),
+        ]
+    )
+
+
+def _directions(e: Explanation) -> list[tuple[str, float]]:
+    """Of pins whose force is unique in one direction alone: the name, and which (rad)."""
+    found, null_rows = [], e.null_rows / np.abs(e.null_rows).max(initial=np.finfo(float).tiny)
+    for name, joint in e.mechanism.joints.items():
+        own = [k for k, (owner, _) in enumerate(e.row_names) if owner == name]
+        angle = unique_direction(null_rows[own]) if isinstance(joint, Revolute) else None
+        found += [] if angle is None else [(name, angle)]
+    return found
+
+
+def _gauss(e: Explanation) -> str:
+    g = e.gauss
+    lines = [
+        _title(8, "Gauss's principle: of all accelerations that the constraints allow, a has the least"),
+        "     G(x) = (x - a_F)^T M (x - a_F) / 2",
+        f"  G(a) = {g.at_a:.10g}",
+    ]
+    if g.free:
+        free = f"  {plural(g.free, 'direction')} {'is' if g.free == 1 else 'are'} left free"
+        lines += [
+            f"{free}. The slope of G there is {g.slope:.1e} of its size: zero, to rounding.",
+            f"  The least G of {g.rivals} other feasible accelerations is {g.least_rival:.10g}: "
+            + ("more." if g.least_rival >= g.at_a else "LESS, which must not be."),
+        ]
+    else:
+        lines.append("  The constraints leave nothing free: a is the only one.")
+    return "\n".join(lines)
+
+
+def _checks(e: Explanation) -> str:
+    width = max(map(len, e.checks))
+    return "\n".join(
+        [_title(9, "Checks, relative: all vanish"), *(f"  {name:<{width}}  {x:.1e}" for name, x in e.checks.items())]
+    )
+
+
+def _width(names: list[str]) -> int:
+    return max(map(len, names))
+
+
+def _table(rows: list[str], columns: list[str], values: np.ndarray) -> str:
+    """A matrix with its names; wide ones in pieces below each other."""
+    width, pieces = _width(rows), []
+    for start in range(0, len(columns), WIDE):
+        part = slice(start, start + WIDE)
+        sizes = np.abs(values).max(axis=0 if values.shape[1] <= 3 else None, initial=0.0)
+        cells = [
+            [_number(x, size) for x, size in zip(row[part], np.broadcast_to(sizes, row.shape)[part], strict=True)]
+            for row in values
+        ]
+        widths = [max(len(name), *(len(line[k]) for line in cells)) for k, name in enumerate(columns[part])]
+        lines = ["  " + " " * width + "  " + " ".join(f"{name:>{w}}" for name, w in zip(columns[part], widths, strict=True))]
+        lines += [
+            f"  {name:<{width}}  " + " ".join(f"{cell:>{w}}" for cell, w in zip(line, widths, strict=True))
+            for name, line in zip(rows, cells, strict=True)
+        ]
+        pieces.append("\n".join(lines))
+    return "\n\n".join(pieces)
+
+
+def _number(x: float, size: float) -> str:
+    """Four digits; zero where it is rounding beside the largest."""
+    return "0" if abs(x) <= TINY * size else f"{x:.4g}"

@@ -1,7 +1,6 @@
 """The directions in which joints let a mechanism move: the null space of their Jacobian."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +30,6 @@ def null_space(J: Float[Array, "m n"], free: int) -> Float[Array, "n free"]:
     return jnp.linalg.svd(J, full_matrices=True)[2][n - free :].T
 
 
-def symmetric(A: Any) -> Any:
+def symmetric(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Half of A and of its transpose."""
     return 0.5 * (A + A.T)

@@ -11,7 +11,7 @@ that, f is of least weighted norm, sum_i w_i f_i^2.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Literal, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
@@ -27,6 +27,7 @@ from udkjax.scene.drivers import Motion, Spline
 from udkjax.scene.fields import number, optional_number
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.channels import Trajectory
 from udkjax.study.drive import Coordinate, choose_name, coordinate_value, element_of, value_of, without_drivers
 from udkjax.study.free_directions import free_part
 from udkjax.study.kinematics import Kinematics, kinematics
@@ -49,6 +50,16 @@ class InverseDynamics(eqx.Module):
         return sum(self.powers.values(), jnp.zeros_like(self.ts))
 
 
+States: TypeAlias = Float[Array, "T bodies 3"]
+
+
+class AcceleratedTrajectory(Trajectory, Protocol):
+    """A trajectory with accelerations a (T, bodies, 3), such as a `Kinematics`."""
+
+    @property
+    def a(self) -> Array: ...
+
+
 class Effort(ForceElement):
     """An effort (N m, N) along a coordinate of two bodies: it does the work effort times the change of the coordinate.
 
@@ -60,7 +71,7 @@ class Effort(ForceElement):
     points: Float[Array, "2 2"] | None = eqx.field(converter=optional_number, default=None)
 
     def potential(self, t, *frames):
-        return -self.law(t) * coordinate_value(self, *frames)
+        return -self.law(t) * coordinate_value(Coordinate(self.bodies, self.coordinate, self.points), *frames)
 
     @property
     def breakpoints(self):
@@ -70,7 +81,7 @@ class Effort(ForceElement):
 def inverse_dynamics(
     mechanism: Mechanism,
     ts: Float[ArrayLike, "T"] | Sequence[float],
-    motion: Any = None,
+    motion: AcceleratedTrajectory | None = None,
     drivers: Sequence[str | Coordinate] | None = None,
     weights: Mapping[str, ArrayLike] | None = None,
 ) -> InverseDynamics:
@@ -128,13 +139,15 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
 
 
 @eqx.filter_jit
-def _efforts(mechanism: Mechanism, analysis: Analysis, values: Any, w: Any, ts: Any, q: Any, v: Any, a: Any) -> Any:
+def _efforts(
+    mechanism: Mechanism, analysis: Analysis, values: Sequence[Coordinate], w: Array, ts: Array, q: States, v: States, a: States
+) -> tuple[Array, Array, Array]:
     """Efforts (T, k), rates of their coordinates (T, k), and what is left over (T,)."""
     scales = analysis.scales
     units, share = scales.coordinates(analysis.coordinates), 1 / jnp.sqrt(w)
     coordinates = [value_of(mechanism, element) for element in values]
 
-    def at(t: Any, q: Any, v: Any, a: Any) -> Any:
+    def at(t: Array, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
         q, v, a = q.ravel(), v.ravel(), a.ravel()
         C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
         missing = units * (loads.mass(mechanism) * a - loads.force(mechanism, t, q, v))

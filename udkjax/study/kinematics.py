@@ -1,16 +1,16 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from udkjax.equations.analysis import analyse
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.march import can_march, march, march_at_once, psi_at_once
@@ -22,6 +22,8 @@ from udkjax.study.drive import Drive, Driven, drive
 
 FAR = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
 TURN = 2.0 * np.pi  # rad
+
+Rows: TypeAlias = Float[Array, "T n"]
 
 
 class Kinematics(eqx.Module):
@@ -115,7 +117,7 @@ def kinematics(
     values, rate, acceleration = number(values), number(rate), number(acceleration)
     if values.ndim != 1 or not len(values):
         raise ValueError(f"values must be a list of at least one number, not of the shape {values.shape}; batch it by jax.vmap")
-    driven, q = _start(mechanism, driver, values, state, held)
+    driven, q = _start(mechanism, driver, values[0], state, held)
     if is_known((driven, q, values, rate, acceleration)) and can_march(driven.mechanism, driven.analysis):
         given = np.asarray(q), np.asarray(values), np.asarray(rate), np.asarray(acceleration)
         found = _at_once(driven, *given, mechanism.body_names)
@@ -125,18 +127,20 @@ def kinematics(
 
 
 def travel(
-    mechanism: Mechanism, driver: str | Any, state: State | None = None, held: Mapping[str, ArrayLike] | None = None
+    mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, ArrayLike] | None = None
 ) -> Travel:
     """Return between which values a coordinate can be driven: the toggles on either side, ds/dsigma = 0, to rounding.
 
     Args and errors are those of `kinematics`. An angle that makes a whole turn has no limits. `lower` and `upper` have exact
     derivatives by every number of the mechanism.
     """
-    driven, q = _start(mechanism, driver, None, state, held)
+    driven, q = _start(mechanism, driver, 0.0, state, held)
     return _travel(driven, q, TURN if driven.is_angle else FAR * driven.unit)
 
 
-def _at_once(driven: Driven, q: Any, values: Any, rate: Any, acceleration: Any, bodies: tuple[str, ...]) -> Kinematics | None:
+def _at_once(
+    driven: Driven, q: np.ndarray, values: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, bodies: tuple[str, ...]
+) -> Kinematics | None:
     """By machine code alone, and NumPy: nothing is compiled for it. None where care is needed."""
     mechanism, analysis = driven.mechanism, driven.analysis
     s = psi_at_once(mechanism, analysis, q)[driven.row] if driven.name else values[0]
@@ -144,22 +148,28 @@ def _at_once(driven: Driven, q: Any, values: Any, rate: Any, acceleration: Any, 
     if found.trusted < len(values):
         return None
     shape, rate = (len(values), -1, 3), np.broadcast_to(rate, values.shape)
-    q, dq, ddq = (x.reshape(shape) for x in found[:3])
+    at, dq, ddq = (np.asarray(x).reshape(shape) for x in found[:3])
     per = rate[:, None, None]
     a = ddq * per**2 + dq * np.broadcast_to(acceleration, values.shape)[:, None, None]
     status, nowhere = np.zeros(len(values), int), np.full((len(bodies), 3), np.nan)
-    arrays: Any = (values, q, dq * per, a, rate, status, np.nan, nowhere)
-    values, q, v, a, rate, status, limit, limit_q = map(jnp.asarray, arrays)
-    return Kinematics(values, q, v, a, rate, status, limit, limit_q, bodies)
+    values_, q_, v, a_, rate_, code, limit, limit_q = map(jnp.asarray, (values, at, dq * per, a, rate, status, np.nan, nowhere))
+    return Kinematics(values_, q_, v, a_, rate_, code, limit, limit_q, bodies)
 
 
-def is_known(tree: Any) -> bool:
+def is_known(tree: PyTree) -> bool:
     """Whether no number is traced."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 @eqx.filter_jit
-def _kinematics(driven: Driven, q: Any, values: Any, rate: Any, acceleration: Any, bodies: tuple[str, ...]) -> Kinematics:
+def _kinematics(
+    driven: Driven,
+    q: Float[Array, "n"],
+    values: Float[Array, "T"],
+    rate: Float[Array, "*T"],
+    acceleration: Float[Array, "*T"],
+    bodies: tuple[str, ...],
+) -> Kinematics:
     points = _solve(driven, driven.value(q) if driven.name else values[0], q, values)
     rate, acceleration = (jnp.broadcast_to(x, values.shape) for x in (rate, acceleration))
     v = points.dq * rate[:, None]
@@ -169,7 +179,7 @@ def _kinematics(driven: Driven, q: Any, values: Any, rate: Any, acceleration: An
 
 
 @eqx.filter_jit
-def _travel(driven: Driven, q: Any, far: Any) -> Travel:
+def _travel(driven: Driven, q: Float[Array, "n"], far: ArrayLike) -> Travel:
     s = driven.value(q)
     ways = jnp.array([-1.0, 1.0])
     down_up = jax.vmap(lambda way: _solve(driven, s, q, jax.lax.stop_gradient(s + way * far)[None], False))(ways)
@@ -179,11 +189,13 @@ def _travel(driven: Driven, q: Any, far: Any) -> Travel:
     return Travel(lower, upper, lower_q, upper_q, jnp.stack([down.status[0], up.status[0]]))
 
 
-def _start(mechanism: Mechanism, driver: Drive, values: Any, state: State | None, held: Any) -> tuple[Driven, Any]:
-    """The mechanism driven, and the closed position that it starts from."""
+def _start(
+    mechanism: Mechanism, driver: Drive, start: ArrayLike, state: State | None, held: Mapping[str, ArrayLike] | None
+) -> tuple[Driven, Float[Array, "n"]]:
+    """Return the mechanism driven, and the closed position that it starts from; at time `start`, if that drives it."""
     driven = drive(mechanism, driver, 0.0, held)
     if driver is None:
-        return driven, _assemble(driven.mechanism, values[0], state, driven.analysis)
+        return driven, _assemble(driven.mechanism, start, state, driven.analysis)
     q = _assemble(mechanism, 0.0, state, analyse(mechanism))
     if held:
         still = State(q.reshape(-1, 3), jnp.zeros((len(q) // 3, 3)))
@@ -191,11 +203,11 @@ def _start(mechanism: Mechanism, driver: Drive, values: Any, state: State | None
     return driven, q
 
 
-def _assemble(mechanism: Mechanism, t: Any, state: State | None, analysis: Any) -> Any:
+def _assemble(mechanism: Mechanism, t: ArrayLike, state: State | None, analysis: Analysis) -> Float[Array, "n"]:
     return jnp.ravel(assemble(mechanism, t, state, throw=False, analysis=analysis).q)
 
 
-def _solve(driven: Driven, s: Any, q: Any, values: Any, fast: bool = True) -> Points:
+def _solve(driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], fast: bool = True) -> Points:
     """By machine code as far as that is to be relied on, if it may be `fast`, and with care from there on."""
     curve = Curve.of(driven)
     points, first = no_points(len(values), len(q)), jnp.asarray(0)
@@ -217,7 +229,7 @@ def _solve(driven: Driven, s: Any, q: Any, values: Any, fast: bool = True) -> Po
 
 
 @eqx.filter_custom_jvp
-def _with_derivatives(curve: Curve, values: Any, q: Any, dq: Any, ddq: Any) -> tuple[Any, Any, Any]:
+def _with_derivatives(curve: Curve, values: Float[Array, "T"], q: Rows, dq: Rows, ddq: Rows) -> tuple[Rows, Rows, Rows]:
     """Closed positions with the derivatives that the constraints give them: those of one Newton step there."""
     return q, dq, ddq
 
@@ -226,18 +238,18 @@ def _with_derivatives(curve: Curve, values: Any, q: Any, dq: Any, ddq: Any) -> t
 def _(primals, tangents):
     curve, values, *_ = primals
     found = _with_derivatives(*primals)
-    moving = eqx.combine(tangents[:2], jax.tree.map(_zeros, eqx.filter((curve, values), eqx.is_inexact_array)))
+    moving = eqx.combine(tangents[:2], jax.tree.map(jnp.zeros_like, eqx.filter((curve, values), eqx.is_inexact_array)))
     return found, _tangents(curve, values, found[0], moving)
 
 
-def _tangents(curve: Curve, values: Any, q: Any, moving: Any) -> Any:
-    def closed(curve: Curve, values: Any) -> Any:
+def _tangents(curve: Curve, values: Float[Array, "T"], q: Rows, moving: PyTree) -> tuple[Rows, Rows, Rows]:
+    def closed(curve: Curve, values: Float[Array, "T"]) -> tuple[Rows, Rows, Rows]:
         return jax.vmap(lambda s, q: _newton(curve, s, q))(values, q)
 
     return eqx.filter_jvp(closed, (curve, values), moving)[1]
 
 
-def _newton(curve: Curve, s: Any, q: Any) -> tuple[Any, Any, Any]:
+def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
     X = jnp.append(q, s) / curve.units
     E = curve.slopes(X)
     q = ((X - plus(E.at[:, -1].set(0.0)) @ curve.residual(X)) * curve.units)[:-1]
@@ -246,7 +258,7 @@ def _newton(curve: Curve, s: Any, q: Any) -> tuple[Any, Any, Any]:
 
 
 @eqx.filter_custom_jvp
-def _limit(curve: Curve, x: Any) -> Any:
+def _limit(curve: Curve, x: Float[Array, "n+1"]) -> Float[Array, ""]:
     """The value at a toggle, which changes by as much as that of the nearest point of the curve."""
     return x[-1]
 
@@ -254,11 +266,7 @@ def _limit(curve: Curve, x: Any) -> Any:
 @_limit.def_jvp
 def _(primals, tangents):
     curve, x = primals
-    moving = eqx.combine(tangents[0], jax.tree.map(_zeros, eqx.filter(curve, eqx.is_inexact_array)))
+    moving = eqx.combine(tangents[0], jax.tree.map(jnp.zeros_like, eqx.filter(curve, eqx.is_inexact_array)))
     X = x / jax.lax.stop_gradient(curve.units)
     nearest = lambda curve: ((X - plus(curve.slopes(X)) @ curve.residual(X)) * curve.units)[-1]  # noqa: E731
     return _limit(*primals), eqx.filter_jvp(nearest, (curve,), (moving,))[1]
-
-
-def _zeros(x: Any) -> Any:
-    return jnp.zeros_like(x)

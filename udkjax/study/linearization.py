@@ -8,11 +8,11 @@ The second part of K, the constraints' curvature under load, is what makes a pen
 constraints lambda is of least norm; N^T K N does not depend on that choice. No derivative is taken by differences.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
@@ -34,7 +34,7 @@ class Linearization(NamedTuple):
     multipliers: Float[Array, "m"]  # lambda (N, N m)
 
 
-def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: Any, q: Float[Array, "n"]) -> Linearization:
+def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike, q: Float[Array, "n"]) -> Linearization:
     """Return the linearization at rest in a closed position q at time t (s), of `free` degrees of freedom.
 
     N = M^(-1/2) (I - D^+ D) V with V a basis of the null space of D here: it spans that of D nearby, too, so that derivatives of
@@ -51,7 +51,7 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: Any, q: Fl
     else:
         N, multipliers = root[:, None] * V, jnp.zeros(0)
 
-    def residual_force(q: Any) -> Any:
+    def residual_force(q: Float[Array, "n"]) -> Float[Array, "n"]:
         pull = jax.grad(lambda q: jnp.sum(multipliers * constraints.psi(mechanism, t, q)))(q)
         return pull - F(q, still)
 

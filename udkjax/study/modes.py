@@ -1,11 +1,9 @@
 """Vibration about a position of rest: frequencies, damping and mode shapes of the linearized mechanism."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float, Int
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.assembly import State
@@ -60,7 +58,7 @@ def modes(mechanism: Mechanism, state: State | None = None, t: ArrayLike = 0.0, 
 
 
 @eqx.filter_jit
-def _modes(mechanism: Any, analysis: Analysis, free: int, t: Any, q: Any) -> Modes:
+def _modes(mechanism: Mechanism, analysis: Analysis, free: int, t: Float[Array, ""], q: Float[Array, "n"]) -> Modes:
     at = linearize(mechanism, analysis, free, t, q)
     L = jnp.linalg.cholesky(at.mass)
     solve = jax.scipy.linalg.solve_triangular
@@ -81,9 +79,9 @@ def _modes(mechanism: Any, analysis: Analysis, free: int, t: Any, q: Any) -> Mod
     )
 
 
-def _order(s: Any) -> Any:
+def _order(s: Complex[Array, "k"]) -> Int[Array, "k"]:
     return jnp.lexsort((s.real, s.imag))
 
 
-def _sort(s: Any) -> Any:
+def _sort(s: Complex[Array, "k"]) -> Complex[Array, "k"]:
     return s[_order(s)]

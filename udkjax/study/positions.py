@@ -1,12 +1,11 @@
 """Positions to start searches from, and which of those that are found differ."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.analysis import analyse
+from udkjax.equations.scales import Scales
 from udkjax.integrate.assembly import State
 from udkjax.scene.mechanism import Mechanism
 
@@ -24,14 +23,14 @@ def random_positions(mechanism: Mechanism, count: int, seed: int, state: State |
     return jnp.asarray(found)
 
 
-def distinct(q: Float[Array, "count bodies 3"], counts: Any, scales: Any) -> list[int]:
+def distinct(q: Float[Array, "count bodies 3"], counts: Bool[Array, "count"], scales: Scales) -> list[int]:
     """Return which of the positions that count differ from all before them; whole turns make no difference."""
     points = np.asarray(q, float)
-    length, kept = float(scales.length), []
+    length, different = float(scales.length), []
     for k in np.flatnonzero(np.asarray(counts)):
-        d = points[k] - points[kept]
+        d = points[k] - points[different]
         d[..., 2] = 2 * np.abs(np.sin(d[..., 2] / 2))
         d[..., :2] /= length
-        if not kept or np.min(np.max(np.abs(d), axis=(1, 2))) > SAME:
-            kept.append(int(k))
-    return kept
+        if not different or np.min(np.max(np.abs(d), axis=(1, 2))) > SAME:
+            different.append(int(k))
+    return different

@@ -8,7 +8,7 @@ the power of springs' dampers, forces, torques and friction, of potentials that 
 The left side is the derivative of the energies along (v, a); the right one knows forces only.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +22,10 @@ from udkjax.equations.structure import evaluate_by_kind
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.bodies import Frame
+from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.channels import Trajectory
 
 
 class PowerBalance(NamedTuple):
@@ -53,7 +56,7 @@ class PowerBalance(NamedTuple):
 
 
 def power_balance(
-    mechanism: Mechanism, solution: Any, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+    mechanism: Mechanism, solution: Trajectory, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
 ) -> PowerBalance:
     """Return the power of each driver, force element and joint along a motion, and the rates of the energies.
 
@@ -102,7 +105,7 @@ def _powers(mechanism, analysis, ts, q, v, method, baumgarte):
 def _of_forces(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[Array, "forces"]:
     """The power of each force element that is not the rate of its potential along the motion."""
 
-    def power(element: Any, *frames: Any) -> Array:
+    def power(element: ForceElement, *frames: Frame) -> Array:
         stated = element.loads(t, *frames)
         total = jnp.zeros(())
         for load, frame in zip(stated or (), frames, strict=bool(stated)):

@@ -43,13 +43,13 @@ class Progress:
         return f"{self.what}:{part} ({self.seconds:.0f} s{left}){f' {self.message}' if self.message else ''}"
 
 
-ProgressOption: TypeAlias = Callable[[Progress], Any] | bool | Literal["auto"] | None
+ProgressOption: TypeAlias = Callable[[Progress], object] | bool | Literal["auto"] | None
 
 
 class Report:
     """What a computation calls: `report(done, message)`; with None for `done`, as much is done as before."""
 
-    def __init__(self, show: Callable[[Progress], Any], what: str, total: float | None):
+    def __init__(self, show: Callable[[Progress], object], what: str, total: float | None):
         self.show, self.begun = show, time.monotonic()
         self.state = Progress(what, 0, total, 0.0)
 

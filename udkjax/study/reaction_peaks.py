@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from udkjax.equations.reactions import reactions
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.channels import Trajectory
 
 
 class Peak(NamedTuple):
@@ -45,7 +46,7 @@ class Envelope(NamedTuple):
 Peaks = dict[str, dict[str, Peak]]  # of a joint or driver, of a body
 
 
-def reaction_peaks(mechanism: Mechanism, solution: Any, **choices: Any) -> Peaks:
+def reaction_peaks(mechanism: Mechanism, solution: Trajectory, **choices: Any) -> Peaks:
     """Return the peaks and root mean squares of all reactions over a run.
 
     Args:
@@ -69,7 +70,7 @@ def envelope(cases: Peaks | Sequence[Peaks]) -> dict[str, dict[str, Envelope]]:
 
     `cases` are the peaks of each, or of a batch, as `jax.vmap(reaction_peaks)` returns them, with the cases as the first axis.
     """
-    batch: Any = cases if isinstance(cases, Mapping) else jax.tree.map(lambda *xs: jnp.stack(xs), *cases)
+    batch: Peaks = cases if isinstance(cases, Mapping) else jax.tree.map(lambda *xs: jnp.stack(xs), *cases)
     return {name: {body: _envelope(peak) for body, peak in loads.items()} for name, loads in batch.items()}
 
 

@@ -1,13 +1,16 @@
 """Batches of functions that take as many steps as they need: one member after another."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import equinox as eqx
 import jax
+from jaxtyping import PyTree
+
+T = TypeVar("T")
 
 
-def sequential(function: Callable[..., Any], *arguments: Any) -> Any:
+def sequential(function: Callable[..., T], *arguments: PyTree) -> T:
     """Return function(*arguments), pytrees of arrays and choices; under `vmap`, of one member after another.
 
     Side by side, all members of a loop would take as many steps as the slowest. Without derivatives.
@@ -15,11 +18,11 @@ def sequential(function: Callable[..., Any], *arguments: Any) -> Any:
     arrays, choices = eqx.partition(arguments, eqx.is_array)
 
     @jax.custom_batching.custom_vmap
-    def each(arrays: Any) -> Any:
+    def each(arrays: PyTree) -> T:
         return function(*eqx.combine(arrays, choices))
 
     @each.def_vmap
-    def _(axis_size: int, batched: Any, arrays: Any) -> Any:
+    def _(axis_size: int, batched: PyTree, arrays: PyTree) -> tuple[T, PyTree]:
         del axis_size
         moving, shared = eqx.partition(arrays, batched[0])
         found = jax.lax.map(lambda moving: each(eqx.combine(moving, shared)), moving)

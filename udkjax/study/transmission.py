@@ -13,6 +13,7 @@ from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.channels import Trajectory
 from udkjax.study.continuation import Reached
 from udkjax.study.drive import Coordinate, value_of
 from udkjax.study.kinematics import Kinematics, kinematics
@@ -25,7 +26,7 @@ class Workspace(NamedTuple):
     reached: Bool[Array, "S T"]
 
 
-def transmission_angle(mechanism: Mechanism, motion: Any, joint: str) -> Float[Array, "T"]:
+def transmission_angle(mechanism: Mechanism, motion: Trajectory, joint: str) -> Float[Array, "T"]:
     """Return the angle (rad, 0 to pi) at a pin between the two links that it joins: acos(u . w / (|u| |w|)).
 
     u and w lead from the pin to the other pin of each link. At pi/2 force is passed on best, at 0 and pi not at all.
@@ -62,7 +63,7 @@ def mechanical_advantage(mechanism: Mechanism, motion: Kinematics, output: str |
     """
     value = value_of(mechanism, output)
 
-    def rate(q: Any, v: Any) -> Any:
+    def rate(q: Float[Array, "bodies 3"], v: Float[Array, "bodies 3"]) -> Float[Array, ""]:
         return jax.jvp(value, (q,), (v,))[1]
 
     return motion.rate / jax.vmap(rate)(motion.q, motion.v)
@@ -105,7 +106,7 @@ def workspace(
     (first, outer), (second, inner) = ((name, number(values)) for name, values in drivers.items())
     along = kinematics(mechanism, first, outer, state, held={second: inner[0]})
 
-    def across(value: Any, q: Any) -> tuple[Any, Any]:
+    def across(value: Float[Array, ""], q: Float[Array, "bodies 3"]) -> tuple[Float[Array, "T 2"], Bool[Array, "T"]]:
         found = kinematics(mechanism, second, inner, State(q, jnp.zeros_like(q)), held={first: value})
         return found.path(body, jnp.asarray(point)), found.status <= Reached.singular
 

@@ -4,7 +4,7 @@ diffrax is imported where one is asked for: that takes as long as all of JAX.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from udkjax.native.tableau import DOPRI8, Method, method
 if TYPE_CHECKING:
     import diffrax
 
+Solver: TypeAlias = "diffrax.AbstractSolver"
 OWN = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # the solvers of this folder, and their modules
 
 

@@ -98,6 +98,14 @@ class Positions:
         return found
 
 
+class JointForces(NamedTuple):
+    """Which multipliers of a constraint equilibrium decides."""
+
+    unique: tuple[bool, ...]  # row by row
+    share: tuple[float, ...]  # the length of each row of N: 0 unique, 1 arbitrary
+    direction: float | None  # of a joint that holds a point: the only one (rad) in which its force is unique, if there is one
+
+
 def decompose(J: np.ndarray, rank_tol: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """U, the singular values, V^T and the rank of a matrix; of one without entries, too."""
     if not J.size:

@@ -1,7 +1,5 @@
 """`diagnose`: freedoms, redundancy, singularity and determinate forces of a mechanism, and its rank along a trajectory."""
 
-from typing import Any
-
 import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
@@ -9,11 +7,12 @@ from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, unique_dir
 from udkjax.integrate.assembly import State, close, require_closed
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.channels import Trajectory
 from udkjax.study.diagnosis.clearance import clearance
-from udkjax.study.diagnosis.configuration import Configuration, Positions, decompose
+from udkjax.study.diagnosis.configuration import Configuration, JointForces, Positions, decompose
 from udkjax.study.diagnosis.dependence import Dependency, dependencies
-from udkjax.study.diagnosis.diagnosis import Diagnosis, JointForces, Redundancy
-from udkjax.study.diagnosis.fixes import Fix, fixes_of
+from udkjax.study.diagnosis.diagnosis import Diagnosis
+from udkjax.study.diagnosis.fixes import Fix, Redundancy, fixes_of
 from udkjax.study.diagnosis.second_order import branches
 from udkjax.study.diagnosis.timeline import timeline
 
@@ -23,7 +22,7 @@ MOST_FIXES = 64  # of a cure, one after another
 def diagnose(
     mechanism: Mechanism,
     state: State | None = None,
-    solution: Any = None,
+    solution: Trajectory | None = None,
     t: float = 0.0,
     rank_tol: float = STATIC_RANK_TOL,
     time_tol: float | None = None,

@@ -1,34 +1,22 @@
 """What `diagnose` finds, as numbers and as text."""
 
+import html
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.diagnosis.clearance import Clearance
-from udkjax.study.diagnosis.fixes import Fix
+from udkjax.study.diagnosis.clearance import Clearance, RankChange
+from udkjax.study.diagnosis.configuration import JointForces
+from udkjax.study.diagnosis.fixes import Fix, Redundancy
 from udkjax.study.diagnosis.second_order import Branch
-from udkjax.study.diagnosis.texts import as_dict, as_html, as_text
 from udkjax.study.diagnosis.timeline import Timeline
+from udkjax.study.row_labels import row_label
+from udkjax.study.wording import plural
 
-
-class Redundancy(NamedTuple):
-    """A minimal set of constraints that depend on each other: take any of them away, and the others do not."""
-
-    constraints: tuple[str, ...]
-    count: int  # of their rows that are redundant
-    permanent: bool  # along the motion; otherwise in this configuration only
-    fixes: tuple[Fix, ...]  # verified: each takes redundancy away and leaves the mobility; none of a momentary one
-
-
-class JointForces(NamedTuple):
-    """Which multipliers of a constraint equilibrium decides."""
-
-    unique: tuple[bool, ...]  # row by row
-    share: tuple[float, ...]  # the length of each row of N: 0 unique, 1 arbitrary
-    direction: (
-        float | None
-    )  # of a joint that holds a point: the only direction (rad) in which its force is unique, if there is one
+WIDTH = 14
+MOST = 8  # fixes of one set that are printed
+ROUNDED = 1e-9  # rad, and of the length: smaller numbers of a pose are rounding
 
 
 class Diagnosis(NamedTuple):
@@ -106,3 +94,205 @@ class Diagnosis(NamedTuple):
 
     def _repr_html_(self) -> str:
         return as_html(self)
+
+
+# --- as text
+
+
+def as_text(found: Diagnosis) -> str:
+    """Lay out a diagnosis for a terminal."""
+    lines = [found.mechanism.name or "mechanism"]
+    for title, entries in sections(found):
+        for k, entry in enumerate(entries):
+            lines.append(f"  {title if k == 0 else '':<{WIDTH}}  {entry}")
+    return "\n".join(lines)
+
+
+def as_html(found: Diagnosis) -> str:
+    """Lay out a diagnosis as a table."""
+    rows = "".join(
+        f"<tr><th style='text-align:left;vertical-align:top'>{html.escape(title)}</th>"
+        f"<td style='text-align:left'>{'<br>'.join(html.escape(entry) for entry in entries)}</td></tr>"
+        for title, entries in sections(found)
+    )
+    return f"<table><caption>{html.escape(found.mechanism.name or 'mechanism')}</caption>{rows}</table>"
+
+
+def sections(found: Diagnosis) -> list[tuple[str, list[str]]]:
+    """Say everything, title by title, in lines."""
+    parts = [
+        ("freedoms", _freedoms(found)),
+        ("dependent", [line for r in found.redundancies for line in _redundancy(r)]),
+        ("cure", _cure(found)),
+        ("singular", _singular(found)),
+        ("branches", _branches(found)),
+        ("forces", _forces(found)),
+        ("conditioning", _conditioning(found)),
+        ("timeline", [] if found.timeline is None else _timeline(found.timeline)),
+    ]
+    return [(title, lines) for title, lines in parts if lines]
+
+
+def _freedoms(found: Diagnosis) -> list[str]:
+    bodies = f"{found.coordinates // 3} {'body' if found.coordinates == 3 else 'bodies'}"
+    free = plural(found.degrees_of_freedom, "degree") + " of freedom"
+    lines = [
+        f"Gruebler's count: 3 x {bodies} - {plural(found.rows, 'row')} = {found.gruebler}",
+        f"true: {found.coordinates} - rank {found.ordinary_rank} = {found.coordinates - found.ordinary_rank}"
+        + (f" ({free})" if found.degrees_of_freedom == found.coordinates - found.ordinary_rank else f"; it moves in {free}"),
+    ]
+    if found.gruebler != found.coordinates - found.ordinary_rank:
+        extra = found.rows - found.ordinary_rank
+        lines.append(
+            f"the count takes every row for independent; {extra} {'says' if extra == 1 else 'say'} what others say already"
+        )
+    if found.rows > found.joint_rows:
+        lines.append(
+            f"the joints alone leave {found.joint_mobility}, of which drivers hold {found.joint_mobility - found.mobility}"
+        )
+    return lines
+
+
+def _redundancy(r: Redundancy) -> list[str]:
+    when = "everywhere along the motion" if r.permanent else "in this configuration only"
+    lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant row')}, {when}"]
+    for fix in r.fixes[:MOST]:
+        more = f", takes {fix.removes} redundant rows" if fix.removes > 1 and fix.removes > r.count else ""
+        lines.append(f"  fix {fix.constraint}: {fix.change} (condition {1 / fix.conditioning:.3g}{more})")
+    lines += [f"  ... {len(r.fixes) - MOST} more"] if len(r.fixes) > MOST else []
+    if r.permanent and not r.fixes:
+        lines.append("  no single change of a joint was found that takes redundancy away and leaves the mobility")
+    return lines
+
+
+def _cure(found: Diagnosis) -> list[str]:
+    return [f"{fix.constraint}: {fix.change}" for fix in found.cure] if len(found.cure) > 1 else []
+
+
+def _singular(found: Diagnosis) -> list[str]:
+    if found.rank < found.ordinary_rank:
+        return [
+            f"the rank here is {found.rank}, around it {found.ordinary_rank}; to first order the mobility is {found.mobility}"
+        ]
+    if found.is_singular:
+        return [f"it moves to first order only, in {found.mobility}: no displacement satisfies the constraints to second order"]
+    return []
+
+
+def _branches(found: Diagnosis) -> list[str]:
+    if not found.is_singular:
+        return []
+    lines = [f"{len(found.branches)} meet" if len(found.branches) != 1 else "one goes through"]
+    for k, branch in enumerate(found.branches):
+        moving = [
+            f"{name} ({', '.join(f'{x:.3g}' if abs(x) > ROUNDED else '0' for x in row)})"
+            for name, row in zip(found.mechanism.body_names, branch.tangent, strict=True)
+            if np.abs(row).max() > ROUNDED
+        ]
+        state = f"rank {branch.rank}" if branch.followed else "not followed: it may end here"
+        lines.append(f"  {k + 1}: {state}; dx, dy, dangle of {'; '.join(moving)}")
+    return lines
+
+
+def _forces(found: Diagnosis) -> list[str]:
+    """Name what is not unique, constraints with the same direction together."""
+    groups: dict[str, list[str]] = {}
+    for name, forces in found.forces.items():
+        if all(forces.unique):
+            continue
+        loose = [row_label(found.mechanism, name, k) for k, unique in enumerate(forces.unique) if not unique]
+        along = "" if forces.direction is None else f"; unique only along {np.rad2deg(forces.direction):.4g} degrees"
+        groups.setdefault(along, []).extend(loose)
+    lines = [f"not unique: {', '.join(loose)}{along}" for along, loose in groups.items()]
+    return lines or (["all unique"] if found.rows else [])
+
+
+def _conditioning(found: Diagnosis) -> list[str]:
+    c = found.clearance
+    lines = [f"{found.conditioning:.4g}, the largest singular value over the smallest of rank {found.rank}"]
+    if found.rank == found.ordinary_rank and np.isfinite(c.estimate):
+        lines.append(f"next rank change, by the slope of the smallest: {c.estimate:.3g} away (lengths over L, angles in rad)")
+    if c.nearest is not None:
+        lines.append(
+            f"next rank change on the path: {c.nearest.distance:.6g} away, rank {c.nearest.rank}, at {_pose(found, c.nearest)}"
+        )
+    elif c.searched:
+        lines.append(f"no rank change on the path within {c.searched:.3g}")
+    return lines
+
+
+def _pose(found: Diagnosis, change: RankChange) -> str:
+    angles = np.rad2deg(np.where(np.abs(change.q[:, 2]) > ROUNDED, change.q[:, 2], 0.0))
+    return ", ".join(f"{name} {angle:.4g}" for name, angle in zip(found.mechanism.body_names, angles, strict=True)) + " degrees"
+
+
+def _timeline(line: Timeline) -> list[str]:
+    ordinary = int(line.rank.max(initial=0))
+    lines = [f"{line.ts[0]:g} to {line.ts[-1]:g} s, {len(line.ts)} instants: rank {ordinary}"]
+    lines[0] += f"; the smallest singular value is least at {line.closest[0]:.6g} s: {line.closest[1]:.3g} of the largest"
+    for change in line.changes:
+        half = (change.latest - change.earliest) / 2
+        lines.append(f"  rank {change.rank} at {change.time:.10g} s (+- {half:.1g} s)")
+    return lines
+
+
+def as_dict(found: Diagnosis) -> dict[str, Any]:
+    """Return a diagnosis as plain numbers, lists and texts."""
+    line, nearest = found.timeline, found.clearance.nearest
+    return {
+        "mechanism": found.mechanism.name,
+        "t": found.t,
+        "q": dict(zip(found.mechanism.body_names, found.q.tolist(), strict=True)),
+        "coordinates": found.coordinates,
+        "rows": found.rows,
+        "rank": found.rank,
+        "ordinary_rank": found.ordinary_rank,
+        "gruebler": found.gruebler,
+        "degrees_of_freedom": found.degrees_of_freedom,
+        "mobility": found.mobility,
+        "joint_mobility": found.joint_mobility,
+        "singular": found.is_singular,
+        "redundancies": [
+            {
+                "constraints": list(r.constraints),
+                "count": r.count,
+                "permanent": r.permanent,
+                "fixes": [_fix(fix) for fix in r.fixes],
+            }
+            for r in found.redundancies
+        ],
+        "cure": [_fix(fix) for fix in found.cure],
+        "branches": [
+            {
+                "tangent": dict(zip(found.mechanism.body_names, branch.tangent.tolist(), strict=True)),
+                "degrees_of_freedom": branch.degrees_of_freedom,
+                "rank": branch.rank,
+                "followed": branch.followed,
+            }
+            for branch in found.branches
+        ],
+        "forces": {
+            name: {"unique": list(f.unique), "share": list(f.share), "direction": f.direction} for name, f in found.forces.items()
+        },
+        "singular_values": found.singular_values.tolist(),
+        "conditioning": found.conditioning,
+        "clearance": {
+            "smallest": found.clearance.smallest,
+            "estimate": found.clearance.estimate if np.isfinite(found.clearance.estimate) else None,
+            "searched": found.clearance.searched,
+            "nearest": None if nearest is None else {**nearest._asdict(), "q": nearest.q.tolist()},
+        },
+        "timeline": None
+        if line is None
+        else {
+            "ts": line.ts.tolist(),
+            "rank": line.rank.tolist(),
+            "smallest": line.smallest.tolist(),
+            "changes": [change._asdict() for change in line.changes],
+            "closest": {"time": line.closest[0], "smallest": line.closest[1]},
+        },
+    }
+
+
+def _fix(fix: Fix) -> dict[str, Any]:
+    return {"constraint": fix.constraint, "change": fix.change, "removes": fix.removes, "conditioning": fix.conditioning}

@@ -6,14 +6,14 @@ stress by which the constraints of a set hold each other in balance, and frees n
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
-from udkjax.scene.joints import Angle, Prismatic, Revolute, Slot, Weld
+from udkjax.scene.joints import Angle, Constraint, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, Positions, decompose
 from udkjax.study.diagnosis.dependence import Dependency, stress_of
@@ -25,11 +25,11 @@ class Change(NamedTuple):
     """One way to relax a constraint: what takes its place, and which of its rows stay."""
 
     text: str
-    element: Any  # a joint; None: nothing
+    element: Constraint | None  # None: nothing
     slides: tuple[int, float] | None = None  # of a slot made of a revolute: the body that it is in, and its axis there (rad)
     rows: tuple[int, ...] = ()  # which rows stay, where it is no slot
 
-    def kept(self, rows: np.ndarray, q: np.ndarray, places: list[int | None]) -> np.ndarray:
+    def remaining_rows(self, rows: np.ndarray, q: np.ndarray, places: list[int | None]) -> np.ndarray:
         """The rows of the Jacobian that stay, of those of the constraint."""
         if self.slides is None:
             return rows[list(self.rows)]
@@ -58,6 +58,15 @@ class Fix(NamedTuple):
     removes: int
     conditioning: float  # of the scaled Jacobian where it is worst: the smallest singular value that counts over the largest
     mechanism: Mechanism
+
+
+class Redundancy(NamedTuple):
+    """A minimal set of constraints that depend on each other: take any of them away, and the others do not."""
+
+    constraints: tuple[str, ...]
+    count: int  # of their rows that are redundant
+    permanent: bool  # along the motion; otherwise in this configuration only
+    fixes: tuple[Fix, ...]  # verified: each takes redundancy away and leaves the mobility; none of a momentary one
 
 
 def fixes_of(
@@ -110,7 +119,7 @@ def _places(mechanism: Mechanism, name: str) -> list[int | None]:
 
 def _changes(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarray) -> Iterator[Change]:
     """The ways to relax a constraint, which carries the multipliers `force` (rows, redundancy) of the stress."""
-    element: Any = mechanism.constraints[name]
+    element = mechanism.constraints[name]
     yield Change("remove it", None)
     if isinstance(element, Revolute):
         most = np.linalg.svd(force)[0][:, 0]  # the direction that carries most
@@ -145,9 +154,9 @@ def _effect(
     own, places, falls, conditioning = _own(owners, name), _places(mechanism, name), set(), np.inf
     for position in at:
         rest = np.delete(position.J, own, axis=0)
-        kept = np.concatenate([rest, change.kept(position.J[own], position.q, places)])
-        _, sigma, _, rank = decompose(kept, rank_tol)
-        falls.add(position.redundancy - (len(kept) - rank) if rank == position.rank else -1)
+        remaining = np.concatenate([rest, change.remaining_rows(position.J[own], position.q, places)])
+        _, sigma, _, rank = decompose(remaining, rank_tol)
+        falls.add(position.redundancy - (len(remaining) - rank) if rank == position.rank else -1)
         conditioning = min(conditioning, sigma[rank - 1] / sigma[0] if rank else 1.0)
     return falls.pop() if len(falls) == 1 else -1, float(conditioning)
 

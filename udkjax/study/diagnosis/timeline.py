@@ -6,7 +6,7 @@ integrated anew from the output before, then of a quintic through q, v and a.
 """
 
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from udkjax.integrate import State, simulate
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.channels import Trajectory
 
 BETWEEN = 4  # samples from one output to the next, to look for minima
 FINER = 8  # parts of an interval that is integrated anew
@@ -54,7 +55,7 @@ class Timeline(NamedTuple):
         return self.singular_values[:, max(int(self.rank.max()) - 1, 0)] / self.singular_values[:, 0]
 
 
-def timeline(mechanism: Mechanism, solution: Any, rank_tol: float, tol: float | None = None) -> Timeline:
+def timeline(mechanism: Mechanism, solution: Trajectory, rank_tol: float, tol: float | None = None) -> Timeline:
     """Follow the rank along a trajectory.
 
     Args:
@@ -119,7 +120,9 @@ def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, 
     return Change(float(at), float(max(start, at - tol)), float(min(end, at + tol)), found, float(values[rank - 1] / values[0]))
 
 
-def _renew(mechanism: Mechanism, analysis: Analysis, solution: Any, ts: np.ndarray, low: float, high: float) -> "_Path | None":
+def _renew(
+    mechanism: Mechanism, analysis: Analysis, solution: Trajectory, ts: np.ndarray, low: float, high: float
+) -> "_Path | None":
     """The trajectory between two times, integrated anew from the output before."""
     if not isinstance(solution, Solution):
         return None

@@ -1,0 +1,138 @@
+"""The derivation of the accelerations for one state, with the paper's symbols and numbers: `explain`.
+
+Everything comes from the textbook's functions (equations/constraints.py, loads.py, udwadia_kalaba.py), one symbol each, and each
+claim is checked beside it: the equations of motion, the constraints, Penrose's four conditions, and Gauss's principle.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from udkjax.equations import constraints, loads
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.determinacy import left_null_space, uniqueness
+from udkjax.equations.scales import rank_tolerance
+from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.integrate.assembly import State, assemble
+from udkjax.pinv import SVD
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.explanation import Explanation, Gauss
+
+RIVALS = 200  # feasible accelerations that a is compared with
+
+
+def explain(
+    mechanism: Mechanism, t: float = 0.0, state: State | None = None, stabilization: Baumgarte | None = None
+) -> Explanation:
+    """Derive the accelerations and multipliers of one state, step by step, with numbers; print the result.
+
+    Args:
+        mechanism: its numbers are known.
+        t: time (s), for drivers and loads.
+        state: the state; it is closed first. By default the initial guess.
+        stabilization: Baumgarte's terms in b, if any.
+
+    Returns:
+        The `Explanation`: Psi, Psi_q, M, gamma, F, D, D^+, a_F, b, a, lambda, and the checks.
+
+    Raises:
+        AssemblyError: the state cannot be closed.
+        ValueError: numbers of the mechanism are traced.
+
+    Source:
+        D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005, section 3.
+    """
+    if not mechanism.is_concrete:
+        raise ValueError("explain takes known numbers; under jit and vmap take accelerations and uniqueness, which are pure")
+    state = assemble(mechanism, t, state)
+    analysis = analyse(mechanism)
+    q, v = jnp.ravel(state.q), jnp.ravel(state.v)
+    symbols = _symbols(mechanism.without_origin, analysis, float(t), q, v, stabilization, rank_tolerance(mechanism))
+    s = {name: np.asarray(value) for name, value in symbols.items()}
+    n = len(s["a"])
+    rank = int(s["rank"])
+    null_rows = s["null"][:, np.linalg.norm(s["null"], axis=0) > 0]
+    return Explanation(
+        mechanism=mechanism,
+        t=float(t),
+        q=np.asarray(q),
+        v=np.asarray(v),
+        row_names=analysis.row_names,
+        **{
+            key: s[key]
+            for key in ("psi", "psi_dot", "psi_q", "gamma", "mass", "force", "weights", "D", "D_plus", "a_F", "b", "a")
+        },
+        singular_values=s["sigma"],
+        rank=rank,
+        multipliers=s["multipliers"],
+        unique=s["unique"],
+        null_rows=null_rows,
+        constraint_force=-s["psi_q"].T @ s["multipliers"] if len(s["psi"]) else np.zeros(n),
+        gauss=_gauss(s, rank),
+        checks=_checks(s),
+    )
+
+
+@jax.jit
+def _symbols(
+    mechanism: Mechanism, analysis: Analysis, t: Array, q: Array, v: Array, baumgarte: Baumgarte | None, tol: ArrayLike
+) -> dict[str, Array]:
+    w, method = analysis.scales.weights, SVD(rank_tol=tol)
+    psi_q = constraints.psi_q(mechanism, t, q)
+    rows, columns = psi_q.shape
+    D, unique = uk.D(mechanism, t, q, w), uniqueness(mechanism, t, q, analysis)
+    null = left_null_space(mechanism, t, q, analysis).basis / analysis.scales.rows[:, None]
+    sigma = jnp.linalg.svd(D, compute_uv=False) if rows else jnp.zeros(0)
+    return {
+        "psi": constraints.psi(mechanism, t, q),
+        "psi_dot": constraints.psi_dot(mechanism, t, q, v),
+        "psi_q": psi_q,
+        "gamma": constraints.gamma(mechanism, t, q, v),
+        "mass": loads.mass(mechanism),
+        "force": loads.force(mechanism, t, q, v),
+        "weights": w,
+        "D": D,
+        "sigma": sigma,
+        "rank": method.rank(D) if rows else jnp.zeros((), int),
+        "D_plus": method(D) if rows else jnp.zeros((columns, 0)),
+        "a_F": uk.a_F(mechanism, t, q, v),
+        "b": uk.b(mechanism, t, q, v, baumgarte, w),
+        "a": uk.accelerations(mechanism, t, q, v, method, baumgarte, w),
+        "multipliers": uk.multipliers(mechanism, t, q, v, method, baumgarte, w),
+        "unique": unique.unique,
+        "null": null,
+    }
+
+
+def _gauss(s: dict[str, np.ndarray], rank: int) -> Gauss:
+    root = np.sqrt(s["mass"])
+    deviation = root * (s["a"] - s["a_F"])  # M^(1/2) (a - a_F)
+    free = np.linalg.svd(s["D"])[2][rank:].T if len(s["D"]) else np.eye(len(root))  # M^(1/2) V
+    size = float(np.linalg.norm(deviation))
+    slope = float(np.abs(free.T @ deviation).max(initial=0.0)) / (size if size > 0 else 1.0)
+    spread = max(size, float(np.linalg.norm(root * s["a_F"])), np.finfo(float).tiny) / 10
+    steps = np.random.default_rng(0).standard_normal((RIVALS if free.shape[1] else 0, free.shape[1])) * spread
+    rivals = 0.5 * np.sum((deviation + steps @ free.T) ** 2, axis=1)
+    return Gauss(0.5 * size**2, free.shape[1], slope, float(rivals.min(initial=np.inf)), len(rivals))
+
+
+def _checks(s: dict[str, np.ndarray]) -> dict[str, float]:
+    """What must vanish, each relative to the largest number that it is the difference of."""
+    inertia, reaction = s["mass"] * s["a"], s["psi_q"].T @ s["multipliers"]
+    asked = s["b"] + s["D"] @ (np.sqrt(s["mass"]) * s["a_F"])  # of the rows of D, with Baumgarte's terms
+    D, plus = s["D"], s["D_plus"]
+    return {
+        "M a + Psi_q^T lambda - F": _relative(inertia + reaction - s["force"], inertia, reaction, s["force"]),
+        "Psi_q a - gamma": _relative(D @ (np.sqrt(s["mass"]) * s["a"]) - asked, asked, s["b"]),
+        "D D^+ D - D": _relative(D @ plus @ D - D, D),
+        "D^+ D D^+ - D^+": _relative(plus @ D @ plus - plus, plus),
+        "(D D^+)^T - D D^+": _relative((D @ plus).T - D @ plus, np.ones(1)),
+        "(D^+ D)^T - D^+ D": _relative((plus @ D).T - plus @ D, np.ones(1)),
+    }
+
+
+def _relative(difference: np.ndarray, *parts: np.ndarray) -> float:
+    size = max(float(np.abs(part).max(initial=0.0)) for part in parts)
+    return float(np.abs(difference).max(initial=0.0)) / (size if size > 0 else 1.0)
