@@ -20,9 +20,8 @@ def loaded(*functions: Function, globals: Sequence[str] = ()) -> Callable[..., N
     """The last of some functions, to be called with arrays, whole numbers and numbers."""
     declared = sorted(set().union(*(f.declared for f in functions)))
     last = functions[-1]
-    library = machine.Library(
-        machine.compile_module("\n".join([*declared, *globals, *(f.text() for f in functions)])), [last.name]
-    )
+    text = "\n".join([*declared, *globals, *(f.text() for f in functions)])
+    library = machine.Library([machine.compile_module(text)], [last.name])
     kinds = {POINTER: ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
     run = machine.function(library[last.name], *(kinds[value.base] for value in last.given.values()))
 

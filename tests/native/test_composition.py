@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
-from udkjax.native import machine
+from udkjax.native import code_cache, machine
 
 TS = np.array([0.0, 0.3, 0.6])
 PENDULUM = udk.library.compound_pendulum()
@@ -158,7 +158,7 @@ def test_a_file_that_is_not_whole_is_made_again(folder, spoil):
 
 
 def test_the_folder_stays_bounded(folder, monkeypatch):
-    monkeypatch.setattr(machine, "MAX_FILES", 3)
+    monkeypatch.setattr(code_cache, "MAX_FILES", 3)
     for k in range(5):
         assert answer(TEXT.replace("4.2e1", f"{k}.0")) == k
     assert len(list(folder.iterdir())) == 3
@@ -184,3 +184,21 @@ def test_processes_share_the_folder(folder):
     processes = [subprocess.Popen([sys.executable, "-c", MANY], env=environment) for _ in range(2)]
     assert [p.wait(timeout=300) for p in processes] == [0, 0]
     assert len(list(folder.iterdir())) == 20
+
+
+def test_a_module_is_compiled_in_parts_that_others_share(monkeypatch):
+    """Functions that are large alone, the others together; and what calls what, and constants, are found again."""
+    monkeypatch.setattr(machine, "PART_LINES", 4)
+    body = "".join(f"  %x{k} = fadd double %x{k - 1}, 1.0e0\n" for k in range(1, 9))
+    large = "define double @eight(double %x0) {\n" + body + "  ret double %x8\n}\n"
+    text = (
+        "declare double @llvm.sqrt.f64(double)\n@two = private constant double 2.0e0\n"
+        + large
+        + "define void @answer(ptr %x) {\n  %a = load double, ptr @two\n  %b = call double @eight(double %a)\n"
+        + "  %c = call double @root(double %b)\n  store double %c, ptr %x\n  ret void\n}\n"
+        + "define double @root(double %x) {\n  %y = call double @llvm.sqrt.f64(double %x)\n  ret double %y\n}\n"
+    )
+    parts = machine.split_module(text)
+    assert len(parts) == 3 and parts[0] == large
+    assert machine.split_module(TEXT + large)[0] == large  # the same text in another module, hence the same file
+    assert answer(text) == np.sqrt(10.0)

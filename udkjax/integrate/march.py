@@ -15,8 +15,7 @@ from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.kinematic_programs import kinematic_programs
 from udkjax.equations.structure import is_large
 from udkjax.native.layout import INPUTS, SETTINGS
-from udkjax.native.operation import Kind, Tableau, generate, machine_code, native_p, shapes_of
-from udkjax.native.program import UnsupportedError
+from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
 from udkjax.native.tableau import EULER
 from udkjax.scene.mechanism import Mechanism
 
@@ -39,11 +38,7 @@ def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
     """Tell whether machine code can follow a mechanism."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64 or is_large(mechanism):
         return False
-    try:
-        generate(_kind(mechanism, analysis), 1)
-    except UnsupportedError:
-        return False
-    return True
+    return not unsupported(_kind(mechanism, analysis))
 
 
 def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> March:
@@ -60,7 +55,7 @@ def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Sca
     kind = _kind(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
     inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
-    return _march(machine_code(kind, 1)(inputs, shapes_of(inputs, kind, APPROACH + len(values))), np)
+    return _march(machine_code(kind, 1, False)(inputs, shapes_of(inputs, kind, APPROACH + len(values))), np)
 
 
 def psi_at_once(mechanism: Mechanism, analysis: Analysis, q: np.ndarray) -> np.ndarray:

@@ -16,8 +16,7 @@ from udkjax.equations.structure import is_large
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_numbers import active_numbers, active_tangents, cotangent_tree, vector
 from udkjax.native.layout import INPUTS, SETTINGS
-from udkjax.native.operation import Kind, Tableau, generate, machine_code, native_p, shapes_of
-from udkjax.native.program import UnsupportedError
+from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
 from udkjax.native.tableau import EULER
 from udkjax.scene.mechanism import Mechanism
 
@@ -29,11 +28,7 @@ def can_close(mechanism: Mechanism) -> bool:
     """Whether machine code can close a mechanism."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
-    try:
-        generate(_closing(mechanism), 1)
-    except UnsupportedError:
-        return False
-    return True
+    return not unsupported(_closing(mechanism))
 
 
 def close(mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q: Any, v: Any) -> Closed:
@@ -44,7 +39,7 @@ def close(mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q:
 def close_known(mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q: Any, v: Any) -> Closed:
     """As `close`, of known numbers, without tracing anything."""
     kind, inputs = _closing(mechanism), _inputs(mechanism, scales, tol, t, q, v, np)
-    return _unpack(machine_code(kind, 1)(inputs, shapes_of(inputs, kind, 2)), len(q))
+    return _unpack(machine_code(kind, 1, False)(inputs, shapes_of(inputs, kind, 2)), len(q))
 
 
 def _unpack(found: Sequence[Any], n: int) -> Closed:

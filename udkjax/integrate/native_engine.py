@@ -20,8 +20,7 @@ from udkjax.integrate.native_numbers import active_numbers, active_tangents, cot
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.solvers import is_explicit, method_of
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS
-from udkjax.native.operation import Kind, Tableau, generate, machine_code, native_p, shapes_of
-from udkjax.native.program import UnsupportedError
+from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
 from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
 from udkjax.pinv import Auto, Elimination
 from udkjax.pinv.rank_policy import RankPolicy
@@ -49,17 +48,14 @@ def reason_for_diffrax(problem: Problem, adjoint: Any = None, meter: Any = None)
         return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
     if not jax.config.jax_enable_x64:
         return "it computes in float64, which JAX is told not to"
-    try:
-        generate(_kind(problem), 1)
-    except UnsupportedError as error:
-        return f"the scene takes {error}, which is no arithmetic on numbers"
-    return ""
+    missing = unsupported(_kind(problem))
+    return f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
 
 
 def integrate_known(problem: Problem) -> IntegratorOutput:
     """Integrate a problem whose numbers are all known, without tracing anything: `IntegratorOutput` of NumPy's arrays."""
     kind, inputs = _kind(problem), _inputs(problem, xp=np)
-    return _output(machine_code(kind, 1)(inputs, shapes_of(inputs, kind, len(problem.ts))))
+    return _output(machine_code(kind, 1, False)(inputs, shapes_of(inputs, kind, len(problem.ts))))
 
 
 def integrate(problem: Problem) -> IntegratorOutput:

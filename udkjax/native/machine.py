@@ -1,28 +1,26 @@
-"""Machine code for this processor from LLVM's text, and its cache on disk.
+"""Machine code for this processor from LLVM's text, compiled on all cores and stored on disk.
 
-The cache holds object code as the compiler leaves it, under a digest of the text, the processor and the compiler: plain bytes. A
-file that is not whole is made again; the oldest go when there are too many.
+A module is compiled in parts: each large function by itself, so that modules which share functions share their code, too.
 """
 
 import ctypes
 import hashlib
 import itertools
 import os
+import re
 import sys
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from pathlib import Path
 from typing import Any
 
-import platformdirs
+from udkjax.native import code_cache
 
 LEVEL = 1  # of code generation: 2 takes a fifth longer, and runs take as long
 # Optimizations of the text before that. Programs come without common subexpressions and dead code: all that LLVM's own selection
 # of level 1 adds is two percent of a run's time, for half of the time of compiling.
 PASSES = ("sroa", "simplify_cfg")
-MAX_FILES = 2_000  # object files: some 100 MB
-_MAGIC = b"udkjax object 1\n"
+PART_LINES = 1_000  # of a function that is compiled by itself: some 20 ms; smaller ones go together, each part costs some 2 ms
 
 
 @cache
@@ -34,9 +32,8 @@ def _llvm() -> Any:
     return llvm
 
 
-@cache
-def target_machine() -> Any:
-    """The compiler for the processor that runs this."""
+def _target_machine() -> Any:
+    """A compiler for the processor that runs this."""
     llvm = _llvm()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=_features(), opt=LEVEL, reloc="pic", codemodel="small", jit=True
@@ -79,8 +76,10 @@ class Library:
 
     _numbers = itertools.count()
 
-    def __init__(self, code: bytes, names: Sequence[str]):
-        builder = _llvm().JITLibraryBuilder().add_object_img(code).add_current_process()
+    def __init__(self, parts: Sequence[bytes], names: Sequence[str]):
+        builder = _llvm().JITLibraryBuilder().add_current_process()
+        for code in parts:
+            builder.add_object_img(code)
         for name in names:
             builder.export_symbol(name)
         self._tracker = builder.link(_linker(), f"library {next(self._numbers)}")
@@ -91,74 +90,71 @@ class Library:
 
 def library(text: str, names: Sequence[str]) -> Library:
     """The code of a module, with the functions of these names: from disk, or compiled and put there."""
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        return Library(list(pool.map(_stored_code, split_module(text))), names)
+
+
+def _stored_code(text: str) -> bytes:
     name = digest(text)
-    folder = cache_folder()
-    code = _read(folder / name) if folder else None
+    code = code_cache.read(name)
     if code is None:
         code = compile_module(text)
-        if folder:
-            _write(folder / name, code)
-    return Library(code, names)
+        code_cache.write(name, code)
+    return code
+
+
+def split_module(text: str) -> list[str]:
+    """Split a module into modules that can be compiled at once, the largest first, each with the declarations that it needs."""
+    bodies = {match[1]: match[0] for match in re.finditer(r"^define [^@\n]*@(\w+)\(.*?^}\n", text, re.DOTALL | re.MULTILINE)}
+    heads = {match[1]: match[0] for match in re.finditer(r"^(?:declare [^@\n]*)?@([\w.]+)[ (].*\n?", text, re.MULTILINE)}
+    lines = {name: body.count("\n") for name, body in bodies.items()}
+    large = sorted((name for name in bodies if lines[name] >= PART_LINES), key=lambda name: -lines[name])
+    rest = [name for name in bodies if lines[name] < PART_LINES]
+    heads |= {name: f"declare{body[len('define') : body.index(')') + 1]}\n" for name, body in bodies.items()}
+    parts = []
+    for members in (*([name] for name in large), rest):
+        part = "".join(bodies[name] for name in members)
+        used = sorted(set(re.findall(r"@([\w.]+)", part)) - {*members})
+        parts.append("".join(heads[name] if heads[name].endswith("\n") else heads[name] + "\n" for name in used) + part)
+    return [part for part in parts if part]
 
 
 def compile_module(text: str) -> bytes:
     """Object code of a module."""
-    llvm, machine = _llvm(), target_machine()
-    module = llvm.parse_assembly(text)
-    module.triple = llvm.get_default_triple()
-    module.data_layout = str(machine.target_data)
-    passes = llvm.create_new_module_pass_manager()
-    for name in PASSES:
-        getattr(passes, f"add_{name}_pass")()
-    passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
-    return machine.emit_object(module)
+    llvm = _llvm()
+    machine = _target_machine()  # of its own, as is the context: several threads compile at once
+    with llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
+        module.triple = llvm.get_default_triple()
+        module.data_layout = str(machine.target_data)
+        passes = llvm.create_new_module_pass_manager()
+        for name in PASSES:
+            getattr(passes, f"add_{name}_pass")()
+        passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
+        return _emit(machine, module)
 
 
-def cache_folder() -> Path | None:
-    """Where code is stored: in the user's cache folder, or where `UDKJAX_CACHE` says; None where that is 0."""
-    choice = os.environ.get("UDKJAX_CACHE", "").strip()
-    if choice == "0":
-        return None
-    return Path(choice).expanduser() if choice else platformdirs.user_cache_path("udkjax")
+def _emit(machine: Any, module: Any) -> bytes:
+    """Object code of a module, without the lock that llvmlite holds during each call: LLVM's contexts share nothing."""
+    from llvmlite.binding import ffi
 
-
-def cached_files() -> list[tuple[float, int, Path]]:
-    """When each file of code was last used or made, its size in bytes, and where it is."""
-    folder, found = cache_folder(), []
+    with ffi.OutputString() as error:
+        buffer = _emission()(machine, module, 1, error)
+        if not buffer:
+            raise RuntimeError(str(error))
     try:
-        for file in folder.iterdir() if folder else ():
-            status = file.stat()
-            found.append((max(status.st_atime, status.st_mtime), status.st_size, file))
-    except OSError:  # not there yet, or another process has just removed a file
-        pass
-    return found
+        return ctypes.string_at(ffi.lib.LLVMPY_GetBufferStart(buffer), ffi.lib.LLVMPY_GetBufferSize(buffer))
+    finally:
+        ffi.lib.LLVMPY_DisposeMemoryBuffer(buffer)
 
 
-def _read(path: Path) -> bytes | None:
-    try:
-        data = path.read_bytes()
-    except OSError:
-        return None
-    head, code = data[: len(_MAGIC) + 32], data[len(_MAGIC) + 32 :]
-    if not head.startswith(_MAGIC) or hashlib.sha256(code).digest() != head[len(_MAGIC) :]:
-        return None
-    return code
+@cache
+def _emission() -> Callable:
+    from llvmlite.binding import ffi
 
-
-def _write(path: Path, code: bytes):
-    """As a whole, or not at all: other processes may read it meanwhile."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(_MAGIC + hashlib.sha256(code).digest() + code)
-        os.replace(temporary, path)
-        files = [p for p in path.parent.iterdir() if p.is_file()]
-        if len(files) > MAX_FILES:
-            for old in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) - MAX_FILES]:
-                old.unlink(missing_ok=True)
-    except OSError:  # nowhere to write: it runs all the same
-        return
+    locked = ffi.lib.LLVMPY_TargetMachineEmitToMemory
+    free = ctypes.CDLL(ffi.lib._name).LLVMPY_TargetMachineEmitToMemory
+    free.argtypes, free.restype = locked.argtypes, locked.restype
+    return free
 
 
 def function(address: int, *arguments: Any) -> Any:

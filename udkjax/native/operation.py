@@ -26,6 +26,7 @@ from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
 from udkjax.native.ffi import handler
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS, Plan
 from udkjax.native.marching import Marching
+from udkjax.native.program import UnsupportedError
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
 from udkjax.native.trajectory import Trajectory
@@ -63,7 +64,7 @@ CLOSING_BY_LOOPS: dict[str, Any] = {"closing forward": ForwardByLoops, "closing 
 
 
 @lru_cache(maxsize=256)
-def generate(kind: Kind, width: int, several: bool = False) -> Trajectory:
+def generate(kind: Kind, width: int, several: bool) -> Trajectory:
     """A kind of trajectory in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it.
 
     `several`: whether there may be more than one direction of a single member, which then are side by side.
@@ -87,10 +88,19 @@ def generate(kind: Kind, width: int, several: bool = False) -> Trajectory:
     return trajectory
 
 
+def unsupported(kind: Kind) -> str:
+    """Return what a kind of trajectory takes that machine code has no instruction for; empty where there is nothing."""
+    try:
+        generate(kind, 1, False)
+    except UnsupportedError as error:
+        return str(error)
+    return ""
+
+
 class Compiled:
     """The machine code of one kind of trajectory, in so many lanes."""
 
-    def __init__(self, kind: Kind, width: int, several: bool = False):
+    def __init__(self, kind: Kind, width: int, several: bool):
         self.trajectory = generate(kind, width, several)
         self.name, self._run = load(self.trajectory.module)
 
@@ -138,7 +148,7 @@ def load(text: str) -> tuple[str, Any]:
 
 
 @lru_cache(maxsize=256)
-def machine_code(kind: Kind, width: int, several: bool = False) -> Compiled:
+def machine_code(kind: Kind, width: int, several: bool) -> Compiled:
     """The machine code of a kind of trajectory."""
     return Compiled(kind, width, several)
 

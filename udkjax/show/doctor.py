@@ -13,7 +13,7 @@ import numpy as np
 from udkjax.extras import EXTRAS
 from udkjax.integrate import simulate
 from udkjax.integrate.solution import versions
-from udkjax.native import machine
+from udkjax.native import code_cache, machine
 from udkjax.scene.library import double_pendulum
 from udkjax.study.machine import cores, processor
 
@@ -22,7 +22,7 @@ FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 
 def facts() -> dict[str, Any]:
     """Return versions, devices, precision, engine, cache and what could be better, by names that scripts can rely on."""
-    folder, sizes = machine.cache_folder(), [size for _, size, _ in machine.cached_files()]
+    folder, sizes = code_cache.cache_folder(), [size for _, size, _ in code_cache.cached_files()]
     engine, reason = engine_here()
     return {
         "versions": versions(),

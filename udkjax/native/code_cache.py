@@ -1,0 +1,67 @@
+"""The cache of machine code on disk.
+
+It holds object code as the compiler leaves it, under a digest of the text, the processor and the compiler: plain bytes. A file
+that is not whole is made again; the oldest go when there are too many.
+"""
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+import platformdirs
+
+MAX_FILES = 10_000  # object files: some 150 MB
+_MAGIC = b"udkjax object 1\n"
+
+
+def cache_folder() -> Path | None:
+    """Where code is stored: in the user's cache folder, or where `UDKJAX_CACHE` says; None where that is 0."""
+    choice = os.environ.get("UDKJAX_CACHE", "").strip()
+    if choice == "0":
+        return None
+    return Path(choice).expanduser() if choice else platformdirs.user_cache_path("udkjax")
+
+
+def cached_files() -> list[tuple[float, int, Path]]:
+    """When each file of code was last used or made, its size in bytes, and where it is."""
+    folder, found = cache_folder(), []
+    try:
+        for file in folder.iterdir() if folder else ():
+            status = file.stat()
+            found.append((max(status.st_atime, status.st_mtime), status.st_size, file))
+    except OSError:  # not there yet, or another process has just removed a file
+        pass
+    return found
+
+
+def read(name: str) -> bytes | None:
+    """Return the stored code of this name; None where there is none, or a file that is not whole."""
+    folder = cache_folder()
+    try:
+        data = (folder / name).read_bytes() if folder else b""
+    except OSError:
+        return None
+    head, code = data[: len(_MAGIC) + 32], data[len(_MAGIC) + 32 :]
+    if not head.startswith(_MAGIC) or hashlib.sha256(code).digest() != head[len(_MAGIC) :]:
+        return None
+    return code
+
+
+def write(name: str, code: bytes) -> None:
+    """Store code as a whole, or not at all: other processes may read it meanwhile."""
+    folder = cache_folder()
+    if folder is None:
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=folder)
+        with os.fdopen(handle, "wb") as file:
+            file.write(_MAGIC + hashlib.sha256(code).digest() + code)
+        os.replace(temporary, folder / name)
+        files = [p for p in folder.iterdir() if p.is_file()]
+        if len(files) > MAX_FILES:
+            for old in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) - MAX_FILES]:
+                old.unlink(missing_ok=True)
+    except OSError:  # nowhere to write: it runs all the same
+        return
