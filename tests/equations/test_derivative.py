@@ -12,7 +12,7 @@ import udkjax as udk
 from udkjax import GROUND
 from udkjax.equations.implicit_derivative import acceleration_derivative, projection_derivative
 from udkjax.equations.scene_programs import elimination_programs
-from udkjax.equations.structure import leaves_as_scalars
+from udkjax.equations.structure import numbers_as_scalars
 from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.pinv.rank_policy import RankPolicy
 
@@ -48,7 +48,7 @@ def test_they_are_those_of_the_textbook(scene, name):
 
     @jax.jit
     def by_jax(leaves, dleaves):
-        numbers = lambda leaves: [*leaves_as_scalars(leaves), 2.0, 3.0, 1e-14, 1e-14]  # noqa: E731
+        numbers = lambda leaves: [*numbers_as_scalars(leaves), 2.0, 3.0, 1e-14, 1e-14]  # noqa: E731
         constants = lambda leaves: jnp.stack([jnp.asarray(c) for c in programs.prologue(numbers(leaves))])  # noqa: E731
 
         def expected(leaves, t, q, v):

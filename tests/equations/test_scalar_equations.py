@@ -12,7 +12,7 @@ import udkjax as udk
 from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, P
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations.scene_programs import elimination_programs, scene_programs
-from udkjax.equations.structure import leaves_as_scalars
+from udkjax.equations.structure import numbers_as_scalars
 from udkjax.pinv.rank_policy import RankPolicy
 
 
@@ -143,7 +143,7 @@ def terms(mech, states):
     """What the programs say."""
 
     programs = scene_programs(mech)
-    constants = programs.prologue([*map(float, leaves_as_scalars(jax.tree.leaves(mech.without_origin))), 1e-8, 1e-8])
+    constants = programs.prologue([*map(float, numbers_as_scalars(jax.tree.leaves(mech.without_origin))), 1e-8, 1e-8])
     (m, n), slots = programs.pattern.shape, programs.pattern.value_count
 
     def at(t, q, v):
@@ -217,7 +217,7 @@ def test_one_force_element_alone(mech, states, name):
     t, q, v = (s[1] for s in states)
     q = q.at[0].set(-0.5)  # at the stop
     programs = scene_programs(alone)
-    constants = programs.prologue([*map(float, leaves_as_scalars(jax.tree.leaves(alone.without_origin))), 1e-8, 1e-8])
+    constants = programs.prologue([*map(float, numbers_as_scalars(jax.tree.leaves(alone.without_origin))), 1e-8, 1e-8])
     free = jnp.array(programs.equation_terms([*constants, float(t), *q.tolist(), *v.tolist()])[-18:-9])
     mass, force = jax.jit(lambda t, q, v: (loads.mass(alone), loads.force(alone, t, q, v)))(t, q, v)
     assert jnp.abs(free).max() > 1e-3

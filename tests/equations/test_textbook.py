@@ -17,7 +17,7 @@ from tests.choices import fast
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.scene_programs import elimination_programs
-from udkjax.equations.structure import is_large, leaves_as_scalars
+from udkjax.equations.structure import is_large, numbers_as_scalars
 from udkjax.pinv.rank_policy import RankPolicy
 
 SVD = udk.SVD(1e-9)
@@ -194,7 +194,7 @@ def test_programs_are_the_textbook(moved, policy):
         pytest.skip("written as loops (tests/native/test_loops.py)")
     programs = elimination_programs(mech, redundant, True, policy)
     leaves = jax.tree.leaves(mech.without_origin)
-    constants = programs.prologue([*map(float, leaves_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14])
+    constants = programs.prologue([*map(float, numbers_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14])
     run = lambda program: named(program, constants, T0, q, v)  # noqa: E731
     (m, n), slots = programs.pattern.shape, programs.pattern.value_count
     values, b, free, root = np.split(run(programs.equation_terms), [slots, slots + m, slots + m + n])

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.equations.structure import ElementKind, element_kinds, evaluate_by_kind
+from udkjax.equations.structure import ElementKind, element_kinds, evaluate_by_kind, numbers_as_vector
 from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 
@@ -117,5 +117,5 @@ def bodies(state: State) -> Float[Array, "bodies 3"]:
 def vector(values: ArrayLike | Sequence[Number]) -> Float[Array, "n"]:
     """A number, a list of numbers or an array as a vector of floats."""
     if isinstance(values, list | tuple):
-        return jnp.stack([jnp.asarray(x, jnp.result_type(float)) for x in values]) if values else jnp.zeros(0)
+        return jnp.asarray(numbers_as_vector(values), jnp.result_type(float))
     return jnp.ravel(jnp.asarray(values, jnp.result_type(float)))

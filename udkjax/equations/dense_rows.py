@@ -12,7 +12,7 @@ from udkjax.equations.abstract_system import Time
 from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed
 from udkjax.equations.scales import Scales, known_scales, rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import leaves_as_scalars
+from udkjax.equations.structure import numbers_as_scalars
 from udkjax.expressions import ScalarProgram
 from udkjax.scene.mechanism import Mechanism
 
@@ -52,7 +52,7 @@ class DenseRows:
         self.scales = jax.tree.map(np.asarray, scales)
         self._programs = scene_programs(mechanism)
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(mechanism)]
-        self._constants = self._programs.prologue([*map(float, leaves_as_scalars(leaves)), 0.0, 0.0])
+        self._constants = self._programs.prologue([*map(float, numbers_as_scalars(leaves)), 0.0, 0.0])
         self.count, self.size = self._programs.pattern.shape
         self.names = self._programs.equations.row_names
         self.root = self._run(self._programs.closure_terms, 0.0, np.zeros(self.size), np.zeros(self.size))[-self.size :]

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, is_large, leaves_as_scalars, leaves_as_vector
+from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, is_large, numbers_as_scalars, numbers_as_vector
 from udkjax.expressions import ScalarProgram
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -87,11 +87,11 @@ def _small_scene_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, x
     """Return the terms of a small scene at the initial guess, by its programs."""
     programs = scene_programs(mechanism)
     rows, columns = programs.pattern.shape
-    given = [*leaves_as_scalars(jax.tree.leaves(mechanism)), 0.0, 0.0]
+    given = [*numbers_as_scalars(jax.tree.leaves(mechanism)), 0.0, 0.0]
     constants = programs.prologue([*map(float, given)] if xp is np else given)
 
     def run(program: ScalarProgram, v: NumericArray) -> NumericArray:
-        state = [0.0, *leaves_as_scalars([q]), *leaves_as_scalars([v])] if xp is jnp else [0.0, *q.tolist(), *v.tolist()]
+        state = [0.0, *numbers_as_scalars([q]), *numbers_as_scalars([v])] if xp is jnp else [0.0, *q.tolist(), *v.tolist()]
         return xp.stack([xp.asarray(x, float) for x in program([*constants, *state])])
 
     if not rows:
@@ -111,7 +111,7 @@ def _large_scene_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, x
     """Return the terms of a large scene at the initial guess, by its loops."""
     programs = loop_programs(mechanism)
     row, column, *_ = programs.d_entries
-    numbers = xp.asarray(leaves_as_vector(jax.tree.leaves(mechanism)))
+    numbers = xp.asarray(numbers_as_vector(jax.tree.leaves(mechanism)))
     _, rate, values = programs.geometry(numbers, xp)(0.0, q, 0 * v)
     psi_q = values * xp.sqrt(mass_of(mechanism, xp))[column]
     free, b = programs.loads(numbers, xp)(0.0, q, v)
@@ -126,14 +126,14 @@ def _large_scene_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, x
 def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
     """The diagonal of the mass matrix, by NumPy or JAX."""
     bodies = mechanism.bodies.values()
-    mass, inertia = (xp.stack([xp.asarray(getattr(body, name), float) for body in bodies]) for name in ("mass", "inertia"))
+    mass, inertia = (numbers_as_vector([getattr(body, name) for body in bodies]) for name in ("mass", "inertia"))
     return xp.ravel(xp.stack([mass, mass, inertia], 1))
 
 
 def _scales(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> Scales:
     rows, columns, psi_q, free, psi_t, gamma = guess
     bodies = mechanism.bodies.values()
-    inertia, mass = (xp.stack([xp.asarray(getattr(body, name)) for body in bodies]) for name in ("inertia", "mass"))
+    inertia, mass = (xp.asarray(numbers_as_vector([getattr(body, name) for body in bodies])) for name in ("inertia", "mass"))
     length = arm = xp.max(xp.sqrt(inertia / mass))
     pair, of_entry = np.unique(rows * len(mass) + columns // 3, return_inverse=True)  # of a row and a body
     turns = columns % 3 == 2
@@ -177,9 +177,7 @@ def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:
     Where a light body carries a heavy one the singular values of D = Psi_q M^(-1/2) are as far apart as the roots of the masses,
     in any position: a ratio of 1e8 brings a constraint between them down to 1e-4 of the largest.
     """
-    masses = [body.mass for body in mechanism.bodies.values()]
-    known = not any(isinstance(mass, Tracer) for mass in masses)
-    xp: ArrayLibrary = np if known else jnp  # while something else is traced, jnp would trace what is known, too
-    masses = [xp.asarray(mass) for mass in masses]
-    ratio = reduce(xp.minimum, masses) / reduce(xp.maximum, masses)
+    masses = numbers_as_vector([body.mass for body in mechanism.bodies.values()])
+    xp: ArrayLibrary = jnp if isinstance(masses, Tracer) else np  # while something is traced, jnp would trace what is known, too
+    ratio = xp.min(masses) / xp.max(masses)
     return jax.lax.stop_gradient(number(RANK_TOL * xp.minimum(1.0, xp.sqrt(ORDINARY_MASS_RATIO * ratio))))

@@ -22,7 +22,7 @@ from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
-from udkjax.equations.structure import leaves_as_vector
+from udkjax.equations.structure import numbers_as_vector
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
 from udkjax.scene.mechanism import Mechanism
@@ -115,7 +115,7 @@ class SparseRows:
         self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
         self._stretch = self.metric / root
         self.driver_time_step = driver_time_step(self.scales)
-        self._evaluate = programs.geometry(np.asarray(leaves_as_vector(jax.tree.leaves(mechanism))), np)
+        self._evaluate = programs.geometry(np.asarray(numbers_as_vector(jax.tree.leaves(mechanism))), np)
 
     @cached_property
     def _order(self) -> list[int]:

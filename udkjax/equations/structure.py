@@ -5,6 +5,7 @@ Elements of the same structure, such as all revolute joints, are traced once and
 
 import dataclasses
 from collections.abc import Callable, Hashable, Sequence
+from itertools import groupby
 from types import ModuleType
 from typing import NamedTuple, TypeAlias, TypeVar
 
@@ -46,14 +47,20 @@ def structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
     return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
 
 
-def leaves_as_vector(leaves: Sequence[NumericArray]) -> NumericArray:
-    """All numbers of some arrays as one vector, in order; by NumPy where they are known."""
-    known = not any(isinstance(x, Tracer) for x in leaves)
-    parts = [np.ravel(np.asarray(x, float)) if known else jnp.ravel(jnp.asarray(x, float)) for x in leaves]
-    return np.concatenate(parts) if known else jnp.concatenate(parts)
+def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
+    """All of some numbers and arrays as one vector, in order: NumPy's where they are known, and what is known in a row is one."""
+    parts = []
+    for traced, group in groupby(numbers, lambda x: isinstance(x, Tracer)):
+        if traced:
+            parts += [jnp.ravel(jnp.asarray(x, float)) for x in group]
+        else:
+            parts.append(np.concatenate([np.ravel(np.asarray(x, float)) for x in group]))
+    if len(parts) < 2:
+        return parts[0] if parts else np.zeros(0)
+    return jnp.concatenate(parts)
 
 
-def leaves_as_scalars(leaves: Sequence[NumericArray]) -> list[NumericArray]:
+def numbers_as_scalars(leaves: Sequence[NumericArray]) -> list[NumericArray]:
     """All numbers of some arrays one by one, in the order in which the graph of a scene counts them."""
     return [x for leaf in leaves for x in _scalars(leaf)]
 
@@ -147,6 +154,6 @@ def evaluate_by_kind(
             return function(element, *(ground if fixed else Frame(*next(rest)) for fixed in kind.ground))
 
         columns = zip(*(jax.tree.leaves(elements[i]) for i in kind.members), strict=True)
-        leaves = [jnp.stack([jnp.asarray(x) for x in column]) for column in columns]
+        leaves = [jnp.asarray(numbers_as_vector(column)).reshape(-1, *np.shape(column[0])) for column in columns]
         found.append((kind, jax.vmap(evaluate)(leaves, frames[kind.bodies.T])))
     return found

@@ -112,7 +112,8 @@ def close(
     """
     if not _is_known((mechanism, t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
-        return _close(mechanism.without_origin, analysis, t, state)
+        within_jit = isinstance(jax.device_put(0.0), Tracer)  # where a program of its own would trace the known numbers, too
+        return (_close if within_jit else _close_compiled)(mechanism.without_origin, analysis, t, state)
     key, time = id(mechanism), np.asarray(t).item()
     cached = _cache.get(key)
     if state is None and cached is not None and cached.mechanism() is mechanism and cached.time == time:
@@ -141,13 +142,15 @@ def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, 
     return SparseRows(mechanism).assemble(t, q, v)
 
 
-@eqx.filter_jit
 def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State | None) -> Closure:
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
     close = close_by_machine_code if native_closing.can_close(mechanism) else close_by_jax
     q, v, psi, psi_dot, rank = close(mechanism, analysis, number(t), q, v)
     return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales)
+
+
+_close_compiled = eqx.filter_jit(_close)
 
 
 def _is_known(tree: PyTree) -> bool:

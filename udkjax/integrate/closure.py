@@ -12,13 +12,11 @@ from udkjax.equations.position_closure import CLOSURE_ITERATIONS, Assembly, Trac
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.textbook import prepare
 from udkjax.integrate import native_closing
-from udkjax.integrate.derivatives import Function, Linear, Mask, select
-from udkjax.integrate.gradients import TreeDef
+from udkjax.integrate.derivatives import Function, Linear, Mask, TreeOfNumbers, select, split_numbers
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
 
 Closed = Assembly[Array]
-Guess = tuple[Mechanism, Analysis, Array, Array, Array]  # and t, q, v
 NativeGuess = tuple[Mechanism, Scales, Float[Array, ""], Array, Array, Array]  # mechanism, scales, rank tolerance, t, q, v
 
 
@@ -31,25 +29,19 @@ def close_by_machine_code(
     mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array
 ) -> Closed:
     """Return the same as `close_by_jax`, by machine code."""
-    arrays, rest = eqx.partition((mechanism, analysis, t, q, v), eqx.is_inexact_array)
-    xs, tree = jax.tree.flatten(arrays)
-    return _close_by_code(AssemblyFunction(rest, tree), xs)
+    guess, xs = split_numbers((mechanism, analysis, t, q, v))
+    return _close_by_code(AssemblyFunction(guess), xs)
 
 
 class AssemblyFunction(Function):
-    """q and v of a closed state as a function of the numbers of a mechanism and a guess; `rest` has all that is no number."""
+    """q and v of a closed state as a function of the numbers of a guess: a mechanism, its analysis, and t, q and v."""
 
-    rest: PyTree
-    tree: TreeDef = eqx.field(static=True)
+    guess: TreeOfNumbers
     is_plain: bool = eqx.field(static=True, default=False)
 
     @property
     def plain(self) -> "AssemblyFunction":
         return replace(self, is_plain=True)
-
-    def guess(self, xs: list[Array]) -> Guess:
-        """Return the mechanism, its analysis, and t, q and v."""
-        return eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
 
     def __call__(self, xs: list[Array]) -> list[Array]:
         return list(close_by_jax(*self.guess(xs))[:2])
@@ -62,8 +54,7 @@ class AssemblyFunction(Function):
         guess, which = self._native(xs, has_tangent)
         if guess is None:
             return super().forward(xs, has_tangent, vs, run)
-        rest = iter(vs)
-        change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in has_tangent])
+        change = self.guess.changes(has_tangent, vs)
         return list(native_closing.close_jvp(guess, _native_inputs(which), _native_inputs(change)))
 
     def backward(self, xs: list[Array], has_tangent: Mask, ws: list[Array], run: PyTree) -> list[Array]:
@@ -76,7 +67,7 @@ class AssemblyFunction(Function):
 
     def _native(self, xs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
         """Return the arguments of machine code and the inputs with tangents; None where it has no such derivatives."""
-        which = jax.tree.unflatten(self.tree, has_tangent)
+        which = self.guess.marks(has_tangent)
         mechanism, analysis, t, q, v = self.guess(xs)
         others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
         if self.is_plain or others or not native_closing.can_close(mechanism):

@@ -25,12 +25,13 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from udkjax.integrate import native_engine
-from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.gradients import TreeDef, stop_gradients
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.split_jvp import split_jvp
+from udkjax.scene.fields import number
 
 Mask = tuple[bool, ...]  # of a list of arrays: those that have tangents
 SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives
@@ -41,9 +42,8 @@ def differentiable(problem: Problem, native: bool) -> IntegratorOutput:
 
     None are taken along numbers that do not depend on what is differentiated.
     """
-    arrays, rest = eqx.partition(problem, eqx.is_inexact_array)
-    xs, tree = jax.tree.flatten(arrays)
-    return _run(Run(rest, tree, native), xs)
+    problem_of, xs = split_numbers(problem)
+    return _run(Run(problem_of, native), xs)
 
 
 @eqx.filter_custom_jvp
@@ -95,6 +95,51 @@ def _(primals, tangents):
 # --- functions, and those that their derivatives are
 
 
+class KnownNumbers:
+    """The known arrays among those of a tree, None in place of the others; compared by value, so that they are static."""
+
+    def __init__(self, arrays: Sequence[np.ndarray | None]):
+        self.arrays = arrays
+        self._key = tuple(None if x is None else (x.shape, x.tobytes()) for x in arrays)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, KnownNumbers) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+class TreeOfNumbers(eqx.Module):
+    """A tree as a function of the arrays of floats in it that are traced. The others stay known: JAX would trace them all."""
+
+    rest: PyTree  # the tree without arrays of floats
+    known: KnownNumbers = eqx.field(static=True)
+    structure: TreeDef = eqx.field(static=True)
+
+    def __call__(self, xs: Sequence[Array]) -> Any:
+        traced = iter(xs)
+        arrays = [next(traced) if x is None else number(x) for x in self.known.arrays]
+        return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
+
+    def marks(self, active: Mask) -> Any:
+        """The tree with True in place of the arrays that are active, and False in place of the others."""
+        traced = iter(active)
+        return jax.tree.unflatten(self.structure, [x is None and next(traced) for x in self.known.arrays])
+
+    def changes(self, active: Mask, some: Sequence[Array]) -> Any:
+        """The tree with some arrays in place of those that are active, and None in place of the others."""
+        marks, rest = jax.tree.leaves(self.marks(active)), iter(some)
+        return jax.tree.unflatten(self.structure, [next(rest) if m else None for m in marks])
+
+
+def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
+    """Return a tree as a function of the arrays of floats in it that are traced, and these arrays."""
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    known = KnownNumbers([None if isinstance(x, jax.core.Tracer) else np.asarray(x) for x in leaves])
+    return TreeOfNumbers(rest, known, structure), [x for x in leaves if isinstance(x, jax.core.Tracer)]
+
+
 class Function(eqx.Module):
     """A function of a list of arrays that returns a list of arrays. Forward mode of it is JAX's."""
 
@@ -131,17 +176,13 @@ class Function(eqx.Module):
 
 
 class Run(Function):
-    """Positions and velocities at the output times, and at the end, of the numbers of a problem. `rest` is what else it has.
+    """Positions and velocities at the output times, and at the end, of the numbers of a problem.
 
     Derivatives beyond the first are those of diffrax alone: `plain`.
     """
 
-    rest: Problem
-    tree: Any = eqx.field(static=True)
+    problem: TreeOfNumbers
     native: bool = eqx.field(static=True)
-
-    def problem(self, xs: list[Array]) -> Problem:
-        return eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
 
     @property
     def plain(self) -> "Run":
@@ -158,7 +199,7 @@ class Run(Function):
     def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
         if run is None:
             return self.pull(xs, active, ws)
-        problem, which = self.problem(xs), jax.tree.unflatten(self.tree, active)
+        problem, which = self.problem(xs), self.problem.marks(active)
         if self._is_native(xs, active):
             q, v, y = ws
             found = native_engine.vjp(problem, which, jnp.concatenate([q, v], axis=1), y)
@@ -174,9 +215,8 @@ class Run(Function):
     def run_and_jvp(self, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
         """The run, and the change of its states along v, of those of x that are active: by machine code, if that serves."""
         if self._is_native(xs, active):
-            rest, which = iter(vs), jax.tree.unflatten(self.tree, active)
-            change = jax.tree.unflatten(self.tree, [next(rest) if m else None for m in active])
-            raw, found = native_engine.jvp(self.problem(xs), which, change)
+            change = self.problem.changes(active, vs)
+            raw, found = native_engine.jvp(self.problem(xs), self.problem.marks(active), change)
             return raw, list(found)
         raw, change = _change(lambda xs: _integrate_by_diffrax(self.problem(xs)), xs, active, vs)
         return raw, [change[k] for k in SMOOTH]
@@ -184,18 +224,18 @@ class Run(Function):
     def recorded(self, xs: list[Array], active: Mask) -> IntegratorOutput:
         """The run, by the machine code of its reverse mode, if that serves: no other is compiled."""
         if self._is_native(xs, active):
-            return native_engine.integrate_for_vjp(self.problem(xs), jax.tree.unflatten(self.tree, active))
+            return native_engine.integrate_for_vjp(self.problem(xs), self.problem.marks(active))
         return _integrate_by_diffrax(self.problem(xs))
 
     def _is_native(self, xs: list[Array], active: Mask) -> bool:
-        return self.native and native_engine.serves_derivatives(jax.tree.unflatten(self.tree, active))
+        return self.native and native_engine.serves_derivatives(self.problem.marks(active))
 
     def __call__(self, xs: list[Array]) -> list[Array]:
         raw = _integrate_by_diffrax(self.problem(xs))
         return [raw[k] for k in SMOOTH]
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        problem = eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
+        problem = self.problem(xs)
         (times,), (n,) = problem.ts.shape, problem.q.shape
         return [(times, n), (times, n), (2 * n,)]
 

@@ -12,9 +12,9 @@ from jaxtyping import Array, ArrayLike, PyTree
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import is_large
+from udkjax.equations.structure import is_large, numbers_as_vector
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.native_numbers import active_numbers, active_tangents, cotangent_tree, vector
+from udkjax.integrate.native_numbers import active_numbers, active_tangents, cotangent_tree
 from udkjax.native.layout import INPUTS, SETTINGS
 from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
 from udkjax.native.tableau import EULER
@@ -52,7 +52,7 @@ def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
     """The changes of q and v along a `change` of what is active of (mechanism, scales, tol, t, q, v)."""
     (mechanism, *_, q, _), (*_, dq, dv) = guess, change
     n, kind = len(q), _closing(mechanism, _active_in_closing(mechanism, active[0]), "closing forward")
-    numbers = vector(active_tangents(mechanism, active[0], change[0], kind.active or ()), jnp)
+    numbers = jnp.asarray(numbers_as_vector(active_tangents(mechanism, active[0], change[0], kind.active or ())))
     along = [numbers, *(jnp.zeros(n) if dx is None else dx for dx in (dq, dv))]
     dstate = native_p.bind(*_inputs(*guess), *(x[None, None] for x in along), kind=kind, times=2)[-1][0, 0]
     return dstate[:n], dstate[n:]
@@ -80,11 +80,11 @@ def _inputs(
     """Those of a run of the closing code, of one member: by JAX without derivatives, by NumPy as they are."""
     settings = {"length": scales.length, "fallback_tol": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
     given = {
-        "numbers": vector([*jax.tree.leaves(mechanism), tol**2 if is_large(mechanism) else 0.0, 0.0], xp),
-        "ts": vector([t, t], xp),
+        "numbers": numbers_as_vector([*jax.tree.leaves(mechanism), tol**2 if is_large(mechanism) else 0.0, 0.0]),
+        "ts": numbers_as_vector([t, t]),
         "q": q,
         "v": v,
-        "settings": vector([settings.get(name, 0.0) for name in SETTINGS], xp),
+        "settings": numbers_as_vector([settings.get(name, 0.0) for name in SETTINGS]),
         "rows": scales.rows,
         "breaks": xp.zeros(0),
     }

@@ -13,10 +13,10 @@ from jaxtyping import Array
 from udkjax.equations.elements import has_pieces
 from udkjax.equations.loop_programs import LoopPrograms, loop_programs
 from udkjax.equations.scene_programs import EliminationPrograms, elimination_programs
-from udkjax.equations.structure import is_large
+from udkjax.equations.structure import is_large, numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.native_numbers import active_numbers, active_tangents, cotangent_tree, vector
+from udkjax.integrate.native_numbers import active_numbers, active_tangents, cotangent_tree
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.solvers import is_explicit, method_of
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS
@@ -87,14 +87,11 @@ def _numbers_of(problem: Any) -> tuple[Any, Any]:
     return problem.equations.mechanism, problem.equations.baumgarte
 
 
-def _gains(baumgarte: Any) -> list[Any]:
-    return [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
-
-
 def jvp(problem: Problem, active: Problem, change: Problem) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is active."""
     kind, n = _kind(problem, _active(problem, active), "forward"), len(problem.q)
-    along = vector(active_tangents(_numbers_of(problem), _numbers_of(active), _numbers_of(change), kind.active or ()), jnp)
+    tangents = active_tangents(_numbers_of(problem), _numbers_of(active), _numbers_of(change), kind.active or ())
+    along = jnp.asarray(numbers_as_vector(tangents))
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     *found, dys, dend = native_p.bind(
         *_inputs(problem, kind.code), *(x[None, None] for x in (along, dq, dv)), kind=kind, times=len(problem.ts)
@@ -149,8 +146,9 @@ def _inputs(problem: Any, code: Any = None, xp: ModuleType = jnp) -> list[Any]:
     programs = _programs(problem) if code is None else code
     drop_tol = (FALLBACK_RANK_SHARE * rank_tol) ** 2 if programs.policy is RankPolicy.FALL_BACK else safe_tol
     first = 0.0 if problem.h is None else problem.h
+    numbers: list[Any] = jax.tree.leaves(_numbers_of(problem))
     fallback_tol = FALLBACK_RANK_SHARE * rank_tol
-    settings = [
+    settings: list[Any] = [
         problem.rtol,
         problem.atol,
         problem.smallest,
@@ -161,11 +159,11 @@ def _inputs(problem: Any, code: Any = None, xp: ModuleType = jnp) -> list[Any]:
         problem.max_steps,
     ]
     given = {
-        "numbers": vector([*jax.tree.leaves(equations.mechanism), *_gains(equations.baumgarte), drop_tol, safe_tol], xp),
+        "numbers": numbers_as_vector([*numbers, drop_tol, safe_tol]),
         "ts": problem.ts,
         "q": problem.q,
         "v": problem.v,
-        "settings": vector(settings, xp),
+        "settings": numbers_as_vector(settings),
         "rows": equations.scales.rows,
         "breaks": xp.zeros(0) if problem.breakpoints is None else problem.breakpoints,
     }

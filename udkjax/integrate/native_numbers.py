@@ -1,18 +1,11 @@
 """Numbers of a scene as machine code takes them: in one vector, and those with derivatives among them."""
 
 from collections.abc import Sequence
-from types import ModuleType
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
-
-
-def vector(parts: Sequence[Any], xp: ModuleType) -> Any:
-    """Numbers and arrays one after the other, by NumPy or JAX."""
-    return xp.concatenate([xp.zeros(0), *(xp.ravel(xp.asarray(x, float)) for x in parts)])
 
 
 def active_numbers(numbers: PyTree[Array], active: PyTree[bool]) -> tuple[bool, ...]:
@@ -29,9 +22,9 @@ def active_tangents(numbers: PyTree[Array], active: PyTree[bool], change: PyTree
             if m is True:
                 found.append(dx)
             elif wanted[place]:
-                found.append(jnp.zeros(np.shape(x)))
+                found.append(np.zeros(np.shape(x)))
             place += np.size(x)
-    return [*found, jnp.zeros(sum(wanted[place:]))]
+    return [*found, np.zeros(sum(wanted[place:]))]
 
 
 def cotangent_tree(bars: Array, numbers: PyTree[Array], active: PyTree[bool], wanted: Sequence[bool]) -> PyTree[Array]:
