@@ -1,23 +1,15 @@
 """Equations of motion: pure functions of a mechanism's numbers, time, coordinates and velocities."""
 
+from udkjax.equations import constraints, determinacy, loads
 from udkjax.equations.analysis import Analysis as Analysis
 from udkjax.equations.analysis import analyse as analyse
-from udkjax.equations.constraints import gamma as gamma
-from udkjax.equations.constraints import psi as psi
-from udkjax.equations.constraints import psi_dot as psi_dot
-from udkjax.equations.constraints import psi_q as psi_q
+from udkjax.equations.compiled import compiled
 from udkjax.equations.determinacy import Uniqueness as Uniqueness
-from udkjax.equations.determinacy import singular_values as singular_values
-from udkjax.equations.determinacy import uniqueness as uniqueness
 from udkjax.equations.formulations import Augmented as Augmented
 from udkjax.equations.formulations import Formulation as Formulation
 from udkjax.equations.formulations import NullSpaceQR as NullSpaceQR
 from udkjax.equations.formulations import NullSpaceSVD as NullSpaceSVD
 from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
-from udkjax.equations.loads import force as force
-from udkjax.equations.loads import kinetic_energy as kinetic_energy
-from udkjax.equations.loads import mass as mass
-from udkjax.equations.loads import potential_energy as potential_energy
 from udkjax.equations.partitioning import CoordinatePartitioning as CoordinatePartitioning
 from udkjax.equations.quantities import Energy as Energy
 from udkjax.equations.quantities import accelerations as accelerations
@@ -29,3 +21,14 @@ from udkjax.equations.reactions import unique_reactions as unique_reactions
 from udkjax.equations.textbook import TextbookEquations as TextbookEquations
 from udkjax.equations.textbook import prepare as prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte as Baumgarte
+
+psi = compiled(constraints.psi)
+psi_q = compiled(constraints.psi_q)
+psi_dot = compiled(constraints.psi_dot)
+gamma = compiled(constraints.gamma)
+force = compiled(loads.force)
+mass = compiled(loads.mass)
+kinetic_energy = compiled(loads.kinetic_energy)
+potential_energy = compiled(loads.potential_energy)
+singular_values = compiled(determinacy.singular_values)
+uniqueness = compiled(determinacy.uniqueness)
