@@ -91,8 +91,7 @@ def sweep(
 
 def _arguments(grid: Path) -> dict[str, Any]:
     """Read a grid, or say everything that is wrong with it and exit."""
-    from udkjax.study.sweep.grid import load_grid
-    from udkjax.study.sweep.reading import GridError
+    from udkjax.study.sweep.grid import GridError, load_grid
 
     try:
         return load_grid(grid)

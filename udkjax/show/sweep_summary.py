@@ -8,8 +8,8 @@ import numpy as np
 from udkjax.integrate import Result
 from udkjax.show.summary import table
 from udkjax.show.sweep_figures import RESULT, scalars
-from udkjax.study.sweep.chunk import bytes_per_member, variables_of
 from udkjax.study.sweep.cost import SweepCost
+from udkjax.study.sweep.dataset import bytes_per_member, variables_of
 from udkjax.study.sweep.plan import Plan
 from udkjax.study.sweep.sweep_progress import duration
 from udkjax.study.wording import plural
@@ -28,7 +28,7 @@ def estimate_summary(plan: Plan, cost: SweepCost) -> str:
         "kept of each": f"{bytes_per_member(plan)} bytes: {', '.join(variables_of(plan))}",
         "programs": plural(cost.groups, "program") + tried,
         "chunks": f"{cost.chunks}",
-        "dataset": size(cost.kept),
+        "dataset": size(cost.stored),
         "memory": f"{size(cost.memory)} at most" if cost.memory else "not known on this system",
         "time": f"about {computing} on the devices of this process, and {compiling} to compile",
     }

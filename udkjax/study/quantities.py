@@ -1,7 +1,8 @@
 """Quantities of a mechanism that are no single number of it: functions of a mechanism and a value, which texts can name."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
@@ -9,6 +10,8 @@ from jaxtyping import Array, ArrayLike
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.scene.reshaping import with_angle, with_length
+
+Setter: TypeAlias = Callable[[Mechanism, ArrayLike], Mechanism]  # (mechanism, value) -> mechanism
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ def client():
 
 
 def compute(monkeypatch, run):
-    monkeypatch.setattr(cluster.computing, "run", run)
+    monkeypatch.setattr(cluster, "run", run)
 
 
 def squares(plan, chunk):

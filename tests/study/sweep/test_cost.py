@@ -36,7 +36,7 @@ def tried(monkeypatch):
 def test_a_sample_of_some_groups_says_how_long_all_take(tried):
     found = estimate_cost(PLAN)
     assert sorted(set(tried)) == [0, 2, 4]
-    assert (found.members, found.groups, found.tried, found.chunks, found.kept) == (5000, 5, 3, 7, 500_000)
+    assert (found.members, found.groups, found.tried, found.chunks, found.stored) == (5000, 5, 3, 7, 500_000)
     assert found.compiling == pytest.approx(15.0)
     assert found.computing == pytest.approx(5000 * 2.0 * 0.75 / 64 / 2)
     assert found.memory > 2 * 500_000

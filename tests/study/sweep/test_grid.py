@@ -10,8 +10,7 @@ from scipy import stats
 import udkjax as udk
 from udkjax.study.quantities import Angle, Length, Scaled
 from udkjax.study.sweep.axes import Axis, LatinHypercube, Sobol, Zipped
-from udkjax.study.sweep.grid import load_grid, loads_grid
-from udkjax.study.sweep.reading import GridError
+from udkjax.study.sweep.grid import GridError, load_grid, loads_grid
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "grids" / "parallelogram.toml"
 

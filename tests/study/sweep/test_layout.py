@@ -65,11 +65,11 @@ def test_a_design_fills_ranges_and_distributions_and_repeats_itself(linkage, des
     axes = {"body.link1.mass": (1.0, 3.0), "rtol": scipy.stats.loguniform(1e-8, 1e-4), "method": [udk.SVD(), udk.Varga()]}
     member, method = lay_out(linkage, axes, design)
     assert (member.name, member.size, method.size) == ("member", 16, 2)
-    mass, rtol = (column.values for column in member.columns)
+    mass, rtol = (column.numbers for column in member.columns)
     assert np.all((mass > 1) & (mass < 3) & (rtol > 1e-8) & (rtol < 1e-4)) and len(set(mass)) == 16
-    again = lay_out(linkage, axes, design)[0].columns[0].values
+    again = lay_out(linkage, axes, design)[0].columns[0].numbers
     assert_allclose(again, mass, rtol=0)
-    assert not np.allclose(lay_out(linkage, axes, type(design)(16, seed=4))[0].columns[0].values, mass)
+    assert not np.allclose(lay_out(linkage, axes, type(design)(16, seed=4))[0].columns[0].numbers, mass)
 
 
 def test_a_latin_hypercube_has_one_member_in_each_part():

@@ -11,10 +11,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.sweep.chunk import program, run
-from udkjax.study.sweep.cost import SECONDS, _cut, cut_chunks, lane_steps
+from udkjax.study.sweep.cost import SECONDS, _cut, cut_chunks
 from udkjax.study.sweep.dataset import NOT_COMPUTED, assemble
+from udkjax.study.sweep.executors import program, run
 from udkjax.study.sweep.plan import make_plan
+from udkjax.study.sweep.program import lane_steps
 
 LINKS = ("link1", "link2", "link3")
 TS = np.linspace(0.0, 1.0, 6)

@@ -14,8 +14,8 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax.integrate.assembly import close
 from udkjax.study.exact import exact_coordinates
-from udkjax.study.sweep.chunk import program, run
 from udkjax.study.sweep.cost import cut_chunks
+from udkjax.study.sweep.executors import program, run
 from udkjax.study.sweep.plan import make_plan
 
 LINKS = ("link1", "link2", "link3")
@@ -24,7 +24,7 @@ SCRIPT = """
 import sys
 import jax, numpy as np, udkjax as udk
 from udkjax.study.sweep.cost import cut_chunks
-from udkjax.study.sweep.chunk import program, run
+from udkjax.study.sweep.executors import program, run
 from udkjax.study.sweep.plan import make_plan
 
 axes = {"mass": udk.Axis(np.linspace(1.0, 3.0, 20), of="body.rod.mass"), "rtol": np.geomspace(1e-10, 1e-4, 30)}

@@ -15,8 +15,8 @@ from udkjax.scene.number_fields import owner_of, parameters_of, split_index
 from udkjax.scene.reshaping import length_of
 from udkjax.scene.schema import keys
 from udkjax.study.identify.records import IdentificationError
-from udkjax.study.identify.unknowns import Setter, Target, Transform, Unknown, Unknowns
-from udkjax.study.quantities import Length, parameter_value
+from udkjax.study.identify.unknowns import Target, Transform, Unknown, Unknowns
+from udkjax.study.quantities import Length, Setter, parameter_value
 from udkjax.study.units import units_of
 
 

@@ -5,12 +5,12 @@ bounds, with u0 the place of x0 between them; and any other one x0 + scale z. An
 coordinates and rates of some bodies are added to, as many as the mechanism has degrees of freedom.
 """
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.scales import known_scales
@@ -20,10 +20,9 @@ from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import RATES, UNITS
 from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
-from udkjax.study.quantities import parameter_value
+from udkjax.study.quantities import Setter, parameter_value
 
 Transform = Literal["positive", "bounded", "free"]
-Setter: TypeAlias = Callable[[Mechanism, ArrayLike], Mechanism]  # (mechanism, value) -> mechanism
 AT_BOUND = 1e-3  # of the distance between the bounds: a value as near to one of them is said to be at it
 FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
 GUESS_RADIUS = 0.5  # of a value: how far other guesses are from the first

@@ -6,18 +6,21 @@ executes a branch that it did not choose, and choices that differ by numbers alo
 """
 
 import abc
-import inspect
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias, cast
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
 
 from udkjax.integrate.assembly import State
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.choices import Choice
+from udkjax.study.quantities import Setter
 
 # The settings of a run that are choices; what each is where none is given, or given as None.
 CHOICES = {
@@ -31,6 +34,17 @@ CHOICES = {
 }
 
 
+class Distribution(Protocol):
+    """A frozen distribution of scipy.stats."""
+
+    def ppf(self, q: np.ndarray) -> np.ndarray: ...
+
+
+AxisChoice: TypeAlias = "Mechanism | State | int | Choice"
+# Numbers (n, ...) or choices; for a design a range or a distribution.
+Values: TypeAlias = "Distribution | State | ArrayLike | Sequence[AxisChoice]"
+
+
 class Axis:
     """The values of one quantity, and what it is the quantity of.
 
@@ -40,7 +54,7 @@ class Axis:
     are applied in the order of the axes. `units` are those of the value, where its name does not tell.
     """
 
-    def __init__(self, values: Any, of: str | Sequence[str] | Callable[[Any, Any], Any] | None = None, units: str | None = None):
+    def __init__(self, values: Values, of: str | Sequence[str] | Setter | None = None, units: str | None = None):
         self.values, self.units = values, units
         self.of = (of,) if isinstance(of, str) else of if of is None or callable(of) else tuple(of)
 
@@ -54,14 +68,7 @@ class Zipped(NamedTuple):
     axes: Mapping[str, "AxisValues"]
 
 
-class Distribution(Protocol):
-    """A frozen distribution of scipy.stats."""
-
-    def ppf(self, q: Any) -> Any: ...
-
-
-# Numbers (n, ...) or choices, or for a design a range or a distribution; with or without an `Axis` around them.
-AxisValues: TypeAlias = Axis | Zipped | Distribution | State | ArrayLike | Sequence[object]
+AxisValues: TypeAlias = "Axis | Zipped | Values"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +76,8 @@ class Column:
     """An axis with its values laid out along a dimension."""
 
     name: str
-    values: Any  # numbers (n, ...), or a tuple of choices
-    of: tuple[str, ...] | Callable[[Any, Any], Any]
+    values: np.ndarray | tuple[AxisChoice, ...]  # numbers (n, ...), or choices
+    of: tuple[str, ...] | Setter
     units: str = ""
     labels: tuple[str, ...] = ()  # of choices, unique
 
@@ -78,6 +85,18 @@ class Column:
     def chosen(self) -> bool:
         """Whether its values are choices, not numbers."""
         return bool(self.labels)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The values of an axis of numbers."""
+        assert isinstance(self.values, np.ndarray)
+        return self.values
+
+    @property
+    def choices(self) -> tuple[AxisChoice, ...]:
+        """The values of an axis of choices."""
+        assert isinstance(self.values, tuple)
+        return self.values
 
     @property
     def setting(self) -> str:
@@ -89,9 +108,9 @@ class Column:
     def coordinate(self) -> np.ndarray:
         """The values as a dataset shows them: numbers, or labels."""
         if not self.chosen:
-            return self.values
+            return self.numbers
         if self.of == ("max_steps",):
-            return np.array(self.values)
+            return np.array(self.choices)
         return np.array(self.labels, dtype=object)
 
 
@@ -104,26 +123,26 @@ class Dimension:
     columns: tuple[Column, ...]
 
 
-def labels_of(setting: str, choices: Sequence[Any]) -> tuple[str, ...]:
+def labels_of(setting: str, choices: Sequence[AxisChoice]) -> tuple[str, ...]:
     """Readable, unique names of choices: their types, where these are the same with their numbers."""
     plain = [_plain(setting, choice) for choice in choices]
     names = [name if plain.count(name) == 1 else _full(name, choice) for name, choice in zip(plain, choices, strict=True)]
     return tuple(name if name not in names[:k] else f"{name} #{names[:k].count(name) + 1}" for k, name in enumerate(names))
 
 
-def _plain(setting: str, choice: Any) -> str:
+def _plain(setting: str, choice: AxisChoice) -> str:
     if choice is None:
         return CHOICES[setting]
-    return choice.name if setting == "mechanism" else str(choice) if isinstance(choice, int) else type(choice).__name__
+    return choice.name if isinstance(choice, Mechanism) else str(choice) if isinstance(choice, int) else type(choice).__name__
 
 
-def _full(name: str, choice: Any) -> str:
+def _full(name: str, choice: AxisChoice) -> str:
     """The type with its numbers, where they are few."""
     numbers = {key: value for key, value in getattr(choice, "__dict__", {}).items() if eqx.is_array(value) and value.ndim == 0}
     return f"{name}({', '.join(f'{key}={float(value):g}' for key, value in numbers.items())})" if numbers else name
 
 
-def structure_of(choice: Any) -> Any:
+def structure_of(choice: PyTree) -> Hashable:
     """Everything of a choice but the values of its numbers: choices of one structure share a program."""
     arrays, rest = eqx.partition(choice, eqx.is_array)
     leaves, tree = jax.tree.flatten(rest)
@@ -157,7 +176,7 @@ class Sobol(Design):
 
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="The balance properties", category=UserWarning)
-            return qmc.Sobol(dimensions, **_generator(qmc.Sobol, self.seed)).random(self.n)
+            return qmc.Sobol(dimensions, rng=np.random.default_rng(self.seed)).random(self.n)
 
 
 class LatinHypercube(Design):
@@ -166,7 +185,7 @@ class LatinHypercube(Design):
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
         from scipy.stats import qmc
 
-        return qmc.LatinHypercube(dimensions, **_generator(qmc.LatinHypercube, self.seed)).random(self.n)
+        return qmc.LatinHypercube(dimensions, rng=np.random.default_rng(self.seed)).random(self.n)
 
 
 class Random(Design):
@@ -176,17 +195,11 @@ class Random(Design):
         return np.random.default_rng(self.seed).random((self.n, dimensions))
 
 
-def _generator(engine: Any, seed: int) -> dict[str, Any]:
-    """SciPy calls it `rng` since 1.15."""
-    name = "rng" if "rng" in inspect.signature(engine).parameters else "seed"
-    return {name: np.random.default_rng(seed)}
-
-
-def scale_to_range(values: Any, unit: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:
+def scale_to_range(values: Values, unit: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:
     """Points of the unit interval in a range (low, high) or a frozen distribution of scipy.stats; None: it is neither."""
     if hasattr(values, "ppf"):
-        return np.asarray(values.ppf(unit), float)
-    ends = np.asarray(values, float)
+        return np.asarray(cast(Distribution, values).ppf(unit), float)
+    ends = np.asarray(cast(ArrayLike, values), float)
     if ends.shape != (2,) or not ends[0] < ends[1]:
         return None
     return ends[0] + (ends[1] - ends[0]) * unit

@@ -11,20 +11,22 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from udkjax.deprecation import renamed_attributes
 from udkjax.pinv import Auto, Elimination
 from udkjax.study.machine import concurrent_chunks
-from udkjax.study.sweep.chunk import bytes_per_member, program, run
-from udkjax.study.sweep.member import STEPS
+from udkjax.study.sweep.dataset import bytes_per_member
+from udkjax.study.sweep.executors import program, run
 from udkjax.study.sweep.plan import Chunk, Group, Plan
+from udkjax.study.sweep.program import STEPS, lane_steps
 
 MEMORY = 2**30  # bytes that members in computation take at most, by default
 PILOT = 256  # members of a sample: 4 for each coefficient of a polynomial of second degree in nine axes
 WORTH = 8  # a sample is run of groups that are so many times as large
 SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
 TURNS, LEAST = 4, 0.05  # chunks for each that computes at a time, so that all have something to do; but none shorter (s)
-SHARE = 4  # chunks in memory at a time, and copies of each: of what is kept, of its parts on the device
+SHARE = 4  # chunks in memory at a time, and copies of each: of what is stored, of its parts on the device
 # Seconds, roughly, of a step of twelve rows: by straight-line code in lanes, and by a dense method.
 QUICK, DENSE = 1e-6, 5e-4
 STEPS_GUESSED = 300.0
@@ -83,7 +85,7 @@ def _by_rule(plan: Plan, group: Group) -> Float[np.ndarray, "n"]:
     places, steps = plan.places(group.members), np.full(len(group.members), STEPS_GUESSED)
     for column in plan.columns:
         if not column.chosen and not callable(column.of):
-            values = column.values[places[column.name]]
+            values = column.numbers[places[column.name]]
             if "t1" in column.of:
                 steps = steps * values / np.max(values)
             tolerances = len({"rtol", "atol"} & set(column.of))
@@ -99,7 +101,7 @@ def _features(plan: Plan, group: Group) -> Float[np.ndarray, "n d"]:
         if column.chosen:
             found += [np.where(at == k, 1.0, -1.0) for k in group.choices[column.name][1:]]
             continue
-        for x in column.values[at].reshape(len(at), -1).T:
+        for x in column.numbers[at].reshape(len(at), -1).T:
             low, high = x.min(), x.max()
             if low < high:
                 x, low, high = (np.log(x), np.log(low), np.log(high)) if low > 0 and high > WIDE * low else (x, low, high)
@@ -118,17 +120,11 @@ def _polynomial(x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n terms"]:
 
 def _seconds_per_step(plan: Plan, group: Group) -> float:
     """Roughly, and the same on every machine, so that chunks are."""
-    mechanism, method = plan.choice(group, "mechanism"), plan.choice(group, "method")
+    mechanism, method = plan.mechanism_of(group), plan.choice(group, "method")
     rows = max(1, 2 * len(mechanism.constraints)) / 12
     if isinstance(method, Auto | Elimination | None):
         return QUICK * rows
     return DENSE * max(rows, rows**3)
-
-
-def lane_steps(steps: Int[np.ndarray, "n"], lanes: int) -> tuple[int, int]:
-    """How many steps a chunk took, and how many it had room for: each lane waits for the slowest beside it."""
-    parts = [steps[k : k + lanes] for k in range(0, len(steps), lanes)]
-    return int(steps.sum()), lanes * sum(int(part.max()) for part in parts)
 
 
 # --- before a sweep is run
@@ -142,10 +138,12 @@ class SweepCost:
     groups: int  # programs, each compiled once
     tried: int  # of these, of which a sample was run
     chunks: int
-    kept: int  # bytes of the dataset, and roughly of the files
+    stored: int  # bytes of the dataset, and roughly of the files
     memory: int  # bytes of this process, at most
     compiling: float  # s; less where programs are in the cache
     computing: float  # s
+
+    __getattr__ = renamed_attributes("SweepCost", kept="stored")
 
 
 def estimate_cost(plan: Plan, memory: int = MEMORY) -> SweepCost:
@@ -159,9 +157,9 @@ def estimate_cost(plan: Plan, memory: int = MEMORY) -> SweepCost:
     tried = [_measure_group(plan, group) for group in chosen]
     compiling = count * float(np.mean([seconds for seconds, _ in tried]))
     computing = plan.size * float(np.mean([seconds for _, seconds in tried])) / concurrent_chunks()
-    kept = plan.size * bytes_per_member(plan)
-    used = _resident() + min(memory, kept) + kept
-    return SweepCost(plan.size, count, len(tried), len(cut_chunks(plan, memory)), kept, used, compiling, computing)
+    stored = plan.size * bytes_per_member(plan)
+    used = _resident() + min(memory, stored) + stored
+    return SweepCost(plan.size, count, len(tried), len(cut_chunks(plan, memory)), stored, used, compiling, computing)
 
 
 def _measure_group(plan: Plan, group: Group) -> tuple[float, float]:

@@ -1,26 +1,85 @@
 """A sweep as one dataset: labelled, with units, and with a result for each member."""
 
 import json
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Int, PyTree
 
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.bodies import COORDINATES
 from udkjax.study.sweep.axes import Column, Dimension
-from udkjax.study.sweep.chunk import program, variables_of
-from udkjax.study.sweep.cost import lane_steps
-from udkjax.study.sweep.member import RESULT, STEPS
-from udkjax.study.sweep.plan import Plan, Variable
+from udkjax.study.sweep.executors import program
+from udkjax.study.sweep.layout import SweepError
+from udkjax.study.sweep.measures import Label, guess_label
+from udkjax.study.sweep.plan import Group, Plan, Variable
+from udkjax.study.sweep.program import END, RESULT, STEPS, lane_steps
+from udkjax.study.units import units_of
 
+if TYPE_CHECKING:
+    import xarray
+
+# Values, or dimensions with the values along them, and attributes: as xarray takes them.
+Labelled: TypeAlias = "np.ndarray | list[str] | tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]"
 FORMAT = "udkjax sweep 1"
+LABELS = {
+    RESULT: Label((), "1", "how the run ended"),
+    END: Label((), "s", "time that was reached"),
+    STEPS: Label((), "1", "steps tried"),
+}
 NOT_COMPUTED = -1  # the result of a member that is not among what is finished
 
 
-def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> Any:
-    """Return the xarray Dataset of a plan, from (members, what was kept of them) in any order.
+def describe_group(plan: Plan, group: Group) -> dict[str, Variable]:
+    """What is stored of each member of a group."""
+    bodies, found = len(plan.mechanism_of(group).body_names), {}
+    known = {name: label for measure in plan.measures for name, label in measure.variables.items()} | LABELS
+    outputs = program(plan, group).outputs
+    slopes = {f"d_{of}_d_{by}": (of, by) for of in outputs for by in plan.derivatives}
+    for name, info in outputs.items():
+        if name in slopes:
+            of, by = slopes[name]
+            label = Label(found[of].dims, _per(found[of].units, by, plan), f"derivative of {of} by {by}")
+        else:
+            label = known.get(name) or guess_label(name, info.shape, len(plan.ts), bodies)
+        found[name] = Variable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
+    return found
+
+
+def _per(units: str, by: str, plan: Plan) -> str:
+    """The unit of a derivative, where it is one."""
+    below = next((column.units for column in plan.columns if column.name == by), None)
+    below = units_of(plan.mechanism, by) if below is None else below
+    return "" if not units or not below or "," in units else f"{units}/({below})"
+
+
+@lru_cache(maxsize=8)
+def variables_of(plan: Plan) -> Mapping[str, Variable]:
+    """What is stored of each member: names, dimensions, units. `result`, `end_time` and `steps` are always among them.
+
+    Where mechanisms have other bodies, the dimension "body" has all of them, and any other is as long as the longest.
+    """
+    found: dict[str, Variable] = {}
+    for group in plan.groups:
+        for name, variable in describe_group(plan, group).items():
+            other = found.setdefault(name, variable)
+            if len(other.shape) != len(variable.shape):
+                raise SweepError([f"measure {name!r} has {other.shape} entries for some members and {variable.shape} for others"])
+            longest = map(max, other.shape, variable.shape)
+            shape = tuple(len(plan.bodies) if d == "body" else size for d, size in zip(variable.dims, longest, strict=True))
+            found[name] = Variable(other.dims, shape, other.dtype, other.units, other.long_name)
+    return found
+
+
+def bytes_per_member(plan: Plan) -> int:
+    """What the stored variables of one member take."""
+    return sum(int(np.prod(v.shape)) * v.dtype.itemsize for v in variables_of(plan).values())
+
+
+def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> "xarray.Dataset":
+    """Return the xarray Dataset of a plan, from (members, what was stored of them) in any order.
 
     What is not among them is not a number, and has the result -1. `lane_efficiency`, where members are
     computed side by side, is the part of the steps that there was room for which they took: who is done waits for the slowest.
@@ -53,13 +112,13 @@ def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[
     return data
 
 
-def _nothing(name: str, variable: Variable) -> Any:
+def _nothing(name: str, variable: Variable) -> float | int | bool:
     if name == RESULT:
         return NOT_COMPUTED
     return np.nan if variable.dtype.kind in "fc" else False if variable.dtype.kind == "b" else -1
 
 
-def _put(into: np.ndarray, variable: Variable, members: np.ndarray, values: np.ndarray, places: Any) -> None:
+def _put(into: np.ndarray, variable: Variable, members: np.ndarray, values: np.ndarray, places: Sequence[int] | None) -> None:
     """Write the values of members; those of bodies in their places among all bodies."""
     if "body" in variable.dims and places is not None:
         axis = variable.dims.index("body")
@@ -72,13 +131,13 @@ def _put(into: np.ndarray, variable: Variable, members: np.ndarray, values: np.n
 def _places(plan: Plan) -> dict[int, list[int]]:
     """For each group, the places of its bodies among all bodies, where it has not all of them."""
     everyone = list(plan.bodies)
-    own = {group.index: list(plan.choice(group, "mechanism").body_names) for group in plan.groups}
+    own = {group.index: list(plan.mechanism_of(group).body_names) for group in plan.groups}
     return {index: [everyone.index(name) for name in names] for index, names in own.items() if names != everyone}
 
 
-def _coordinates(plan: Plan) -> dict[str, Any]:
+def _coordinates(plan: Plan) -> dict[str, Labelled]:
     """Values of the axes, each along its dimension; times, bodies and coordinates where something lies along them."""
-    found: dict[str, Any] = {}
+    found: dict[str, Labelled] = {}
     for dimension in plan.dimensions:
         for column in dimension.columns:
             found |= _coordinate(dimension, column)
@@ -95,7 +154,7 @@ def _coordinates(plan: Plan) -> dict[str, Any]:
     return found
 
 
-def _coordinate(dimension: Dimension, column: Column) -> dict[str, Any]:
+def _coordinate(dimension: Dimension, column: Column) -> dict[str, Labelled]:
     attributes = {"units": column.units} if column.units else {}
     if not callable(column.of) and column.of != (column.name,):
         attributes["of"] = ", ".join(column.of)
@@ -106,7 +165,7 @@ def _coordinate(dimension: Dimension, column: Column) -> dict[str, Any]:
     return {dimension.name: np.arange(dimension.size), f"{column.name}_value": (dims, values, attributes)}
 
 
-def _attributes(plan: Plan) -> dict[str, Any]:
+def _attributes(plan: Plan) -> dict[str, str | int | float]:
     settings = {name: value if isinstance(value, str | int | float) else _shown(value) for name, value in plan.settings.items()}
     return {
         "title": plan.mechanism.name,
@@ -120,5 +179,5 @@ def _attributes(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _shown(value: Any) -> str:
+def _shown(value: PyTree) -> str:
     return "none" if value is None else " ".join(str(value).split())

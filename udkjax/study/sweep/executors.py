@@ -1,25 +1,85 @@
-"""What computes the chunks of a sweep: this machine's devices or cores, or the workers of dask.distributed."""
+"""Compute the chunks of a sweep: on this machine's devices or cores, or by the workers of dask.distributed."""
 
+import threading
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
+import jax
 import numpy as np
 
+from udkjax.equations.analysis import analyse
 from udkjax.extras import OptionalImport
-from udkjax.integrate.solution import versions
+from udkjax.integrate.solution import Result, versions
+from udkjax.scene.mechanism import Mechanism
 from udkjax.study.machine import concurrent_chunks, cores
-from udkjax.study.sweep import chunk as computing
-from udkjax.study.sweep.plan import Chunk, Plan
+from udkjax.study.sweep.plan import Chunk, Group, Plan
+from udkjax.study.sweep.program import RESULT, Program, Recipe
+
+if TYPE_CHECKING:
+    import distributed
 
 Done = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, what it gave, and how long it took (s)
 
 RETRIES = 2  # of a chunk that raised: on another worker there may be memory, or room on the disk
 AHEAD = 2  # tasks for each thread of the cluster, so that none waits for the next; more would only fill the workers' memory
 AT_LEAST = 16  # tasks, so that a cluster that grows by what is asked of it sees that something is
+
+PROGRAMS = 64  # in memory at most: a program holds its plan
+_programs: OrderedDict[tuple[str, int, tuple[int, ...] | None], Program] = OrderedDict()
+_lock = threading.Lock()
+
+
+def program(plan: Plan, group: Group, redundant: tuple[int, ...] | None = None) -> Program:
+    """The program of a group: made once for each process."""
+    key = plan.token, group.index, redundant
+    with _lock:
+        if key not in _programs:
+            _programs[key] = Program(Recipe(plan, group, redundant), jax.local_devices())
+            while len(_programs) > PROGRAMS:
+                _programs.popitem(last=False)
+        _programs.move_to_end(key)
+        return _programs[key]
+
+
+def run(plan: Plan, chunk: Chunk) -> dict[str, np.ndarray]:
+    """Compute the members of a chunk: each stored variable (members, ...), with "result". A failing member has a code, and NaN.
+
+    Where a member's numbers made rows independent that the mechanism leaves out as redundant, it is run again without them.
+    """
+    group = plan.groups[chunk.group]
+    mine = program(plan, group)
+    found = mine(chunk.members)
+    if mine.recipe.redundant and mine.recipe.varied:
+        for rows, which in _other_redundant_rows(mine.recipe, chunk.members, found[RESULT]).items():
+            again = program(plan, group, rows)(chunk.members[which])
+            for name, values in again.items():
+                found[name][which] = values
+    return found
+
+
+def _other_redundant_rows(recipe: Recipe, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
+    """Which of those that drifted, although they were projected, have other redundant rows; by these."""
+    drifted = np.flatnonzero(result == Result.drift)
+    found: dict[tuple[int, ...], list[int]] = {}
+    if len(drifted):
+        mechanisms = _mechanisms(recipe, members[drifted])
+        for k, mechanism in zip(drifted.tolist(), mechanisms, strict=True):
+            rows = analyse(mechanism).redundant_rows
+            if rows is not None and rows != recipe.redundant:
+                found.setdefault(rows, []).append(k)
+    return {rows: np.array(which) for rows, which in found.items()}
+
+
+def _mechanisms(recipe: Recipe, members: np.ndarray) -> list[Mechanism]:
+    own = recipe.own(members)
+    return [recipe.mechanism(recipe.shared, jax.tree.map(lambda x, k=k: x[k], own), {}) for k in range(len(members))]
+
+
+# --- where chunks are computed
 
 
 def compute_on_devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
@@ -41,7 +101,7 @@ def compute_on_devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, N
 
 def _time_run(plan: Plan, chunk: Chunk) -> Done:
     begun = time.perf_counter()
-    data = computing.run(plan, chunk)
+    data = run(plan, chunk)
     return chunk, data, time.perf_counter() - begun
 
 
@@ -49,14 +109,15 @@ class ClusterError(RuntimeError):
     """A cluster cannot do a sweep."""
 
 
-def dask_engine(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]:
+def dask_engine(client: "distributed.Client | None" = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]:
     """Return the engine on the workers of a `distributed.Client`; without one, the client that was made last.
 
     Workers may come and go: what a lost one had not delivered is computed by another. Each result is handed over when it
-    arrives, and kept nowhere else. Raises `ClusterError` where there is no client, where a worker has
+    arrives, and stored nowhere else. Raises `ClusterError` where there is no client, where a worker has
     other versions of the packages that decide the results, and where workers die time and again over one chunk.
     """
-    distributed = _import_distributed()
+    with OptionalImport():
+        import distributed
     if client is None:
         try:
             client = distributed.default_client()
@@ -73,7 +134,7 @@ def dask_engine(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generat
         waiting, running, results = deque(chunks), {}, distributed.as_completed()
 
         def fill() -> None:
-            room = max(AT_LEAST, AHEAD * sum(client.nthreads().values())) - len(running)
+            room = max(AT_LEAST, AHEAD * sum(cast("dict[str, int]", client.nthreads()).values())) - len(running)
             for _ in range(min(room, len(waiting))):
                 chunk = waiting.popleft()
                 future = client.submit(_run, shared, chunk, wanted, pure=False, retries=RETRIES, priority=-chunk.index)
@@ -102,9 +163,10 @@ def dask_engine(client: Any = None) -> Callable[[Plan, Sequence[Chunk]], Generat
 
 
 @contextmanager
-def start_client(scheduler: str | None = None) -> Iterator[Any]:
+def start_client(scheduler: str | None = None) -> Iterator["distributed.Client"]:
     """A client of the scheduler at this address; without one, of a process for each core of this machine, ended afterwards."""
-    distributed = _import_distributed()
+    with OptionalImport():
+        import distributed
     if scheduler is not None:
         try:
             client = distributed.Client(scheduler)
@@ -134,9 +196,3 @@ def _run(plan: Plan, chunk: Chunk, wanted: dict[str, str]) -> Done:
 
 def _deciding_versions() -> dict[str, str]:
     return {name: version for name, version in versions().items() if name != "python"}
-
-
-def _import_distributed() -> Any:
-    with OptionalImport():
-        import distributed
-    return distributed

@@ -3,12 +3,13 @@
 import difflib
 import hashlib
 import re
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from udkjax.integrate.solution import Solution, scene_text, versions
 from udkjax.scene.checks import abbreviate
@@ -17,15 +18,16 @@ from udkjax.study.sweep.axes import Column
 from udkjax.study.sweep.measures import Measure
 from udkjax.study.sweep.plan import Plan
 
+Json: TypeAlias = "str | int | float | bool | Sequence[Json] | Mapping[str, Json] | None"
 MOST_LINES = 12  # lines of a text, and entries of a list, that are spelled out
 SHORT = 64  # numbers that are spelled out; of more, how many, the first, the last, and a digest
 STATS = ("steps", "accepted", "rejected", "right_hand_sides", "projections")
 
 
-def fingerprint(plan: Plan) -> dict[str, Any]:
+def fingerprint(plan: Plan) -> dict[str, Json]:
     """Return everything that two plans of the same results have in common."""
     return {
-        **_value(plan.mechanism),
+        **_mechanism(plan.mechanism),
         "axes": {dimension.name: {c.name: _axis(plan, c) for c in dimension.columns} for dimension in plan.dimensions},
         "design": repr(plan.design) if plan.design else None,
         "ts": _value(plan.ts),
@@ -36,15 +38,15 @@ def fingerprint(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _axis(plan: Plan, column: Column) -> dict[str, Any]:
-    of: Any = column.of
-    if callable(of):
-        of = _function(of, plan.mechanism, np.zeros(column.values.shape[1:]))
+def _axis(plan: Plan, column: Column) -> dict[str, Json]:
+    of: Json = None if callable(column.of) else column.of
+    if callable(column.of):
+        of = _function(column.of, plan.mechanism, np.zeros(column.numbers.shape[1:]))
     return {"of": of, "values": [_value(value) for value in column.values] if column.chosen else _value(column.values)}
 
 
-def _measure(plan: Plan, measure: Measure) -> dict[str, Any]:
-    found: dict[str, Any] = {"under": measure.renamed}
+def _measure(plan: Plan, measure: Measure) -> dict[str, Json]:
+    found: dict[str, Json] = {"under": measure.renamed}
     if measure.function is not None:
         found["function"] = _function(measure.function, plan.mechanism, _solution(plan))
     if callable(measure.reference):
@@ -57,27 +59,31 @@ def _measure(plan: Plan, measure: Measure) -> dict[str, Any]:
 def _solution(plan: Plan) -> Solution:
     """A solution of the right shapes."""
     number, states = np.zeros(()), np.zeros((len(plan.ts), len(plan.mechanism.body_names), 3))
-    count: Any = np.zeros((), int)
+    count = np.zeros((), int)
     stats = dict.fromkeys(STATS, count)
     return Solution(plan.ts, states, states, count, number, stats, number, number, plan.mechanism.body_names, ())  # pyright: ignore[reportArgumentType]
 
 
-def _function(function: Callable, *arguments: Any) -> dict[str, str]:
+def _function(function: Callable, *arguments: PyTree) -> dict[str, Json]:
     """A function by what it computes: its name, and digests of its operations and of the numbers in them."""
-    program: Any = eqx.filter_make_jaxpr(function)(*arguments)[0]
+    program = eqx.filter_make_jaxpr(function)(*arguments)[0]
     text = re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr))
     constants = b"".join(np.ascontiguousarray(x).tobytes() for x in program.consts if eqx.is_array(x))
     name = getattr(function, "__qualname__", None) or repr(function)
     return {"name": name, "operations": _digest(text.encode()), "constants": _digest(constants)}
 
 
-def _value(value: Any) -> Any:
+def _mechanism(mechanism: Mechanism) -> dict[str, Json]:
+    numbers = {name: _value(x) for name, x in mechanism.parameters().items()}
+    return {"scene": scene_text(mechanism), "parameters": numbers}
+
+
+def _value(value: PyTree) -> Json:
     """A number, an array, a choice or a mechanism."""
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, Mechanism):
-        numbers = {name: _value(x) for name, x in value.parameters().items()}
-        return {"scene": scene_text(value), "parameters": numbers}
+        return _mechanism(value)
     if isinstance(value, float | np.ndarray | np.number | jax.Array):
         array = np.asarray(value)
         if array.size <= SHORT:
@@ -105,7 +111,7 @@ def _digest(data: bytes) -> str:
 # --- differences
 
 
-def differences(before: Any, now: Any, path: str = "") -> list[str]:
+def differences(before: Json, now: Json, path: str = "") -> list[str]:
     """Return one line for each difference between two JSON values: its path, what was there, what is there now.
 
     Of texts of several lines, such as scenes, the lines that differ are shown.
@@ -113,7 +119,7 @@ def differences(before: Any, now: Any, path: str = "") -> list[str]:
     return list(_compare(before, now, path))
 
 
-def _compare(before: Any, now: Any, path: str) -> Iterator[str]:
+def _compare(before: Json, now: Json, path: str) -> Iterator[str]:
     if isinstance(before, dict) and isinstance(now, dict):
         for key in {**before, **now}:
             place = f"{path}.{key}" if path else key
@@ -131,7 +137,7 @@ def _compare(before: Any, now: Any, path: str) -> Iterator[str]:
         yield f"{path}: was {abbreviate(before)}, is {abbreviate(now)}"
 
 
-def _lists(before: list, now: list, path: str) -> Iterator[str]:
+def _lists(before: Sequence[Json], now: Sequence[Json], path: str) -> Iterator[str]:
     if len(before) != len(now):
         yield f"{path}: was {abbreviate(before)} ({len(before)} entries), is {abbreviate(now)} ({len(now)} entries)"
         return
@@ -150,6 +156,6 @@ def _texts(before: str, now: str, path: str) -> Iterator[str]:
         yield f"{path}: and {len(lines) - MOST_LINES} more lines"
 
 
-def _same(a: Any, b: Any) -> bool:
+def _same(a: Json, b: Json) -> bool:
     """Equal; not a number is itself, and truth values are no numbers."""
     return isinstance(a, bool) == isinstance(b, bool) and (a == b or (a != a and b != b))

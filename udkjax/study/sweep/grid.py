@@ -1,25 +1,33 @@
-"""Sweeps as TOML files: which values every axis takes, and what is kept. Read into the arguments of `udkjax.sweep`."""
+"""Sweeps as TOML files: which values every axis takes, and what is stored. Read into the arguments of `udkjax.sweep`."""
 
+import math
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from scipy import stats
 
 from udkjax.extras import OptionalImport
-from udkjax.scene.checks import abbreviate, quote, suggestion
-from udkjax.study.choices import CHOICES
-from udkjax.study.quantities import Angle, Length, Scaled
-from udkjax.study.sweep.axes import Axis, LatinHypercube, Random, Sobol, Zipped
-from udkjax.study.sweep.reading import GridError, Reader, key_of
+from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion
+from udkjax.study.choices import CHOICES, Choice, choice
+from udkjax.study.quantities import Angle, Length, Scaled, Setter
+from udkjax.study.sweep.axes import Axis, Design, Distribution, LatinHypercube, Random, Sobol, Values, Zipped
 
+Toml: TypeAlias = "str | int | float | bool | list[Toml] | dict[str, Toml]"
+Table: TypeAlias = Mapping[str, Toml]
 TOP = ("t0", "t1", "dt", "ts", "measures", "derivatives", "reference", "axes", "settings", "design")
 SETTINGS = ("rtol", "atol", *CHOICES, "max_steps", "drift_tol", "dt0")
 DESIGNS = {"sobol": Sobol, "latin-hypercube": LatinHypercube, "random": Random}
 SCALES = {"linear": np.linspace, "log": np.geomspace}
+
+
+class GridError(Mistakes):
+    """A file cannot be the grid of a sweep. `problems` lists every mistake, each with the path of the offending entry."""
+
+    subject = "grid"
 
 
 def load_grid(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -43,17 +51,18 @@ def loads_grid(text: str, source: str = "") -> dict[str, Any]:
     return arguments
 
 
-class _GridReader(Reader):
-    """Reads the file of a sweep; `drawn`: by a design, from ranges and distributions, instead of from lists of values.
+class _GridReader:
+    """Reads the file of a sweep. What is not as it should be becomes one of `problems`, and None or something empty.
 
-    Other files are looked for beside it, in `folder`.
+    `drawn`: members are drawn by a design, from ranges and distributions, instead of from lists of values. Other files are looked
+    for beside it, in `folder`.
     """
 
     def __init__(self, drawn: bool, folder: Path):
-        super().__init__()
         self.drawn, self.folder = drawn, folder
+        self.problems: list[str] = []
 
-    def sweep(self, given: Mapping[str, Any]) -> dict[str, Any]:
+    def sweep(self, given: Table) -> dict[str, Any]:
         self.known("", given, TOP)
         axes = self.table("axes", given.get("axes", {}))
         if given.get("axes", {}) == {}:
@@ -73,7 +82,7 @@ class _GridReader(Reader):
             arguments["reference"] = self.reference(given["reference"])
         return arguments
 
-    def reference(self, given: Any) -> np.ndarray | None:
+    def reference(self, given: Toml) -> np.ndarray | None:
         """Coordinates (T, bodies, 3) from the file of a simulation, such as `udkjax simulate` writes."""
         with OptionalImport():
             import xarray
@@ -85,7 +94,7 @@ class _GridReader(Reader):
         except (OSError, KeyError, ValueError) as error:
             return self.wrong("reference", f"{self.folder / given} has no coordinates q of a simulation ({error})")
 
-    def times(self, given: Mapping[str, Any]) -> np.ndarray | None:
+    def times(self, given: Table) -> np.ndarray | None:
         """Output times: `ts`, or from `t0` (0) to `t1` in steps of `dt`, or the start and the end alone."""
         if "ts" in given:
             for key in ("t0", "t1", "dt"):
@@ -111,7 +120,7 @@ class _GridReader(Reader):
             return self.wrong("dt", f"must be positive and at most t1 - t0 = {t1 - t0:g}, is {dt:g}")
         return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # t1 itself too, where it is a multiple of dt up to rounding
 
-    def axis(self, place: str, name: str, given: Any) -> Any:
+    def axis(self, place: str, name: str, given: Toml) -> Axis | Zipped:
         """One axis: a list of values, or a table that says more."""
         if not isinstance(given, dict):
             return Axis(self.values(place, name, given))
@@ -120,6 +129,8 @@ class _GridReader(Reader):
             axes = self.table(f"{place}.zipped", given["zipped"])
             return Zipped({k: self.axis(f"{place}.zipped.{key_of(k)}", k, v) for k, v in axes.items()})
         of, units = self.of(f"{place}.of", given.get("of")), given.get("units")
+        if units is not None and not isinstance(units, str):
+            units = self.wrong(f"{place}.units", f"must be a text, is {abbreviate(units)}")
         rest = {key: value for key, value in given.items() if key not in ("of", "units")}
         if "distribution" in rest:
             return Axis(self.distribution(place, rest), of, units)
@@ -128,14 +139,16 @@ class _GridReader(Reader):
             return Axis(self.values(f"{place}.values", name, rest["values"]), of, units)
         return Axis(self.range(place, rest), of, units)
 
-    def values(self, place: str, name: str, given: Any) -> Any:
+    def values(self, place: str, name: str, given: Toml) -> np.ndarray | list[Choice]:
         if not isinstance(given, list) or not given:
-            return self.wrong(place, f"must be a list of values, or a table of from, to and num, is {abbreviate(given)}")
+            self.wrong(place, f"must be a list of values, or a table of from, to and num, is {abbreviate(given)}")
+            return []
         if name not in CHOICES:
-            return self.numbers(place, given)
+            numbers = self.numbers(place, given)
+            return [] if numbers is None else numbers
         return [self.choice(f"{place}[{k}]", name, value) for k, value in enumerate(given)]
 
-    def range(self, place: str, given: Mapping[str, Any]) -> Any:
+    def range(self, place: str, given: Table) -> Values:
         """From one number to another: with a design all that is between them, else so many numbers."""
         needed = ("from", "to") if self.drawn else ("from", "to", "num")
         self.known(place, given, (*needed, "scale"))
@@ -146,29 +159,31 @@ class _GridReader(Reader):
         num = self.whole(f"{place}.num", given.get("num", 2), 1)
         scale = given.get("scale", "linear")
         if scale not in SCALES:
-            return self.wrong(f"{place}.scale", f"must be one of {', '.join(map(quote, SCALES))}, is {abbreviate(scale)}")
-        if low is None or high is None or num is None:
-            return None
-        if scale == "log" and min(low, high) <= 0:
-            return self.wrong(place, "from and to must be positive where scale is log")
-        if not self.drawn:
-            return SCALES[scale](low, high, num)
-        return (low, high) if scale == "linear" else stats.loguniform(low, high)
+            self.wrong(f"{place}.scale", f"must be one of {', '.join(map(quote, SCALES))}, is {abbreviate(scale)}")
+        elif scale == "log" and low is not None and high is not None and min(low, high) <= 0:
+            self.wrong(place, "from and to must be positive where scale is log")
+        elif low is not None and high is not None and num is not None:
+            if not self.drawn:
+                return SCALES[scale](low, high, num)
+            return (low, high) if scale == "linear" else cast(Distribution, stats.loguniform(low, high))
+        return ()
 
-    def distribution(self, place: str, given: Mapping[str, Any]) -> Any:
+    def distribution(self, place: str, given: Table) -> Values:
         """A distribution of scipy.stats by its name and its numbers."""
         name, numbers = given["distribution"], {key: value for key, value in given.items() if key != "distribution"}
         known = [key for key, value in vars(stats).items() if isinstance(value, stats.rv_continuous)]
         if not self.drawn:
-            return self.wrong(f"{place}.distribution", "needs a [design] that draws from it")
-        if name not in known:
-            return self.wrong(f"{place}.distribution", f"scipy.stats has no {abbreviate(name)}{suggestion(name, known)}")
-        try:
-            return getattr(stats, name)(**numbers)
-        except TypeError as error:
-            return self.wrong(place, str(error).replace("_parse_args()", name))
+            self.wrong(f"{place}.distribution", "needs a [design] that draws from it")
+        elif not isinstance(name, str) or name not in known:
+            self.wrong(f"{place}.distribution", f"scipy.stats has no {abbreviate(name)}{suggestion(name, known)}")
+        else:
+            try:
+                return getattr(stats, name)(**numbers)
+            except TypeError as error:
+                self.wrong(place, str(error).replace("_parse_args()", name))
+        return ()
 
-    def of(self, place: str, given: Any) -> Any:
+    def of(self, place: str, given: "Toml | None") -> str | tuple[str, ...] | Setter | None:
         """What an axis is the quantity of: names, the length or the initial angle of bodies, or names with factors."""
         if given is None or isinstance(given, str):
             return given
@@ -184,7 +199,7 @@ class _GridReader(Reader):
             return Angle(self.names(f"{place}.angle", given["angle"]))
         return Scaled({name: self.number(f"{place}.{key_of(name)}", factor) or 0.0 for name, factor in given.items()})
 
-    def settings(self, given: Mapping[str, Any]) -> dict[str, Any]:
+    def settings(self, given: Table) -> dict[str, Any]:
         self.known("settings", given, SETTINGS)
         found: dict[str, Any] = {}
         for name, value in given.items():
@@ -197,7 +212,7 @@ class _GridReader(Reader):
                 found[name] = self.number(place, value)
         return found
 
-    def design(self, given: Mapping[str, Any]) -> Any:
+    def design(self, given: Table) -> Design | None:
         self.known("design", given, ("type", "members", "seed"))
         kind = given.get("type")
         members, seed = self.whole("design.members", given.get("members"), 1), self.whole("design.seed", given.get("seed", 0), 0)
@@ -205,3 +220,69 @@ class _GridReader(Reader):
             there = f"must be one of {', '.join(map(quote, DESIGNS))}"
             return self.wrong("design.type", f"{there}, is {abbreviate(kind)}{suggestion(kind, DESIGNS)}")
         return None if members is None or seed is None else DESIGNS[kind](members, seed)
+
+    # --- single values
+
+    def wrong(self, place: str, problem: str) -> None:
+        """Note a mistake."""
+        self.problems.append(f"{place}: {problem}")
+
+    def known(self, place: str, given: Table, expected: Iterable[str]) -> None:
+        """Note the keys of a table that are not expected."""
+        expected = tuple(expected)
+        for key in given:
+            if key not in expected:
+                self.wrong(f"{place}.{key_of(key)}" if place else key_of(key), f"unknown key{suggestion(key, expected)}")
+
+    def choice(self, place: str, setting: str, given: Toml) -> Choice:
+        """Read one of the choices of a run."""
+        try:
+            return choice(setting, cast(str, given))
+        except (TypeError, ValueError) as error:
+            self.wrong(place, str(error))
+            return None
+
+    def table(self, place: str, given: Toml) -> Table:
+        """Read a table."""
+        if isinstance(given, dict):
+            return given
+        self.wrong(place, f"must be a table, is {abbreviate(given)}")
+        return {}
+
+    def names(self, place: str, given: Toml) -> tuple[str, ...]:
+        """Read a name or a list of names."""
+        names = [given] if isinstance(given, str) else given
+        if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
+            return tuple(map(str, names))
+        self.wrong(place, f"must be a list of names, is {abbreviate(given)}")
+        return ()
+
+    def number(self, place: str, given: Toml) -> float | None:
+        """Read a finite number."""
+        if isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given):
+            return float(given)
+        self.wrong(place, f"must be a finite number, is {abbreviate(given)}")
+        return None
+
+    def whole(self, place: str, given: "Toml | None", least: int) -> int | None:
+        """Read a whole number."""
+        if isinstance(given, int) and not isinstance(given, bool) and given >= least:
+            return given
+        self.wrong(place, "missing" if given is None else f"must be a whole number from {least} on, is {abbreviate(given)}")
+        return None
+
+    def numbers(self, place: str, given: Toml) -> np.ndarray | None:
+        """Read a list of finite numbers, or of such lists."""
+        try:
+            values = np.array(given)
+        except ValueError:
+            values = np.array(None)
+        if values.dtype.kind in "iuf" and values.ndim and np.isfinite(values).all():
+            return values.astype(float)
+        self.wrong(place, f"must be a list of finite numbers, is {abbreviate(given)}")
+        return None
+
+
+def key_of(name: str) -> str:
+    """A key as a TOML file shows it."""
+    return name if name.replace("_", "").replace("-", "").isalnum() else quote(name)

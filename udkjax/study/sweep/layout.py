@@ -1,8 +1,9 @@
 """From axes as a user writes them to the dimensions of a sweep; every mistake is named, all at once."""
 
 import difflib
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
+from types import UnionType
+from typing import Any, TypeAlias, cast
 
 import jax
 import numpy as np
@@ -13,11 +14,24 @@ from udkjax.pinv import Auto
 from udkjax.scene.checks import Mistakes, SceneError, abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
-from udkjax.study.sweep.axes import CHOICES, Axis, AxisValues, Column, Design, Dimension, Zipped, labels_of, scale_to_range
+from udkjax.study.sweep.axes import (
+    CHOICES,
+    Axis,
+    AxisChoice,
+    AxisValues,
+    Column,
+    Design,
+    Dimension,
+    Values,
+    Zipped,
+    labels_of,
+    scale_to_range,
+)
 from udkjax.study.units import NUMBERS, units_of
 
+Settings: TypeAlias = Mapping[str, Any]  # arguments of `simulate`, of as many types as it has
 MEMBER = "member"  # the dimension of a design
-# Names of the dimensions of what is kept, which a dimension of the sweep cannot have.
+# Names of the dimensions of what is stored, which a dimension of the sweep cannot have.
 TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
 
 
@@ -61,7 +75,7 @@ def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: Design
     return tuple(found)
 
 
-def _is_range(given: AxisValues) -> bool:
+def _is_range(given: "Axis | Values") -> bool:
     """Whether a design fills this axis: all but choices."""
     values = given.values if isinstance(given, Axis) else given
     return hasattr(values, "ppf") or _numbers(values) is not None
@@ -69,6 +83,7 @@ def _is_range(given: AxisValues) -> bool:
 
 def _column(mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray | None, problems: list[str]) -> Column | None:
     """One axis, or None where its mistake is among the problems."""
+    assert not isinstance(given, Zipped), "its axes come one by one"
     axis = given if isinstance(given, Axis) else Axis(given)
     of = (name,) if axis.of is None else axis.of
     before = len(problems)
@@ -79,9 +94,9 @@ def _column(mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray
         problems.append(f"axis {quote(name)}: with a design its values are a range (low, high), or a frozen distribution")
     elif hasattr(values, "ppf"):
         problems.append(f"axis {quote(name)}: a distribution needs a design to draw from it, such as design=Sobol(1024)")
-    elif not hasattr(values, "__len__") or len(values) == 0:
+    elif not isinstance(values, Sized) or len(values) == 0:
         problems.append(f"axis {quote(name)}: needs at least one value, is {abbreviate(values)}")
-    if len(problems) > before:
+    if len(problems) > before or values is None:
         return None
     if not callable(of) and any(target in CHOICES for target in of):
         return _choices(name, of, values, problems)
@@ -95,23 +110,26 @@ def _column(mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray
     return Column(name, numbers, of, units)
 
 
-def _choices(name: str, of: tuple[str, ...], values: Any, problems: list[str]) -> Column | None:
+def _choices(name: str, of: tuple[str, ...], values: Values, problems: list[str]) -> Column | None:
     if len(of) != 1:
         problems.append(f"axis {quote(name)}: choices cannot be tied, but it is of {', '.join(map(quote, of))}; zip them instead")
         return None
-    values = _states(values) if of == ("state",) and isinstance(values, State) else tuple(values)
-    if of == ("state",) and not all(isinstance(value, State) for value in values):
+    if of == ("state",) and isinstance(values, State):
+        choices: tuple[AxisChoice, ...] = _states(values)
+    else:
+        choices = tuple(cast("Iterable[AxisChoice]", values))
+    if of == ("state",) and not all(isinstance(choice, State) for choice in choices):
         problems.append(f"axis {quote(name)}: must be States, as `assemble` returns them")
-    if of == ("mechanism",) and not all(isinstance(value, Mechanism) for value in values):
+    if of == ("mechanism",) and not all(isinstance(choice, Mechanism) for choice in choices):
         problems.append(f"axis {quote(name)}: must be Mechanisms")
-    return Column(name, values, of, "", labels_of(of[0], values))
+    return Column(name, choices, of, "", labels_of(of[0], choices))
 
 
-def _states(stack_choices: State) -> tuple[State, ...]:
-    return tuple(State(q, v) for q, v in zip(np.asarray(stack_choices.q), np.asarray(stack_choices.v), strict=True))
+def _states(stacked: State) -> tuple[State, ...]:
+    return tuple(State(q, v) for q, v in zip(np.asarray(stacked.q), np.asarray(stacked.v), strict=True))
 
 
-def _numbers(values: Any) -> np.ndarray | None:
+def _numbers(values: Values) -> np.ndarray | None:
     try:
         array = np.asarray(values)
     except (TypeError, ValueError):
@@ -127,7 +145,7 @@ def _unknown(mechanism: Mechanism, name: str, of: Sequence[str]) -> Iterator[str
             yield f"axis {quote(name)}: {quote(target)} is no parameter of the mechanism, nor a setting{near}"
 
 
-def _ending(target: str, known: Mapping[str, Any]) -> str:
+def _ending(target: str, known: Iterable[str]) -> str:
     """What ends as the name does: `mass` may stand for many."""
     last = {full.rpartition(".")[2]: full for full in known}
     close = difflib.get_close_matches(target, last, n=1)
@@ -165,13 +183,13 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
                 owner[target] = column.name
 
 
-def check_settings(dimensions: Sequence[Dimension], settings: Mapping[str, Any]) -> list[str]:
+def check_settings(dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
     """What is wrong between axes and settings: things given twice, gains and thresholds that nothing has."""
     columns = [column for dimension in dimensions for column in dimension.columns]
     targets = {target: column for column in columns if not callable(column.of) for target in column.of}
     problems = [f"{name} is both a setting and an axis: leave one of them out" for name in settings if name in targets]
 
-    def all_are(setting: str, kind: Any, wanted: str, cure: str) -> Iterator[str]:
+    def all_are(setting: str, kind: type | UnionType, wanted: str, cure: str) -> Iterator[str]:
         choices = targets[setting].values if setting in targets else (settings.get(setting),)
         if wanted in targets and not all(isinstance(choice, kind) for choice in choices):
             yield f"axis {quote(targets[wanted].name)}: {wanted} is a number of {cure}, which not all members have"
@@ -188,7 +206,7 @@ def check_tangents(mechanism: Mechanism, dimensions: Sequence[Dimension], names:
     known, problems = parameters_of(mechanism), []
     for name in names:
         if name in columns:
-            if columns[name].chosen or columns[name].values.ndim > 1:
+            if columns[name].chosen or columns[name].numbers.ndim > 1:
                 problems.append(f"derivatives: axis {quote(name)} is not one of plain numbers")
             continue
         owner, index = split_index(name, known)

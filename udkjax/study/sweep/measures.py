@@ -1,8 +1,8 @@
-"""Measures: what is kept of each member, and nothing else is computed."""
+"""Measures: what is stored of each member, and nothing else is computed."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import NamedTuple, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from udkjax.equations.quantities import energy, violation
 from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.solution import Solution
-from udkjax.pinv import SVD, Auto
+from udkjax.pinv import SVD, Auto, Pseudoinverse
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 
@@ -31,7 +31,7 @@ class Run(NamedTuple):
 
     mechanism: Mechanism
     solution: Solution
-    method: Any
+    method: Pseudoinverse | None
     reference: Reference
 
 
@@ -45,7 +45,7 @@ class Label(NamedTuple):
 
 @dataclass(frozen=True)
 class Measure:
-    """What to keep of a run: `compute(run)` gives arrays by name."""
+    """What to store of a run: `compute(run)` gives arrays by name."""
 
     name: str
     along: bool  # whether it needs all output times, not only the end
@@ -54,8 +54,8 @@ class Measure:
     reference: Reference = None
     renamed: str = ""  # the key that it was given under
 
-    def of(self, mechanism: Mechanism, solution: Solution, method: Any) -> dict[str, Array]:
-        """The arrays that are kept, under their names in the dataset."""
+    def of(self, mechanism: Mechanism, solution: Solution, method: Pseudoinverse | None) -> dict[str, Array]:
+        """Return the arrays that are stored, under their names in the dataset."""
         found = self.compute(Run(mechanism, solution, method, self.reference))
         return {self._key(name): jnp.asarray(value) for name, value in found.items()}
 
@@ -140,9 +140,9 @@ def _reference(given: Reference, ts: np.ndarray) -> Reference:
     return q
 
 
-def _largest(x: Array, axis: Any = None) -> Array:
+def _largest(x: Array) -> Array:
     """The largest size that is a number: output times after the end of a run are none."""
-    return jnp.max(jnp.where(jnp.isnan(x), 0.0, jnp.abs(x)), axis=axis, initial=0.0)
+    return jnp.max(jnp.where(jnp.isnan(x), 0.0, jnp.abs(x)), initial=0.0)
 
 
 def _final(run: Run) -> dict[str, Array]:

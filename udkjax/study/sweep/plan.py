@@ -9,14 +9,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Int, PyTree
 from numpy.typing import ArrayLike
 
 from udkjax.equations.analysis import analyse
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.sweep.axes import AxisValues, Column, Design, Dimension, structure_of
-from udkjax.study.sweep.layout import SweepError, check_settings, check_tangents, lay_out
+from udkjax.study.sweep.axes import AxisChoice, AxisValues, Column, Design, Dimension, structure_of
+from udkjax.study.sweep.layout import Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
 
 OUTSIDE = ("throw", "progress", "adjoint")  # arguments of simulate that a sweep decides about
@@ -24,7 +24,7 @@ OUTSIDE = ("throw", "progress", "adjoint")  # arguments of simulate that a sweep
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """What is kept of each member under one name."""
+    """What is stored of each member under one name."""
 
     dims: tuple[str, ...]  # besides those of the sweep
     shape: tuple[int, ...]
@@ -60,7 +60,7 @@ class Plan:
     mechanism: Mechanism
     dimensions: tuple[Dimension, ...]
     ts: np.ndarray  # (T,) s
-    settings: Mapping[str, Any]  # of simulate, those that are no axes
+    settings: Settings  # of simulate, those that are no axes
     measures: tuple[Measure, ...]
     derivatives: tuple[str, ...] = ()
     design: Design | None = None
@@ -114,17 +114,23 @@ class Plan:
         """The index of a member's group."""
         return int(self._numbers[member])
 
-    def choice(self, group: Group, setting: str) -> Any:
+    def choice(self, group: Group, setting: str) -> AxisChoice:
         """What a group has for a setting: the first of its choices, where these differ by numbers."""
         for column in self.columns:
             if column.of == (setting,) and column.chosen:
-                return column.values[group.choices[column.name][0]]
+                return column.choices[group.choices[column.name][0]]
         return self.mechanism if setting == "mechanism" else self.settings.get(setting)
+
+    def mechanism_of(self, group: Group) -> Mechanism:
+        """The mechanism of a group: the first, where these differ by numbers."""
+        found = self.choice(group, "mechanism")
+        assert isinstance(found, Mechanism)
+        return found
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
         """The bodies of all mechanisms, in their order."""
-        return tuple(dict.fromkeys(name for group in self.groups for name in self.choice(group, "mechanism").body_names))
+        return tuple(dict.fromkeys(name for group in self.groups for name in self.mechanism_of(group).body_names))
 
 
 def make_plan(
@@ -162,19 +168,19 @@ def make_plan(
         problems.append(str(error))
     if problems:
         raise SweepError(problems)
-    kept = ts if any(measure.along for measure in measures) else ts[[0, -1]]
-    return Plan(mechanism, dimensions, kept, settings, measures, tuple(derivatives), design)
+    stored = ts if any(measure.along for measure in measures) else ts[[0, -1]]
+    return Plan(mechanism, dimensions, stored, settings, measures, tuple(derivatives), design)
 
 
 def _number_structures(column: Column) -> np.ndarray:
     """For each of the choices of an axis the number of its structure."""
     structures = [
-        (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in column.values
+        (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in column.choices
     ]
     return np.array([structures.index(structure) for structure in structures])
 
 
-def stack_choices(choices: Sequence[Any]) -> tuple[Any, Any]:
+def stack_choices(choices: Sequence[PyTree]) -> tuple[PyTree, PyTree]:
     """Choices of one structure: their numbers one behind the other, and everything else."""
     parts = [eqx.partition(choice, eqx.is_array) for choice in choices]
     return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(arrays for arrays, _ in parts)), parts[0][1]

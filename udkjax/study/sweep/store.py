@@ -15,19 +15,18 @@ import struct
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
 
-from udkjax.study.sweep.fingerprint import differences
+from udkjax.study.sweep.fingerprint import Json, differences
 from udkjax.study.sweep.plan import Chunk
 
 FORMAT = 1
 UNFINISHED = ".unfinished"  # what a file's name ends with while it is written
 DIGEST = 64  # characters of a SHA-256
 MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
-MEMBERS, KEPT = "members", "kept/"  # in a file: whom its numbers belong to, and what goes before the names of these
+MEMBERS, STORED = "members", "kept/"  # in a file: whom its numbers belong to, and what goes before the names of these
 
 Data = Mapping[str, np.ndarray]
 
@@ -42,18 +41,18 @@ class ChunkStore(abc.ABC):
     def __enter__(self) -> "ChunkStore":
         return self
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: object) -> None:
         return None
 
     def done(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the members that are finished, and what is kept of them under a name."""
+        """Return the members that are finished, and what is stored of them under a name."""
         parts = [(members, data[name]) for members, data in self.finished()] or [(np.empty(0, int), np.empty(0, int))]
         members, values = zip(*parts, strict=True)
         return np.concatenate(members), np.concatenate(values)
 
     @abc.abstractmethod
     def write(self, chunk: Chunk, data: Data) -> None:
-        """Keep what a chunk gave: one array for each name, whose first axis is the chunk's members."""
+        """Store what a chunk gave: one array for each name, whose first axis is the chunk's members."""
 
     @abc.abstractmethod
     def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
@@ -80,7 +79,7 @@ class FolderStore(ChunkStore):
     out. Raises `StoreError`.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, Any]):
+    def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, Json]):
         self.folder = Path(folder)
         try:
             (self.folder / CHUNKS).mkdir(parents=True, exist_ok=True)
@@ -99,7 +98,7 @@ class FolderStore(ChunkStore):
             self._lock.release()
             raise
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: object) -> None:
         self._lock.release()
 
     def _writer(self) -> str:
@@ -114,7 +113,7 @@ class FolderStore(ChunkStore):
         members = np.asarray(chunk.members)
         self._write(
             f"{CHUNKS}/{_name(chunk.index, members)}",
-            pack({MEMBERS: members, **{KEPT + name: values for name, values in data.items()}}),
+            pack({MEMBERS: members, **{STORED + name: values for name, values in data.items()}}),
         )
 
     def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
@@ -126,9 +125,9 @@ class FolderStore(ChunkStore):
                 file.unlink()
             else:
                 members = data.pop(MEMBERS)
-                yield members, {name.removeprefix(KEPT): values for name, values in data.items()}
+                yield members, {name.removeprefix(STORED): values for name, values in data.items()}
 
-    def _begin(self, sweep: dict[str, Any]) -> None:
+    def _begin(self, sweep: dict[str, Json]) -> None:
         """Say what the sweep is; where something is there already, compare."""
         for file in (*self.folder.glob(f"*{UNFINISHED}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED}")):
             file.unlink(missing_ok=True)  # of a process that was killed while it wrote
@@ -154,9 +153,9 @@ class FolderStore(ChunkStore):
         try:
             write_whole(self.folder / name, content)
         except OSError as error:
-            kept = f"{len(self._files())} chunks in {self.folder} are finished and stay valid"
+            valid = f"{len(self._files())} chunks in {self.folder} are finished and stay valid"
             advice = "once it can be written to, run the same sweep again: it goes on from there"
-            raise StoreError(f"cannot write {name}: {error.strerror or error}; {kept}; {advice}") from error
+            raise StoreError(f"cannot write {name}: {error.strerror or error}; {valid}; {advice}") from error
 
 
 def unfinished_chunks(chunks: Sequence[Chunk], done: np.ndarray) -> list[Chunk]:
@@ -175,8 +174,8 @@ def unfinished_chunks(chunks: Sequence[Chunk], done: np.ndarray) -> list[Chunk]:
     return found
 
 
-def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Any]) -> ChunkStore:
-    """Return what keeps the finished chunks: the folder `out`, or, without one, memory."""
+def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Json]) -> ChunkStore:
+    """Return what stores the finished chunks: the folder `out`, or, without one, memory."""
     return MemoryStore() if out is None else FolderStore(out, fingerprint)
 
 

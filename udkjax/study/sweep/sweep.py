@@ -16,8 +16,8 @@ from udkjax.study.sweep.executors import Done, compute_on_devices, dask_engine
 from udkjax.study.sweep.fingerprint import fingerprint
 from udkjax.study.sweep.layout import SweepError
 from udkjax.study.sweep.measures import MeasureChoice, Reference
-from udkjax.study.sweep.member import RESULT
 from udkjax.study.sweep.plan import Chunk, Plan, make_plan
+from udkjax.study.sweep.program import RESULT
 from udkjax.study.sweep.store import open_store, unfinished_chunks
 from udkjax.study.sweep.sweep_progress import Watch
 
@@ -87,15 +87,15 @@ def sweep(
     require("xarray")
     plan = make_plan(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
     compute = _engine(engine, client)
-    with open_store(out, fingerprint(plan) if out is not None else {}) as kept:
-        done, codes = kept.done(RESULT)
+    with open_store(out, fingerprint(plan) if out is not None else {}) as store:
+        done, codes = store.done(RESULT)
         with reporting(progress, plan.size, "sweep") as report:
             todo = unfinished_chunks(cut_chunks(plan, memory), done) if len(done) < plan.size else []
             watch = Watch(plan.size, todo, report.show, codes)
             for chunk, data, seconds in compute(plan, todo):
-                kept.write(chunk, data)
+                store.write(chunk, data)
                 watch(chunk, data, seconds)
-        return assemble(plan, kept.finished())
+        return assemble(plan, store.finished())
 
 
 def _engine(engine: str, client: "distributed.Client | None") -> Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]:

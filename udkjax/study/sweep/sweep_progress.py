@@ -4,7 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from udkjax.integrate.solution import Result
 from udkjax.study.progress import Progress
 from udkjax.study.sweep.plan import Chunk
 
+T = TypeVar("T", int, float)
 STEPS = "steps"  # the variable by which members are compared
 
 
@@ -51,7 +52,7 @@ class Watch:
     `show` is called with the `SweepProgress` at the start and after each chunk.
     """
 
-    def __init__(self, members: int, left: Sequence[Chunk], show: Callable[[SweepProgress], Any], codes: ArrayLike = ()):
+    def __init__(self, members: int, left: Sequence[Chunk], show: Callable[[SweepProgress], object], codes: ArrayLike = ()):
         self.show = show
         self.work, self.work_done, self.new = sum(chunk.work for chunk in left), 0.0, 0
         self.begun = time.monotonic()
@@ -110,7 +111,7 @@ def _count_failures(before: Mapping[str, int], codes: ArrayLike) -> dict[str, in
     return dict(found)
 
 
-def _find_slowest(before: tuple[int, Any] | None, who: ArrayLike, values: ArrayLike | None) -> tuple[int, Any] | None:
+def _find_slowest(before: tuple[int, T] | None, who: ArrayLike, values: ArrayLike | None) -> tuple[int, T] | None:
     """Return the largest of the values and whose it is, unless one before was as large."""
     if values is None:
         return before
