@@ -7,11 +7,10 @@ import pytest
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
 from udkjax.integrate.solution import Result
-from udkjax.study.identify.build_problem import build_problem
 from udkjax.study.identify.gradient_check import compare_gradients
 from udkjax.study.identify.identification import identify
 from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.problem import Problem, build_problem
 from udkjax.study.identify.shooting import MultipleShooting
 
 DATA = {"time": TS, ANGLE: np.zeros(len(TS))}

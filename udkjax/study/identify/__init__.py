@@ -3,7 +3,7 @@
 records, tables, record_reader                     measurements, whatever they come as
 parameters, unknowns                               what is to be found
 prediction, problem, shooting                      what would be measured, and how far it is from what was
-build_problem, loop_consistency                    whether all of these fit together
+loop_consistency                                   whether parameters fit the mechanism's loops
 least_squares, optimizer, search                   minimization, from guesses that lead to the minimum
 uncertainty, profile_likelihood                    how well the parameters are known
 gradient_check                                     whether derivatives are right

@@ -19,11 +19,10 @@ from udkjax.deprecation import renamed_arguments, renamed_attributes
 from udkjax.integrate.assembly import State
 from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.identify.build_problem import build_problem
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import MEDIUM, Tolerances
-from udkjax.study.identify.problem import INVISIBLE, Problem
+from udkjax.study.identify.problem import INVISIBLE, Problem, build_problem
 from udkjax.study.identify.records import IdentificationError, Key, Noise, Record, Start
 from udkjax.study.identify.uncertainty import PART
 

@@ -23,10 +23,9 @@ from udkjax.integrate.solution import CAUSES, Result
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, differences, leave_out_far_steps, sizes
 from udkjax.study.identify import prediction
-from udkjax.study.identify.build_problem import build_problem
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import TIGHT, Tolerances
-from udkjax.study.identify.problem import Problem, Residuals
+from udkjax.study.identify.problem import Problem, Residuals, build_problem
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
 from udkjax.study.wording import join_names, table_lines

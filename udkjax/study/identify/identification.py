@@ -11,16 +11,15 @@ from numpy.typing import ArrayLike
 from udkjax.deprecation import renamed_arguments
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.identify.build_problem import build_problem
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History
 from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import LOOSE, TIGHT, Tolerances
-from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.problem import Problem, Strategy, build_problem
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
-from udkjax.study.identify.search import N_STARTS, SearchResult, Strategy, search
+from udkjax.study.identify.search import N_STARTS, SearchResult, search
 from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
 from udkjax.study.progress import ProgressOption, reporting
 from udkjax.study.whiteness import Whiteness, whiteness_of

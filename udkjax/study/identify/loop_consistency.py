@@ -11,19 +11,23 @@ closed again: the rank must still be what it was. All of it is NumPy on the prog
 nothing to do.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import dataclasses
+from collections.abc import Callable, Hashable, Iterator, Sequence
 
 import jax
 import numpy as np
 from jaxtyping import Array
 from scipy.sparse import csr_array
 
-from udkjax.equations.analysis import analyse
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.redundancy import ORDINARY_TOL, PositionRows, choose_redundant_rows, kinematic_rows, sample_positions
 from udkjax.equations.scales import known_scales
-from udkjax.scene.checks import quote
+from udkjax.integrate.assembly import close, require_closed
+from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.records import IdentificationError
+from udkjax.study.identify.unknowns import Unknowns, apply_values, sample_guesses
 from udkjax.study.row_spaces import COEFFICIENT, connected_columns, echelon, null_space, row_space
 from udkjax.study.wording import join_names, ratio
 
@@ -37,8 +41,11 @@ DIFFERENCE_STEP = 1e-5  # of a parameter's value: the step of the central differ
 CLOSING_STEP = 1e-2
 SMALL_VALUE = 1e-5  # of the size by effect: a value as small as this, such as that of a coordinate, counts as zero
 MOST_POSITIONS = 4  # positions that are closed again
+NEARBY_GUESSES = 64  # that are tried where the first cannot be closed
+MOST_STORED = 256  # structures of mechanisms whose parameters keep all loops closed
 SAME_CHANGE = 1e-3  # relative: changes, found by differences, that are said to be the same or in proportion
 SAME_VALUE = 1e-9  # relative: values, as they are given, that are said to be the same
+_consistent: set[Hashable] = set()
 
 
 def loop_problems(
@@ -77,6 +84,35 @@ def loop_problems(
             "constraints than it needs, and only certain values satisfy all of them; start from such values"
         ]
     return loops.problems(names) if loops.redundant else []
+
+
+def nearest_closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tuple[Analysis, Unknowns]:
+    """Return the analysis of the mechanism at its first guess, or, where that cannot be closed, at the nearest that can."""
+    z = sample_guesses(unknowns, np.zeros(len(unknowns.names)), NEARBY_GUESSES, seed)
+    nearby = unknowns.values(z[np.argsort(np.linalg.norm(z, axis=1))])
+    for k, x in enumerate([unknowns.guess, *nearby]):
+        try:
+            placed = mechanism if k == 0 and unknowns.at_scene_values else apply_values(mechanism, unknowns.targets, x)
+        except SceneError:
+            continue
+        if close(placed).is_closed:
+            return analyse(placed), dataclasses.replace(unknowns, guess=np.asarray(x, float))
+    placed = apply_values(mechanism, unknowns.targets, unknowns.guess)
+    require_closed(placed, close(placed))
+    raise AssertionError
+
+
+def require_consistent_loops(mechanism: Mechanism, unknowns: Unknowns) -> None:
+    """Raise where the parameters would open a loop. What keeps it closed does so for other numbers with the same structure."""
+    structure = jax.tree.structure(mechanism), unknowns.targets
+    if structure in _consistent:
+        return
+    wrong = loop_problems(mechanism, lambda mech, x: apply_values(mech, unknowns.targets, x), unknowns.guess, unknowns.names)
+    if wrong:
+        raise IdentificationError(wrong)
+    if len(_consistent) >= MOST_STORED:
+        _consistent.clear()
+    _consistent.add(structure)
 
 
 def _length(mechanism: Mechanism) -> float:

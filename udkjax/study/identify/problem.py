@@ -7,30 +7,36 @@ With y what is measured, yhat(z) what the mechanism with the unknowns z would sh
 followed by (x - mean) / sigma of each prior. Every number y that is there is one residual; the order is record, time, channel.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from udkjax.equations.analysis import analyse
-from udkjax.integrate.assembly import State, assemble
+from udkjax.integrate.assembly import AssemblyError, State, assemble
+from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result
-from udkjax.scene.checks import quote
+from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.study.channels import Quantity, channel_of
-from udkjax.study.identify.prediction import Members, Prediction, Predictor, Tolerances
-from udkjax.study.identify.records import IdentificationError, Key, Record
-from udkjax.study.identify.unknowns import Unknowns, initial_state_unknowns, with_conditions
+from udkjax.study.identify.loop_consistency import nearest_closable, require_consistent_loops
+from udkjax.study.identify.parameters import Asked, unknowns_of
+from udkjax.study.identify.prediction import LOOSE, TIGHT, Members, Prediction, Predictor, Tolerances
+from udkjax.study.identify.record_reader import Data, records_of
+from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, pad_times, tabulate
+from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, initial_state_unknowns, with_conditions
 
-PADDING = 1e-9  # of the length of a record: the distance of the times that pad it; so short a step costs nothing
 STILL = 1e-12  # of the largest number in a channel: with a smaller deviation the channel does not move
 # Of the largest singular value of a Jacobian: directions below it do not show in what was measured. A change that leaves the
 # equations of motion as they are has 1e-16, whatever the tolerance; derivatives integrated at 1e-7 have errors of 1e-8.
 INVISIBLE = 1e-8
 RESIDUALS_PER_UNKNOWN = 3.0  # in the first part of a record that is fitted, and in a piece: fewer would follow the noise
+# Arguments of `simulate` that an identification decides about.
+DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress", "analysis")
+Strategy = Literal["auto", "pieces"]
 
 
 class Residuals(NamedTuple):
@@ -88,33 +94,18 @@ class Problem:
         self.all_units = (*unknowns.units, *(unit for state in self.initial_states for unit in state.units))
         self.state_sizes = np.concatenate([np.zeros(0), *(state.sizes for state in self.initial_states)])
         self.K = len(self.all_names)
-        self._tabulate(keys)
+        self.ts, self.y, sigma = tabulate(self.records, keys)
+        self.present, self.index = np.isfinite(self.y), np.argwhere(np.isfinite(self.y))
+        self.noise_given = np.isfinite(sigma)[self.present]
+        self.channel_scale = np.array([_size_of(self.y[:, :, c]) for c in range(len(keys))])
+        self.sigma = np.where(np.isfinite(sigma), sigma, self.channel_scale)[self.present]
         self.run, self.time, _ = self.index.T
-        self.runs = Runs(self.ts, *_guessed_states(mechanism, self.records), bases, _conditions(mechanism, self.records))
+        self.runs = Runs(self.ts, *guessed_states(mechanism, self.records), bases, conditions_of(mechanism, self.records))
         self.beginnings = np.arange(len(self.records))
         self.priors = np.flatnonzero(np.isfinite(unknowns.sigma))
         self.extra_rows = len(self.priors)
         self.settings = {"analysis": analyse(mechanism), **(settings or {})}
         self.predictor = Predictor(mechanism, unknowns.targets, self.channels, self.settings)
-
-    def _tabulate(self, keys: Sequence[Key]) -> None:
-        """Arrange all records in tables of one length; shorter ones are padded with times at which nothing was measured."""
-        tables = [_with_start(record) for record in self.records]
-        length = max(2, *(len(ts) for ts, _ in tables))
-        self.ts = np.stack([_pad(ts, length) for ts, _ in tables])
-        shape = len(self.records), length, len(keys)
-        self.y, sigma = np.full(shape, np.nan), np.full(shape, np.nan)
-        for r, (record, (ts, first)) in enumerate(zip(self.records, tables, strict=True)):
-            for key, values in record.values.items():
-                place = r, slice(first, len(ts)), keys.index(key)
-                self.y[place] = values
-                if (noise := record.noise[key]) is not None:
-                    sigma[place] = noise
-        self.present = np.isfinite(self.y)
-        self.noise_given = np.isfinite(sigma)[self.present]
-        self.channel_scale = np.array([_size_of(self.y[:, :, c]) for c in range(shape[2])])
-        self.sigma = np.where(np.isfinite(sigma), sigma, self.channel_scale)[self.present]
-        self.index = np.argwhere(self.present)
 
     def series(self) -> list[np.ndarray]:
         """Return which residuals belong to one channel of one record, in the order of time: for each that has some."""
@@ -134,7 +125,7 @@ class Problem:
         full[self.present] = rows
         found = []
         for k, record in enumerate(self.records):
-            ts, first = _with_start(record)
+            ts, first = output_times(record)
             part = full[k, first : len(ts)]
             found.append({name: part[:, c] for c, name in enumerate(self.channel_names) if np.isfinite(part[:, c]).any()})
         return tuple(found)
@@ -209,16 +200,6 @@ def _size_of(values: np.ndarray) -> float:
     return float(deviation if deviation > STILL * size else size or 1.0)
 
 
-def _with_start(record: Record) -> tuple[np.ndarray, int]:
-    """Return output times from the initial state on, and which of them is the first that was measured."""
-    return (record.times, 0) if record.t0 == record.times[0] else (np.concatenate([[record.t0], record.times]), 1)
-
-
-def _pad(ts: np.ndarray, length: int) -> np.ndarray:
-    span = max(ts[-1] - ts[0], PADDING)
-    return np.concatenate([ts, ts[-1] + PADDING * span * np.arange(1, length - len(ts) + 1)])
-
-
 def _end(ts: np.ndarray, horizon: float) -> np.ndarray:
     return ts[..., 0] + horizon * (ts[..., -1] - ts[..., 0])
 
@@ -226,35 +207,88 @@ def _end(ts: np.ndarray, horizon: float) -> np.ndarray:
 def _times_until(ts: np.ndarray, horizon: float) -> np.ndarray:
     """Return the times up to a part of a record, padded to the same length."""
     last = max(1, int(np.searchsorted(ts, _end(ts, horizon), side="right")) - 1)
-    return _pad(ts[: last + 1], len(ts))
+    return pad_times(ts[: last + 1], len(ts))
 
 
-def _guessed_states(mechanism: Mechanism, records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
-    """Return q and v (records, bodies, 3) from which initial states are closed; None where all are the scene's own."""
-    states = [record.start.state for record in records]
-    if all(state is None for state in states):
-        return None, None
-    own = State(mechanism.q0, mechanism.v0)
-    q, v = (np.stack([np.asarray(getattr(state or own, part)) for state in states]) for part in "qv")
-    return q, v
+# --- from what users give
 
 
-def _conditions(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np.ndarray]:
-    """Return values of all records for every parameter that differs between them."""
-    known, problems = parameters_of(mechanism), []
-    found: dict[str, np.ndarray] = {}
-    for name in dict.fromkeys(name for record in records for name in record.conditions):
-        owner, index = split_index(name, known)
-        if owner not in known or known[owner].value is None:
-            problems.append(f"conditions: no parameter {quote(name)}")
-            continue
-        usual = np.asarray(known[owner].value)[index]
+def build_problem(
+    mechanism: Mechanism,
+    data: Data,
+    parameters: Asked,
+    settings: Mapping[str, Any],
+    noise: Noise = None,
+    ignore: Sequence[str] = (),
+    seed: int = 0,
+    strategy: Strategy = "auto",
+    initial_state: Start | Estimated | None = None,
+    tol: float = TIGHT,
+) -> Problem:
+    """Build the problem that arguments of `identify` pose.
+
+    Raises:
+        IdentificationError: with every mistake in them.
+        AssemblyError: the mechanism cannot be closed with the first guess, nor with any near it.
+    """
+    unknowns, records = _collect(
+        lambda: _check_settings(settings, strategy),
+        lambda: unknowns_of(mechanism, parameters),
+        lambda: _with_initial_state(records_of(mechanism, data, noise, ignore), initial_state),
+    )[1:]
+    return _closable_problem(mechanism, unknowns, records, settings, seed, tol)
+
+
+def _collect(*steps: Callable[[], Any]) -> list[Any]:
+    """Return the results of some steps; if any of them raises `IdentificationError`, raise one with the mistakes of all."""
+    found, problems = [], []
+    for step in steps:
         try:
-            found[name] = np.stack(
-                [np.broadcast_to(np.asarray(r.conditions.get(name, usual), float), usual.shape) for r in records]
-            )
-        except ValueError:
-            problems.append(f"conditions: {quote(name)} must be of shape {usual.shape} in each record")
+            found.append(step())
+        except IdentificationError as error:
+            problems += error.problems
     if problems:
         raise IdentificationError(problems)
     return found
+
+
+def _with_initial_state(records: Sequence[Record], given: Start | Estimated | None) -> Sequence[Record]:
+    if given is None:
+        return records
+    start = given if isinstance(given, Start) else Start(estimate=given)
+    return [record.with_start(start) for record in records]
+
+
+def _check_settings(settings: Mapping[str, Any], strategy: str) -> None:
+    known = [name for name in inspect.signature(simulate).parameters if name not in DECIDED]
+    problems = [
+        f"{name}: no setting of simulate that can be given here{suggestion(name, known)}"
+        for name in settings
+        if name not in known
+    ]
+    if strategy not in get_args(Strategy):
+        problems.append(f"strategy must be one of {', '.join(get_args(Strategy))}, is {strategy!r}")
+    if problems:
+        raise IdentificationError(problems)
+
+
+def _closable_problem(
+    mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any], seed: int, tol: float
+) -> Problem:
+    """Build the problem at the first guess; where that cannot be closed, at the nearest that can.
+
+    Whether a mechanism without redundant rows closes is seen by the first run, which the fit begins with: to look before would
+    cost more than the run.
+    """
+    if unknowns.at_scene_values and analyse(mechanism).redundant_rows == ():
+        try:
+            problem = Problem(mechanism, unknowns, records, settings)
+            first = problem.evaluate(np.zeros((1, problem.K)), (max(tol, LOOSE), max(tol, LOOSE)))
+            if first.code[0] != Result.could_not_assemble:
+                return problem
+        except AssemblyError:
+            pass
+    analysis, unknowns = nearest_closable(mechanism, unknowns, seed)
+    if analysis.redundant_rows:
+        require_consistent_loops(mechanism, unknowns)
+    return Problem(mechanism, unknowns, records, {**settings, "analysis": analysis})

@@ -17,6 +17,7 @@ from udkjax.study.channels import Channel, Quantity
 if TYPE_CHECKING:
     import xarray
 
+PADDING = 1e-9  # of the length of a record: the distance of the times that pad it; so short a step costs nothing
 Estimated = Literal["nothing", "position", "velocity", "both"]
 Key: TypeAlias = str | Quantity  # channels go by their names, a user's own by itself
 T = TypeVar("T")
@@ -152,6 +153,31 @@ def labels(records: Sequence[Record]) -> list[str]:
     """Return the names of records; those without a name, or with one that another has too, are numbered."""
     names = [record.name for record in records]
     return [name if name and names.count(name) == 1 else f"{name or 'record'} {k + 1}" for k, name in enumerate(names)]
+
+
+def output_times(record: Record) -> tuple[Float[np.ndarray, "T"], int]:
+    """Return the times of a record from its initial state on, and which of them is the first that was measured."""
+    return (record.times, 0) if record.t0 == record.times[0] else (np.concatenate([[record.t0], record.times]), 1)
+
+
+def pad_times(ts: Float[np.ndarray, "T"], length: int) -> Float[np.ndarray, "length"]:
+    """Return the times with as many after them, hardly later, as make up a length."""
+    span = max(ts[-1] - ts[0], PADDING)
+    return np.concatenate([ts, ts[-1] + PADDING * span * np.arange(1, length - len(ts) + 1)])
+
+
+def tabulate(records: Sequence[Record], keys: Sequence[Key]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Arrange records in tables of one length: times (records, T), values and their noise (records, T, C), nan where unknown."""
+    times = [output_times(record) for record in records]
+    length = max(2, *(len(ts) for ts, _ in times))
+    y, sigma = np.full((2, len(records), length, len(keys)), np.nan)
+    for k, (record, (ts, first)) in enumerate(zip(records, times, strict=True)):
+        for key, values in record.values.items():
+            place = k, slice(first, len(ts)), keys.index(key)
+            y[place] = values
+            if (noise := record.noise[key]) is not None:
+                sigma[place] = noise
+    return np.stack([pad_times(ts, length) for ts, _ in times]), y, sigma
 
 
 def label_prefixes(records: Sequence[Record]) -> list[str]:

@@ -6,7 +6,7 @@ record, each time from where it was; and where that fails too, from other guesse
 of chaotic motion: see `shooting`.
 """
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, SOME_STEPS, STEPS, Fit, History
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import LOOSE, MEDIUM, Tolerances
-from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem
+from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Strategy
 from udkjax.study.identify.shooting import PieceFailed, fit_pieces
 from udkjax.study.identify.unknowns import sample_guesses
 
@@ -27,8 +27,6 @@ EXPLAINED_PART = 1e-3  # of what the channels show: smaller residuals are taken 
 LIKELY_SQUARE = 2.0  # mean square of residuals whose noise is known, up to which they are taken for a fit
 WHITE_CORRELATION = 4.0  # standard deviations of the correlation of neighbours, up to which residuals are taken for noise
 SAME_MINIMUM = 1e-4  # of an unknown: fits this near are at one minimum
-
-Strategy = Literal["auto", "pieces"]
 
 
 class SearchResult(NamedTuple):

@@ -18,6 +18,7 @@ from udkjax.integrate.assembly import State, assemble
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.study.channels import RATES, UNITS
 from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
 from udkjax.study.quantities import Setter, parameter_value
@@ -253,3 +254,37 @@ def _independent_rows(free: np.ndarray) -> list[int]:
         else:
             return sorted(chosen)
     return sorted(chosen)
+
+
+# --- what else differs between records
+
+
+def guessed_states(mechanism: Mechanism, records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+    """Return q and v (records, bodies, 3) from which initial states are closed; None where all are the scene's own."""
+    states = [record.start.state for record in records]
+    if all(state is None for state in states):
+        return None, None
+    own = State(mechanism.q0, mechanism.v0)
+    q, v = (np.stack([np.asarray(getattr(state or own, part)) for state in states]) for part in "qv")
+    return q, v
+
+
+def conditions_of(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np.ndarray]:
+    """Return values of all records for every parameter that differs between them."""
+    known, problems = parameters_of(mechanism), []
+    found: dict[str, np.ndarray] = {}
+    for name in dict.fromkeys(name for record in records for name in record.conditions):
+        owner, index = split_index(name, known)
+        if owner not in known or known[owner].value is None:
+            problems.append(f"conditions: no parameter {quote(name)}")
+            continue
+        usual = np.asarray(known[owner].value)[index]
+        try:
+            found[name] = np.stack(
+                [np.broadcast_to(np.asarray(r.conditions.get(name, usual), float), usual.shape) for r in records]
+            )
+        except ValueError:
+            problems.append(f"conditions: {quote(name)} must be of shape {usual.shape} in each record")
+    if problems:
+        raise IdentificationError(problems)
+    return found
