@@ -7,11 +7,11 @@ from itertools import pairwise
 import pytest
 
 from udkjax.study import progress as module
-from udkjax.study.progress import Progress, reporting
+from udkjax.study.progress import Progress, report_progress
 
 
 def work(progress, steps=4, pause=0.0):
-    with reporting(progress, steps, "count") as report:
+    with report_progress(progress, steps, "count") as report:
         for k in range(steps):
             report(message=f"number {k}")
             time.sleep(pause)
@@ -55,7 +55,7 @@ def test_by_default_there_is_a_line_only_after_the_time_of_patience(capsys, monk
 
 def test_the_line_appears_while_the_first_piece_takes_long(capsys, monkeypatch):
     monkeypatch.setattr(module, "PATIENCE", 0.02)
-    with reporting(None, None, "compile"):
+    with report_progress(None, None, "compile"):
         for _ in range(100):
             time.sleep(0.02)
             if "compile: 00:0" in capsys.readouterr().err:
@@ -66,7 +66,7 @@ def test_the_line_appears_while_the_first_piece_takes_long(capsys, monkeypatch):
 def test_nothing_remains_of_it(monkeypatch):
     monkeypatch.setattr(module, "PATIENCE", 60.0)
     before = threading.active_count()
-    with pytest.raises(ZeroDivisionError), reporting(None, 1, "fail"):
+    with pytest.raises(ZeroDivisionError), report_progress(None, 1, "fail"):
         raise ZeroDivisionError
     for _ in range(100):
         if threading.active_count() == before:

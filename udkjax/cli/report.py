@@ -60,7 +60,7 @@ def report(
     if not -180 < start < 0 or start == -90:
         refuse(f"--start {start:g}: between -180 and 0 degrees the links swing without becoming collinear; at -90 they hang")
 
-    from udkjax.study.progress import reporting
+    from udkjax.study.progress import report_progress
 
     cases, page, record, study = (_module(name) for name in ("cases", "page", "record", "study"))
     if from_file:
@@ -69,8 +69,8 @@ def report(
         except (OSError, ValueError) as problem:
             refuse(f"cannot read {from_file}: {problem}")
     else:
-        with reporting(False if quiet else None, 1.0, "report") as report_progress:
-            tell = lambda what, part: report_progress(part, what)  # noqa: E731
+        with report_progress(False if quiet else None, 1.0, "report") as report_part:
+            tell = lambda what, part: report_part(part, what)  # noqa: E731
             data = study.study(cases.QUICK if quick else cases.FULL, start, seed, tell=tell)
     target.parent.mkdir(exist_ok=True)
     files = [target]

@@ -171,7 +171,7 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: ArrayLi
     """With one driver of this name along its value, and the others held."""
     known = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
-        origin = known and Origin(_add_driver(known, name, _known_element(known, name, element), _known(t, 0.0)))
+        origin = known and Origin(_add_driver(known, name, _known_element(known, name, element), _value_or(t, 0.0)))
     held = {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
     held[name] = Driver(element.bodies, element.coordinate, Value(), element.points)
     return with_drivers(mechanism, held, origin=origin)
@@ -230,7 +230,7 @@ def _constant(value: Numbers) -> Polynomial:
     return Polynomial(jnp.stack([number(value)]))
 
 
-def _known(x: ArrayLike, otherwise: float) -> ArrayLike:
+def _value_or(x: ArrayLike, otherwise: float) -> ArrayLike:
     return otherwise if isinstance(x, Tracer) else x
 
 

@@ -120,7 +120,7 @@ def _equilibrium(
     curve: Curve, analysis: Analysis, t: Float[Array, ""], start: Float[Array, "n"], free: int, stable: bool
 ) -> Equilibrium:
     q = sequential(_settle, *stop_gradients((curve, analysis, t, start)), free, stable)
-    q = _resting(curve, analysis, t, q, free)
+    q = _rest_position(curve, analysis, t, q, free)
     at = linearize(curve.mechanism, analysis, free, t, q)
     left = _left(curve.mechanism, at, t, q)
     closed = curve.is_closed(jnp.append(q, t) / curve.units)
@@ -179,15 +179,15 @@ def _towards_rest(here: Linearization, stable: bool) -> Float[Array, "f"]:
 
 
 @eqx.filter_custom_jvp
-def _resting(curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int) -> Float[Array, "n"]:
+def _rest_position(curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int) -> Float[Array, "n"]:
     """A position of rest, with the derivatives of one Newton step there."""
     return q
 
 
-@_resting.def_jvp
+@_rest_position.def_jvp
 def _(primals, tangents):
     curve, analysis, t, _, free = primals
-    q = _resting(*primals)
+    q = _rest_position(*primals)
 
     def newton(curve: Curve, t: Float[Array, ""]) -> Float[Array, "n"]:
         X = jnp.append(q, t) / curve.units

@@ -93,10 +93,10 @@ def kinematics(
 
     With Psi_q q' = -Psi_s and Psi_q q'' = gamma, velocities are q' s_dot and accelerations q'' s_dot^2 + q' s_ddot.
 
-    The branch is that of `state`, or of the initial guess, and is followed from there by its arc length: it is kept, or the
-    motion ends, with a `status` that says why. Toggles, where the driver can get no farther, are found to rounding. Redundant
-    constraints do no harm. Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any order by every
-    number of the mechanism and by the values.
+    The branch is that of `state`, or of the initial guess, and is followed from there by its arc length. Where it cannot be
+    followed, the motion ends, with a `status` that says why. Toggles, where the driver can get no farther, are found to rounding.
+    Redundant constraints do no harm. Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any
+    order by every number of the mechanism and by the values.
 
     Args:
         mechanism: whatever has one degree of freedom once its drivers hold.
@@ -243,10 +243,10 @@ def _(primals, tangents):
 
 
 def _tangents(curve: Curve, values: Float[Array, "T"], q: Rows, moving: PyTree) -> tuple[Rows, Rows, Rows]:
-    def closed(curve: Curve, values: Float[Array, "T"]) -> tuple[Rows, Rows, Rows]:
+    def positions(curve: Curve, values: Float[Array, "T"]) -> tuple[Rows, Rows, Rows]:
         return jax.vmap(lambda s, q: _newton(curve, s, q))(values, q)
 
-    return eqx.filter_jvp(closed, (curve, values), moving)[1]
+    return eqx.filter_jvp(positions, (curve, values), moving)[1]
 
 
 def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:

@@ -61,7 +61,7 @@ class Report:
 
 
 @contextmanager
-def reporting(progress: ProgressOption, total: float | None, what: str) -> Iterator[Report]:
+def report_progress(progress: ProgressOption, total: float | None, what: str) -> Iterator[Report]:
     """Report the progress of the computation in the body of a `with` statement.
 
     Args:

@@ -28,13 +28,13 @@ def data(chunk):
     return {"result": np.zeros(len(chunk.members), int), "q": np.sqrt(chunk.members[:, None] + np.arange(3.0))}
 
 
-def not_done(kept, chunks=CHUNKS):
-    return store.unfinished_chunks(chunks, kept.done("result")[0])
+def not_done(stored, chunks=CHUNKS):
+    return store.unfinished_chunks(chunks, stored.read_variable("result")[0])
 
 
-def collected(kept):
+def collected(stored):
     """Everything that is finished, by member."""
-    return {int(m): d["q"][k].tolist() for members, d in kept.finished() for k, m in enumerate(members)}
+    return {int(m): d["q"][k].tolist() for members, d in stored.read_chunks() for k, m in enumerate(members)}
 
 
 def files(folder):
@@ -44,58 +44,58 @@ def files(folder):
 @pytest.mark.parametrize("place", ["folder", None])
 def test_what_is_finished_is_left_out_and_given_back(tmp_path, place):
     out = place and tmp_path / place
-    with open_store(out, FINGERPRINT) as kept:
-        assert not_done(kept) == CHUNKS
-        kept.write(CHUNKS[1], data(CHUNKS[1]))
-        assert not_done(kept) == [CHUNKS[0], CHUNKS[2]]
-        done, codes = kept.done("result")
+    with open_store(out, FINGERPRINT) as stored:
+        assert not_done(stored) == CHUNKS
+        stored.write(CHUNKS[1], data(CHUNKS[1]))
+        assert not_done(stored) == [CHUNKS[0], CHUNKS[2]]
+        done, codes = stored.read_variable("result")
         np.testing.assert_array_equal(done, [0, 5])
         np.testing.assert_array_equal(codes, [0, 0])
-        ((members, found),) = kept.finished()
+        ((members, found),) = stored.read_chunks()
         np.testing.assert_array_equal(members, [0, 5])
         assert {name: values.dtype.kind for name, values in found.items()} == {"result": "i", "q": "f"}
         np.testing.assert_array_equal(found["q"], data(CHUNKS[1])["q"])
-    assert isinstance(kept, MemoryStore if place is None else FolderStore)
+    assert isinstance(stored, MemoryStore if place is None else FolderStore)
 
 
 def test_what_is_kept_may_have_any_name(tmp_path):
-    given = {name: np.array([k, 2 * k]) for k, name in enumerate(("file", "members", "allow_pickle", "kept/x", "a b"))}
-    with FolderStore(tmp_path, FINGERPRINT) as kept:
-        kept.write(CHUNKS[0], given)
-        ((members, found),) = kept.finished()
+    given = {name: np.array([k, 2 * k]) for k, name in enumerate(("file", "members", "allow_pickle", "stored/x", "a b"))}
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
+        stored.write(CHUNKS[0], given)
+        ((members, found),) = stored.read_chunks()
     np.testing.assert_array_equal(members, CHUNKS[0].members)
     assert {name: values.tolist() for name, values in found.items()} == {name: v.tolist() for name, v in given.items()}
 
 
 def test_a_sweep_goes_on_where_it_was_cut_into_other_chunks(tmp_path):
-    with FolderStore(tmp_path, FINGERPRINT) as kept:
-        kept.write(CHUNKS[0], data(CHUNKS[0]))
-    with FolderStore(tmp_path, FINGERPRINT) as kept:
-        left = not_done(kept, [chunk(0, [0, 1, 2]), chunk(1, [3, 4]), chunk(2, [5])])
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
+        stored.write(CHUNKS[0], data(CHUNKS[0]))
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
+        left = not_done(stored, [chunk(0, [0, 1, 2]), chunk(1, [3, 4]), chunk(2, [5])])
         assert [c.members.tolist() for c in left] == [[0, 2], [3], [5]]
         assert [(c.index, c.work) for c in left] == [(0, 4.0), (1, 3.0), (2, 6.0)]
         for c in left:
-            kept.write(c, data(c))
-        assert collected(kept) == {m: data(chunk(0, [m]))["q"][0].tolist() for m in range(6)}
-        assert not_done(kept) == []
+            stored.write(c, data(c))
+        assert collected(stored) == {m: data(chunk(0, [m]))["q"][0].tolist() for m in range(6)}
+        assert not_done(stored) == []
 
 
 @pytest.mark.parametrize(
     "damage", [lambda content: content[: len(content) // 2], lambda content: b"", lambda content: b"\0" * len(content)]
 )
 def test_a_damaged_chunk_is_computed_again_and_no_other(tmp_path, damage):
-    with FolderStore(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
         for c in CHUNKS:
-            kept.write(c, data(c))
-        whole = collected(kept)
+            stored.write(c, data(c))
+        whole = collected(stored)
         broken = files(tmp_path)[1]
         broken.write_bytes(damage(broken.read_bytes()))
-    with FolderStore(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
         with pytest.warns(UserWarning, match=f"{broken.name} is damaged"):
-            left = not_done(kept)
+            left = not_done(stored)
         assert left == [CHUNKS[1]]
-        kept.write(left[0], data(left[0]))
-        assert collected(kept) == whole
+        stored.write(left[0], data(left[0]))
+        assert collected(stored) == whole
 
 
 def test_another_sweep_is_refused_and_the_difference_spelled_out(tmp_path):
@@ -149,19 +149,19 @@ def test_two_processes_do_not_write_the_same_sweep(tmp_path):
 
 
 def test_what_was_being_written_when_the_process_died_is_removed(tmp_path):
-    with FolderStore(tmp_path, FINGERPRINT) as kept:
-        kept.write(CHUNKS[0], data(CHUNKS[0]))
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
+        stored.write(CHUNKS[0], data(CHUNKS[0]))
     torn = tmp_path / "chunks" / f"000001-abc.npz.123{store.UNFINISHED}"
     torn.write_bytes(b"half")
-    with FolderStore(tmp_path, FINGERPRINT) as kept:
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
         assert not torn.exists()
-        assert not_done(kept) == CHUNKS[1:]
+        assert not_done(stored) == CHUNKS[1:]
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
 def test_a_full_disk_is_named_and_what_is_finished_stays_valid(tmp_path, monkeypatch, call):
-    with FolderStore(tmp_path, FINGERPRINT) as kept:
-        kept.write(CHUNKS[0], data(CHUNKS[0]))
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
+        stored.write(CHUNKS[0], data(CHUNKS[0]))
 
         def full(*_):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -169,10 +169,10 @@ def test_a_full_disk_is_named_and_what_is_finished_stays_valid(tmp_path, monkeyp
         with monkeypatch.context() as patched:
             patched.setattr(os, call, full)
             with pytest.raises(StoreError, match=r"No space left on device; 1 chunks in .* stay valid.*run the same sweep again"):
-                kept.write(CHUNKS[1], data(CHUNKS[1]))
+                stored.write(CHUNKS[1], data(CHUNKS[1]))
         assert len(files(tmp_path)) == 1
-    with FolderStore(tmp_path, FINGERPRINT) as kept:
-        assert not_done(kept) == CHUNKS[1:]
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
+        assert not_done(stored) == CHUNKS[1:]
 
 
 def test_the_manifest_says_what_the_sweep_is(tmp_path):

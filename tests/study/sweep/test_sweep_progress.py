@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from udkjax.integrate import Result
-from udkjax.study.progress import reporting
+from udkjax.study.progress import report_progress
 from udkjax.study.sweep import sweep_progress
 from udkjax.study.sweep.plan import Chunk
 from udkjax.study.sweep.sweep_progress import SweepProgress, Watch, duration
@@ -59,7 +59,7 @@ def test_a_sweep_is_followed(clock):
 
 def test_it_is_reported_as_everything_else_is(capsys):
     for option, says in ((False, False), (True, True)):
-        with reporting(option, 20, "sweep") as report:
+        with report_progress(option, 20, "sweep") as report:
             watch = Watch(20, CHUNKS, report.show)
             for chunk in CHUNKS:
                 watch(chunk, result(Result.drift))

@@ -24,7 +24,7 @@ class Dependency(NamedTuple):
 def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple[str, ...]]) -> list[Dependency]:
     """Return minimal dependent sets that together say all that N (m, k) does, the smallest first.
 
-    `owners` is the constraint of each row, `attached` the bodies of each constraint, by which near ones are kept in a set first.
+    `owners` is the constraint of each row, `attached` the bodies of each constraint, by which near ones come first into a set.
     """
     owner, found = np.array(owners), []
     spanned = np.zeros((N.shape[1], 0))  # the combinations of columns that the sets found so far are made of
@@ -33,7 +33,7 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
         involved = list(dict.fromkeys(owner[np.linalg.norm(remaining, axis=1) > DEPENDS].tolist()))
         candidates = [_around(seed, involved, remaining, owner, attached) for seed in involved]
         for members in sorted(candidates, key=len):
-            own = _vanishing(N[~np.isin(owner, members)])
+            own = _null_space(N[~np.isin(owner, members)])
             both = np.linalg.svd(np.concatenate([spanned, own], axis=1), full_matrices=False)
             rank = int(np.sum(both[1] > DEPENDS))
             if rank > spanned.shape[1]:
@@ -56,7 +56,7 @@ def redundant_by(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -
 
 def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> np.ndarray:
     """The combinations of the rows of a set alone that vanish, (m, redundancy): forces by which it keeps itself in balance."""
-    return N @ _vanishing(N[~np.isin(np.array(owners), list(members))])
+    return N @ _null_space(N[~np.isin(np.array(owners), list(members))])
 
 
 def _around(seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]) -> list[str]:
@@ -85,8 +85,8 @@ def _rank(matrix: np.ndarray) -> int:
     return int(np.sum(np.linalg.svd(matrix, compute_uv=False) > DEPENDS)) if matrix.size else 0
 
 
-def _vanishing(matrix: np.ndarray) -> np.ndarray:
-    """The combinations of columns that vanish, orthonormal."""
+def _null_space(matrix: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis, as columns, of what a matrix maps to zero."""
     if not matrix.size:
         return np.eye(matrix.shape[1])
     return np.linalg.svd(matrix)[2][_rank(matrix) :].T

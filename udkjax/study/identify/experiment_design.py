@@ -115,25 +115,18 @@ def design_experiment(
     Raises:
         IdentificationError: with every mistake.
     """
-    made = [_candidate(candidate, k) for k, candidate in enumerate(candidates)]
-    problems = [] if made else ["candidates: there is none"]
+    experiments = [_candidate(candidate, k) for k, candidate in enumerate(candidates)]
+    problems = [] if experiments else ["candidates: there is none"]
     if criterion not in get_args(Criterion):
         problems.append(f"criterion must be one of {', '.join(get_args(Criterion))}, is {criterion!r}")
-    if not 1 <= pick <= max(len(made), 1):
-        problems.append(f"pick must be from 1 to {len(made)}, the number of candidates, is {pick}")
+    if not 1 <= pick <= max(len(experiments), 1):
+        problems.append(f"pick must be from 1 to {len(experiments)}, the number of candidates, is {pick}")
     if problems:
         raise IdentificationError(problems)
     ts = np.asarray(ts, float)
     records = [
-        Record(
-            ts,
-            {channel: np.zeros(ts.shape) for channel in channels},
-            noise,
-            c.initial_state,
-            conditions=c.conditions,
-            name=c.name,
-        )
-        for c in made
+        Record(ts, dict.fromkeys(channels, np.zeros(ts.shape)), noise, c.initial_state, None, c.conditions, c.name)
+        for c in experiments
     ]
     problem = build_problem(mechanism if given is None else given.mechanism, records, parameters, settings)
     names = problem.unknowns.names
@@ -147,20 +140,20 @@ def design_experiment(
         every = np.concatenate([before, *(roots[k] for k in which)])
         return _score(_eliminate(every, np.setdiff1d(np.arange(len(names)), wanted), floor), criterion, floor)
 
-    alone = [evaluate([k]) for k in range(len(made))]
+    alone = [evaluate([k]) for k in range(len(experiments))]
     chosen: list[int] = []
     while len(chosen) < pick:
-        left = [k for k in range(len(made)) if k not in chosen]
+        left = [k for k in range(len(experiments)) if k not in chosen]
         chosen.append(max(left, key=lambda k: evaluate([*chosen, k])[0]))
     full = len(wanted)
     nothing = 0.0 if criterion == "E" else -np.inf
     return Design(
         criterion,
         tuple(names[k] for k in wanted),
-        tuple(c.name for c in made),
+        tuple(c.name for c in experiments),
         np.array([score if rank == full else nothing for (rank, score), _ in alone]),
         np.stack([errors * dx_dz for _, errors in alone]),
-        tuple(sorted(range(len(made)), key=lambda k: alone[k][0], reverse=True)),
+        tuple(sorted(range(len(experiments)), key=lambda k: alone[k][0], reverse=True)),
         tuple(chosen),
         np.stack([evaluate(chosen[: n + 1])[1] * dx_dz for n in range(pick)]),
     )

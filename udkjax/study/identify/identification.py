@@ -21,7 +21,7 @@ from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
 from udkjax.study.identify.search import N_STARTS, SearchResult, search
 from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
-from udkjax.study.progress import ProgressOption, reporting
+from udkjax.study.progress import ProgressOption, report_progress
 from udkjax.study.whiteness import Whiteness, whiteness_of
 
 REWEIGHTED = 2  # fits, each with the noise that the one before left
@@ -91,7 +91,7 @@ def identify(
     first = _first_guesses(problem, n_starts, guesses)
     residual_loss = squares if callable(loss) else named_loss(loss, len(problem.index))
     method = choose_method(optimizer, loss)
-    with reporting(progress, None, "identify") as report:
+    with report_progress(progress, None, "identify") as report:
         minimizer = Minimizer(method, residual_loss, lambda text: report(report.state.done + 1, text))
         found = search(problem, first, (tol, tol), minimizer, 0 if guesses is not None else n_starts, seed, strategy)
         _require_finite(problem, found)

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from udkjax.study.identify.problem import INVISIBLE, Residuals
 from udkjax.study.identify.unknowns import FAR
@@ -51,6 +51,15 @@ class Fit(NamedTuple):
     cost: Float[np.ndarray, "B"]
     settled: Bool[np.ndarray, "B"]
     history: History  # of the best fit
+
+    def take(self, which: Int[np.ndarray, "n"]) -> "Fit":
+        """Return some of the fits."""
+        return Fit(self.z[which], self.cost[which], self.settled[which], self.history)
+
+    def join(self, other: "Fit") -> "Fit":
+        """Return these fits, then others."""
+        z, cost, settled = (np.concatenate(pair) for pair in zip(self[:3], other[:3], strict=True))
+        return Fit(z, cost, settled, self.history)
 
 
 def minimize_squares(

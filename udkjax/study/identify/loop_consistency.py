@@ -53,14 +53,8 @@ def loop_problems(
 ) -> list[str]:
     """Return what is wrong with moving parameters each by itself; nothing if loops stay closed whatever they are.
 
-    Args:
-        mechanism: a mechanism that closes.
-        apply: assigns values (P,) to it; pure, and the values may be traced.
-        x: the values (P,) around which they are to move.
-        names: what messages call the parameters.
-
-    Returns:
-        Messages: the constraints that close a loop, the parameters that would open it, and the ties that keep it closed.
+    `apply` assigns values (P,), which may be traced, to a mechanism that closes; x are those around which they are to move. A
+    message names the constraints that close a loop, the parameters that would open it, and the ties that leave it closed.
     """
     redundant = analyse(mechanism).redundant_rows
     if redundant == () or not names:

@@ -123,7 +123,7 @@ class _Static:
         return self is other or (isinstance(other, _Static) and self._key == other._key)
 
     @property
-    def fixed(self) -> PyTree:
+    def static_part(self) -> PyTree:
         """What is not an array, in its place."""
         structure, leaves, _ = self._key
         return jax.tree.unflatten(structure, leaves)
@@ -136,7 +136,7 @@ def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
 
 @partial(jax.jit, static_argnums=0)
 def _predict(static, arrays, members, tol):
-    mechanism, settings = eqx.combine(arrays, static.fixed)
+    mechanism, settings = eqx.combine(arrays, static.static_part)
     targets, channels, ends = static.rest
     several = len(members.x) > 1
 

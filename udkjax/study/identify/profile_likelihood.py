@@ -164,16 +164,10 @@ def trace_profile(
     Args:
         fit: (index, value, z0) -> (z, cost) minimizes the cost over all other unknowns from z0 on; a cost that is not finite is a
             failure, before which the walk ends.
-        index: of the unknown.
-        z: the estimate (K,).
-        cost: of the estimate.
-        step: a first guess of the standard error of z_k; steps adapt.
-        level: of confidence.
-        noise: where it was estimated, how many times larger it is than what residuals were divided by.
-        degrees_of_freedom: where the noise was estimated, those that it leaves: the quantile is then that of F.
-        bounds: of z_k.
-        value: x of z_k, which increases.
-        name, units: of the parameter, in texts.
+        index: of the unknown, whose estimate has the `cost`, and whose standard error is about a first `step`.
+        noise: where it was estimated, how many times larger it is than what residuals were divided by; then it leaves
+            `degrees_of_freedom`, and the quantile is that of F.
+        value: x of z_k, which increases between the `bounds` of z_k.
         steps: fits at most, to one side.
     """
     limit = quantile(level, degrees_of_freedom)

@@ -51,16 +51,9 @@ def search(
 ) -> SearchResult:
     """Find the unknowns that explain the records best.
 
-    Where no guess leads to a fit, and they do not agree or the motion is chaotic, the records are cut into pieces.
-
-    Args:
-        problem: whose records are fitted.
-        z: first guesses.
-        tol: tolerances of the integration at the end; on the way it is looser.
-        minimizer: how each fit is made.
-        more: how many guesses beside the first may be tried where the given ones do not lead to a fit.
-        seed: of these guesses.
-        strategy: "pieces" cuts the records into pieces at once.
+    Where the guesses z do not lead to a fit, `more` are tried beside the first. Where none does, and they do not agree or the
+    motion is chaotic, the records are cut into pieces; with the strategy "pieces" at once. The tolerances `tol` are those at the
+    end: on the way they are looser.
     """
     loose = max(tol[0], LOOSE), max(tol[1], LOOSE)
     if strategy == "pieces":
@@ -75,7 +68,7 @@ def search(
         other = fit_growing_parts(problem, z, loose, minimizer)
         history += other.history
         tried = [other.z, z]
-        fit = _choose_better(fit, other)
+        fit = fit.join(other).take(np.arange(len(z)) + np.where(other.cost < fit.cost, len(z), 0))
     if more and not explains(problem, fit, loose):
         ways.append(f"{more} more first guesses")
         guesses = sample_guesses(problem.unknowns, z[0], more, seed)
@@ -83,11 +76,11 @@ def search(
         history += other.history
         z = np.concatenate([z, guesses])
         tried.append(other.z)
-        fit = _concatenate(fit, other)
+        fit = fit.join(other)
     best = int(np.argmin(fit.cost))
     there = np.abs(fit.z - fit.z[best]).max(1) <= SAME_MINIMUM * (1.0 + np.abs(fit.z[best]).max())
     agreeing = int((there & np.isfinite(fit.cost)).sum())
-    only = Fit(fit.z[best : best + 1], fit.cost[best : best + 1], fit.settled[best : best + 1], fit.history)
+    only = fit.take(np.array([best]))
     lost = 2 * agreeing < len(z) or is_chaotic(problem, only.z, loose)  # else the mechanism does not move like that
     if more and lost and not explains(problem, only, loose):
         found = fit_in_pieces(problem, np.concatenate(tried), tol, minimizer)
@@ -176,17 +169,3 @@ def is_white(r: np.ndarray) -> bool:
     """Return whether residuals in the order of time are not correlated with those before them."""
     power = r @ r
     return len(r) < 3 or power == 0.0 or abs(r[1:] @ r[:-1]) / power <= WHITE_CORRELATION / np.sqrt(len(r))
-
-
-def _choose_better(one: Fit, two: Fit) -> Fit:
-    """Return the better of two fits from each guess."""
-    which = two.cost < one.cost
-    z = np.where(which[:, None], two.z, one.z)
-    cost, settled = np.where(which, two.cost, one.cost), np.where(which, two.settled, one.settled)
-    return Fit(z, cost, settled, one.history)
-
-
-def _concatenate(one: Fit, two: Fit) -> Fit:
-    """Return fits from some guesses, then those from others."""
-    z, cost, settled = (np.concatenate(pair) for pair in zip(one[:3], two[:3], strict=True))
-    return Fit(z, cost, settled, one.history)

@@ -82,7 +82,7 @@ class Column:
     labels: tuple[str, ...] = ()  # of choices, unique
 
     @property
-    def chosen(self) -> bool:
+    def is_choice(self) -> bool:
         """Whether its values are choices, not numbers."""
         return bool(self.labels)
 
@@ -101,13 +101,13 @@ class Column:
     @property
     def setting(self) -> str:
         """What its choices are of."""
-        assert self.chosen and not callable(self.of)
+        assert self.is_choice and not callable(self.of)
         return self.of[0]
 
     @property
     def coordinate(self) -> np.ndarray:
         """The values as a dataset shows them: numbers, or labels."""
-        if not self.chosen:
+        if not self.is_choice:
             return self.numbers
         if self.of == ("max_steps",):
             return np.array(self.choices)

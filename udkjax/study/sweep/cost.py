@@ -84,7 +84,7 @@ def _by_rule(plan: Plan, group: Group) -> Float[np.ndarray, "n"]:
     """What is known beforehand: steps grow with the length of a run, and slowly with the tightness of its tolerances."""
     places, steps = plan.places(group.members), np.full(len(group.members), STEPS_GUESSED)
     for column in plan.columns:
-        if not column.chosen and not callable(column.of):
+        if not column.is_choice and not callable(column.of):
             values = column.numbers[places[column.name]]
             if "t1" in column.of:
                 steps = steps * values / np.max(values)
@@ -98,7 +98,7 @@ def _features(plan: Plan, group: Group) -> Float[np.ndarray, "n d"]:
     places, found = plan.places(group.members), []
     for column in plan.columns:
         at = places[column.name]
-        if column.chosen:
+        if column.is_choice:
             found += [np.where(at == k, 1.0, -1.0) for k in group.choices[column.name][1:]]
             continue
         for x in column.numbers[at].reshape(len(at), -1).T:

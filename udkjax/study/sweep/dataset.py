@@ -88,7 +88,7 @@ def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[
 
     variables = variables_of(plan)
     places = _places(plan)
-    flat = {name: np.full((plan.size, *v.shape), _nothing(name, v), v.dtype) for name, v in variables.items()}
+    flat = {name: np.full((plan.size, *v.shape), _fill_value(name, v), v.dtype) for name, v in variables.items()}
     taken = room = 0
     for members, data in finished:
         group = plan.groups[plan.group_of(int(members[0]))]
@@ -112,7 +112,7 @@ def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[
     return data
 
 
-def _nothing(name: str, variable: Variable) -> float | int | bool:
+def _fill_value(name: str, variable: Variable) -> float | int | bool:
     if name == RESULT:
         return NOT_COMPUTED
     return np.nan if variable.dtype.kind in "fc" else False if variable.dtype.kind == "b" else -1

@@ -42,7 +42,7 @@ def _axis(plan: Plan, column: Column) -> dict[str, Json]:
     of: Json = None if callable(column.of) else column.of
     if callable(column.of):
         of = _function(column.of, plan.mechanism, np.zeros(column.numbers.shape[1:]))
-    return {"of": of, "values": [_value(value) for value in column.values] if column.chosen else _value(column.values)}
+    return {"of": of, "values": [_value(value) for value in column.values] if column.is_choice else _value(column.values)}
 
 
 def _measure(plan: Plan, measure: Measure) -> dict[str, Json]:

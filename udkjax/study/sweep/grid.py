@@ -63,7 +63,7 @@ class _GridReader:
         self.problems: list[str] = []
 
     def sweep(self, given: Table) -> dict[str, Any]:
-        self.known("", given, TOP)
+        self.check_keys("", given, TOP)
         axes = self.table("axes", given.get("axes", {}))
         if given.get("axes", {}) == {}:
             self.wrong("axes", 'missing; write [axes], and below it such as "body.link1.mass" = [1.0, 2.0]')
@@ -125,7 +125,7 @@ class _GridReader:
         if not isinstance(given, dict):
             return Axis(self.values(place, name, given))
         if "zipped" in given:
-            self.known(place, given, ("zipped",))
+            self.check_keys(place, given, ("zipped",))
             axes = self.table(f"{place}.zipped", given["zipped"])
             return Zipped({k: self.axis(f"{place}.zipped.{key_of(k)}", k, v) for k, v in axes.items()})
         of, units = self.of(f"{place}.of", given.get("of")), given.get("units")
@@ -135,7 +135,7 @@ class _GridReader:
         if "distribution" in rest:
             return Axis(self.distribution(place, rest), of, units)
         if "values" in rest:
-            self.known(place, rest, ("values",))
+            self.check_keys(place, rest, ("values",))
             return Axis(self.values(f"{place}.values", name, rest["values"]), of, units)
         return Axis(self.range(place, rest), of, units)
 
@@ -151,7 +151,7 @@ class _GridReader:
     def range(self, place: str, given: Table) -> Values:
         """From one number to another: with a design all that is between them, else so many numbers."""
         needed = ("from", "to") if self.drawn else ("from", "to", "num")
-        self.known(place, given, (*needed, "scale"))
+        self.check_keys(place, given, (*needed, "scale"))
         for key in needed:
             if key not in given:
                 self.wrong(f"{place}.{key}", "missing")
@@ -192,15 +192,15 @@ class _GridReader:
         if not isinstance(given, dict) or not given:
             return self.wrong(place, f"must be a name, a list of names or a table, is {abbreviate(given)}")
         if "length" in given:
-            self.known(place, given, ("length", "as_rod"))
+            self.check_keys(place, given, ("length", "as_rod"))
             return Length(self.names(f"{place}.length", given["length"]), given.get("as_rod", False) is True)
         if "angle" in given:
-            self.known(place, given, ("angle",))
+            self.check_keys(place, given, ("angle",))
             return Angle(self.names(f"{place}.angle", given["angle"]))
         return Scaled({name: self.number(f"{place}.{key_of(name)}", factor) or 0.0 for name, factor in given.items()})
 
     def settings(self, given: Table) -> dict[str, Any]:
-        self.known("settings", given, SETTINGS)
+        self.check_keys("settings", given, SETTINGS)
         found: dict[str, Any] = {}
         for name, value in given.items():
             place = f"settings.{name}"
@@ -213,7 +213,7 @@ class _GridReader:
         return found
 
     def design(self, given: Table) -> Design | None:
-        self.known("design", given, ("type", "members", "seed"))
+        self.check_keys("design", given, ("type", "members", "seed"))
         kind = given.get("type")
         members, seed = self.whole("design.members", given.get("members"), 1), self.whole("design.seed", given.get("seed", 0), 0)
         if kind not in DESIGNS:
@@ -227,7 +227,7 @@ class _GridReader:
         """Note a mistake."""
         self.problems.append(f"{place}: {problem}")
 
-    def known(self, place: str, given: Table, expected: Iterable[str]) -> None:
+    def check_keys(self, place: str, given: Table, expected: Iterable[str]) -> None:
         """Note the keys of a table that are not expected."""
         expected = tuple(expected)
         for key in given:

@@ -88,7 +88,7 @@ def _column(mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray
     of = (name,) if axis.of is None else axis.of
     before = len(problems)
     if not callable(of):
-        problems += _unknown(mechanism, name, of)
+        problems += _unknown_targets(mechanism, name, of)
     values = axis.values if unit is None else scale_to_range(axis.values, unit)
     if values is None:
         problems.append(f"axis {quote(name)}: with a design its values are a range (low, high), or a frozen distribution")
@@ -137,15 +137,15 @@ def _numbers(values: Values) -> np.ndarray | None:
     return array.astype(float) if array.dtype.kind in "iuf" and array.ndim else None
 
 
-def _unknown(mechanism: Mechanism, name: str, of: Sequence[str]) -> Iterator[str]:
+def _unknown_targets(mechanism: Mechanism, name: str, of: Sequence[str]) -> Iterator[str]:
     known = parameters_of(mechanism)
     for target in of:
         if target not in NUMBERS and target not in CHOICES and split_index(target, known)[0] not in known:
-            near = suggestion(target, (*known, *NUMBERS, *CHOICES)) or _ending(target, known)
+            near = suggestion(target, (*known, *NUMBERS, *CHOICES)) or _suggest_ending(target, known)
             yield f"axis {quote(name)}: {quote(target)} is no parameter of the mechanism, nor a setting{near}"
 
 
-def _ending(target: str, known: Iterable[str]) -> str:
+def _suggest_ending(target: str, known: Iterable[str]) -> str:
     """What ends as the name does: `mass` may stand for many."""
     last = {full.rpartition(".")[2]: full for full in known}
     close = difflib.get_close_matches(target, last, n=1)
@@ -206,7 +206,7 @@ def check_tangents(mechanism: Mechanism, dimensions: Sequence[Dimension], names:
     known, problems = parameters_of(mechanism), []
     for name in names:
         if name in columns:
-            if columns[name].chosen or columns[name].numbers.ndim > 1:
+            if columns[name].is_choice or columns[name].numbers.ndim > 1:
                 problems.append(f"derivatives: axis {quote(name)} is not one of plain numbers")
             continue
         owner, index = split_index(name, known)

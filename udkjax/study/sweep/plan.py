@@ -89,7 +89,7 @@ class Plan:
     @cached_property
     def groups(self) -> tuple[Group, ...]:
         """One for each combination of structures that occurs among the choices."""
-        chosen = [column for column in self.columns if column.chosen]
+        chosen = [column for column in self.columns if column.is_choice]
         places = self.places(np.arange(self.size))
         kinds = np.stack(
             [_number_structures(column)[places[column.name]] for column in chosen] or [np.zeros(self.size, int)], axis=1
@@ -117,7 +117,7 @@ class Plan:
     def choice(self, group: Group, setting: str) -> AxisChoice:
         """What a group has for a setting: the first of its choices, where these differ by numbers."""
         for column in self.columns:
-            if column.of == (setting,) and column.chosen:
+            if column.of == (setting,) and column.is_choice:
                 return column.choices[group.choices[column.name][0]]
         return self.mechanism if setting == "mechanism" else self.settings.get(setting)
 

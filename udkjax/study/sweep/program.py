@@ -70,12 +70,12 @@ class Recipe:
     def __init__(self, plan: Plan, group: Group, redundant: tuple[int, ...] | None = None):
         self.plan, self.group = plan, group
         self.names = tuple(plan.derivatives)
-        self.numbers = tuple(column for column in plan.columns if not column.chosen)
+        self.numbers = tuple(column for column in plan.columns if not column.is_choice)
         fixed: dict[str, PyTree] = {"mechanism": plan.mechanism, **plan.settings}
         fixed |= {name: number(value) for name, value in plan.settings.items() if name in NUMBERS and value is not None}
         self._own: dict[str, Choices] = {}
         for column in plan.columns:
-            if column.chosen:
+            if column.is_choice:
                 setting, places = column.setting, group.choices[column.name]
                 fixed[setting] = column.choices[places[0]]
                 if len(places) > 1 and jax.tree.leaves(eqx.filter(fixed[setting], eqx.is_array)):
@@ -218,11 +218,11 @@ class Program:
         if not names:
             return members({}), {}
 
-        def shifted(shift: Array) -> tuple[Outputs, Outputs]:
+        def outputs_at(shift: Array) -> tuple[Outputs, Outputs]:
             stored = members(dict(zip(names, shift, strict=True)))
             return {k: x for k, x in stored.items() if jnp.issubdtype(x.dtype, jnp.floating) and k != END}, stored
 
-        slopes, stored = jax.jacfwd(shifted, has_aux=True)(jnp.zeros(len(names)))
+        slopes, stored = jax.jacfwd(outputs_at, has_aux=True)(jnp.zeros(len(names)))
         return stored, slopes
 
     def _lower(self) -> jax.stages.Lowered:

@@ -44,9 +44,9 @@ class ChunkStore(abc.ABC):
     def __exit__(self, *_: object) -> None:
         return None
 
-    def done(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+    def read_variable(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return the members that are finished, and what is stored of them under a name."""
-        parts = [(members, data[name]) for members, data in self.finished()] or [(np.empty(0, int), np.empty(0, int))]
+        parts = [(members, data[name]) for members, data in self.read_chunks()] or [(np.empty(0, int), np.empty(0, int))]
         members, values = zip(*parts, strict=True)
         return np.concatenate(members), np.concatenate(values)
 
@@ -55,7 +55,7 @@ class ChunkStore(abc.ABC):
         """Store what a chunk gave: one array for each name, whose first axis is the chunk's members."""
 
     @abc.abstractmethod
-    def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
+    def read_chunks(self) -> Iterator[tuple[np.ndarray, Data]]:
         """Iterate over what is finished, one chunk at a time: members, and their data."""
 
 
@@ -68,7 +68,7 @@ class MemoryStore(ChunkStore):
     def write(self, chunk: Chunk, data: Data) -> None:
         self._done.append((np.asarray(chunk.members), data))
 
-    def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
+    def read_chunks(self) -> Iterator[tuple[np.ndarray, Data]]:
         yield from self._done
 
 
@@ -116,7 +116,7 @@ class FolderStore(ChunkStore):
             pack({MEMBERS: members, **{STORED + name: values for name, values in data.items()}}),
         )
 
-    def finished(self) -> Iterator[tuple[np.ndarray, Data]]:
+    def read_chunks(self) -> Iterator[tuple[np.ndarray, Data]]:
         """Iterate over what is finished, one file at a time: members, and their data. Damaged files are removed."""
         for file in self._files():
             data = unpack(file.read_bytes())

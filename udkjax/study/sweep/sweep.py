@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from udkjax.extras import require
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.progress import ProgressOption, reporting
+from udkjax.study.progress import ProgressOption, report_progress
 from udkjax.study.sweep.axes import AxisValues, Design
 from udkjax.study.sweep.cost import MEMORY, cut_chunks
 from udkjax.study.sweep.dataset import assemble
@@ -88,14 +88,14 @@ def sweep(
     plan = make_plan(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
     compute = _engine(engine, client)
     with open_store(out, fingerprint(plan) if out is not None else {}) as store:
-        done, codes = store.done(RESULT)
-        with reporting(progress, plan.size, "sweep") as report:
+        done, codes = store.read_variable(RESULT)
+        with report_progress(progress, plan.size, "sweep") as report:
             todo = unfinished_chunks(cut_chunks(plan, memory), done) if len(done) < plan.size else []
             watch = Watch(plan.size, todo, report.show, codes)
             for chunk, data, seconds in compute(plan, todo):
                 store.write(chunk, data)
                 watch(chunk, data, seconds)
-        return assemble(plan, store.finished())
+        return assemble(plan, store.read_chunks())
 
 
 def _engine(engine: str, client: "distributed.Client | None") -> Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]:
