@@ -97,11 +97,11 @@ class _Motion:
         return {owner: by_row[:, own[0] : own[-1] + 1].sum(1) for owner, own in rows.items()}
 
     def acceleration(self, body: str) -> list[Array]:
-        """ax, ay and alpha of a body, each (T,)."""
+        """Return ax, ay and alpha of a body, each (T,)."""
         return self._entries(self.dynamics.a, body)
 
     def load(self, owner: str, body: str) -> tuple[Array, Array, Array]:
-        """Force and torque of a constraint on a body; on the ground: minus those on the others."""
+        """Return force and torque of a constraint on a body; on the ground: minus those on the others."""
         loads = self.loads[owner]
         if body != GROUND:
             fx, fy, torque = self._entries(loads, body)

@@ -67,7 +67,7 @@ class Driven(NamedTuple):
         return bool(self.name) and self.mechanism.drivers[self.name].coordinate == "angle"
 
     def value(self, q: Float[Array, "n"] | Float[Array, "bodies 3"]) -> Float[Array, ""]:
-        """The value of the coordinate (rad, m) in a position."""
+        """Return the value of the coordinate (rad, m) in a position."""
         return psi(self.mechanism, 0.0, q)[self.row]
 
 
@@ -168,7 +168,7 @@ def choose_name(name: str, taken: Container[str]) -> str:
 
 
 def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: ArrayLike) -> Mechanism:
-    """With one driver of this name along its value, and the others held."""
+    """Return the mechanism with a driver of this name that goes along its own value; all others hold theirs."""
     known = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
         origin = known and Origin(_add_driver(known, name, _known_element(known, name, element), _value_or(t, 0.0)))
@@ -178,7 +178,7 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: ArrayLi
 
 
 def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:
-    """With one more driver, or another motion of one that is there."""
+    """Return the mechanism with one more driver, or with another motion of one that is there."""
     drivers = {**mechanism.drivers, name: Driver(element.bodies, element.coordinate, motion, element.points)}
     known = mechanism if mechanism.is_known else mechanism.origin and mechanism.origin.mechanism
     found = with_drivers(mechanism, drivers)
@@ -204,7 +204,7 @@ def with_drivers(
 
 
 def _known_element(known: Mechanism, name: str, element: Coordinate) -> Coordinate:
-    """The same coordinate, with points that are not traced."""
+    """Return the same coordinate, with points that are not traced."""
     if name in known.drivers:
         return _element(known, name)[1]
     if element.points is not None and isinstance(element.points, Tracer):
@@ -213,7 +213,7 @@ def _known_element(known: Mechanism, name: str, element: Coordinate) -> Coordina
 
 
 def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
-    """The mechanism whose driver starts from the value in the initial guess: an analysis closes it at time zero."""
+    """Return the mechanism whose driver starts from its value in the initial guess: an analysis closes it at time zero."""
     mechanism = mechanism if mechanism.origin is None else mechanism.origin.mechanism
     with _at_once(mechanism):
         value = jax.lax.stop_gradient(value_of(mechanism, name)(mechanism.q0))
@@ -221,7 +221,7 @@ def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
 
 
 def _at_once(given: PyTree) -> AbstractContextManager:
-    """What is known is computed at once, also while something else is traced."""
+    """Compute what is known at once, also while something else is traced."""
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given))
     return nullcontext() if traced else jax.ensure_compile_time_eval()
 

@@ -93,7 +93,7 @@ def equilibria(
 
 
 def degrees_of_freedom(analysis: Analysis) -> int:
-    """How many there are; raises ValueError where that is not known."""
+    """Return how many degrees of freedom there are; raise ValueError where that is not known."""
     free = analysis.degrees_of_freedom
     if free is None:
         raise ValueError(
@@ -103,12 +103,12 @@ def degrees_of_freedom(analysis: Analysis) -> int:
 
 
 def rest_curve(mechanism: Mechanism, analysis: Analysis) -> Curve:
-    """The positions of the mechanism, with time in place of a driver's value."""
+    """Return the positions of the mechanism as a curve, with time in place of a driver's value."""
     return Curve.of(Driven(mechanism.without_origin, analysis, "", -1, jnp.ones(())))
 
 
 def omega2(at: Linearization) -> Float[Array, "f"]:
-    """(rad/s)^2, ascending, of the undamped linearization."""
+    """Return omega^2 of the undamped linearization, (rad/s)^2, ascending."""
     L = jnp.linalg.cholesky(at.mass)
     A = jax.scipy.linalg.solve_triangular(L, at.stiffness, lower=True)
     A = jax.scipy.linalg.solve_triangular(L, A.T, lower=True)
@@ -128,7 +128,7 @@ def _equilibrium(
 
 
 def _left(mechanism: Mechanism, at: Linearization, t: Float[Array, ""], q: Float[Array, "n"]) -> Float[Array, ""]:
-    """N^T F relative to F, each coordinate over the root of its mass: N is orthonormal in that metric."""
+    """Return N^T F relative to F, each coordinate over the root of its mass: N is orthonormal in that metric."""
     size = jnp.linalg.norm(loads.force(mechanism, t, q, jnp.zeros_like(q)) / jnp.sqrt(loads.mass(mechanism)))
     return jnp.linalg.norm(at.force) / jnp.where(size > 0, size, 1.0)
 
@@ -136,7 +136,7 @@ def _left(mechanism: Mechanism, at: Linearization, t: Float[Array, ""], q: Float
 def _settle(
     curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int, stable: bool
 ) -> Float[Array, "n"]:
-    """Newton steps until nothing gets better."""
+    """Take Newton steps until nothing gets better."""
 
     def at(q: Float[Array, "n"]) -> Linearization:
         return linearize(curve.mechanism, analysis, free, t, q)
@@ -169,7 +169,7 @@ def _settle(
 
 
 def _towards_rest(here: Linearization, stable: bool) -> Float[Array, "f"]:
-    """The step eta, of the linearization; only downhill, where the equilibrium is to be stable."""
+    """Return the step eta of the linearization; only downhill, where the equilibrium is to be stable."""
     if not stable:
         return SVD(NEUTRAL).plus(here.stiffness) @ here.force
     values, vectors = jnp.linalg.eigh(0.5 * (here.stiffness + here.stiffness.T))
@@ -180,7 +180,7 @@ def _towards_rest(here: Linearization, stable: bool) -> Float[Array, "f"]:
 
 @eqx.filter_custom_jvp
 def _rest_position(curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int) -> Float[Array, "n"]:
-    """A position of rest, with the derivatives of one Newton step there."""
+    """Return a position of rest, with the derivatives of one Newton step there."""
     return q
 
 

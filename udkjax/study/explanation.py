@@ -94,7 +94,7 @@ def as_text(e: Explanation) -> str:
 
 
 def as_html(e: Explanation) -> str:
-    """The same text, as it stands."""
+    """Return the same text for a notebook, as it stands."""
     return f"<pre>{html.escape(as_text(e))}</pre>"
 
 
@@ -224,7 +224,7 @@ def _multipliers(e: Explanation, rows: list[str]) -> str:
 
 
 def _directions(e: Explanation) -> list[tuple[str, float]]:
-    """Of pins whose force is unique in one direction alone: the name, and which (rad)."""
+    """Return the pins whose force is unique in one direction alone, and that direction (rad)."""
     found, null_rows = [], e.null_rows / np.abs(e.null_rows).max(initial=np.finfo(float).tiny)
     for name, joint in e.mechanism.joints.items():
         own = [k for k, (owner, _) in enumerate(e.row_names) if owner == name]
@@ -264,7 +264,7 @@ def _width(names: list[str]) -> int:
 
 
 def _table(rows: list[str], columns: list[str], values: np.ndarray) -> str:
-    """A matrix with its names; wide ones in pieces below each other."""
+    """Lay out a matrix with its names; wide ones in pieces below each other."""
     width, pieces = _width(rows), []
     for start in range(0, len(columns), WIDE):
         part = slice(start, start + WIDE)
@@ -284,5 +284,5 @@ def _table(rows: list[str], columns: list[str], values: np.ndarray) -> str:
 
 
 def _number(x: float, size: float) -> str:
-    """Four digits; zero where it is rounding beside the largest."""
+    """Write a number with four digits; as zero where it is rounding beside the largest."""
     return "0" if abs(x) <= TINY * size else f"{x:.4g}"

@@ -31,5 +31,5 @@ def null_space(J: Float[Array, "m n"], free: int) -> Float[Array, "n free"]:
 
 
 def symmetric(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Half of A and of its transpose."""
+    """Return (A + A^T) / 2."""
     return 0.5 * (A + A.T)

@@ -54,7 +54,7 @@ class Kinematics(eqx.Module):
         return self.values
 
     def frame(self, body: str) -> Frame:
-        """The frame of a body, each of its numbers (T,)."""
+        """Return the frame of a body, each of its numbers (T,)."""
         if body == GROUND:
             zero = jnp.zeros_like(self.values)
             return Frame(zero, zero, zero, zero + 1.0, zero, zero, zero, zero)
@@ -141,7 +141,7 @@ def travel(
 def _at_once(
     driven: Driven, q: np.ndarray, values: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, bodies: tuple[str, ...]
 ) -> Kinematics | None:
-    """By machine code alone, and NumPy: nothing is compiled for it. None where care is needed."""
+    """Solve by machine code and NumPy alone, for which nothing is compiled. None where its steps are not to be relied on."""
     mechanism, analysis = driven.mechanism, driven.analysis
     s = psi_at_once(mechanism, analysis, q)[driven.row] if driven.name else values[0]
     found = march_at_once(mechanism, analysis, driven.unit, s, q, values)
@@ -157,7 +157,7 @@ def _at_once(
 
 
 def is_known(tree: PyTree) -> bool:
-    """Whether no number is traced."""
+    """Return whether no number is traced."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -208,7 +208,7 @@ def _assemble(mechanism: Mechanism, t: ArrayLike, state: State | None, analysis:
 
 
 def _solve(driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], fast: bool = True) -> Points:
-    """By machine code as far as that is to be relied on, if it may be `fast`, and with care from there on."""
+    """Solve by machine code as far as its steps are to be relied on (if `fast`), and by continuation from there on."""
     curve = Curve.of(driven)
     points, first = no_points(len(values), len(q)), jnp.asarray(0)
     if fast and can_march(driven.mechanism, driven.analysis):
@@ -230,7 +230,7 @@ def _solve(driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Fl
 
 @eqx.filter_custom_jvp
 def _with_derivatives(curve: Curve, values: Float[Array, "T"], q: Rows, dq: Rows, ddq: Rows) -> tuple[Rows, Rows, Rows]:
-    """Closed positions with the derivatives that the constraints give them: those of one Newton step there."""
+    """Return closed positions, whose derivatives are those of one Newton step there."""
     return q, dq, ddq
 
 
@@ -259,7 +259,7 @@ def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Ar
 
 @eqx.filter_custom_jvp
 def _limit(curve: Curve, x: Float[Array, "n+1"]) -> Float[Array, ""]:
-    """The value at a toggle, which changes by as much as that of the nearest point of the curve."""
+    """Return the value at a toggle, which changes by as much as that of the nearest point of the curve."""
     return x[-1]
 
 

@@ -16,7 +16,7 @@ def cores() -> int:
 
 
 def concurrent_chunks() -> int:
-    """How many chunks are computed at a time.
+    """Return how many chunks are computed at a time.
 
     One CPU device runs as many programs side by side as it has cores; several devices share each chunk.
     """

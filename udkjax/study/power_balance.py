@@ -103,7 +103,7 @@ def _powers(mechanism, analysis, ts, q, v, method, baumgarte):
 
 
 def _of_forces(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[Array, "forces"]:
-    """The power of each force element that is not the rate of its potential along the motion."""
+    """Return the power of each force element that is not the rate of its potential along the motion."""
 
     def power(element: ForceElement, *frames: Frame) -> Array:
         stated = element.loads(t, *frames)

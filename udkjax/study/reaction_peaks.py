@@ -82,7 +82,7 @@ def _peak(ts: Array, load: Float[Array, "T 3"]) -> Peak:
 
 
 def _largest(ts: Array, y: Float[Array, "T"]) -> tuple[Array, Array]:
-    """The largest of samples, by the parabola through it and its neighbours, and when; at an end of the run, the sample."""
+    """Return the peak of the parabola through the largest sample and its neighbours, and when; at an end of a run, the sample."""
     top = jnp.argmax(y)
     middle = jnp.clip(top, 1, len(y) - 2)
     before, at, after = y[middle - 1], y[middle], y[middle + 1]
@@ -96,7 +96,7 @@ def _largest(ts: Array, y: Float[Array, "T"]) -> tuple[Array, Array]:
 
 
 def _root_mean_square(ts: Array, square: Float[Array, "T"]) -> Array:
-    """The root of the mean over time, by trapezoids."""
+    """Return the root of the mean over time, by trapezoids."""
     mean = jnp.sum((square[1:] + square[:-1]) * jnp.diff(ts)) / (2 * (ts[-1] - ts[0]))
     return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0 * mean)
 

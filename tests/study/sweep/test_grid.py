@@ -103,6 +103,7 @@ def test_output_times():
         ("t1 = 1.0\naxes.a = {from = 1, to = 2, num = 3, scale = 'lin'}", 'axes.a.scale: must be one of "linear", "log"'),
         ("t1 = 1.0\naxes.method = ['auto', 'sdv']", 'axes.method[1]: no method "sdv"; did you mean "svd"?'),
         ("t1 = 1.0\naxes.a = {zipped = {rtol = [1], method = ['x']}}", 'axes.a.zipped.method[0]: no method "x"'),
+        ("t1 = 1.0\naxes.a = {values = [1], units = 3}", "axes.a.units: must be a text, is 3"),
         ("t1 = 1.0\naxes.a = {values = [1], of = 3}", "axes.a.of: must be a name, a list of names or a table, is 3"),
         ("t1 = 1.0\naxes.a = {values = [1], of = {length = 3}}", "axes.a.of.length: must be a list of names, is 3"),
         ("t1 = 1.0\naxes.a = {distribution = 'norm'}", "axes.a.distribution: needs a [design]"),

@@ -60,7 +60,7 @@ def _slope(positions: Positions, at: Configuration, direction: np.ndarray, rank:
 
 
 def _search(positions: Positions, start: Configuration, rank: int) -> tuple[RankChange | None, float]:
-    """The nearest rank change on the path, and how far that was followed."""
+    """Return the nearest rank change on the path, and how far that was followed."""
     onward, around = _walk(positions, start, rank, 1.0)
     back = [] if around else _walk(positions, start, rank, -1.0)[0]
     path = [*reversed(back), start, *onward]
@@ -75,7 +75,7 @@ def _search(positions: Positions, start: Configuration, rank: int) -> tuple[Rank
 
 
 def _walk(positions: Positions, start: Configuration, rank: int, side: float) -> tuple[list[Configuration], bool]:
-    """Closed positions along the path, to somewhat beyond the first minimum of sigma; and whether they came back to the start."""
+    """Follow closed positions along the path to beyond the first minimum of sigma; say whether they came back to the start."""
     path, more = [start], WALK
     heading = side * start.right[:, 0] if start.right.shape[1] else np.zeros(len(start.q))
     while more:
@@ -105,7 +105,7 @@ def _step(positions: Positions, at: Configuration, heading: np.ndarray, step: fl
 
 
 def _root(positions: Positions, path: list, way: np.ndarray, sigma: np.ndarray, k: int, rank: int) -> RankChange | None:
-    """The configuration beside the k-th position where sigma vanishes, if it does."""
+    """Return the configuration beside the k-th position where sigma vanishes, if it does."""
     if not _has_kink(sigma[k - 1 : k + 2].tolist()):
         return None
     near = slice(max(0, k - BESIDE), k + BESIDE + 1)

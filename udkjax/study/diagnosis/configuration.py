@@ -57,30 +57,30 @@ class Positions:
         self.row_unit = np.asarray(rows.scales.rows, float)
 
     def at(self, t: float, q: np.ndarray) -> Configuration:
-        """The configuration of coordinates that are closed."""
+        """Return the configuration of closed coordinates."""
         J = self.rows.jacobian(t, q) * self.unit / self.row_unit[:, None]
         return Configuration(t, q, J, *decompose(J, self.rank_tol))
 
     def near(self, t: float, q: np.ndarray) -> Configuration | None:
-        """The closed position nearest to q, or None."""
+        """Return the closed position nearest to q, or None."""
         if not self.rows.count:
             return self.at(t, q)
         position = self.rows.close(t, q)
         return None if position is None else self.at(t, position.q)
 
     def displace(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
-        """The closed position next to one that is displaced by a step along a direction, in scaled coordinates."""
+        """Return the closed position nearest to one that is displaced by a step along a direction, in scaled coordinates."""
         return self.near(start.t if t is None else t, start.q + step * self.unit * direction)
 
     def distance(self, one: Configuration, two: Configuration, turns: bool = True) -> float:
-        """How far two positions are apart: the norm of the scaled displacement; whole turns may not count."""
+        """Return how far two positions are apart: the norm of the scaled displacement; whole turns may not count."""
         way = (two.q - one.q) / self.unit
         if not turns:
             way[2::3] = np.remainder(way[2::3] + np.pi, 2 * np.pi) - np.pi
         return float(np.linalg.norm(way))
 
     def around(self, start: Configuration) -> list[Configuration]:
-        """Closed positions along a random motion from one, drivers going on; none where it cannot move."""
+        """Return closed positions along a random motion from one, while drivers go on; none where it cannot move."""
         random, found, last = np.random.default_rng(0), [], start
         heading, t = random.standard_normal(len(start.q)), start.t
         for _ in range(POSITIONS if self.rows.count else 0):
@@ -107,7 +107,7 @@ class JointForces(NamedTuple):
 
 
 def decompose(J: np.ndarray, rank_tol: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """U, the singular values, V^T and the rank of a matrix; of one without entries, too."""
+    """Return U, the singular values, V^T and the rank of a matrix, which may have no entries."""
     if not J.size:
         return np.eye(len(J)), np.zeros(0), np.eye(J.shape[1]), 0
     u, sigma, vt = np.linalg.svd(J)

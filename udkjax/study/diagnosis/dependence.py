@@ -50,17 +50,17 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
 
 
 def redundant_by(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> int:
-    """By how many rows a set of constraints is redundant in itself."""
+    """Return by how many rows a set of constraints is redundant in itself."""
     return N.shape[1] - _rank(N[~np.isin(np.array(owners), list(members))])
 
 
 def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> np.ndarray:
-    """The combinations of the rows of a set alone that vanish, (m, redundancy): forces by which it keeps itself in balance."""
+    """Return combinations of a set's rows that vanish, (m, redundancy): forces by which it balances itself."""
     return N @ _null_space(N[~np.isin(np.array(owners), list(members))])
 
 
 def _around(seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]) -> list[str]:
-    """A minimal dependent set that is grown around one constraint: the farthest are taken out first."""
+    """Return a minimal dependent set around one constraint: of all, the farthest are taken out first."""
     far = _distances(seed, involved, attached)
     members = list(involved)
     for name in sorted(involved, key=lambda name: -far[name]):
@@ -71,7 +71,7 @@ def _around(seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, at
 
 
 def _distances(seed: str, names: list[str], attached: dict[str, tuple[str, ...]]) -> dict[str, int]:
-    """How many bodies lie between one constraint and each of the others."""
+    """Return how many bodies lie between one constraint and each of the others."""
     far, edge = {seed: 0}, [seed]
     while edge:
         reached = {body for name in edge for body in attached[name]}

@@ -98,7 +98,7 @@ def diagnose(
 def _dependencies(
     mechanism: Mechanism, here: Configuration, usual: list[Configuration], owners: list[str]
 ) -> tuple[list[Dependency], list[Dependency]]:
-    """Those that depend on each other in all positions of ordinary rank, and those that only do so here."""
+    """Return the sets that depend on each other in all positions of ordinary rank, and those that only do so here."""
     attached = {name: mechanism.frames_of(element) for name, element in mechanism.constraints.items()}
     best = max(usual, key=lambda c: c.smallest)
     permanent = dependencies(best.left, owners, attached)
@@ -114,7 +114,7 @@ def _dependencies(
 
 
 def _choose_redundant(N: np.ndarray) -> list[int]:
-    """Rows, as many as N has columns, without which the others are independent where N vanishes on J."""
+    """Choose as many rows as N has columns, without which the others are independent, where N^T J = 0."""
     chosen: list[int] = []
     while N.shape[1]:
         row = int(np.argmax(np.linalg.norm(N, axis=1)))
@@ -126,14 +126,14 @@ def _choose_redundant(N: np.ndarray) -> list[int]:
 def _fixes(
     mechanism: Mechanism, positions: Positions, usual: list[Configuration], owners: list[str], dependency: Dependency
 ) -> list[Fix]:
-    """The fixes of a set; its stress is that of the first of the positions."""
+    """Return the fixes of a set; its stress is that of the first of the positions."""
     first = max(usual, key=lambda c: c.smallest)
     others = [c for c in usual if c is not first]
     return fixes_of(mechanism, positions, [first, *others], owners, dependency)
 
 
 def _cure(mechanism: Mechanism, positions: Positions, usual: list[Configuration], found: list[Redundancy]) -> tuple[Fix, ...]:
-    """The best fixes one after another, each found on what the one before has left, until nothing is redundant."""
+    """Return the best fixes one after another, each found on what the one before has left, until nothing is redundant."""
     done: list[Fix] = []
     current, at, sets = mechanism, usual, [r for r in found if r.permanent]
     while sets and len(done) < MOST_FIXES:
@@ -155,7 +155,7 @@ def _cure(mechanism: Mechanism, positions: Positions, usual: list[Configuration]
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:
-    """Which multipliers are unique, by N; where one direction of a pin's force alone is, which."""
+    """Return which multipliers are unique, by N; and of a pin's force the direction that alone is unique, if there is one."""
     found = {}
     for name, element in mechanism.constraints.items():
         own = [k for k, owner in enumerate(owners) if owner == name]

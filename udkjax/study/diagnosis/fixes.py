@@ -30,20 +30,20 @@ class Change(NamedTuple):
     rows: tuple[int, ...] = ()  # which rows stay, where it is no slot
 
     def remaining_rows(self, rows: np.ndarray, q: np.ndarray, places: list[int | None]) -> np.ndarray:
-        """The rows of the Jacobian that stay, of those of the constraint."""
+        """Return the rows of the constraint's Jacobian that stay."""
         if self.slides is None:
             return rows[list(self.rows)]
         cos, sin = self._direction(q, places)
         return np.array([[-sin, cos]]) @ rows
 
     def alignment(self, force: np.ndarray, q: np.ndarray, places: list[int | None]) -> float:
-        """How much of the stress (rows, redundancy) lies in what a slot gives up, 0 to 1; of any other change, 1."""
+        """Return how much of the stress (rows, redundancy) lies in what a slot gives up, 0 to 1; for any other change, 1."""
         if self.slides is None:
             return 1.0
         return float(np.linalg.norm(self._direction(q, places) @ force[:2]) / np.linalg.norm(force[:2], 2))
 
     def _direction(self, q: np.ndarray, places: list[int | None]) -> np.ndarray:
-        """The line of the slot in ground axes."""
+        """Return the line of the slot in ground axes."""
         body, axis = self.slides or (0, 0.0)
         place = places[body]
         angle = axis + (0.0 if place is None else q[3 * place + 2])
@@ -112,13 +112,13 @@ def _own(owners: list[str], name: str) -> list[int]:
 
 
 def _places(mechanism: Mechanism, name: str) -> list[int | None]:
-    """Where the bodies of a constraint are among all; None: the ground."""
+    """Return where the bodies of a constraint are among all; None: the ground."""
     bodies = mechanism.frames_of(mechanism.constraints[name])
     return [None if body == GROUND else mechanism.body_names.index(body) for body in bodies]
 
 
 def _changes(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarray) -> Iterator[Change]:
-    """The ways to relax a constraint, which carries the multipliers `force` (rows, redundancy) of the stress."""
+    """Iterate over the ways to relax a constraint that carries the multipliers `force` (rows, redundancy) of the stress."""
     element = mechanism.constraints[name]
     yield Change("remove it", None)
     if isinstance(element, Revolute):
@@ -140,7 +140,7 @@ def _changes(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarr
 
 
 def _half_turn(angle: float) -> float:
-    """The same line's direction in (-90, 90] degrees, rounding left out."""
+    """Return the direction of the same line in (-90, 90] degrees, without rounding."""
     angle = float(np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2)
     near = round(angle / (np.pi / 2)) * np.pi / 2
     angle = near if abs(angle - near) < 1e-9 else angle
@@ -150,7 +150,7 @@ def _half_turn(angle: float) -> float:
 def _effect(
     mechanism: Mechanism, name: str, change: Change, at: list[Configuration], owners: list[str], rank_tol: float
 ) -> tuple[int, float]:
-    """By how much the redundancy falls, -1 where the mobility changes or it is not everywhere the same, and how it conditions."""
+    """Return by how much the redundancy falls (-1: the mobility changes, or it falls unevenly), and the conditioning then."""
     own, places, falls, conditioning = _own(owners, name), _places(mechanism, name), set(), np.inf
     for position in at:
         rest = np.delete(position.J, own, axis=0)

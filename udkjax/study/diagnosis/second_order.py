@@ -45,7 +45,7 @@ def branches(mechanism: Mechanism, positions: Positions, at: Configuration) -> l
 
 
 def quadratic_forms(mechanism: Mechanism, positions: Positions, at: Configuration) -> np.ndarray:
-    """The forms A (k, d, d) of the second-order condition: N^T of the second derivative of scaled Psi along V."""
+    """Return the forms A (k, d, d) of the second-order condition: N^T of the second derivative of scaled Psi along V."""
     N, V = at.left, at.right
     if not N.shape[1] or not V.shape[1]:
         return np.zeros((N.shape[1], V.shape[1], V.shape[1]))
@@ -70,7 +70,7 @@ class Zeros(NamedTuple):
 
 
 def zeros_of(A: np.ndarray) -> list[Zeros]:
-    """The directions x where all forms x^T A_i x vanish: isolated lines, linear spaces, and cones by one line of theirs."""
+    """Return the directions x where all forms x^T A_i x vanish: isolated lines, linear spaces, and one line of each cone."""
     d, size = A.shape[1], np.abs(A).max(initial=0.0)
     if size < ZERO:
         return [Zeros(np.eye(d), d)]
@@ -88,7 +88,7 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
 
 
 def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Zeros on the unit sphere, by Gauss-Newton from many directions x (s, d)."""
+    """Find zeros on the unit sphere, by Gauss-Newton from many directions x (s, d)."""
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     for _ in range(ITERATIONS):
         residual = np.einsum("kij,si,sj->sk", A, x, x)
@@ -99,7 +99,7 @@ def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _around(A: np.ndarray, x: np.ndarray) -> Zeros:
-    """The zeros around one: the kernel of all A_i x if all forms vanish on it; a cone if there are others near; or x alone."""
+    """Return the zeros around x: the kernel of all A_i x if all forms vanish on it; a cone if others are near; or x alone."""
     sigma, vt = np.linalg.svd(2 * np.einsum("kij,j->ki", A, x))[1:]
     kernel = vt[int(np.sum(sigma > SAME)) :].T
     if kernel.shape[1] > 1:

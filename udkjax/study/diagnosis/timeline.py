@@ -97,14 +97,14 @@ def _tolerance(analysis: Analysis, ts: np.ndarray) -> float:
 
 
 def _kinks(sigma: np.ndarray) -> list[int]:
-    """Samples with a minimum that may be one of zero."""
+    """Return samples at which a singular value has a minimum that may be zero."""
     before, after = np.append(np.inf, sigma[:-1]), np.append(sigma[1:], np.inf)
     rise = np.where(np.isfinite(before), before - sigma, 0.0) + np.where(np.isfinite(after), after - sigma, 0.0)
     return np.flatnonzero((sigma < before) & (sigma <= after) & (sigma <= KINKED * rise)).tolist()
 
 
 def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> Change | None:
-    """The minimum of a singular value in a bracket, if the rank is lower there."""
+    """Return the minimum of a singular value in a bracket, if the rank is lower there."""
     start, end, at, values = low, high, low, np.zeros(0)
     while True:
         grid = np.linspace(low, high, GRID + 1)
@@ -123,7 +123,7 @@ def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, 
 def _renew(
     mechanism: Mechanism, analysis: Analysis, solution: Trajectory, ts: np.ndarray, low: float, high: float
 ) -> "_Path | None":
-    """The trajectory between two times, integrated anew from the output before."""
+    """Integrate the trajectory between two times anew, from the output before."""
     if not isinstance(solution, Solution):
         return None
     first = int(np.searchsorted(ts, low, side="right")) - 1
@@ -143,7 +143,7 @@ class _Path:
         self.ts, self.states = ts, (q, v, np.asarray(_accelerations(self.mechanism, analysis, ts, q, v)))
 
     def singular_values(self, times: np.ndarray) -> np.ndarray:
-        """Of the scaled Jacobian (times, k)."""
+        """Return the singular values of the scaled Jacobian (times, k)."""
         k = np.clip(np.searchsorted(self.ts, times, side="right") - 1, 0, max(len(self.ts) - 2, 0))
         following = np.minimum(k + 1, len(self.ts) - 1)
         h = (self.ts[following] - self.ts[k])[:, None]
@@ -153,7 +153,7 @@ class _Path:
 
 
 def _quintic(s: np.ndarray, h: np.ndarray, one: list[np.ndarray], two: list[np.ndarray]) -> np.ndarray:
-    """The polynomial of degree five through q, v and a at both ends, at the part s of the way."""
+    """Evaluate the polynomial of degree five through q, v and a at both ends, at the part s of the way."""
     (q, v, a), (p, w, c) = one, two
     rest, slope, bend = p - q - h * v - h**2 * a / 2, h * (w - v - h * a), h**2 * (c - a)
     third, fourth, fifth = 10 * rest - 4 * slope + bend / 2, -15 * rest + 7 * slope - bend, 6 * rest - 3 * slope + bend / 2

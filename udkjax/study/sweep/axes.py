@@ -124,7 +124,7 @@ class Dimension:
 
 
 def labels_of(setting: str, choices: Sequence[AxisChoice]) -> tuple[str, ...]:
-    """Readable, unique names of choices: their types, where these are the same with their numbers."""
+    """Return readable, unique names of choices: their types; where these are the same, with their numbers."""
     plain = [_plain(setting, choice) for choice in choices]
     names = [name if plain.count(name) == 1 else _full(name, choice) for name, choice in zip(plain, choices, strict=True)]
     return tuple(name if name not in names[:k] else f"{name} #{names[:k].count(name) + 1}" for k, name in enumerate(names))
@@ -137,13 +137,13 @@ def _plain(setting: str, choice: AxisChoice) -> str:
 
 
 def _full(name: str, choice: AxisChoice) -> str:
-    """The type with its numbers, where they are few."""
+    """Return the type of a choice with its numbers."""
     numbers = {key: value for key, value in getattr(choice, "__dict__", {}).items() if eqx.is_array(value) and value.ndim == 0}
     return f"{name}({', '.join(f'{key}={float(value):g}' for key, value in numbers.items())})" if numbers else name
 
 
 def structure_of(choice: PyTree) -> Hashable:
-    """Everything of a choice but the values of its numbers: choices of one structure share a program."""
+    """Return everything of a choice but the values of its numbers: choices of one structure share a program."""
     arrays, rest = eqx.partition(choice, eqx.is_array)
     leaves, tree = jax.tree.flatten(rest)
     return jax.tree.structure(arrays), tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(arrays)), tree, tuple(leaves)
@@ -196,7 +196,7 @@ class Random(Design):
 
 
 def scale_to_range(values: Values, unit: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:
-    """Points of the unit interval in a range (low, high) or a frozen distribution of scipy.stats; None: it is neither."""
+    """Map points of the unit interval to a range (low, high) or a frozen distribution of scipy.stats; None: it is neither."""
     if hasattr(values, "ppf"):
         return np.asarray(cast(Distribution, values).ppf(unit), float)
     ends = np.asarray(cast(ArrayLike, values), float)

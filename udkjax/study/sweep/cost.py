@@ -54,7 +54,7 @@ def cut_chunks(plan: Plan, memory: int = MEMORY) -> list[Chunk]:
 
 
 def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = SECONDS) -> list[slice]:
-    """Consecutive parts of at most `limit` seconds and of at most so many members, each of whole pieces."""
+    """Cut members into consecutive parts of whole pieces, each of at most `limit` seconds and of at most so many members."""
     most = max(piece, most // piece * piece)
     parts, start = [], 0
     total = np.concatenate([[0.0], np.cumsum(seconds)])
@@ -68,7 +68,7 @@ def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = 
 
 
 def expected_steps(plan: Plan, group: Group) -> Float[np.ndarray, "n"]:
-    """Steps that the members of a group will take, roughly: up to a factor where no sample is run."""
+    """Estimate the steps that the members of a group will take: up to a common factor, where no sample is run."""
     features, own = _features(plan, group), program(plan, group)
     if own.piece == 1 or len(group.members) < WORTH * PILOT or features.shape[1] == 0:
         return _by_rule(plan, group)
@@ -81,7 +81,7 @@ def expected_steps(plan: Plan, group: Group) -> Float[np.ndarray, "n"]:
 
 
 def _by_rule(plan: Plan, group: Group) -> Float[np.ndarray, "n"]:
-    """What is known beforehand: steps grow with the length of a run, and slowly with the tightness of its tolerances."""
+    """Estimate steps beforehand: they grow with the length of a run, and slowly with the tightness of its tolerances."""
     places, steps = plan.places(group.members), np.full(len(group.members), STEPS_GUESSED)
     for column in plan.columns:
         if not column.is_choice and not callable(column.of):
@@ -94,7 +94,7 @@ def _by_rule(plan: Plan, group: Group) -> Float[np.ndarray, "n"]:
 
 
 def _features(plan: Plan, group: Group) -> Float[np.ndarray, "n d"]:
-    """The axes of a group's members, each from -1 to 1: numbers, or their logarithms, and which choices were made."""
+    """Return the axes of a group's members, each from -1 to 1: numbers, or their logarithms, and which choices were made."""
     places, found = plan.places(group.members), []
     for column in plan.columns:
         at = places[column.name]
@@ -110,7 +110,7 @@ def _features(plan: Plan, group: Group) -> Float[np.ndarray, "n d"]:
 
 
 def _polynomial(x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n terms"]:
-    """All monomials of the features up to the second degree, or the first where the sample is too small for these."""
+    """Return all monomials of the features up to the second degree, or the first where the sample is too small for these."""
     n, d = x.shape
     terms = [np.ones(n), *x.T]
     if (d + 1) * (d + 2) // 2 <= PILOT // 4:
@@ -119,7 +119,7 @@ def _polynomial(x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n terms"]:
 
 
 def _seconds_per_step(plan: Plan, group: Group) -> float:
-    """Roughly, and the same on every machine, so that chunks are."""
+    """Guess how long a step takes (s): the same on every machine, so that chunks are the same, too."""
     mechanism, method = plan.mechanism_of(group), plan.choice(group, "method")
     rows = max(1, 2 * len(mechanism.constraints)) / 12
     if isinstance(method, Auto | Elimination | None):
@@ -163,7 +163,7 @@ def estimate_cost(plan: Plan, memory: int = MEMORY) -> SweepCost:
 
 
 def _measure_group(plan: Plan, group: Group) -> tuple[float, float]:
-    """How long the program of a group takes to compile, and then a member of it (s)."""
+    """Measure how long the program of a group takes to compile, and then a member of it (s)."""
     own = program(plan, group)
     size = min(len(group.members), own.piece * len(own.devices) if own.piece > 1 else FEW)
     sample = Chunk(0, group.index, np.random.default_rng(0).choice(group.members, size, replace=False), 0.0)
@@ -177,7 +177,7 @@ def _measure_group(plan: Plan, group: Group) -> tuple[float, float]:
 
 
 def _resident() -> int:
-    """The most memory that this process has used so far, in bytes; 0 where it cannot be known."""
+    """Return the most memory that this process has used so far, in bytes; 0 where it cannot be known."""
     try:
         import resource
     except ImportError:  # Windows

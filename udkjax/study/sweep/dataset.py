@@ -33,7 +33,7 @@ NOT_COMPUTED = -1  # the result of a member that is not among what is finished
 
 
 def describe_group(plan: Plan, group: Group) -> dict[str, Variable]:
-    """What is stored of each member of a group."""
+    """Return the variables that are stored of each member of a group."""
     bodies, found = len(plan.mechanism_of(group).body_names), {}
     known = {name: label for measure in plan.measures for name, label in measure.variables.items()} | LABELS
     outputs = program(plan, group).outputs
@@ -49,7 +49,7 @@ def describe_group(plan: Plan, group: Group) -> dict[str, Variable]:
 
 
 def _per(units: str, by: str, plan: Plan) -> str:
-    """The unit of a derivative, where it is one."""
+    """Return the unit of a derivative; an empty text where it has none."""
     below = next((column.units for column in plan.columns if column.name == by), None)
     below = units_of(plan.mechanism, by) if below is None else below
     return "" if not units or not below or "," in units else f"{units}/({below})"
@@ -57,7 +57,7 @@ def _per(units: str, by: str, plan: Plan) -> str:
 
 @lru_cache(maxsize=8)
 def variables_of(plan: Plan) -> Mapping[str, Variable]:
-    """What is stored of each member: names, dimensions, units. `result`, `end_time` and `steps` are always among them.
+    """Return the variables that are stored of each member. `result`, `end_time` and `steps` are always among them.
 
     Where mechanisms have other bodies, the dimension "body" has all of them, and any other is as long as the longest.
     """
@@ -74,7 +74,7 @@ def variables_of(plan: Plan) -> Mapping[str, Variable]:
 
 
 def bytes_per_member(plan: Plan) -> int:
-    """What the stored variables of one member take."""
+    """Return how many bytes the stored variables of one member take."""
     return sum(int(np.prod(v.shape)) * v.dtype.itemsize for v in variables_of(plan).values())
 
 
@@ -129,14 +129,14 @@ def _put(into: np.ndarray, variable: Variable, members: np.ndarray, values: np.n
 
 
 def _places(plan: Plan) -> dict[int, list[int]]:
-    """For each group, the places of its bodies among all bodies, where it has not all of them."""
+    """Return for each group the places of its bodies among all bodies, where it has not all of them."""
     everyone = list(plan.bodies)
     own = {group.index: list(plan.mechanism_of(group).body_names) for group in plan.groups}
     return {index: [everyone.index(name) for name in names] for index, names in own.items() if names != everyone}
 
 
 def _coordinates(plan: Plan) -> dict[str, Labelled]:
-    """Values of the axes, each along its dimension; times, bodies and coordinates where something lies along them."""
+    """Return the values of axes along their dimensions; times, bodies and coordinates where a variable lies along them."""
     found: dict[str, Labelled] = {}
     for dimension in plan.dimensions:
         for column in dimension.columns:

@@ -34,7 +34,7 @@ _lock = threading.Lock()
 
 
 def program(plan: Plan, group: Group, redundant: tuple[int, ...] | None = None) -> Program:
-    """The program of a group: made once for each process."""
+    """Return the program of a group, which is compiled once for each process."""
     key = plan.token, group.index, redundant
     with _lock:
         if key not in _programs:
@@ -62,7 +62,7 @@ def run(plan: Plan, chunk: Chunk) -> dict[str, np.ndarray]:
 
 
 def _other_redundant_rows(recipe: Recipe, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
-    """Which of those that drifted, although they were projected, have other redundant rows; by these."""
+    """Find members that drifted, although they were projected, as other rows of theirs are redundant: by these rows."""
     drifted = np.flatnonzero(result == Result.drift)
     found: dict[tuple[int, ...], list[int]] = {}
     if len(drifted):
@@ -164,7 +164,7 @@ def dask_engine(client: "distributed.Client | None" = None) -> Callable[[Plan, S
 
 @contextmanager
 def start_client(scheduler: str | None = None) -> Iterator["distributed.Client"]:
-    """A client of the scheduler at this address; without one, of a process for each core of this machine, ended afterwards."""
+    """Start a client of the scheduler at this address; without one, of a process for each core, which end with the client."""
     with OptionalImport():
         import distributed
     if scheduler is not None:

@@ -57,7 +57,7 @@ def _measure(plan: Plan, measure: Measure) -> dict[str, Json]:
 
 
 def _solution(plan: Plan) -> Solution:
-    """A solution of the right shapes."""
+    """Return a solution of the right shapes."""
     number, states = np.zeros(()), np.zeros((len(plan.ts), len(plan.mechanism.body_names), 3))
     count = np.zeros((), int)
     stats = dict.fromkeys(STATS, count)
@@ -65,7 +65,7 @@ def _solution(plan: Plan) -> Solution:
 
 
 def _function(function: Callable, *arguments: PyTree) -> dict[str, Json]:
-    """A function by what it computes: its name, and digests of its operations and of the numbers in them."""
+    """Describe a function by what it computes: its name, and digests of its operations and of the numbers in them."""
     program = eqx.filter_make_jaxpr(function)(*arguments)[0]
     text = re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr))
     constants = b"".join(np.ascontiguousarray(x).tobytes() for x in program.consts if eqx.is_array(x))
@@ -79,7 +79,7 @@ def _mechanism(mechanism: Mechanism) -> dict[str, Json]:
 
 
 def _value(value: PyTree) -> Json:
-    """A number, an array, a choice or a mechanism."""
+    """Describe a number, an array, a choice or a mechanism."""
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, Mechanism):
@@ -157,5 +157,5 @@ def _texts(before: str, now: str, path: str) -> Iterator[str]:
 
 
 def _same(a: Json, b: Json) -> bool:
-    """Equal; not a number is itself, and truth values are no numbers."""
+    """Return whether two are equal; nan equals nan, and truth values are no numbers."""
     return isinstance(a, bool) == isinstance(b, bool) and (a == b or (a != a and b != b))

@@ -83,7 +83,7 @@ class _GridReader:
         return arguments
 
     def reference(self, given: Toml) -> np.ndarray | None:
-        """Coordinates (T, bodies, 3) from the file of a simulation, such as `udkjax simulate` writes."""
+        """Read coordinates (T, bodies, 3) from the file of a simulation, such as `udkjax simulate` writes."""
         with OptionalImport():
             import xarray
         if not isinstance(given, str):
@@ -95,7 +95,7 @@ class _GridReader:
             return self.wrong("reference", f"{self.folder / given} has no coordinates q of a simulation ({error})")
 
     def times(self, given: Table) -> np.ndarray | None:
-        """Output times: `ts`, or from `t0` (0) to `t1` in steps of `dt`, or the start and the end alone."""
+        """Read output times: `ts`, or from `t0` (0) to `t1` in steps of `dt`, or the start and the end alone."""
         if "ts" in given:
             for key in ("t0", "t1", "dt"):
                 if key in given:
@@ -121,7 +121,7 @@ class _GridReader:
         return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # t1 itself too, where it is a multiple of dt up to rounding
 
     def axis(self, place: str, name: str, given: Toml) -> Axis | Zipped:
-        """One axis: a list of values, or a table that says more."""
+        """Read one axis: a list of values, or a table that says more."""
         if not isinstance(given, dict):
             return Axis(self.values(place, name, given))
         if "zipped" in given:
@@ -149,7 +149,7 @@ class _GridReader:
         return [self.choice(f"{place}[{k}]", name, value) for k, value in enumerate(given)]
 
     def range(self, place: str, given: Table) -> Values:
-        """From one number to another: with a design all that is between them, else so many numbers."""
+        """Read a range: for a design its two ends, else the `num` numbers between them."""
         needed = ("from", "to") if self.drawn else ("from", "to", "num")
         self.check_keys(place, given, (*needed, "scale"))
         for key in needed:
@@ -169,7 +169,7 @@ class _GridReader:
         return ()
 
     def distribution(self, place: str, given: Table) -> Values:
-        """A distribution of scipy.stats by its name and its numbers."""
+        """Read a distribution of scipy.stats by its name and its numbers."""
         name, numbers = given["distribution"], {key: value for key, value in given.items() if key != "distribution"}
         known = [key for key, value in vars(stats).items() if isinstance(value, stats.rv_continuous)]
         if not self.drawn:
@@ -184,7 +184,7 @@ class _GridReader:
         return ()
 
     def of(self, place: str, given: "Toml | None") -> str | tuple[str, ...] | Setter | None:
-        """What an axis is the quantity of: names, the length or the initial angle of bodies, or names with factors."""
+        """Read what an axis sets: names, the length or the initial angle of bodies, or names with factors."""
         if given is None or isinstance(given, str):
             return given
         if isinstance(given, list):
@@ -284,5 +284,5 @@ class _GridReader:
 
 
 def key_of(name: str) -> str:
-    """A key as a TOML file shows it."""
+    """Return a key as a TOML file shows it."""
     return name if name.replace("_", "").replace("-", "").isalnum() else quote(name)

@@ -82,7 +82,7 @@ def _is_range(given: "Axis | Values") -> bool:
 
 
 def _column(mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray | None, problems: list[str]) -> Column | None:
-    """One axis, or None where its mistake is among the problems."""
+    """Lay out one axis; None: its mistake is among the problems."""
     assert not isinstance(given, Zipped), "its axes come one by one"
     axis = given if isinstance(given, Axis) else Axis(given)
     of = (name,) if axis.of is None else axis.of
@@ -146,14 +146,14 @@ def _unknown_targets(mechanism: Mechanism, name: str, of: Sequence[str]) -> Iter
 
 
 def _suggest_ending(target: str, known: Iterable[str]) -> str:
-    """What ends as the name does: `mass` may stand for many."""
+    """Suggest a parameter that ends as the name does: `mass` may stand for many."""
     last = {full.rpartition(".")[2]: full for full in known}
     close = difflib.get_close_matches(target, last, n=1)
     return f"; did you mean {quote(last[close[0]])}?" if close else ""
 
 
 def _misfits(mechanism: Mechanism, name: str, of: Sequence[str], numbers: np.ndarray) -> Iterator[str]:
-    """What the mechanism says to the values: their shape, and what each must satisfy."""
+    """Iterate over what the mechanism refuses of the values: their shape, and what each must satisfy."""
     parameters = [target for target in of if target not in NUMBERS]
     if parameters:
         for value in (numbers.min(axis=0), numbers.max(axis=0)):
@@ -184,7 +184,7 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
 
 
 def check_settings(dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
-    """What is wrong between axes and settings: things given twice, gains and thresholds that nothing has."""
+    """Return what is wrong between axes and settings: what is given twice, gains and thresholds that no choice has."""
     columns = [column for dimension in dimensions for column in dimension.columns]
     targets = {target: column for column in columns if not callable(column.of) for target in column.of}
     problems = [f"{name} is both a setting and an axis: leave one of them out" for name in settings if name in targets]
@@ -201,7 +201,7 @@ def check_settings(dimensions: Sequence[Dimension], settings: Settings) -> list[
 
 
 def check_tangents(mechanism: Mechanism, dimensions: Sequence[Dimension], names: Sequence[str]) -> list[str]:
-    """What is wrong with the names by which derivatives are asked for."""
+    """Return what is wrong with the names by which derivatives are asked for."""
     columns = {column.name: column for dimension in dimensions for column in dimension.columns}
     known, problems = parameters_of(mechanism), []
     for name in names:

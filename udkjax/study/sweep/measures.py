@@ -141,7 +141,7 @@ def _reference(given: Reference, ts: np.ndarray) -> Reference:
 
 
 def _largest(x: Array) -> Array:
-    """The largest size that is a number: output times after the end of a run are none."""
+    """Return the largest absolute value; nan, at output times after the end of a run, does not count."""
     return jnp.max(jnp.where(jnp.isnan(x), 0.0, jnp.abs(x)), initial=0.0)
 
 
@@ -173,7 +173,7 @@ def _counts(run: Run) -> dict[str, Array]:
 
 
 def _rank(run: Run) -> dict[str, Array]:
-    """By the method's own rule: that of `Auto` is the one of singular values that it turns to."""
+    """Compute ranks by the method's own rule; that of `Auto` is the rule of the singular values that it falls back to."""
     method = Auto() if run.method is None else run.method
     method = method.rank_revealing if isinstance(method, Auto) else method
     if method.rank_tol is None:

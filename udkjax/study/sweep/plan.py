@@ -82,7 +82,7 @@ class Plan:
         return tuple(column for dimension in self.dimensions for column in dimension.columns)
 
     def places(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
-        """For each axis, which of its values each member has."""
+        """Return for each axis which of its values each member has."""
         along = np.unravel_index(members, self.shape)
         return {column.name: k for d, k in zip(self.dimensions, along, strict=True) for column in d.columns}
 
@@ -111,18 +111,18 @@ class Plan:
         return number
 
     def group_of(self, member: int) -> int:
-        """The index of a member's group."""
+        """Return the index of a member's group."""
         return int(self._numbers[member])
 
     def choice(self, group: Group, setting: str) -> AxisChoice:
-        """What a group has for a setting: the first of its choices, where these differ by numbers."""
+        """Return what a group has for a setting: the first of its choices, where these differ by numbers."""
         for column in self.columns:
             if column.of == (setting,) and column.is_choice:
                 return column.choices[group.choices[column.name][0]]
         return self.mechanism if setting == "mechanism" else self.settings.get(setting)
 
     def mechanism_of(self, group: Group) -> Mechanism:
-        """The mechanism of a group: the first, where these differ by numbers."""
+        """Return the mechanism of a group: the first, where these differ by numbers."""
         found = self.choice(group, "mechanism")
         assert isinstance(found, Mechanism)
         return found
@@ -173,7 +173,7 @@ def make_plan(
 
 
 def _number_structures(column: Column) -> np.ndarray:
-    """For each of the choices of an axis the number of its structure."""
+    """Return for each of the choices of an axis the number of its structure."""
     structures = [
         (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in column.choices
     ]
@@ -181,6 +181,6 @@ def _number_structures(column: Column) -> np.ndarray:
 
 
 def stack_choices(choices: Sequence[PyTree]) -> tuple[PyTree, PyTree]:
-    """Choices of one structure: their numbers one behind the other, and everything else."""
+    """Return the numbers of choices of one structure, stacked, and everything else of them."""
     parts = [eqx.partition(choice, eqx.is_array) for choice in choices]
     return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(arrays for arrays, _ in parts)), parts[0][1]

@@ -209,7 +209,7 @@ class Program:
         return None if self.devices[0].platform in CHUNKED else self.piece
 
     def _compute(self, shared: Shared, own: Own) -> tuple[Outputs, Outputs]:
-        """What is stored, and the derivatives of it by each name, last."""
+        """Compute what is stored of members, and its derivatives by each name along the last axis."""
         names = self.recipe.names
 
         def members(shift: Mapping[str, Array]) -> Outputs:
@@ -276,6 +276,6 @@ def _outputs_by_name(
 
 
 def lane_steps(steps: Int[np.ndarray, "n"], lanes: int) -> tuple[int, int]:
-    """How many steps a chunk took, and how many it had room for: each lane waits for the slowest beside it."""
+    """Return how many steps a chunk took, and how many it had room for: each lane waits for the slowest beside it."""
     parts = [steps[k : k + lanes] for k in range(0, len(steps), lanes)]
     return int(steps.sum()), lanes * sum(int(part.max()) for part in parts)

@@ -86,7 +86,7 @@ class Watch:
         self.show(self.state)
 
     def _left(self, now: float) -> float | None:
-        """How long the rest takes (s), by the pace since the first chunk came."""
+        """Estimate how long the rest takes (s), by the pace since the first chunk came."""
         assert self.first is not None
         since, work = now - self.first[0], self.work_done - self.first[1]
         return since / work * (self.work - self.work_done) if work > 0 else None
