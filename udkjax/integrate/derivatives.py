@@ -98,9 +98,9 @@ def _(primals, tangents):
 class KnownNumbers:
     """The known arrays among those of a tree, None in place of the others; compared by value, so that they are static."""
 
-    def __init__(self, arrays: Sequence[np.ndarray | None]):
+    def __init__(self, arrays: Sequence[Array | None]):
         self.arrays = arrays
-        self._key = tuple(None if x is None else (x.shape, x.tobytes()) for x in arrays)
+        self._key = tuple(None if x is None else (x.shape, np.asarray(x).tobytes()) for x in arrays)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, KnownNumbers) and self._key == other._key
@@ -118,7 +118,7 @@ class TreeOfNumbers(eqx.Module):
 
     def __call__(self, xs: Sequence[Array]) -> Any:
         traced = iter(xs)
-        arrays = [next(traced) if x is None else number(x) for x in self.known.arrays]
+        arrays = [next(traced) if x is None else x for x in self.known.arrays]
         return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
 
     def marks(self, active: Mask) -> Any:
@@ -136,7 +136,9 @@ def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
     """Return a tree as a function of the arrays of floats in it that are traced, and these arrays."""
     arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
-    known = KnownNumbers([None if isinstance(x, jax.core.Tracer) else np.asarray(x) for x in leaves])
+    known = KnownNumbers(
+        [None if isinstance(x, jax.core.Tracer) else number(x) if isinstance(x, np.ndarray) else x for x in leaves]
+    )
     return TreeOfNumbers(rest, known, structure), [x for x in leaves if isinstance(x, jax.core.Tracer)]
 
 

@@ -142,7 +142,7 @@ def _inputs(problem: Any, code: Any = None, xp: ModuleType = jnp) -> list[Any]:
     equations: TextbookEquations = problem.equations
     method: Any = equations.method
     rank_tol = method.rank_tol
-    safe_tol = method.branch_tol if isinstance(method, Auto) else rank_tol**2
+    safe_tol: Any = method.branch_tol if isinstance(method, Auto) else rank_tol**2
     programs = _programs(problem) if code is None else code
     drop_tol = (FALLBACK_RANK_SHARE * rank_tol) ** 2 if programs.policy is RankPolicy.FALL_BACK else safe_tol
     first = 0.0 if problem.h is None else problem.h
