@@ -195,7 +195,7 @@ class Reverse(Differentiated):
         stages = range(1, last)
         for i in stages:
             stage_state(self, f, s, i, "P2", step)
-            self.accelerate_stage(f, i)
+            self.evaluate_stage(f, i)
         setattr(s, "X t", s.T3)
         with f.each(self.rowcount) as r:
             for x in "qv":

@@ -38,7 +38,8 @@ class Differentiated(Trajectory):
         if self.of_projection:
             self.places.add("KP", self.of_projection.stored)
 
-    def accelerate_stage(self, f: Function, i: int):
+    def evaluate_stage(self, f: Function, i: int):
+        """The accelerations of stage i at the state in X, with what their derivatives need to know of it."""
         f.call("evaluation", f.given["work"], self.address(f, f"A{i}"), self.address(f, f"K{i}"))
 
     def write_programs(self):
@@ -64,6 +65,7 @@ class Forward(Differentiated):
     many directions side by side as there are lanes.
     """
 
+    accelerate_stage = Differentiated.evaluate_stage  # in each step, since its changes follow at once
     inputs = ("dnumbers", "dq", "dv")
     outputs = ("dys", "dend")
     directions_in = 1
