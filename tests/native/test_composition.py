@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
-from udkjax.native import code_cache, machine
+from udkjax.native import code_cache, machine, record
 
 TS = np.array([0.0, 0.3, 0.6])
 PENDULUM = udk.library.compound_pendulum()
@@ -78,6 +78,29 @@ SLOPES = {
 @pytest.mark.parametrize("run", SLOPES.values(), ids=SLOPES)
 def test_every_way_gives_the_same_slopes(run, slopes):
     assert_allclose(jax.jit(run)(INERTIAS), slopes, rtol=1e-7)
+
+
+@pytest.fixture
+def record_length(monkeypatch):
+    """A function that sets how many points a record may have; JAX keeps the shapes of what it has traced."""
+
+    def change(points):
+        monkeypatch.setattr(record, "STORED", points)
+        jax.clear_caches()
+
+    yield change
+    jax.clear_caches()
+
+
+def test_a_member_whose_record_is_too_long_is_run_again(record_length):
+    """On its way back; beside others whose record is long enough, and alone."""
+    rtols = jnp.array([1e-4, 1e-6, 1e-8, 1e-10])  # of 11 to 14 points
+    slopes = lambda: [jax.jit(jax.vmap(jax.grad(angle)))(INERTIAS[:n], rtols[:n]) for n in (1, 4)]  # noqa: E731
+    expected = slopes()
+    for points in (1, 12, 13):
+        record_length(points)
+        for found, known in zip(slopes(), expected, strict=True):
+            assert_array_equal(found, known)
 
 
 @pytest.mark.slow

@@ -60,8 +60,8 @@ def _(primals, tangents):
 
     def in_parts(at: Any, *directions: list[Array]) -> tuple[list[Any], ...]:
         """The run, and linear maps of the directions."""
-        raw = at[0].recorded(stop_gradients(at[1]), active)
-        linear = Linear(function=at[0], xs=at[1], run=raw, active=active)
+        raw, record = at[0].recorded(stop_gradients(at[1]), active)
+        linear = Linear(function=at[0], xs=at[1], run=(raw, record), active=active)
         return list(_as_run(*at, raw)), *(linear.applied(direction) for direction in directions)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
@@ -204,7 +204,7 @@ class Run(Function):
         problem, which = self.problem(xs), self.problem.marks(active)
         if self._is_native(xs, active):
             q, v, y = ws
-            found = native_engine.vjp(problem, which, jnp.concatenate([q, v], axis=1), y)
+            found = native_engine.vjp(problem, which, run, jnp.concatenate([q, v], axis=1), y)
             pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
             return [bar for m, bar in pairs if m is True]
 
@@ -223,11 +223,11 @@ class Run(Function):
         raw, change = _change(lambda xs: _integrate_by_diffrax(self.problem(xs)), xs, active, vs)
         return raw, [change[k] for k in SMOOTH]
 
-    def recorded(self, xs: list[Array], active: Mask) -> IntegratorOutput:
-        """The run, by the machine code of its reverse mode, if that serves: no other is compiled."""
+    def recorded(self, xs: list[Array], active: Mask) -> tuple[IntegratorOutput, Array | None]:
+        """The run and its record, by the machine code of its reverse mode, if that serves: no other is compiled."""
         if self._is_native(xs, active):
             return native_engine.integrate_for_vjp(self.problem(xs), self.problem.marks(active))
-        return _integrate_by_diffrax(self.problem(xs))
+        return _integrate_by_diffrax(self.problem(xs)), None
 
     def _is_native(self, xs: list[Array], active: Mask) -> bool:
         return self.native and native_engine.serves_derivatives(self.problem.marks(active))

@@ -63,11 +63,12 @@ def integrate(problem: Problem) -> IntegratorOutput:
     return _output(native_p.bind(*_inputs(problem), kind=_kind(problem), times=len(problem.ts)))
 
 
-def integrate_for_vjp(problem: Problem, active: Problem) -> IntegratorOutput:
-    """Integrate a problem by the code that `vjp` takes: no other is compiled."""
+def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, Array]:
+    """Integrate a problem by the code that `vjp` takes: no other is compiled. Return the record that it walks back from, too."""
     kind, n, times = _kind(problem, _active(problem, active), "reverse"), len(problem.q), len(problem.ts)
-    none = jnp.zeros((0, times, 2 * n)), jnp.zeros((0, 2 * n))
-    return _output(native_p.bind(*_inputs(problem, kind.code), *none, kind=kind, times=times)[: len(OUTPUTS)])
+    none = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
+    found = native_p.bind(*_inputs(problem, kind.code), *none, kind=kind, times=times)
+    return _output(found[: len(OUTPUTS)]), found[-1][0]
 
 
 def independent_row_count(problem: Any) -> int:
@@ -99,11 +100,16 @@ def jvp(problem: Problem, active: Problem, change: Problem) -> tuple[IntegratorO
     return _output(found), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
 
 
-def vjp(problem: Problem, active: Problem, ys: Array, end: Array) -> Problem:
-    """The cotangents of what is `active`, from those of the states at the output times (T, 2n) and of the end (2n,)."""
-    kind = _kind(problem, _active(problem, active), "reverse")
-    bars = [ys[None], end[None]]
-    numbersbar, qbar, vbar = native_p.bind(*_inputs(problem, kind.code), *bars, kind=kind, times=len(problem.ts))[len(OUTPUTS) :]
+def vjp(problem: Problem, active: Problem, run: tuple[IntegratorOutput, Array], ys: Array, end: Array) -> Problem:
+    """The cotangents of what is `active`, from those of the states at the output times (T, 2n) and of the end (2n,).
+
+    `run` is what `integrate_for_vjp` has left.
+    """
+    kind, (raw, record) = _kind(problem, _active(problem, active), "reverse"), run
+    given = [x[None] for x in (record, raw.q, raw.v, ys, end)]
+    numbersbar, qbar, vbar, _ = native_p.bind(*_inputs(problem, kind.code), *given, kind=kind, times=len(problem.ts))[
+        len(OUTPUTS) :
+    ]
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
     numbers = cotangent_tree(numbersbar[0], _numbers_of(problem), _numbers_of(active), kind.active or ())
     q, v = qbar[0] if active.q is True else None, vbar[0] if active.v is True else None

@@ -1,4 +1,4 @@
-"""Derivatives of a trajectory in reverse mode: the steps are recorded, and walked back.
+"""Derivatives of a trajectory in reverse mode: the recorded steps (record.py) are walked back.
 
 A point is an accepted state (q, v, a) at its time; each step leads from one to the next. Cotangents of the points are collected
 from the last to the first: those of an output go through its projection and through the interpolation to the four points that it
@@ -9,32 +9,29 @@ lies on; those of a point through its accelerations and its projection to the en
 of its stages, the last first, to the point before. The stages are evaluated again on the way, with what the derivatives need to
 know of them; the transposed programs are those of equations/derivative.py.
 
-Members run side by side in lanes and walk back side by side; the next ones follow when all are back.
+Members walk back side by side, in lanes; the next ones follow when all are back.
 """
 
 from collections.abc import Sequence
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.layout import Lane, Plan
+from udkjax.native.layout import Plan
 from udkjax.native.prologue import REVERSE, write_prologue_reverse
+from udkjax.native.record import Recorded
 from udkjax.native.runge_kutta import stage_state
 from udkjax.native.steps import DONE, POINTS, STRETCH
-from udkjax.native.tangents import Differentiated
-
-FIRST = 512  # points that a record has room for, before it grows
-HEAD = 3  # numbers of a point before its state: its time, how many outputs were written before its step, whether it begins anew
 
 
-class Reverse(Differentiated):
+class Reverse(Recorded):
     """A trajectory that is walked back, with cotangents of its outputs and its end; or not, where these have no members."""
 
-    inputs = ("ysbar", "endbar")
-    outputs = ("numbersbar", "qbar", "vbar")
+    inputs = ("given record", "given qs", "given vs", "ysbar", "endbar")
+    outputs = ("numbersbar", "qbar", "vbar", "record")
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
         super().__init__(plan, active)
         p, n = self.places, self.n
-        for name in ("record", "capacity", "points", "at", "before", "ready", "any"):
+        for name in ("before", "any"):
             p.add(name)
         p.add("cbar", self.count)
         p.add("G c", self.count)
@@ -47,7 +44,6 @@ class Reverse(Differentiated):
             p.add(f"S{j}", n)
         for k in range(3 * POINTS):
             p.add(f"M{k}", n)
-        self.row = HEAD + 3 * n
 
     def write_derivatives(self):
         for each in self._linearizations:
@@ -58,64 +54,7 @@ class Reverse(Differentiated):
         self._write_step_back()
         self._write_backpropagate()
 
-    # --- the record
-
-    def record_step(self, f: Function, s: Lane, accept: Value):
-        with f.if_(self._backpropagates(f)):
-            for k in self._each_lane(f, accept):
-                self._store_point(f, s, k)
-
-    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
-        del member, constants
-        with f.if_(self._backpropagates(f)):
-            self._new_record(f, lane)
-
-    def _new_record(self, f: Function, lane: Value):
-        s = Lane(f, self.places)
-        record = f.op(f"call ptr @malloc(i64 {FIRST * self.row * 8})", POINTER)
-        self._put_lane(f, "record", lane, record, POINTER)
-        self._put_lane(f, "capacity", lane, f.const(float(FIRST)))
-        self._put_lane(f, "points", lane, f.const(0.0))
-        self._store_point(f, s, lane)
-
-    def _put_lane(self, f: Function, name: str, k: Value, x: Value, base: str = DOUBLE):
-        f.store(x, f.given["work"], k + self.places[name] * f.width, base=base)
-
-    def _lane(self, f: Function, name: str, k: Value, base: str = DOUBLE) -> Value:
-        return f.load(f.given["work"], k + self.places[name] * f.width, base=base)
-
-    def _store_point(self, f: Function, s: Lane, k: Value):
-        """One more point, that of P3."""
-        points, capacity = self._lane(f, "points", k), self._lane(f, "capacity", k)
-        with f.if_(points >= capacity):
-            self._put_lane(f, "capacity", k, capacity * 2.0)
-            size = self.to_int(f, capacity * 2.0) * (self.row * 8)
-            old = self._lane(f, "record", k, POINTER)
-            new = f.op(f"call ptr @realloc(ptr {old.name}, i64 {size.name})", POINTER)
-            f.declared.add("declare ptr @realloc(ptr, i64)")
-            self._put_lane(f, "record", k, new, POINTER)
-        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, points) * self.row)
-        for j, name in enumerate(("T3", "written", "begin")):
-            f.store(self._lane(f, name, k), row, j)
-        for j, x in enumerate("qva"):
-            self.copy_lane(f, row, HEAD + j * self.n, f"P3 {x}", k)
-        self._put_lane(f, "points", k, points + 1.0)
-
-    def _load_point(self, f: Function, k: Value, number: Value, point: str):
-        """A point of lane k from its record; before the first one there is the first."""
-        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, f.max(number, 0.0)) * self.row)
-        self._put_lane(f, f"T{point[1:]}", k, f.load(row, 0))
-        for j, x in enumerate("qva"):
-            with f.each(self.n) as i:
-                place = i * f.width + k + self.start(f"{point} {x}", "work")
-                f.store(f.load(row, i + (HEAD + j * self.n)), f.given["work"], place)
-
     # --- the way back
-
-    def _each_lane(self, f: Function, mask: Value):
-        marked = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
-        with f.each(f.width) as k, f.if_(f.lane(marked, k) > 0.5):
-            yield k
 
     def _accumulate_constants(self, f: Function, mask: Value):
         """The cotangents of the constants that a program has found, to those of lanes in question."""
@@ -282,9 +221,8 @@ class Reverse(Differentiated):
                     number, member = self.to_int(f, self._lane(f, "written", k)), self._lane(f, "member", k)
                     self._put_lane(f, "next", k, self.input_number(f, call, "ts", member, number))
                     given(k, number, "Y")
-                    row = (self.to_int(f, member) * times + number) * n
                     for x in "qv":
-                        state = f.at(f.load(call, self.call_fields.index(f"{x}s"), base=POINTER), row)
+                        state = f.at(self.member_address(f, call, f"given {x}s", member), number * n)
                         with f.each(n) as i:
                             place = i * f.width + k + self.start(f"X {x}", "work")
                             f.store(f.load(state, i), f.given["work"], place)
@@ -333,28 +271,10 @@ class Reverse(Differentiated):
                 numbers = self.member_address(f, call, "numbers", self._lane(f, "member", k))
                 to = self._result(f, call, "numbersbar", k, sum(self.active_numbers))
                 f.call(REVERSE, numbers, constants, bars, to)
-            f.line(f"call void @free(ptr {self._lane(f, 'record', k, POINTER).name})")
+            self.free_record(f, k)
         s.ready = f.const(0.0, DOUBLE, f.width)
 
     def _result(self, f: Function, call: Value, name: str, k: Value, length: int) -> Value:
         """Where an output of the member in lane k begins, that has so many numbers of each."""
         number = self.to_int(f, self._lane(f, "member", k))
         return f.at(f.load(call, self.call_fields.index(name), base=POINTER), number * length)
-
-    def _load_head(self, f: Function, k: Value):
-        """What is noted of the step that led to the point where lane k is."""
-        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, self._lane(f, "at", k)) * self.row)
-        self._put_lane(f, "before", k, f.load(row, 1))
-        self._put_lane(f, "begin", k, f.load(row, 2))
-
-    def end_members(self, f: Function, s: Lane):
-        s.where(s.due > 0.5, ready=1.0)
-
-    def take_next(self, f: Function, s: Lane, fill):
-        with f.if_(~f.any_of(s.active > 0.5)):
-            with f.if_(self._backpropagates(f)):
-                f.call("walk", f.given["work"], f.given["call"])
-            fill()
-
-    def _backpropagates(self, f: Function) -> Value:
-        return f.load(self.call_record(f), self.call_fields.index("directions"), base=INT) > 0

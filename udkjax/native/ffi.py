@@ -55,6 +55,8 @@ def handler(trajectory: Trajectory, name: str) -> Function:
     put("times", dimension("ts", 1))
     put("knots", dimension("breaks", 1))
     put("directions", dimension(inputs[-1], trajectory.directions_in))
+    for field in trajectory.lengths:
+        put(f"{field} length", dimension(field, 1))
     for field in inputs:
         length = f.variable(1, INT, 1)
         with f.each(word(found[field], RANK), 1) as k:

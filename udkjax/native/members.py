@@ -148,7 +148,7 @@ def write_run(t: Module):
                 f.call("begin", work, call, k, member)
 
     fill()
-    with f.while_(lambda: f.any_of(s.active > 0.5)):
+    with f.while_(lambda: t.goes_on(f, s)):
         t.step_all(f, s, fill)
     for block in blocks:
         f.line(f"call void @free(ptr {block.name})")

@@ -38,6 +38,7 @@ class Module:
     inputs: tuple[str, ...] = ()  # besides those of every run
     results: tuple[str, ...] = OUTPUTS
     outputs: tuple[str, ...] = ()
+    lengths: tuple[str, ...] = ()  # inputs and outputs of which it must know how many numbers they have of each member
     directions_in = 0  # which dimension of the last input says how many directions there are
     module = ""  # the text, once it is written
 
@@ -45,7 +46,8 @@ class Module:
     def call_fields(self) -> tuple[str, ...]:
         inputs = (*INPUTS, *self.inputs)
         strides = (f"{x} stride" for x in inputs)
-        return "members", "times", "knots", "directions", *inputs, *strides, *self.results, *self.outputs, "next"
+        lengths = (f"{x} length" for x in self.lengths)
+        return "members", "times", "knots", "directions", *inputs, *strides, *self.results, *self.outputs, *lengths, "next"
 
     def __init__(self, plan: Plan):
         self.plan, self.code, self.method = plan, plan.code, plan.method
@@ -317,6 +319,10 @@ class Module:
 
     def end_members(self, f: Function, s: Lane):
         """What it does with members that are done, in lanes that are `due`."""
+
+    def goes_on(self, f: Function, s: Lane) -> Value:
+        """Whether there is something to do in the lanes."""
+        return f.any_of(s.active > 0.5)
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
         """One step of all lanes, and what becomes of those that are done."""

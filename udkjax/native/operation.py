@@ -27,6 +27,7 @@ from udkjax.native.ffi import handler
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS, Plan
 from udkjax.native.marching import Marching
 from udkjax.native.program import UnsupportedError
+from udkjax.native.record import record_length
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
 from udkjax.native.trajectory import Trajectory
@@ -113,6 +114,8 @@ class Compiled:
             fields[name] = x.ctypes.data
             fields[f"{name} stride"] = math.prod(x.shape[1:]) if len(x) > 1 else 0
         fields |= {name: x.ctypes.data for name, x in zip((*names.results, *names.outputs), found, strict=True)}
+        arrays = dict(zip((*INPUTS, *names.inputs, *names.results, *names.outputs), (*inputs, *found), strict=True))
+        fields |= {f"{name} length": arrays[name].shape[1] for name in names.lengths}
         members, times = shapes[0][0], inputs[INPUTS.index("ts")].shape[1]
         following = ctypes.c_int64(0)
         fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
@@ -177,7 +180,8 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
         shapes += [(members, directions, times, 2 * n), (members, directions, 2 * n)]
     if kind.mode == "reverse":
         assert kind.active is not None
-        shapes += [(members, sum(kind.active)), (members, n), (members, n)]
+        is_first = not inputs[-1].shape[0]  # without cotangents
+        shapes += [(members, sum(kind.active)), (members, n), (members, n), (members, record_length(n) if is_first else 0)]
     return shapes
 
 

@@ -1,0 +1,157 @@
+"""The record of a trajectory, from which reverse mode walks back: its accepted states, and what led to each of them.
+
+A first call of the code runs, and leaves the record of each member among its outputs. A second one, with cotangents, is given the
+record and walks back at once; a member whose record was too long for its place is run again.
+"""
+
+from collections.abc import Callable
+
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.layout import Lane, Plan
+from udkjax.native.tangents import Differentiated
+
+FIRST = 512  # points that a record has room for while a member runs, before it grows
+STORED = 200  # points up to which a record is given to the second call: as much memory as 300 outputs
+TITLE = 3  # numbers of a record before its points: how many points, how the run ended, how many outputs it wrote
+HEAD = 3  # numbers of a point before its state: its time, how many outputs were written before its step, whether it begins anew
+
+
+def record_length(n: int) -> int:
+    """How many numbers the record of a member has, of n coordinates."""
+    return TITLE + STORED * (HEAD + 3 * n)
+
+
+class Recorded(Differentiated):
+    """A trajectory that leaves a record, or walks back from one."""
+
+    lengths = ("given record", "record")
+
+    def __init__(self, plan: Plan, active: tuple[bool, ...]):
+        super().__init__(plan, active)
+        for name in ("record", "capacity", "points", "at", "ready", "given"):
+            self.places.add(name)
+        self.row = HEAD + 3 * self.n
+
+    def walks_back(self, f: Function) -> Value:
+        """Whether there are cotangents."""
+        return f.load(self.call_record(f), self.call_fields.index("directions"), base=INT) > 0
+
+    def _leaves_record(self, f: Function) -> Value:
+        return f.load(self.call_record(f), self.call_fields.index("record length"), base=INT) > 0
+
+    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
+        del constants
+        call = self.call_record(f)
+        self._put_lane(f, "given", lane, f.const(0.0))
+        with f.if_(f.load(call, self.call_fields.index("given record length"), base=INT) > 0):
+            given = self.member_address(f, call, "given record", member)
+            with f.if_(f.load(given) > 0.0):
+                for k, name in enumerate(("points", "code", "written")):
+                    self._put_lane(f, name, lane, f.load(given, k))
+                self._put_lane(f, "record", lane, f.at(given, TITLE), POINTER)
+                for name, x in (("active", 0.0), ("ready", 1.0), ("given", 1.0)):
+                    self._put_lane(f, name, lane, f.const(x))
+        with f.if_((self._lane(f, "given", lane) < 0.5) & (self.walks_back(f) | self._leaves_record(f))):
+            self._new_record(f, lane)
+
+    def record_step(self, f: Function, s: Lane, accept: Value):
+        with f.if_(self.walks_back(f) | self._leaves_record(f)):
+            for k in self._each_lane(f, accept):
+                self._store_point(f, s, k)
+
+    def end_members(self, f: Function, s: Lane):
+        with f.if_(self.walks_back(f)):
+            s.where(s.due > 0.5, ready=1.0)
+        with f.if_(self._leaves_record(f)):
+            for k in self._each_lane(f, s.due > 0.5):
+                self._leave_record(f, k)
+
+    def _leave_record(self, f: Function, k: Value):
+        """Write the record of lane k, or none where it is too long: no points."""
+        call = self.call_record(f)
+        length = f.load(call, self.call_fields.index("record length"), base=INT)
+        member = self.to_int(f, self._lane(f, "member", k))
+        to = f.at(f.load(call, self.call_fields.index("record"), base=POINTER), member * length)
+        points, record = self._lane(f, "points", k), self._lane(f, "record", k, POINTER)
+        count = self.to_int(f, points) * self.row
+        fits = count + TITLE <= length
+        for j, x in enumerate((f.select(fits, points, 0.0), self._lane(f, "code", k), self._lane(f, "written", k))):
+            f.store(x, to, j)
+        with f.if_(fits), f.each(count) as i:
+            f.store(f.load(record, i), to, i + TITLE)
+        f.line(f"call void @free(ptr {record.name})")
+
+    def free_record(self, f: Function, k: Value):
+        """Free what lane k took for its record."""
+        with f.if_(self._lane(f, "given", k) < 0.5):
+            f.line(f"call void @free(ptr {self._lane(f, 'record', k, POINTER).name})")
+
+    # --- which members are next
+
+    def goes_on(self, f: Function, s: Lane) -> Value:
+        return f.any_of(s.active > 0.5) | f.any_of(s.ready > 0.5)
+
+    def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
+        with f.if_(~self.walks_back(f)):
+            fill()
+
+    def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """The members in the lanes walk back side by side when all have run, and the next ones follow."""
+        with f.if_(f.any_of(s.active > 0.5)):
+            super().step_all(f, s, fill)
+        with f.if_(self.walks_back(f) & ~f.any_of(s.active > 0.5)):
+            f.call("walk", f.given["work"], f.given["call"])
+            fill()
+
+    # --- its points
+
+    def _new_record(self, f: Function, lane: Value):
+        s = Lane(f, self.places)
+        record = f.op(f"call ptr @malloc(i64 {FIRST * self.row * 8})", POINTER)
+        self._put_lane(f, "record", lane, record, POINTER)
+        self._put_lane(f, "capacity", lane, f.const(float(FIRST)))
+        self._put_lane(f, "points", lane, f.const(0.0))
+        self._store_point(f, s, lane)
+
+    def _put_lane(self, f: Function, name: str, k: Value, x: Value, base: str = DOUBLE):
+        f.store(x, f.given["work"], k + self.places[name] * f.width, base=base)
+
+    def _lane(self, f: Function, name: str, k: Value, base: str = DOUBLE) -> Value:
+        return f.load(f.given["work"], k + self.places[name] * f.width, base=base)
+
+    def _store_point(self, f: Function, s: Lane, k: Value):
+        """One more point, that of P3."""
+        points, capacity = self._lane(f, "points", k), self._lane(f, "capacity", k)
+        with f.if_(points >= capacity):
+            self._put_lane(f, "capacity", k, capacity * 2.0)
+            size = self.to_int(f, capacity * 2.0) * (self.row * 8)
+            old = self._lane(f, "record", k, POINTER)
+            new = f.op(f"call ptr @realloc(ptr {old.name}, i64 {size.name})", POINTER)
+            f.declared.add("declare ptr @realloc(ptr, i64)")
+            self._put_lane(f, "record", k, new, POINTER)
+        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, points) * self.row)
+        for j, name in enumerate(("T3", "written", "begin")):
+            f.store(self._lane(f, name, k), row, j)
+        for j, x in enumerate("qva"):
+            self.copy_lane(f, row, HEAD + j * self.n, f"P3 {x}", k)
+        self._put_lane(f, "points", k, points + 1.0)
+
+    def _load_point(self, f: Function, k: Value, number: Value, point: str):
+        """A point of lane k from its record; before the first one there is the first."""
+        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, f.max(number, 0.0)) * self.row)
+        self._put_lane(f, f"T{point[1:]}", k, f.load(row, 0))
+        for j, x in enumerate("qva"):
+            with f.each(self.n) as i:
+                place = i * f.width + k + self.start(f"{point} {x}", "work")
+                f.store(f.load(row, i + (HEAD + j * self.n)), f.given["work"], place)
+
+    def _load_head(self, f: Function, k: Value):
+        """What is noted of the step that led to the point where lane k is."""
+        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, self._lane(f, "at", k)) * self.row)
+        self._put_lane(f, "before", k, f.load(row, 1))
+        self._put_lane(f, "begin", k, f.load(row, 2))
+
+    def _each_lane(self, f: Function, mask: Value):
+        marked = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+        with f.each(f.width) as k, f.if_(f.lane(marked, k) > 0.5):
+            yield k
