@@ -187,9 +187,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
         np.concatenate([unknowns.dx_dz(z[:P]), problem.state_sizes]),
         (*unknowns.kinds, *["free"] * (problem.K - P)),
     )
-    uncertainty, of_all = (
-        estimate_uncertainty(weighted.J[0], weighted.r[0], values, groups, count, len(problem.priors)) for count in (P, problem.K)
-    )
+    uncertainty = estimate_uncertainty(weighted.J[0], weighted.r[0], values, groups, P, len(problem.priors))
     scale = np.append(uncertainty.noise, 1.0)[groups]
     rows = len(problem.index)
     sigma = problem.sigma * scale[:rows]
@@ -201,16 +199,14 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
             times = problem.ts[record, problem.index[places, 1]]
             seen = (weighted.r[0, :rows] / scale[:rows])[places]
             white[int(record), problem.channel_names[channel]] = whiteness_of(times, seen, uncertainty.projection[places])
+    names = [name for state in problem.initial_states for name in state.names]
     return Estimate(
         names=unknowns.names,
         units=unknowns.units,
         values=x,
         uncertainty=uncertainty,
         at_bounds=unknowns.at_bounds(x),
-        initial_state_values={
-            name: (float(states[k]), float(of_all.standard_errors[P + k]))
-            for k, name in enumerate(name for state in problem.initial_states for name in state.names)
-        },
+        initial_state_values=dict(zip(names, zip(states.tolist(), uncertainty.state_errors.tolist(), strict=True), strict=False)),
         predicted=problem.by_record(problem.y[problem.present] - left),
         residuals=problem.by_record(left),
         noise=problem.by_record(sigma),

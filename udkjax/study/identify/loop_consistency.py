@@ -59,9 +59,7 @@ def loop_problems(
     redundant = analyse(mechanism).redundant_rows
     if redundant == () or not names:
         return []
-    placed = jax.jit(
-        lambda x: apply(mechanism, x).without_origin
-    )  # traced, so that no step of differences is refused for its sign
+    placed = jax.jit(lambda x: apply(mechanism, x).without_origin)  # traced: no step of differences is refused for its sign
     x = np.asarray(x, float)
     steps = DIFFERENCE_STEP * np.where(x != 0.0, np.abs(x), min(_length(placed(x)), 1.0))
     moving = [

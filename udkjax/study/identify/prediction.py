@@ -170,9 +170,8 @@ def _place(mechanism: Mechanism, member: Members, targets: tuple[Target, ...]) -
     """Return the mechanism of a member, and the state from which its initial state is closed."""
     base = mechanism.with_parameters(member.conditions) if member.conditions else mechanism
     found = guess = apply_values(base, targets, member.x)
-    if (
-        member.q is not None and member.v is not None
-    ):  # lengths move the guess: that of the record, while the scene's own decides about the constants
+    if member.q is not None and member.v is not None:
+        # Lengths move the guess: that of the record, while the scene's own decides about the constants.
         guess = apply_values(_with_state(base, member.q, member.v), targets, member.x)
     q, v = (part.reshape(-1, 3) for part in jnp.einsum("iks,s->ik", member.bases, member.shift))
     return found, State(guess.q0 + q, guess.v0 + v)

@@ -75,6 +75,7 @@ class Uncertainty:
         degrees_of_freedom: residuals minus directions that they show.
         noise: for each group of residuals whose noise was estimated, how many times larger it is than what they were divided by.
         projection: U, the part of the residuals that the fit removes.
+        state_errors: standard errors of the other unknowns, those of initial states.
     """
 
     values: UnknownValues
@@ -89,6 +90,7 @@ class Uncertainty:
     degrees_of_freedom: int
     noise: Float[np.ndarray, "G"]
     projection: Float[np.ndarray, "R D"]
+    state_errors: Float[np.ndarray, "K-P"]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -139,8 +141,7 @@ def estimate_uncertainty(
     default). The first `parameters` unknowns are asked for, by default all. The last rows are those of `priors`: what only they
     show is as known as they say, however much better other directions are measured.
     """
-    K = len(values.names)
-    P = K if parameters is None else parameters
+    K, P = len(values.names), len(values.names) if parameters is None else parameters
     size, before = np.linalg.norm(J, axis=0), J[len(J) - priors :]
     alive = np.flatnonzero((size > INVISIBLE * size.max(initial=0.0)) | np.any(before != 0.0, axis=0))
     group = np.full(len(r), -1) if noise_group is None else np.asarray(noise_group, int)
@@ -156,9 +157,10 @@ def estimate_uncertainty(
     lost = np.any(flats != 0.0, axis=0)
     lost[np.setdiff1d(np.arange(K), alive)] = True
     root = directions[shown].T / sigma[shown] * np.asarray(values.dx_dz)[:, None]  # (K, D)
-    covariance = (root @ root.T)[:P, :P] * (1.0 if known else np.nan)
-    errors = np.where(lost[:P], np.inf, np.sqrt(np.diag(covariance)))
-    covariance[lost[:P]] = covariance[:, lost[:P]] = np.nan
+    every = root @ root.T * (1.0 if known else np.nan)
+    every[lost] = every[:, lost] = np.nan
+    every_error = np.where(lost, np.inf, np.sqrt(np.diag(every)))
+    errors, covariance = every_error[:P], every[:P, :P]
     correlation = covariance / np.outer(errors, errors)
     np.fill_diagonal(correlation, 1.0)
     np.fill_diagonal(covariance, errors**2)
@@ -175,6 +177,7 @@ def estimate_uncertainty(
         degrees_of_freedom=len(r) - int(shown.sum()),
         noise=noise,
         projection=u[:, shown],
+        state_errors=every_error[P:],
     )
 
 
@@ -266,15 +269,13 @@ def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
     ratio = np.sqrt(chi2 / freedom)
     numbers = f"chi^2 = {chi2:.4g} with {freedom} degrees of freedom"
     if chdtrc(freedom, chi2) < IMPROBABLE:
-        yield (
-            f"residuals are {ratio:.3g} times as large as the noise given ({numbers}): the model leaves something out, or the "
-            "noise is larger; standard errors are those of the noise given"
-        )
+        size, why = f"{ratio:.3g}", "the model leaves something out, or the noise is larger"
     elif chdtr(freedom, chi2) < IMPROBABLE:
-        yield (
-            f"residuals are only {ratio:.3g} times as large as the noise given ({numbers}): the noise is smaller, or its samples "
-            "are not independent; standard errors are those of the noise given"
-        )
+        size, why = f"only {ratio:.3g}", "the noise is smaller, or its samples are not independent"
+    else:
+        return
+    end = "standard errors are those of the noise given"
+    yield f"residuals are {size} times as large as the noise given ({numbers}): {why}; {end}"
 
 
 def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Direction:
