@@ -4,16 +4,17 @@ import gc
 import json
 import os
 import shutil
-import tempfile
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-# What the tests compile stays out of the user's cache; the processes of one run share theirs.
-OWN_CACHE = None if "UDKJAX_CACHE" in os.environ else tempfile.mkdtemp(prefix="udkjax-cache-")
-CACHE = os.environ.setdefault("UDKJAX_CACHE", OWN_CACHE or "")
+# What the tests compile stays out of the user's cache. The processes of one run share theirs, and the next run finds it: its keys
+# are what was compiled, and by which version. `--cache-clear` empties it.
+HAS_OWN_CACHE = "UDKJAX_CACHE" not in os.environ
+CACHE = os.environ.setdefault("UDKJAX_CACHE", str(Path(__file__).parents[1] / ".pytest_cache" / "compiled"))
+CACHE_SIZE = 2**30  # bytes; a cache that is larger before a run begins anew
 # XLA compiles in less than half of the time what it does not optimize; no test is about how fast that runs.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 jax.config.update("jax_compilation_cache_dir", f"{CACHE}/jax")
@@ -32,9 +33,12 @@ DATA = Path(__file__).parent / "data"
 MAPS = 20_000  # pieces of memory; Linux lets a process have 65,530
 
 
-def pytest_unconfigure():
-    if OWN_CACHE:
-        shutil.rmtree(OWN_CACHE, ignore_errors=True)
+def pytest_configure(config):
+    if not HAS_OWN_CACHE or hasattr(config, "workerinput"):  # of a process that another one has started
+        return
+    size = sum(x.stat().st_size for x in Path(CACHE).rglob("*") if x.is_file())
+    if config.getoption("cacheclear", False) or size > CACHE_SIZE:
+        shutil.rmtree(CACHE, ignore_errors=True)
 
 
 @pytest.fixture(scope="module", autouse=True)
