@@ -23,8 +23,8 @@ def test_absolute_and_relative_thresholds():
 
 
 def test_absolute_threshold_is_in_the_units_of_the_matrix(entry):
-    a = jnp.diag(jnp.array([1.0, 1e-3]))
-    ranks = jax.vmap(lambda scale: entry.make(1e-6, relative=False).rank(scale * a))(jnp.array([1.0, 1e-2, 1e-4, 1e-7]))
+    a, scales = np.diag([1.0, 1e-3]), np.array([1.0, 1e-2, 1e-4, 1e-7])
+    ranks = jax.jit(jax.vmap(lambda scale: entry.make(1e-6, relative=False).rank(scale * a)))(scales)
     assert ranks.tolist() == [2, 2, 1, 0]
 
 
@@ -44,8 +44,9 @@ def test_rank_tol_is_a_leaf():
 
 
 def test_an_invalid_matrix_gives_nan_not_a_plausible_answer(entry):
-    a = jnp.eye(3).at[1, 2].set(jnp.nan)
-    assert jnp.isnan(entry.make(1e-4).solve(a, jnp.ones(3)).x).any()
+    a = np.eye(3)
+    a[1, 2] = np.nan
+    assert np.isnan(jax.jit(lambda a, b: entry.make(1e-4).solve(a, b).x)(a, np.ones(3))).any()
 
 
 def test_plus_is_an_operator_factorized_once():

@@ -76,8 +76,8 @@ def reactions(
     """
     soft = None if compliances is None else _compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
-    by_row = _loads_by_row(mechanism.without_origin, analysis, *states, method, stabilization, soft)
-    return _split_by_body(mechanism, states[1], by_row, lambda part: part.sum(0), frame, about)
+    loads = _loads(mechanism.without_origin, analysis, *states, method, stabilization, soft, frame, about)
+    return _name_by_body(mechanism, loads)
 
 
 def unique_reactions(
@@ -103,31 +103,34 @@ def unique_reactions(
         For each joint and driver, and each of its bodies, booleans (T, 3) for force x, force y and torque.
     """
     analysis, (ts, q, _) = analyse(mechanism), _states(solution)
-    Psi_q, N = _null_spaces(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol))
-    rows = [name for name, _ in analysis.row_names]
-    unit = jnp.stack([1.0, 1.0, analysis.length])  # of a force, and of a torque in forces
+    found = _uniqueness_of_loads(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol), frame, about)
+    return _name_by_body(mechanism, found)
 
-    def unique(part: Array, N: Array) -> Array:
-        """Of a component's map c (rows, T, 3) and the rows (T, rows, m) of N that it has: whether c^T N = 0."""
-        size = jnp.max(jnp.linalg.norm(part, axis=0) / unit, axis=-1, keepdims=True)
-        return jnp.linalg.norm(jnp.einsum("rtc,trk->tck", part, N), axis=-1) <= UNIQUE_TOL * unit * size
 
-    found = _split_by_body(mechanism, q, Psi_q / analysis.scales.rows[:, None], lambda part: part, frame, about)
+def _name_by_body(mechanism: Mechanism, values: list[list[Array]]) -> ByBody:
+    """Return values under the names of their constraints and bodies; in order, which a dictionary loses under `jit`."""
+    bodies = {name: dict.fromkeys(mechanism.frames_of(element)) for name, element in mechanism.constraints.items()}
     return {
-        name: {body: unique(part, N[:, [k for k, n in enumerate(rows) if n == name]]) for body, part in loads.items()}
-        for name, loads in found.items()
+        name: dict(zip([body for body in bodies[name] if body != GROUND], own, strict=True))
+        for name, own in zip(bodies, values, strict=True)
     }
 
 
 def _split_by_body(
-    mechanism: Mechanism, q: Array, by_row: Float[Array, "T m n"], total: Callable[[Array], Array], frame: Axes, about: About
+    mechanism: Mechanism,
+    row_names: list[str],
+    q: Array,
+    by_row: Float[Array, "T m n"],
+    total: Callable[[Array], Array],
+    frame: Axes,
+    about: About,
 ) -> ByBody:
     """Split the loads of rows by joints and bodies, (rows, T, 3) each, in other axes and about another point."""
     if frame not in ("ground", "body", "joint") or about not in ("centre", "joint"):
         raise ValueError(f'frame is "ground", "body" or "joint", not {frame!r}; about is "centre" or "joint", not {about!r}')
     places = {name: k for k, name in enumerate(mechanism.body_names)}
     seen = {name: _frame(q, place) for name, place in places.items()} | {GROUND: GROUND_FRAME}
-    row_names, found = [name for name, _ in analyse(mechanism).row_names], {}
+    found: ByBody = {}
     for name, element in mechanism.constraints.items():
         own = np.array([k for k, owner in enumerate(row_names) if owner == name])
         bodies = mechanism.frames_of(element)
@@ -216,8 +219,8 @@ def split_by_compliance(
 
 
 @eqx.filter_jit
-def _loads_by_row(mechanism, analysis, ts, q, v, method, baumgarte, soft):
-    """-Psi_q^T lambda, row by row (T, m, n)."""
+def _loads(mechanism, analysis, ts, q, v, method, baumgarte, soft, frame, about):
+    """-Psi_q^T lambda of each constraint on each of its bodies (T, 3)."""
     equations = prepare(mechanism, method, baumgarte, analysis)
 
     def one(t, q, v):
@@ -226,14 +229,29 @@ def _loads_by_row(mechanism, analysis, ts, q, v, method, baumgarte, soft):
             found = split_by_compliance(mechanism, t, q, found, soft, analysis.scales.weights)
         return -equations.jacobian(t, q) * found[:, None]
 
-    return jax.vmap(one)(ts, q, v)
+    by_row, rows = jax.vmap(one)(ts, q, v), [name for name, _ in analysis.row_names]
+    found = _split_by_body(mechanism, rows, q, by_row, lambda part: part.sum(0), frame, about)
+    return [list(loads.values()) for loads in found.values()]
 
 
 @eqx.filter_jit
-def _null_spaces(mechanism, analysis, ts, q, rank_tol):
-    """Psi_q (T, m, n), and N (T, m, m) of its scaled rows."""
+def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
+    """Whether equilibrium determines each component of `_loads`, by Psi_q (T, m, n), and N (T, m, m) of its scaled rows."""
 
     def one(t, q):
         return psi_q(mechanism, t, q), left_null_space(mechanism, t, q, analysis, rank_tol).basis
 
-    return jax.vmap(one)(ts, q)
+    Psi_q, N = jax.vmap(one)(ts, q)
+    rows = [name for name, _ in analysis.row_names]
+    unit = jnp.stack([1.0, 1.0, analysis.length])  # of a force, and of a torque in forces
+
+    def unique(part: Array, N: Array) -> Array:
+        """Of a component's map c (rows, T, 3) and the rows (T, rows, m) of N that it has: whether c^T N = 0."""
+        size = jnp.max(jnp.linalg.norm(part, axis=0) / unit, axis=-1, keepdims=True)
+        return jnp.linalg.norm(jnp.einsum("rtc,trk->tck", part, N), axis=-1) <= UNIQUE_TOL * unit * size
+
+    found = _split_by_body(mechanism, rows, q, Psi_q / analysis.scales.rows[:, None], lambda part: part, frame, about)
+    return [
+        [unique(part, N[:, [k for k, n in enumerate(rows) if n == name]]) for part in loads.values()]
+        for name, loads in found.items()
+    ]
