@@ -293,5 +293,5 @@ class Estimate:
 
 
 def _finite(x: float) -> float | None:
-    """A number as JSON knows it: what is not finite is null."""
+    """Return a number as JSON knows it: what is not finite is null."""
     return float(x) if np.isfinite(x) else None

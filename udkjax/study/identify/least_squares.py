@@ -151,7 +151,7 @@ def _gauss_newton(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _linear(y: Array, known: tuple[Array, Array]) -> tuple[Array, None]:
-    """Residuals around a point, from the triangle there."""
+    """Return residuals around a point, from the triangle there."""
     point, T = known
     return T[:, -1] + T[:, :-1] @ (y - point), None
 

@@ -163,7 +163,7 @@ class RedundantLoops:
         self._circuits = np.array([N @ np.linalg.inv(N[self._redundant_rows]) for N in null_spaces])
 
     def problems(self, names: Sequence[str]) -> list[str]:
-        """One message for each set of parameters that depend on each other."""
+        """Return a message for each set of parameters that depend on each other."""
         found = []
         relations = row_space(self._unclosed, DEPENDENT)
         sets = connected_columns(relations)
@@ -180,7 +180,7 @@ class RedundantLoops:
         return found
 
     def _closes(self, directions: np.ndarray) -> bool:
-        """Whether the mechanism closes, as redundant as it was, after a step along all of some directions at once."""
+        """Return whether the mechanism closes, as redundant as before, after a step along all of some directions at once."""
         if not len(directions):
             return True
         step = np.random.default_rng(1).uniform(0.5, 1.0, len(directions)) @ directions

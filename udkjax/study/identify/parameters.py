@@ -154,7 +154,7 @@ def _units(mechanism: Mechanism, target: Target) -> str:
 
 
 def _is_positive(mechanism: Mechanism, target: Target, guess: float) -> bool:
-    """Whether a value must not become negative."""
+    """Return whether a value must stay positive."""
     if target.function is not None:
         return isinstance(target.function, Length)
     return guess > 0 and (target.scaled or all(_must_be_positive(mechanism, name) for name in target.names))
@@ -226,7 +226,7 @@ def _read(mechanism: Mechanism, text: str, scaled: bool) -> tuple[Length | tuple
 
 
 def _length(mechanism: Mechanism, text: str) -> tuple[str, ...]:
-    """The bodies of `length(a, b)` or `a.length`."""
+    """Return the bodies of `length(a, b)` or `a.length`; none where the text is no length."""
     if text.startswith("length(") and text.endswith(")"):
         return tuple(body.strip().strip("\"'") for body in text[7:-1].split(","))
     owner, dot, field = text.rpartition(".")

@@ -130,7 +130,7 @@ class _Static:
 
 
 def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
-    """Some members, filled up with copies of the last."""
+    """Return some members, filled up with copies of the last."""
     return x[np.minimum(np.arange(first, first + count), len(x) - 1)]
 
 

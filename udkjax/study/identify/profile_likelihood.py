@@ -196,7 +196,7 @@ def quantile(level: float, degrees_of_freedom: float | None) -> float:
 
 
 def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, bound: float, rise: float, steps: int) -> _Side:
-    """One side: steps that raise psi by equal parts; where one went past the end, between the two points beside it."""
+    """Walk along one side by steps that raise psi by equal parts; once past the end, between the two points beside it."""
     end, sign = np.sqrt(rise), np.sign(step)
     inside: tuple[np.ndarray, float] = z, 0.0  # the last point within the interval, and its psi
     before, outside = None, None  # the point within before that one; the nearest beyond

@@ -135,7 +135,7 @@ def table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) -
 
 
 def _values(column: "pandas.Series") -> np.ndarray:
-    """The values of a pandas Series; missing numbers become nan."""
+    """Return the values of a pandas Series; missing numbers become nan."""
     return column.to_numpy(float, na_value=np.nan) if column.dtype.kind in "iuf" else column.to_numpy()
 
 
@@ -160,7 +160,7 @@ def table_of_columns(
 
 
 def _is_scalar(values: ArrayLike) -> bool:
-    """Whether this is one value for all rows."""
+    """Return whether this is one value for all rows."""
     return isinstance(values, str) or not hasattr(values, "__len__") or getattr(values, "shape", None) == ()
 
 
