@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from udkjax.study.row_spaces import null_space
+
 DEPENDS = 1e-6  # the length of rows of N, whose columns are orthonormal: rounding leaves far less
 
 
@@ -33,7 +35,7 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
         involved = list(dict.fromkeys(owner[np.linalg.norm(remaining, axis=1) > DEPENDS].tolist()))
         candidates = [_around(seed, involved, remaining, owner, attached) for seed in involved]
         for members in sorted(candidates, key=len):
-            own = _null_space(N[~np.isin(owner, members)])
+            own = null_space(N[~np.isin(owner, members)], DEPENDS).T
             both = np.linalg.svd(np.concatenate([spanned, own], axis=1), full_matrices=False)
             rank = int(np.sum(both[1] > DEPENDS))
             if rank > spanned.shape[1]:
@@ -51,12 +53,12 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
 
 def redundant_by(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> int:
     """Return by how many rows a set of constraints is redundant in itself."""
-    return N.shape[1] - _rank(N[~np.isin(np.array(owners), list(members))])
+    return len(null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS))
 
 
 def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> np.ndarray:
     """Return combinations of a set's rows that vanish, (m, redundancy): forces by which it balances itself."""
-    return N @ _null_space(N[~np.isin(np.array(owners), list(members))])
+    return N @ null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS).T
 
 
 def _around(seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]) -> list[str]:
@@ -79,14 +81,3 @@ def _distances(seed: str, names: list[str], attached: dict[str, tuple[str, ...]]
         far |= dict.fromkeys(near, max(far.values()) + 1)
         edge = near
     return {name: far.get(name, len(names)) for name in names}
-
-
-def _rank(matrix: np.ndarray) -> int:
-    return int(np.sum(np.linalg.svd(matrix, compute_uv=False) > DEPENDS)) if matrix.size else 0
-
-
-def _null_space(matrix: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis, as columns, of what a matrix maps to zero."""
-    if not matrix.size:
-        return np.eye(matrix.shape[1])
-    return np.linalg.svd(matrix)[2][_rank(matrix) :].T

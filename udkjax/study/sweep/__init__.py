@@ -1,4 +1,13 @@
-"""Sweeps: many runs that differ in parameters, settings and methods, as one dataset."""
+"""Sweeps: many runs that differ in parameters, settings and methods, as one dataset.
+
+axes, layout, grid          what varies: as users write it, as dimensions, as a TOML file
+measures                    what is stored of each member
+plan, program               members and their groups; the compiled program of a group
+cost, executors             chunks of members that take alike long, computed on devices or on a cluster
+store, fingerprint          finished chunks on disk; what decides the results
+dataset                     all results, labelled
+sweep, sweep_progress       what users call, and how far it is
+"""
 
 from udkjax.study.sweep.axes import Axis as Axis
 from udkjax.study.sweep.axes import LatinHypercube as LatinHypercube
