@@ -37,16 +37,22 @@ Numbers: TypeAlias = np.ndarray | Array
 Tolerances: TypeAlias = tuple[float, float]  # relative and absolute
 
 
+class Runs(NamedTuple):
+    """N runs that show what was measured, each a record or a piece of one. S >= 0: unknowns of an initial state."""
+
+    ts: np.ndarray  # (N, T) s; the first is when the motion begins
+    q: np.ndarray | None  # (N, bodies, 3) the guess of the initial state; None: that of the scene
+    v: np.ndarray | None
+    bases: np.ndarray  # (N, 2, 3 bodies, S) how each unknown of the initial state changes q and v
+    conditions: Mapping[str, np.ndarray]  # values by name, (N, ...)
+
+
 class Members(NamedTuple):
-    """The numbers of M members, by which a compiled prediction varies. S >= 0: unknowns of an initial state."""
+    """The numbers of M members, by which a compiled prediction varies: parameters, and the run of each."""
 
     x: Numbers  # (M, P) parameters
     shift: Numbers  # (M, S) unknowns of the initial state
-    ts: Numbers  # (M, T) s; the first is when the motion begins
-    q: Numbers | None  # (M, bodies, 3) the guess of the initial state; None: that of the scene
-    v: Numbers | None
-    bases: Numbers  # (M, 2, 3 bodies, S) how each unknown of the initial state changes q and v
-    conditions: Mapping[str, Numbers]  # values by name, (M, ...)
+    runs: Runs
 
 
 class Prediction(NamedTuple):
@@ -142,24 +148,24 @@ def _predict(static, arrays, members, tol):
 
     def along(e):
         def at(x, shift):
-            outputs, code = every(members._replace(x=x, shift=shift)) if several else one(members, x, shift)
-            return outputs, code
+            return (every if several else one)(members._replace(x=x, shift=shift))
 
         points = members.x, members.shift
         by = jnp.split(e, [members.x.shape[1]])
         tangents = tuple(jnp.broadcast_to(t, p.shape) for t, p in zip(by, points, strict=True))
         return jax.jvp(at, points, tangents, has_aux=True)
 
-    def one(members, x, shift):
-        member = jax.tree.map(lambda leaf: leaf[0], members._replace(x=x, shift=shift))
+    def one(members):
+        member = jax.tree.map(lambda leaf: leaf[0], members)
         mech, state = _place(mechanism, member, targets)
-        closure = close(mech, member.ts[0], state, analysis=settings["analysis"])
-        return jax.tree.map(lambda leaf: leaf[None], _run(mech, member.ts, closure, tol, settings, channels, ends))
+        closure = close(mech, member.runs.ts[0], state, analysis=settings["analysis"])
+        return jax.tree.map(lambda leaf: leaf[None], _run(mech, member.runs.ts, closure, tol, settings, channels, ends))
 
     def every(members):
         mechs, states = jax.vmap(lambda member: _place(mechanism, member, targets))(members)
-        closures = jax.vmap(lambda m, t, state: close(m, t, state, settings["analysis"]))(mechs, members.ts[:, 0], states)
-        return jax.vmap(lambda m, ts, c: _run(m, ts, c, tol, settings, channels, ends))(mechs, members.ts, closures)
+        ts = members.runs.ts
+        closures = jax.vmap(lambda m, t, state: close(m, t, state, settings["analysis"]))(mechs, ts[:, 0], states)
+        return jax.vmap(lambda m, ts, c: _run(m, ts, c, tol, settings, channels, ends))(mechs, ts, closures)
 
     size = members.x.shape[1] + members.shift.shape[1]
     outputs, derivatives, code = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(size))
@@ -168,12 +174,13 @@ def _predict(static, arrays, members, tol):
 
 def _place(mechanism: Mechanism, member: Members, targets: tuple[Target, ...]) -> tuple[Mechanism, State]:
     """Return the mechanism of a member, and the state from which its initial state is closed."""
-    base = mechanism.with_parameters(member.conditions) if member.conditions else mechanism
+    run = member.runs
+    base = mechanism.with_parameters(run.conditions) if run.conditions else mechanism
     found = guess = apply_values(base, targets, member.x)
-    if member.q is not None and member.v is not None:
+    if run.q is not None and run.v is not None:
         # Lengths move the guess: that of the record, while the scene's own decides about the constants.
-        guess = apply_values(_with_state(base, member.q, member.v), targets, member.x)
-    q, v = (part.reshape(-1, 3) for part in jnp.einsum("iks,s->ik", member.bases, member.shift))
+        guess = apply_values(_with_state(base, run.q, run.v), targets, member.x)
+    q, v = (part.reshape(-1, 3) for part in jnp.einsum("iks,s->ik", run.bases, member.shift))
     return found, State(guess.q0 + q, guess.v0 + v)
 
 

@@ -24,7 +24,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Quantity, channel_of
 from udkjax.study.identify.loop_consistency import nearest_closable, require_consistent_loops
 from udkjax.study.identify.parameters import Asked, unknowns_of
-from udkjax.study.identify.prediction import LOOSE, TIGHT, Members, Prediction, Predictor, Tolerances
+from udkjax.study.identify.prediction import LOOSE, TIGHT, Members, Prediction, Predictor, Runs, Tolerances
 from udkjax.study.identify.record_reader import Data, records_of
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, pad_times, tabulate
 from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, initial_state_unknowns, with_conditions
@@ -50,16 +50,6 @@ class Residuals(NamedTuple):
     def ok(self) -> np.ndarray:
         """Whether all of it is finite, of runs that came to their end (B,)."""
         return (self.code == Result.successful) & np.isfinite(self.r).all(1) & np.isfinite(self.J).all((1, 2))
-
-
-class Runs(NamedTuple):
-    """The N runs that show what was measured, each a record or a piece of one: what `Members` holds of them."""
-
-    ts: Float[np.ndarray, "N T"]
-    q: Float[np.ndarray, "N bodies 3"] | None
-    v: Float[np.ndarray, "N bodies 3"] | None
-    bases: Float[np.ndarray, "N 2 n S"]
-    conditions: Mapping[str, np.ndarray]
 
 
 class Problem:
@@ -135,13 +125,15 @@ class Problem:
         sets, (N, S) = len(z), self.columns.shape
         x = np.repeat(self.unknowns.values(z[:, : len(self.unknowns.names)]), N, axis=0)
         shift = np.where(self.columns < 0, 0.0, z[:, self.columns]).reshape(sets * N, S)
-        runs = np.tile(np.arange(N), sets)
-        found = self.members_of(runs, x, shift)
-        return found if horizon is None else found._replace(ts=np.stack([_times_until(ts, horizon) for ts in self.runs.ts])[runs])
+        found = self.members_of(np.tile(np.arange(N), sets), x, shift)
+        if horizon is None:
+            return found
+        ts = np.tile([_times_until(ts, horizon) for ts in self.runs.ts], (sets, 1))
+        return found._replace(runs=found.runs._replace(ts=ts))
 
     def members_of(self, runs: Int[np.ndarray, "M"], x: Float[np.ndarray, "M P"], shift: Float[np.ndarray, "M S"]) -> Members:
         """Return the members of some runs, with these parameters and unknowns of their initial states."""
-        return Members(x, shift, *jax.tree.map(lambda leaf: leaf[runs], self.runs))
+        return Members(x, shift, jax.tree.map(lambda leaf: leaf[runs], self.runs))
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
         """Compute residuals and their Jacobian.

@@ -31,8 +31,8 @@ from udkjax.study.identify.least_squares import (
     minimize_squares,
 )
 from udkjax.study.identify.optimizer import Minimizer
-from udkjax.study.identify.prediction import Prediction, Predictor, Tolerances
-from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals, Runs
+from udkjax.study.identify.prediction import Prediction, Predictor, Runs, Tolerances
+from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals
 from udkjax.study.identify.unknowns import InitialStateUnknowns, apply_values, state_unknowns, with_conditions
 
 MOST_PIECES = 60  # of all records: the algebra is that of dense matrices
