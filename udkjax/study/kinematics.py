@@ -152,8 +152,8 @@ def _at_once(
     per = rate[:, None, None]
     a = ddq * per**2 + dq * np.broadcast_to(acceleration, values.shape)[:, None, None]
     status, nowhere = np.zeros(len(values), int), np.full((len(bodies), 3), np.nan)
-    values_, q_, v, a_, rate_, code, limit, limit_q = map(jnp.asarray, (values, at, dq * per, a, rate, status, np.nan, nowhere))
-    return Kinematics(values_, q_, v, a_, rate_, code, limit, limit_q, bodies)
+    arrays = values, at, dq * per, a, rate, status, np.nan, nowhere
+    return Kinematics(*[jnp.asarray(x) for x in arrays], bodies=bodies)
 
 
 def is_known(tree: PyTree) -> bool:

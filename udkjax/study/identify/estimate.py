@@ -157,8 +157,9 @@ class Estimate:
     def rows(self) -> list[Row]:
         """Return what was found, in the order in which it was asked for; then what was found of initial states."""
         known, guess = self.uncertainty, self.problem.unknowns.guess
-        notes = [", ".join([*known.notes(name), *["at a bound"] * (name in self.at_bounds)]) for name in self.names]
-        columns = self.names, self.values.tolist(), known.standard_errors.tolist(), self.units, guess.tolist(), notes
+        notes = [known.notes(name) + (["at a bound"] if name in self.at_bounds else []) for name in self.names]
+        errors = known.standard_errors.tolist()
+        columns = self.names, self.values.tolist(), errors, self.units, guess.tolist(), map(", ".join, notes)
         units = dict(zip(self.problem.all_names, self.problem.all_units, strict=True))
         states = [
             Row(name, change, error, units[name], 0.0, "added to the guess of the start")
