@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.core import Tracer
 from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
@@ -76,7 +77,7 @@ def _positions_are_traced(name, key, default):
     found = []
 
     def build(value):
-        found.append(isinstance(getattr(library, name)(**{key: value}).q0, jax.core.Tracer))
+        found.append(isinstance(getattr(library, name)(**{key: value}).q0, Tracer))
 
     jax.eval_shape(build, jax.tree.map(float, default))
     return found[0]

@@ -17,12 +17,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.structure import ElementKind, element_kinds, evaluate_by_kind, numbers_as_vector
+from udkjax.equations.traced_once import traced_once
 from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 
 State = Float[ArrayLike, "n"] | Float[ArrayLike, "bodies 3"]
 
 
+@traced_once
 def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
     """Psi(t, q), the residuals of all constraints, which are zero where all joints are closed.
 
@@ -40,6 +42,7 @@ def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
     return jnp.concatenate([jnp.ravel(rows) for _, rows in found])[_row_order(found)] if found else jnp.zeros(0)
 
 
+@traced_once
 def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
     """Psi_q = dPsi/dq, the Jacobian of the constraints.
 
@@ -54,6 +57,7 @@ def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
     return jax.jacfwd(lambda q: psi(mechanism, t, q))(vector(q))
 
 
+@traced_once
 def psi_dot(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
     """Psi_dot = Psi_q v + Psi_t, the rate of Psi along a motion.
 
@@ -69,6 +73,7 @@ def psi_dot(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Arr
     return rate_along_motion(lambda t, q: psi(mechanism, t, q), t, q, v)
 
 
+@traced_once
 def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
     """gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt, with which Psi_ddot = Psi_q a - gamma.
 

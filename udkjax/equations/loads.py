@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.constraints import State, bodies, vector
 from udkjax.equations.structure import ElementKind, evaluate_by_kind
+from udkjax.equations.traced_once import traced_once
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
@@ -30,6 +31,7 @@ def mass(mechanism: Mechanism) -> Float[Array, "n"]:
     return vector([m for body in mechanism.bodies.values() for m in (body.mass, body.mass, body.inertia)])
 
 
+@traced_once
 def force(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
     """F = -V_q + the loads of force elements.
 
@@ -58,6 +60,7 @@ def kinetic_energy(mechanism: Mechanism, v: State) -> Float[Array, ""]:
     return mass(mechanism) @ vector(v) ** 2 / 2
 
 
+@traced_once
 def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, ""]:
     """V = the potential energy of gravity, zero at the origin, and of the force elements that have one.
 
@@ -75,6 +78,7 @@ def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> 
     return sum((jnp.sum(V) for _, V in found if V is not None), -(mass(mechanism) * gravity) @ vector(q))
 
 
+@traced_once
 def element_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
     """The sum of the loads that force elements return by their method `loads`, without those of potentials."""
 
