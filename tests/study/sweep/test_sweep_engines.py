@@ -178,7 +178,19 @@ def test_the_papers_table_is_one_sweep():
     alone = udk.simulate(linkage, ts, None, 1e-8, 1e-8, method, udk.Baumgarte(0.0, 0.0), **settings)
     member = data.sel({"method": "Varga", "tol": 1e-8, "stabilization": gains[0]})  # sel has a method of its own
     assert int(member.steps) == int(alone.stats["steps"])
-    assert_allclose(member.angle_error, np.abs(alone.q - exact)[..., 2].max(), rtol=1e-6)
+
+    # A batch and a single run round differently. What that may do to an error of 4e-12 is what a unit of rounding in the initial
+    # angles does, by another seed each time: some 3e-13.
+    def error_from(q):
+        given = linkage, ts, udk.State(q, linkage.v0), 1e-8, 1e-8, method, udk.Baumgarte(0.0, 0.0)
+        return np.abs(udk.simulate(*given, **settings).q - exact)[..., 2].max()
+
+    random, q = np.random.default_rng(0), np.asarray(linkage.q0)
+    errors = [error_from(q + np.spacing(np.abs(q)) * random.choice([-1, 0, 1], q.shape)) for _ in range(8)]
+    own = np.abs(alone.q - exact)[..., 2].max()
+    assert np.ptp(errors) < 1e-4 * 1e-8  # of the tolerance: members of other tolerances err by other powers of ten
+    assert np.min(errors) - np.ptp(errors) < min(float(member.angle_error), own)
+    assert max(float(member.angle_error), own) < np.max(errors) + np.ptp(errors)
 
 
 @pytest.mark.slow
