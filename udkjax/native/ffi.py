@@ -2,6 +2,9 @@
 
 XLA calls a handler with a frame whose layout is its stable C interface (jaxlib/include/xla/ffi/api/c_api.h). The handler is
 generated along with the code that it calls: it reads the buffers of the frame and writes what `run` is told (trajectory.py).
+
+Many members are shared with the threads of XLA's pool, as its own operations are. A thread that comes too late finds the work
+closed and leaves: the handler waits for those alone that have begun, so that threads that all wait cannot be waited for.
 """
 
 from typing import Any
@@ -12,16 +15,26 @@ from udkjax.native.trajectory import Trajectory
 
 # Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, and in it the arguments and results, 40 bytes each:
 # size, extensions, count, types, buffers.
-EXTENSIONS, ARGUMENTS, RESULTS, BUFFERS = 8, 40, 80, 32
+EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, BUFFERS = 8, 16, 24, 40, 80, 32
+# Functions of XLA_FFI_Api, each of a struct of its arguments: size, extensions, and then the words that are given.
+DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 64, 136, 144
 # XLA_FFI_Buffer: size, extensions, dtype, data, rank, dims.
 DATA, RANK, DIMS = 24, 32, 40
 # Of an extension that asks for metadata: where they go, and in them the version (of the interface) that the handler speaks.
 METADATA, MAJOR, MINOR = 24, 24, 28
 VERSION = (0, 1)
+SHARE = 16  # members of a thread, at least: to wake it takes some 10 us, as long as one of a small scene in lanes
+# Words of the work that threads share: how many may still look at it, how many have begun (and whether it is closed), how many
+# are done, the number of the next member, and what `run` is called with.
+USERS, BEGUN, ENDED, NEXT, CALL = range(5)
+CLOSED = 2**32
 
 
-def handler(trajectory: Trajectory, name: str) -> Function:
-    """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions."""
+def handler(trajectory: Trajectory, name: str) -> list[Function]:
+    """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions.
+
+    The last of some functions.
+    """
     f, fields = Function(name, [(POINTER, "frame")], returns="ptr", cold=True), trajectory.call_fields
     inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
     frame = f.given["frame"]
@@ -65,6 +78,79 @@ def handler(trajectory: Trajectory, name: str) -> Function:
     following = Value(f, f.reserve(INT), POINTER)
     f.store(0, following, base=INT)
     put("next", following, POINTER)
-    f.call("run", call)
+    shares = f.arithmetic("div", dimension(outputs[0], 0), SHARE)
+    threads = f.variable(1, INT, 1)
+    with f.if_(shares > 1):
+        threads.value = _thread_count(f, frame)
+    helpers = f.select(threads.value < shares, threads.value, shares) - 1
+    f.choose(helpers > 0, lambda: _run_shared(f, frame, call, len(fields), helpers), lambda: f.call("run", call))
     f.line("ret ptr null")
+    return [_help(), f]
+
+
+def _of_api(f: Function, frame: Value, function: int, *arguments: Value) -> Value:
+    """Call one of XLA's functions; return its error, or null."""
+    given = Value(f, f.reserve(INT, 2 + len(arguments)), POINTER)
+    for k, x in enumerate((f.const(8 * (2 + len(arguments)), INT), f.const(0, INT), *arguments)):
+        f.store(x, given, k, base=x.base)
+    api = f.load(f.at(frame, API, "i8"), 0, base=POINTER)
+    address = f.load(f.at(api, function, "i8"), 0, base=POINTER)
+    return f.op(f"call ptr {address.name}(ptr {given.name})", POINTER)
+
+
+def _is_null(f: Function, pointer: Value) -> Value:
+    return f.op(f"ptrtoint ptr {pointer.name} to i64", INT).is_(0)
+
+
+def _thread_count(f: Function, frame: Value) -> Value:
+    """How many threads XLA's pool has; one where there is none."""
+    count = Value(f, f.reserve(INT), POINTER)
+    f.store(1, count, base=INT)
+    error = _of_api(f, frame, THREAD_COUNT, f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), count)
+    with f.if_(~_is_null(f, error)):
+        _of_api(f, frame, DESTROY_ERROR, error)
+    return f.load(count, base=INT)
+
+
+def _add(f: Function, work: Value, word: int, number: Value | int) -> Value:
+    """Add to a word of shared work; return what it was."""
+    number = f.like(number, INT, 1)
+    return f.op(f"atomicrmw add ptr {f.at(work, word, 'i64').name}, i64 {number.name} seq_cst", INT)
+
+
+def _leave(f: Function, work: Value, users: Value | int = 1):
+    """Look at shared work no more: who does so last frees it."""
+    with f.if_(_add(f, work, USERS, f.like(0, INT, 1) - users).is_(users)):
+        f.line(f"call void @free(ptr {work.name})")
+
+
+def _help() -> Function:
+    """`help(work)`: take part in the work, if it is not closed yet."""
+    f = Function("help", [(POINTER, "work")], cold=True)
+    work = f.given["work"]
+    with f.if_(_add(f, work, BEGUN, 1) < CLOSED):
+        f.call("run", f.at(work, CALL, "i64"))
+        _add(f, work, ENDED, 1)
+    _leave(f, work)
     return f
+
+
+def _run_shared(f: Function, frame: Value, call: Value, count: int, helpers: Value):
+    """Run the members together with so many threads of the pool."""
+    work = f.op(f"call ptr @malloc(i64 {8 * (CALL + count)})", POINTER)
+    for word, x in ((USERS, helpers + 1), (BEGUN, f.const(0, INT)), (ENDED, f.const(0, INT)), (NEXT, f.const(0, INT))):
+        f.store(x, work, word, base=INT)
+    with f.each(count - 1) as k:  # all but the next member's address, the last
+        f.store(f.load(call, k, base=INT), work, k + CALL, base=INT)
+    f.store(f.at(work, NEXT, "i64"), work, CALL + count - 1, base=POINTER)
+    context, task = f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), f.op("getelementptr i8, ptr @help, i64 0", POINTER)
+    with f.each(helpers):
+        error = _of_api(f, frame, SCHEDULE, context, task, work)
+        with f.if_(~_is_null(f, error)):
+            _of_api(f, frame, DESTROY_ERROR, error)
+            _add(f, work, USERS, -1)
+    f.call("run", f.at(work, CALL, "i64"))
+    begun = _add(f, work, BEGUN, CLOSED)
+    with f.while_(lambda: _add(f, work, ENDED, 0) < begun):
+        pass
+    _leave(f, work)

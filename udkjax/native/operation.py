@@ -84,8 +84,9 @@ def generate(kind: Kind, width: int, several: bool) -> Trajectory:
             trajectory = Forward(plan, kind.active, machine.lanes() if several else width)
         else:
             trajectory = Reverse(plan, kind.active) if kind.active is not None else Trajectory(plan)
-    main = handler(trajectory, "call_frame")
-    trajectory.module = "\n".join([trajectory.text(), *sorted(main.declared), main.text()])
+    handlers = handler(trajectory, "call_frame")
+    declared = sorted(set().union(*(f.declared for f in handlers)))
+    trajectory.module = "\n".join([trajectory.text(), *declared, *(f.text() for f in handlers)])
     return trajectory
 
 
