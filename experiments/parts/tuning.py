@@ -59,7 +59,7 @@ def scene(name: str) -> Scene:
         return jax.jacfwd(psi, has_aux=True)(z)
 
     def psi(z, state, end, tol):
-        choices: dict[str, Any] = {"adjoint": diffrax.ForwardMode(), "drift_tol": jnp.inf, "careful": False}
+        choices: dict[str, Any] = {"adjoint": diffrax.ForwardMode(), "drift_tol": jnp.inf, "throw": False}
         gains = udk.Baumgarte(*jnp.exp(z))
         sol = udk.simulate(mechanism, jnp.stack([0.0, end]), state, tol, tol, method, gains, **choices)
         return udk.violation(mechanism, sol)[-1], (sol.stats["right_hand_sides"], sol.stats["accepted"])
@@ -133,7 +133,7 @@ def drift_of_steps(mechanism: udk.Mechanism, method: Pseudoinverse, most: int) -
 
     def run(gains: Any, state: udk.State, span: Any, steps: Any) -> Any:
         equations: Any = prepare(mechanism, method, udk.Baumgarte(gains[0], gains[1]))
-        terms, solver, h = diffrax.ODETerm(derivative), diffrax.Dopri8(), span / steps
+        terms, solver, h = diffrax.ODETerm(derivative), diffrax.Dopri8(scan_kind="lax"), span / steps
         y = jnp.concatenate([state.q.ravel(), state.v.ravel()])
         start = solver.init(terms, jnp.zeros(()), h, y, equations)
 
