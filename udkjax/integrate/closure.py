@@ -12,7 +12,8 @@ from udkjax.equations.position_closure import CLOSURE_ITERATIONS, Assembly, Trac
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.textbook import prepare
 from udkjax.integrate import native_closing
-from udkjax.integrate.derivatives import Function, Linear, Mask, TreeOfNumbers, select, split_numbers
+from udkjax.integrate.linear_map import Function, Linear
+from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
 

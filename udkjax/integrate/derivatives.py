@@ -1,39 +1,26 @@
 """Derivatives of a run, forward and reverse, of any order.
 
 A run is a function x -> f(x) of its numbers. Its first derivatives, forward x' -> J x' and in reverse w -> J^T w, are machine
-code where that serves, else diffrax's. Both together are one linear map with its transpose (`Linear`), to JAX a primitive, so
-that no derivative is ever transposed operation by operation.
-
-A derivative of the map is one of two functions again, of x and a direction v, or of x and a cotangent w,
-
-    g(x, v) = J(x) v,        h(x, w) = J(x)^T w.
-
-Forward mode of both is JAX's. In reverse mode, since w^T J(x) v is one number, of which derivatives may be taken in any order,
-the cotangents of x are d/dx (w^T J v) = dh(x, w) along v, and those of v and w are h and g. There h is found row by row, w^T J e
-for each unit vector e, so that forward mode through diffrax is all that derivatives of higher orders take.
+code where that serves, else diffrax's. Both together are one linear map with its transpose, to JAX a primitive (linear_map.py),
+so that no derivative is ever transposed operation by operation.
 """
 
-import math
-from abc import abstractmethod
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.core
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 from udkjax.integrate import native_engine
-from udkjax.integrate.gradients import TreeDef, stop_gradients
+from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.linear_map import Function, Linear, change_along
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.split_jvp import split_jvp
-from udkjax.scene.fields import number
+from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, replaced, select, split_numbers
 
-Mask = tuple[bool, ...]  # of a list of arrays: those that have tangents
 SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives
 
 
@@ -92,91 +79,6 @@ def _(primals, tangents):
     return raw, eqx.filter_jvp(_run, tuple(at), tuple(tangents[:2]))[1]
 
 
-# --- functions, and those that their derivatives are
-
-
-class KnownNumbers:
-    """The known arrays among those of a tree, None in place of the others; compared by value, so that they are static."""
-
-    def __init__(self, arrays: Sequence[Array | None]):
-        self.arrays = arrays
-        self._key = tuple(None if x is None else (x.shape, np.asarray(x).tobytes()) for x in arrays)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, KnownNumbers) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-
-class TreeOfNumbers(eqx.Module):
-    """A tree as a function of the arrays of floats in it that are traced. The others stay known: JAX would trace them all."""
-
-    rest: PyTree  # the tree without arrays of floats
-    known: KnownNumbers = eqx.field(static=True)
-    structure: TreeDef = eqx.field(static=True)
-
-    def __call__(self, xs: Sequence[Array]) -> Any:
-        traced = iter(xs)
-        arrays = [next(traced) if x is None else x for x in self.known.arrays]
-        return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
-
-    def marks(self, active: Mask) -> Any:
-        """The tree with True in place of the arrays that are active, and False in place of the others."""
-        traced = iter(active)
-        return jax.tree.unflatten(self.structure, [x is None and next(traced) for x in self.known.arrays])
-
-    def changes(self, active: Mask, some: Sequence[Array]) -> Any:
-        """The tree with some arrays in place of those that are active, and None in place of the others."""
-        marks, rest = jax.tree.leaves(self.marks(active)), iter(some)
-        return jax.tree.unflatten(self.structure, [next(rest) if m else None for m in marks])
-
-
-def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
-    """Return a tree as a function of the arrays of floats in it that are traced, and these arrays."""
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(arrays)
-    known = KnownNumbers(
-        [None if isinstance(x, jax.core.Tracer) else number(x) if isinstance(x, np.ndarray) else x for x in leaves]
-    )
-    return TreeOfNumbers(rest, known, structure), [x for x in leaves if isinstance(x, jax.core.Tracer)]
-
-
-class Function(eqx.Module):
-    """A function of a list of arrays that returns a list of arrays. Forward mode of it is JAX's."""
-
-    @abstractmethod
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        """f(x)."""
-
-    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
-        """J^T w, of those of x that are active: w^T J e for each unit vector e. Forward mode of it is JAX's, too."""
-        some = select(xs, active)
-        units = jnp.eye(sum(x.size for x in some))
-        shapes = [x.shape for x in some]
-        row = lambda e: jnp.vdot(_flat(ws), _flat(_change(self, xs, active, _split(e, shapes))[1]))  # noqa: E731
-        return _split(jax.vmap(row)(units), shapes)
-
-    @abstractmethod
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        """Those of f(x)."""
-
-    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
-        """J v. `run` is what evaluating f at x has left for its first derivatives, if anything."""
-        del run
-        return _change(self, xs, active, vs)[1]
-
-    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
-        """J^T w, of those of x that are active, in the same way."""
-        del run
-        return self.pull(xs, active, ws)
-
-    @property
-    def plain(self) -> "Function":
-        """The same in the form that is differentiated more than once."""
-        return self
-
-
 class Run(Function):
     """Positions and velocities at the output times, and at the end, of the numbers of a problem.
 
@@ -220,7 +122,7 @@ class Run(Function):
             change = self.problem.changes(active, vs)
             raw, found = native_engine.jvp(self.problem(xs), self.problem.marks(active), change)
             return raw, list(found)
-        raw, change = _change(lambda xs: _integrate_by_diffrax(self.problem(xs)), xs, active, vs)
+        raw, change = change_along(lambda xs: _integrate_by_diffrax(self.problem(xs)), xs, active, vs)
         return raw, [change[k] for k in SMOOTH]
 
     def recorded(self, xs: list[Array], active: Mask) -> tuple[IntegratorOutput, Array | None]:
@@ -240,142 +142,6 @@ class Run(Function):
         problem = self.problem(xs)
         (times,), (n,) = problem.ts.shape, problem.q.shape
         return [(times, n), (times, n), (2 * n,)]
-
-
-class Along(Function):
-    """g(x, v) = J(x) v, with v of those of x that are active."""
-
-    of: Function
-    active: Mask = eqx.field(static=True)
-
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        xs, vs = self.parts(xs)
-        return _change(self.of, xs, self.active, vs)[1]
-
-    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
-        xs, vs = self.parts(xs)
-        of_x, of_v = active[: len(xs)], active[len(xs) :]
-        either = tuple(a or b for a, b in zip(of_x, self.active, strict=True))
-        found, change = _change(lambda xs: self.of.pull(xs, either, ws), xs, self.active, vs)
-        change = select(change, tuple(x for x, e in zip(of_x, either, strict=True) if e))
-        found = select(found, tuple(m for m, e in zip(self.active, either, strict=True) if e))
-        return [*change, *select(found, of_v)]
-
-    def parts(self, xs: list[Array]) -> tuple[list[Array], list[Array]]:
-        return xs[: len(self.active)], xs[len(self.active) :]
-
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        return self.of.shapes(self.parts(xs)[0])
-
-
-class Back(Along):
-    """h(x, w) = J(x)^T w, of those of x that are active."""
-
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        xs, ws = self.parts(xs)
-        return self.of.pull(xs, self.active, ws)
-
-    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
-        (xs, bars), directions = self.parts(xs), ws
-        of_x, of_w = active[: len(xs)], active[len(xs) :]
-        found = []
-        if any(of_x):
-            found += _change(lambda xs: self.of.pull(xs, of_x, bars), xs, self.active, directions)[1]
-        if any(of_w):
-            found += select(_change(self.of, xs, self.active, directions)[1], of_w)
-        return found
-
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        return [x.shape for x in select(self.parts(xs)[0], self.active)]
-
-
-def _change(function: Callable, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[Any, Any]:
-    """f(x), and its change along v, of those of x that are active, by forward mode."""
-    return jax.jvp(lambda *some: function(replaced(xs, active, some)), select(xs, active), vs)
-
-
-# --- the linear map
-
-
-class Linear(eqx.Module):
-    """v -> J(x) v, or transposed w -> J(x)^T w, of those of x that are active."""
-
-    function: Function
-    xs: list[Array]
-    run: Any  # what evaluating it has left for its first derivatives; None: nothing
-    active: Mask = eqx.field(static=True)
-    transposed: bool = eqx.field(static=True, default=False)
-
-    @property
-    def T(self) -> "Linear":
-        return replace(self, transposed=not self.transposed)
-
-    @property
-    def inputs(self) -> list[tuple[int, ...]]:
-        """The shapes of what it is applied to."""
-        return self.function.shapes(self.xs) if self.transposed else [x.shape for x in select(self.xs, self.active)]
-
-    def applied(self, vs: list[Array]) -> list[Array]:
-        return _split(_bind(self, _flat(vs)), self.T.inputs)
-
-
-def _apply(linear: Linear, vector: Array) -> Array:
-    function, vs = linear.function, _split(vector, linear.inputs)
-    apply = function.backward if linear.transposed else function.forward
-    return _flat(apply(linear.xs, linear.active, vs, linear.run))
-
-
-@eqxi.filter_primitive_def
-def _shape(linear, vector):
-    return jax.core.ShapedArray((sum(map(math.prod, linear.T.inputs)),), vector.dtype)
-
-
-@eqxi.filter_primitive_jvp
-def _derivative(primals, tangents):
-    linear, vector = primals
-    at, change = tangents
-    found = _bind(linear, vector)
-    if all(dx is None for dx in at.xs):
-        return found, _bind(linear, change)
-    kind, function = Back if linear.transposed else Along, linear.function
-    parts = [None] * len(linear.inputs) if change is None else _split(change, linear.inputs)
-    dxs = [*at.xs, *parts]
-    active = tuple(dx is not None for dx in dxs)
-    further = Linear(kind(function.plain, linear.active), [*linear.xs, *_split(vector, linear.inputs)], None, active)
-    return found, _bind(further, _flat(select(dxs, active)))
-
-
-@eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
-def _transpose(inputs, cotangent):
-    linear, _ = inputs
-    return jax.tree.map(lambda _: None, linear), _bind(linear.T, cotangent)
-
-
-_linear_p = eqxi.create_vprim("derivative_of_a_run", eqxi.filter_primitive_def(_apply), _shape, _derivative, _transpose)
-
-
-def _bind(linear: Linear, vector: Array) -> Array:
-    return eqxi.filter_primitive_bind(_linear_p, linear, vector)
-
-
-def select(xs: Sequence[Any], which: Mask) -> list[Any]:
-    """Those that are marked."""
-    return [x for x, m in zip(xs, which, strict=True) if m]
-
-
-def replaced(xs: Sequence[Array], active: Mask, some: Sequence[Array]) -> list[Array]:
-    """The same, with others in place of those that are active."""
-    rest = iter(some)
-    return [next(rest) if m else x for x, m in zip(xs, active, strict=True)]
-
-
-def _flat(xs: Sequence[Any]) -> Array:
-    return jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in xs])
-
-
-def _split(vector: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
-    return [part.reshape(shape) for part, shape in zip(jnp.split(vector, ends), shapes, strict=True)]
 
 
 def _integrate_by_diffrax(problem: Problem, adjoint: str = "ForwardMode") -> IntegratorOutput:

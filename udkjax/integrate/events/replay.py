@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from udkjax.integrate.derivatives import replaced, select
 from udkjax.integrate.events.crossings import ZERO_RATE
 from udkjax.integrate.events.hybrid import Hybrid, RunState
 from udkjax.integrate.events.jumps import apply_event
 from udkjax.integrate.events.loop import run_loop
 from udkjax.integrate.gradients import TreeDef, stop_gradients
 from udkjax.integrate.solution import Result
+from udkjax.integrate.traced_numbers import replaced, select
 
 OUTPUTS = 32  # of one piece
 
