@@ -1,16 +1,15 @@
-"""One module of machine code: its functions, and how they reach the numbers of a run."""
+"""One module of machine code: its functions, and what the memory of a run has room for."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from udkjax.equations.loop_programs import LoopPrograms
 from udkjax.equations.scene_programs import EliminationPrograms, ScenePrograms
 from udkjax.expressions import ScalarProgram
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.layout import INPUTS, LANE_NUMBERS, OUTPUTS, Lane, Layout, Plan
+from udkjax.native.ir import POINTER, Function, Value
+from udkjax.native.layout import LANE_NUMBERS, Lane, Layout, Plan
 from udkjax.native.loops import LoopWriter
+from udkjax.native.memory import Memory
 from udkjax.native.program import Place, consecutive, write
 from udkjax.native.steps import POINTS
 
@@ -27,27 +26,8 @@ COLD = (
 )
 
 
-class Module:
-    """The text of one module of machine code: its functions, and how they reach the numbers of a run.
-
-    `run` is called with a record of 8-byte fields (`call_fields`): how many members, output times, breakpoints and directions
-    there are; the addresses of inputs, their strides from member to member (numbers), the addresses of outputs, and that of the
-    number of the next member, which threads share.
-    """
-
-    inputs: tuple[str, ...] = ()  # besides those of every run
-    results: tuple[str, ...] = OUTPUTS
-    outputs: tuple[str, ...] = ()
-    lengths: tuple[str, ...] = ()  # inputs and outputs of which it must know how many numbers they have of each member
-    directions_in = 0  # which dimension of the last input says how many directions there are
-    module = ""  # the text, once it is written
-
-    @property
-    def call_fields(self) -> tuple[str, ...]:
-        inputs = (*INPUTS, *self.inputs)
-        strides = (f"{x} stride" for x in inputs)
-        lengths = (f"{x} length" for x in self.lengths)
-        return "members", "times", "knots", "directions", *inputs, *strides, *self.results, *self.outputs, *lengths, "next"
+class Module(Memory):
+    """The text of one module of machine code: its functions."""
 
     def __init__(self, plan: Plan):
         self.plan, self.code, self.method = plan, plan.code, plan.method
@@ -195,112 +175,6 @@ class Module:
         f = Function(name, arguments, self.plan.width, cold=name in COLD)
         self.functions.append(f)
         return f, Lane(f, self.places)
-
-    def layout(self, pointer: str) -> Layout:
-        """How the memory at a pointer is laid out."""
-        return self.places if pointer == "work" else self.tangents
-
-    def start(self, name: str, pointer: str) -> int:
-        """Where an array is, in numbers from a pointer."""
-        layout = self.layout(pointer)
-        return layout[name] * layout.width
-
-    def registers(self, pointer: str) -> int:
-        """How many registers the coordinates take."""
-        return -(-self.n * self.layout(pointer).width // self.plan.vector)
-
-    def vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
-        """One register of an array of coordinates."""
-        return f.load(f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
-
-    def put(self, f: Function, name: str, r: Value, x: Value, pointer: str = "work"):
-        f.store(x, f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
-
-    def broadcast(self, f: Function, x: Value) -> Value:
-        """A number of each lane, to go with registers of coordinates."""
-        return x if x.width == self.plan.vector else f.repeat(x, self.plan.vector)
-
-    def largest(self, f: Function, values: Any) -> Value:
-        """The largest, in each lane, of `values(r)` of each register; without what is not a number."""
-        worst = f.variable(0.0, width=self.plan.vector)
-        with f.each(self.rowcount) as r:
-            for x in values(r):
-                worst.value = f.max(x, worst.value)
-        found = worst.value
-        return found if self.plan.width > 1 else f.reduce("fmax", found)
-
-    def total(self, f: Function, x: Value) -> Value:
-        name = f"llvm.vector.reduce.fadd.v{x.width}f64"
-        f.declared.add(f"declare double @{name}(double, {x.type})")
-        return f.op(f"call double @{name}(double {f.const(0.0).name}, {x.type} {x.name})", DOUBLE)
-
-    def address(self, f: Function, name: str) -> Value:
-        return f.at(f.given["work"], self.places[name] * self.plan.width)
-
-    def invoke(self, f: Function, name: str, out: str | None = None):
-        f.call(name, f.given["work"], self.address(f, out) if out else f.given["work"])
-
-    def weighted_sum(
-        self, f: Function, row: np.ndarray, r: Value, names: Sequence[str] | None = None, pointer: str = "work"
-    ) -> Value | None:
-        """sum_j row_j a_j of one register of coordinates; None where all are zero."""
-        total = None
-        for weight, name in zip(row, names or self.stage_accelerations, strict=False):
-            if weight != 0:
-                a = self.vector(f, name, r, pointer)
-                total = a * float(weight) if total is None else f.fma(a, float(weight), total)
-        return total
-
-    def copy_point(self, f: Function, mask: Value, source: Any, to: str):
-        sources = source if isinstance(source, tuple) else [f"{source} {x}" for x in "qva"]
-        with f.each(self.rowcount) as r:
-            for name, x in zip(sources, "qva", strict=True):
-                self.put(f, f"{to} {x}", r, f.select(mask, self.vector(f, name, r), self.vector(f, f"{to} {x}", r)))
-
-    def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work", count: int | None = None):
-        """The coordinates of lane k to an address, or the first numbers of another array."""
-        with f.each(self.n if count is None else count) as i:
-            place = i * self.layout(pointer).width + k + self.start(name, pointer)
-            f.store(f.load(f.given[pointer], place), to, i + start)
-
-    def lane_number(self, f: Function, name: str, k: Value, i: Any) -> Value:
-        """The i-th number of an array, of lane k."""
-        return f.load(f.given["work"], f.like(i, INT, 1) * f.width + self.places[name] * f.width + k)
-
-    def to_int(self, f: Function, x: Value) -> Value:
-        return f.op(f"fptosi double {x.name} to i64", INT)
-
-    def call_record(self, f: Function) -> Value:
-        """What `run` was told."""
-        return f.load(f.given["work"], self.places["call"] * f.width, base=POINTER)
-
-    def input_number(self, f: Function, call: Value, name: str, member: Value, k: Value) -> Value:
-        """The k-th number of an input of a member (one lane)."""
-        return f.load(self.member_address(f, call, name, member), k)
-
-    def member_address(self, f: Function, call: Value, name: str, member: Value) -> Value:
-        """The address of what an input holds of a member (one lane)."""
-        number = member if member.base == INT else self.to_int(f, member)
-        stride = f.load(call, self.call_fields.index(f"{name} stride"), base=INT)
-        pointer = f.load(call, self.call_fields.index(name), base=POINTER)
-        return f.at(pointer, number * stride)
-
-    def write_state(self, f: Function, s: Lane, call: Value, k: Value, number: Value, q: str, v: str):
-        """State number `number` of lane k into the outputs."""
-        member = self.to_int(f, f.lane(s.member, k))
-        times = f.load(call, self.call_fields.index("times"), base=INT)
-        row = member * times + number
-        for name, x in (("qs", q), ("vs", v)):
-            self.copy_lane(f, f.at(f.load(call, self.call_fields.index(name), base=POINTER), row * self.n), 0, x, k)
-        f.store(f.lane(s.violated, k), f.load(call, self.call_fields.index("violation"), base=POINTER), row)
-
-    def allocate(self, f: Function, count: Value) -> tuple[Value, Value]:
-        """So many numbers: what to free, and where they begin, at a register's boundary."""
-        size = count * 8 + 64
-        block = f.op(f"call ptr @malloc(i64 {size.name})", POINTER)
-        address = f.op(f"ptrtoint ptr {block.name} to i64", INT)
-        aligned = f.logic("and", address + 63, -64)
-        return block, f.op(f"inttoptr i64 {aligned.name} to ptr", POINTER)
 
     def write_derivatives(self):
         """Its functions."""
