@@ -8,7 +8,7 @@ from typing import Any
 
 from udkjax.equations.loop_programs import LoopPrograms
 from udkjax.native.closing import POSITION, VELOCITY, Closing
-from udkjax.native.closing_derivatives import ForwardMode, ReverseMode
+from udkjax.native.closing_modes import ForwardMode, ReverseMode
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.linearization import ByLoops
