@@ -180,9 +180,9 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: ArrayLi
 def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:
     """Return the mechanism with one more driver, or with another motion of one that is there."""
     drivers = {**mechanism.drivers, name: Driver(element.bodies, element.coordinate, motion, element.points)}
-    known = mechanism if mechanism.is_known else mechanism.origin and mechanism.origin.mechanism
+    known = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     found = with_drivers(mechanism, drivers)
-    if known is None or found.is_known:
+    if known is None or found.is_concrete:
         return found
     with jax.ensure_compile_time_eval():
         element = _known_element(known, name, element)
