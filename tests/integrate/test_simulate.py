@@ -307,7 +307,6 @@ def test_a_batch_of_mechanisms(pendulum):
     assert_allclose(early, acceleration * 0.005, rtol=0.02)
 
 
-@pytest.mark.xfail(strict=True, reason="a nearly redundant row is not projected, and keeps the violation that interpolation has")
 @pytest.mark.parametrize("tol", [1e-4, 1e-3])
 def test_an_output_beside_a_singular_configuration_is_closed(tol):
     """At 0.55 s the links are 2e-5 rad from being in line. Outputs within 1e-4 rad leave a row open by up to the tolerance."""

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.layout import Lane
 from udkjax.native.least_norm import LEAST_NORM
 from udkjax.native.manifold import iterate_newton, with_threshold
 from udkjax.native.module import Module
@@ -62,6 +63,30 @@ def write_fallback(t: Module):
     def root(f: Function, k: Value, i: Value) -> Value:
         return number(f, "R", k, i + (slots + m + n))
 
+    def close_in_position(f: Function, s: Lane, mask: Value):
+        """Newton's method in positions, of some lanes."""
+
+        def closer(active: Value):
+            t.invoke(f, "equation_terms")
+            t.invoke(f, "psi")
+            with f.each(t.rowcount) as r:
+                t.put(f, "C", r, t.vector(f, "X q", r))
+            for k, right, x in each_lane(f, active):
+                solved(f, k, right, x, "psi")
+                with f.each(n) as i:
+                    put(f, "C", k, i, number(f, "X q", k, i) - root(f, k, i) * f.load(x, i))
+
+        iterate_newton(t, f, s, mask, closer)
+        t.invoke(f, "equation_terms")
+
+    def close_in_velocity(f: Function, mask: Value):
+        """X v, as the constraints allow it, in O v, of some lanes."""
+        t.invoke(f, "psi_dot")
+        for k, right, x in each_lane(f, mask):
+            solved(f, k, right, x, "psi")
+            with f.each(n) as i:
+                put(f, "O v", k, i, number(f, "X v", k, i) - root(f, k, i) * f.load(x, i))
+
     # The accelerations of lanes whose pivots were not safe.
     f, s = t.function("accelerate_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     t.invoke(f, "equation_terms")
@@ -75,25 +100,10 @@ def write_fallback(t: Module):
     f, s = t.function("finish_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
 
-    def closer(active: Value):
-        t.invoke(f, "equation_terms")
-        t.invoke(f, "psi")
-        with f.each(t.rowcount) as r:
-            t.put(f, "C", r, t.vector(f, "X q", r))
-        for k, right, x in each_lane(f, active):
-            solved(f, k, right, x, "psi")
-            with f.each(n) as i:
-                put(f, "C", k, i, number(f, "X q", k, i) - root(f, k, i) * f.load(x, i))
-
-    iterate_newton(t, f, s, fallback & (s.ok < 0.5), closer)
-    t.invoke(f, "equation_terms")
+    close_in_position(f, s, fallback & (s.ok < 0.5))
     due_for_fallback = fallback & (s.ok < 0.5)
     with f.if_(f.any_of(due_for_fallback)):
-        t.invoke(f, "psi_dot")
-        for k, right, x in each_lane(f, due_for_fallback):
-            solved(f, k, right, x, "psi")
-            with f.each(n) as i:
-                put(f, "O v", k, i, number(f, "X v", k, i) - root(f, k, i) * f.load(x, i))
+        close_in_velocity(f, due_for_fallback)
         with f.each(t.rowcount) as r:
             t.put(f, "X v", r, f.select(due_for_fallback, t.vector(f, "O v", r), t.vector(f, "X v", r)))
         t.invoke(f, "accelerations", "C")
@@ -111,10 +121,15 @@ def write_fallback(t: Module):
             f.call("solve", f.given["work"], k, right, x, f.const(np.sqrt(ROUNDING_PIVOT)))
             with f.each(n) as i:
                 put(f, f"O {d}", k, i, number(f, f"X {d}", k, i) - root(f, k, i) * f.load(x, i))
+    # An output that elimination leaves open.
+    f, s = t.function("close_output")
+    close_in_position(f, s, s.open > 0.5)
+    close_in_velocity(f, s.open > 0.5)
+    t.invoke(f, "psi")
 
 
 def write_fallback_by_loops(t: Module):
-    """As `_care`, of a large scene: by elimination of all rows, without those whose pivots are small."""
+    """As `write_fallback`, of a large scene: by elimination of all rows, without those whose pivots are small."""
     f, s = t.function("accelerate_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     t.invoke(f, "fallback_accelerations")
     select_lanes(t, f, (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5), "fallback a", "out")

@@ -77,6 +77,7 @@ LANE_NUMBERS = {  # numbers of each lane, and what they are
     "rank": "of D, as the fallback found it",
     "iterating": "whether Newton's method goes on",
     "violated": "the largest violation of Psi at an output, over the row's scale",
+    "open": "whether the output is open after its projection",
     "next": "next output time (s)",
     "until": "outputs up to here are due (s)",
     "due": "lanes that are concerned, of what is called",

@@ -7,7 +7,7 @@ from udkjax.equations.scene_programs import EliminationPrograms
 from udkjax.native.ir import DOUBLE, INT, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
-from udkjax.native.steps import NEWTON_STEPS, NEWTON_TOL, OUTPUT_PIVOT_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
+from udkjax.native.steps import NEWTON_STEPS, NEWTON_TOL, OPEN_OUTPUT, OUTPUT_PIVOT_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
 
 
 def newton(t: Module, f: Function, s: Lane):
@@ -84,6 +84,11 @@ def project_output(t: Module, f: Function, s: Lane, which: str):
             with f.each(t.rowcount) as r:
                 t.put(f, "O v", r, f.select(far, t.vector(f, "O v", r), t.vector(f, "O dv", r)))
             s.where(far, violated=largest_violation(t, f))
+        if t.falls_back:  # a row that was left out, and a pivot that is small: nothing holds what they do
+            s.open = f.select(mask & (s.violated > OPEN_OUTPUT), f.const(1.0, DOUBLE, f.width), 0.0)
+            with f.if_(f.any_of(s.open > 0.5)):
+                f.call("close_output", f.given["work"])
+                s.where(s.open > 0.5, violated=largest_violation(t, f))
 
     if t.plan.projected:
         with_threshold(t, f, s, f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width), project) if t.checks_pivots else project()

@@ -19,6 +19,7 @@ COLD = (
     "finish_members",
     "begin",
     "finish_by_fallback",
+    "close_output",
     "accelerate_by_fallback",
     "equation_terms",
     "psi_dot",

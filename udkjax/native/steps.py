@@ -67,5 +67,8 @@ NEWTON_STEPS = 3  # in a projection, at most: the last of which usually finds no
 # Of the characteristic length, and rad: a Newton step that moves q by less leaves rounding errors, since it converges
 # quadratically.
 NEWTON_TOL = 1e-8
+# What an output may be open after its projection, each row over its scale: what Newton's last step leaves is far below, what
+# interpolation leaves of a row that is not projected far above it. Beyond, it is closed on all rows.
+OPEN_OUTPUT = 1e-9
 # An output that lies nearer to the manifold takes one Newton step in q and v alike: what that leaves is the square.
 SINGLE_STEP_TOL = 1e-7
