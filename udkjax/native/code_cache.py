@@ -11,7 +11,7 @@ from pathlib import Path
 
 import platformdirs
 
-MAX_FILES = 10_000  # object files: some 150 MB
+MAX_FILES = 5_000  # object files, of 10 to 75 KiB: some 150 MB
 _MAGIC = b"udkjax object 1\n"
 
 

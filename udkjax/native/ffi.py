@@ -23,7 +23,7 @@ DATA, RANK, DIMS = 24, 32, 40
 # Of an extension that asks for metadata: where they go, and in them the version (of the interface) that the handler speaks.
 METADATA, MAJOR, MINOR = 24, 24, 28
 VERSION = (0, 1)
-SHARE = 16  # members of a thread, at least: to wake it takes some 10 us, as long as one of a small scene in lanes
+SHARE = 32  # members of a thread, at least: to wake it takes some 50 us, and the shortest runs take one or two each
 # Words of the work that threads share: how many may still look at it, how many have begun (and whether it is closed), how many
 # are done, the number of the next member, and what `run` is called with.
 USERS, BEGUN, ENDED, NEXT, CALL = range(5)

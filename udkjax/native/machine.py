@@ -20,7 +20,7 @@ LEVEL = 1  # of code generation: 2 takes a fifth longer, and runs take as long
 # Optimizations of the text before that. Programs come without common subexpressions and dead code: all that LLVM's own selection
 # of level 1 adds is two percent of a run's time, for half of the time of compiling.
 PASSES = ("sroa", "simplify_cfg")
-PART_LINES = 1_000  # of a function that is compiled by itself: some 20 ms; smaller ones go together, each part costs some 2 ms
+PART_LINES = 1_000  # of a function that is compiled by itself: 20 to 30 ms; smaller ones go together, each part costs 2 ms
 
 
 @cache
