@@ -12,6 +12,7 @@ import xarray
 import udkjax as udk
 from tests.command_line import udkjax
 from udkjax.cli import COMMANDS, common
+from udkjax.cli.datasets import save
 from udkjax.extras import MissingExtraError
 from udkjax.integrate import Result
 from udkjax.study.sweep.executors import ClusterError
@@ -128,6 +129,7 @@ def test_all_mistakes_of_a_scene_are_named_and_nothing_is_written(tmp_path, caps
         ([PARALLELOGRAM, "--t1", "1", "--dt", "2"], "--dt 2"),
         ([PARALLELOGRAM, "--t1", "1", "--plot", "run.nc"], "same file"),
         ([PARALLELOGRAM, "--t1", "1", "--plot", "nowhere/run.png"], "no folder nowhere"),
+        ([PARALLELOGRAM, "--t1", "1", "--plot", "run.gif"], "--plot run.gif ends with none of .png, .svg, .pdf, .jpg"),
     ],
 )
 def test_wrong_input_is_refused_by_name(tmp_path, monkeypatch, capsys, arguments, cause):
@@ -135,6 +137,59 @@ def test_wrong_input_is_refused_by_name(tmp_path, monkeypatch, capsys, arguments
     assert udkjax("simulate", *arguments, "--out", "run.nc") == 2
     assert cause in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", PARALLELOGRAM, "--t1", "1"],
+        ["kinematics", PARALLELOGRAM, "--driver", "body.link1.angle"],
+        ["inverse", PARALLELOGRAM, "--t1", "1"],
+        ["statics", PARALLELOGRAM],
+        ["modes", PARALLELOGRAM],
+    ],
+)
+def test_a_file_of_no_known_kind_is_refused_before_anything_runs(tmp_path, monkeypatch, capsys, command):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("udkjax.load", lambda _: pytest.fail("it ran"))
+    for name in ("run.xls", "run"):
+        assert udkjax(*command, "--out", name) == 2
+        assert f"--out {name} ends with none of .nc, .h5, .csv, .npz" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "command", [["sweep", PARALLELOGRAM, "grid.toml"], ["identify", PARALLELOGRAM, "a.csv", "--parameters", "x"]]
+)
+def test_a_folder_is_not_called_as_a_file_is(tmp_path, monkeypatch, capsys, command):
+    monkeypatch.chdir(tmp_path)
+    assert udkjax(*command, "--out", "out.csv") == 2
+    assert "--out out.csv: a folder is written" in capsys.readouterr().err
+
+
+def test_a_run_is_written_in_the_kind_that_its_name_says(tmp_path, capsys):
+    """All kinds hold the same numbers; a table is one that identification reads."""
+    from udkjax.study.identify.record_reader import records_of
+
+    scene = EXAMPLES / "simple_pendulum.toml"
+    assert udkjax("simulate", scene, "--t1", 0.2, "--out", tmp_path / "run.csv") == 0
+    mech = udk.load(scene)
+    run = udk.simulate(mech, np.arange(5) * 0.05)
+    ts, q, v, (body,) = np.asarray(run.ts), np.asarray(run.q), np.asarray(run.v), mech.body_names
+    for kind in ("h5", "npz"):
+        save(run.to_xarray(mech), tmp_path / f"run.{kind}")
+    with xarray.open_dataset(tmp_path / "run.h5", engine="h5netcdf") as data:
+        np.testing.assert_array_equal(data.q, q)
+    with np.load(tmp_path / "run.npz") as data:
+        np.testing.assert_array_equal(data["q"], q)
+        assert json.loads(str(data["attributes"]))["result"] == "successful"
+    heading, *lines = (tmp_path / "run.csv").read_text().splitlines()
+    names = [f"body.{body}.{name}" for name in ("x [m]", "y [m]", "angle [rad]", "vx [m/s]", "vy [m/s]", "omega [rad/s]")]
+    assert heading.split(",") == ["time [s]", *names]
+    table = np.array([[float(x) for x in line.split(",")] for line in lines])
+    np.testing.assert_array_equal(table, np.column_stack([ts, q[:, 0], v[:, 0]]))
+    (record,) = records_of(mech, tmp_path / "run.csv", noise=1e-3)
+    assert len(record.values) == 6
 
 
 def test_a_run_that_fails_says_why_and_keeps_what_it_got(tmp_path, capsys):

@@ -69,3 +69,17 @@ def test_a_scene_of_classes_of_ones_own_is_refused(run, tmp_path, capsys):
         data.assign_attrs(scene="# joint of a class of your own").to_netcdf(path, engine="h5netcdf")
     assert udkjax("animate", path, "--out", tmp_path / "run.html") == 2
     assert "use `udkjax.animate` in Python" in capsys.readouterr().err
+
+
+def test_a_run_that_failed_is_shown_and_how_it_ended_is_said(tmp_path, capsys):
+    """By a file and by a scene, on the page and on the terminal; in Python by a warning."""
+    mech = udk.load(SCENE)
+    failed = udk.simulate(mech, np.linspace(0.0, 1.0, 21), max_steps=3, throw=False)
+    failed.to_xarray(mech).to_netcdf(tmp_path / "failed.nc", engine="h5netcdf")
+    assert udkjax("animate", tmp_path / "failed.nc", "--out", tmp_path / "run.html", "--json") == 1
+    shown = capsys.readouterr()
+    assert "the run failed: step limit at t = " in shown.err and "UserWarning" not in shown.err
+    assert "step limit" in json.loads(shown.out)["failures"][""]
+    assert "step limit at t" in (tmp_path / "run.html").read_text()
+    with pytest.warns(udk.show.player.animation.FailedRunWarning, match="the run failed: step limit"):
+        udk.animate(mech, failed)

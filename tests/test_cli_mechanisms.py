@@ -1,5 +1,6 @@
 """The commands that ask what a mechanism does: each against what the functions return, as JSON and as a file."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 import xarray
 
 from tests.command_line import udkjax
+from udkjax.cli.datasets import save
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -35,12 +37,21 @@ def test_kinematics_refuses_what_cannot_be_driven(capsys):
     assert 'did you mean "motor"' in capsys.readouterr().err
 
 
+def test_kinematics_refuses_at_once_what_a_driver_holds(capsys):
+    assert udkjax("kinematics", EXAMPLES / "slider_crank.toml", "--driver", "body.slider.x") == 2
+    assert 'body.slider.x is held by driver "motor"' in capsys.readouterr().err
+
+
 def test_inverse(tmp_path, capsys):
     out = tmp_path / "i.nc"
     found = results(capsys, "inverse", EXAMPLES / "slider_crank.toml", "--t1", 0.3, "--dt", 0.1, "--out", out)
     torque, power = np.array(found["efforts"]["motor"]), np.array(found["powers"]["motor"])
     with xarray.open_dataset(out, engine="h5netcdf") as data:
         np.testing.assert_allclose(data.effort.sel(driver="motor"), torque)
+        save(data, tmp_path / "i.csv")
+    heading, *lines = (tmp_path / "i.csv").read_text().splitlines()
+    assert heading == "time,effort.motor [N m or N],power.motor [W]"
+    np.testing.assert_array_equal([float(line.split(",")[1]) for line in lines], torque)
     rate = power[0] / torque[0]
     np.testing.assert_allclose(power, rate * torque)
     peak = found["peaks"]["motor"]
@@ -64,3 +75,7 @@ def test_statics_and_modes_of_the_papers_linkage(tmp_path, capsys):
     with xarray.open_dataset(tmp_path / "m.nc", engine="h5netcdf") as data:
         assert data["shape"].dims == ("mode", "body", "coordinate")
         np.testing.assert_allclose(data["shape"], found["shapes"])
+        save(data, tmp_path / "m.csv")  # a position has no mode: each row repeats it
+    (row,) = csv.DictReader((tmp_path / "m.csv").open())
+    assert float(row["omega2 [1/s2]"]) == found["omega2"][0]
+    assert float(row["body.link2.x [m]"]) == found["q"][found["bodies"].index("link2")][0]

@@ -8,6 +8,7 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from udkjax.study.continuation import Reached
+from udkjax.study.drive import drive
 
 TURN = np.linspace(np.pi / 3, np.pi / 3 + 2 * np.pi, 73)
 VALUES = np.linspace(1.1, 1.5, 12)  # as many as all tests take that compile something
@@ -263,3 +264,29 @@ def test_what_cannot_be_driven_is_refused():
         udk.kinematics(mech, "body.crank.omega", [1.0])
     with pytest.raises(udk.SceneError, match="keeps 1 degree of freedom"):
         udk.kinematics(udk.library.double_pendulum(), f"body.{udk.library.double_pendulum().body_names[0]}.angle", [1.0])
+
+
+ASK = {
+    "kinematics": lambda mech, driver: udk.kinematics(mech, driver, [1.0]),
+    "travel": udk.travel,
+    "branches": lambda mech, driver: udk.branches(mech, driver, 1.0),
+    "coupler_curve": lambda mech, driver: udk.coupler_curve(mech, driver, [1.0], "rod"),
+    "workspace": lambda mech, driver: udk.workspace(mech, {driver: [1.0], "body.rod.angle": [0.1]}, "rod"),
+}
+
+
+@pytest.mark.parametrize("name", ASK)
+def test_a_coordinate_that_a_driver_holds_is_refused_by_the_drivers_name(name):
+    with pytest.raises(udk.SceneError, match=r'body\.slider\.x is held by (driver "motor"|"body\.rod\.angle")'):
+        ASK[name](udk.library.slider_crank(0.3, 4.0), "body.slider.x")
+
+
+def test_what_is_held_and_what_joints_hold_is_refused():
+    mech = udk.library.four_bar()
+    with pytest.raises(udk.SceneError, match=r'rocker\.angle is held by "body\.crank\.angle", which `held` gives'):
+        udk.kinematics(mech, "body.rocker.angle", [1.0], held={"body.crank.angle": 1.0})
+    fixed = udk.Mechanism({"a": udk.Body(1.0, 1.0)}, {"W": udk.Weld(["ground", "a"], [[0.0, 0.0], [0.0, 0.0]])})
+    with pytest.raises(udk.SceneError, match="the joints leave it no motion"):
+        udk.travel(fixed, "body.a.angle")
+    free = udk.library.parallelogram(0.0)  # flat: there the angle depends on the joints, and nowhere else
+    assert drive(free, "body.link1.angle").name

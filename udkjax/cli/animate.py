@@ -1,12 +1,14 @@
 """`udkjax animate`."""
 
 import math
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from udkjax.cli.common import Json, load, refuse, show
+from udkjax.cli.common import Json, fail, load, refuse, show
+from udkjax.cli.datasets import check_target
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,6 +42,8 @@ def animate(
 ) -> None:
     """Show a motion, or several side by side and in step, as a page to open in a browser, a film or a picture.
 
+    A run that failed is shown as far as it came, how it ended is said, and the exit code is 1.
+
     Args:
         files: runs that `udkjax simulate` wrote (NetCDF), or scenes (TOML), which are simulated.
         out: what to write: .html, a page that needs no network; .gif or .mp4, a film; .svg, .png or .dxf, one pose.
@@ -57,11 +61,8 @@ def animate(
         width: of a film or a picture (px).
         json: write the results as JSON.
     """
+    check_target(out, KINDS)
     kind = out.suffix.lower()
-    if kind not in KINDS:
-        refuse(f"--out {out} ends with none of {', '.join(KINDS)}")
-    if not out.parent.is_dir():
-        refuse(f"there is no folder {out.parent} to write {out.name} to")
     if not files:
         refuse("give a run (.nc) or a scene (.toml)")
     if not 0 < dt <= t1 < math.inf:
@@ -73,6 +74,7 @@ def animate(
         refuse(f"runs must have different labels, not {', '.join(names)}: give --labels")
 
     import udkjax as udk
+    from udkjax.show.player.animation import FailedRunWarning
 
     runs = {name: _run(file, t1, dt) for name, file in zip(names, files, strict=True)}
     film = {"fps": fps, "speed": speed} if kind in (".gif", ".mp4") else {}
@@ -80,20 +82,23 @@ def animate(
     look = {"theme": theme} if kind != ".dxf" else {}
     options = {name: value for name, value in (film | page | look).items() if value is not None}
     try:
-        found = udk.animate(
-            {name: mechanism for name, (mechanism, _, _) in runs.items()},
-            {name: run for name, (_, run, _) in runs.items()},
-            measures=_measures(measures, runs) if kind == ".html" else (),
-            reactions=reactions,
-            traces=traces or None,
-        )
+        with warnings.catch_warnings(action="ignore", category=FailedRunWarning):  # said below
+            found = udk.animate(
+                {name: mechanism for name, (mechanism, _, _) in runs.items()},
+                {name: run for name, (_, run, _) in runs.items()},
+                measures=_measures(measures, runs) if kind == ".html" else (),
+                reactions=reactions,
+                traces=traces or None,
+            )
         found.save(out, t, **options)
     except (ValueError, OSError) as problem:
         refuse(problem)
     size = out.stat().st_size
     data = found.data
     results = {"files": [out], "bytes": size, "start": data["start"], "end": data["end"], "speed": data["speed"]}
-    show(results, f"wrote {out} ({size / 1e3:.0f} kB)", json)
+    show(results | {"failures": found.failures}, f"wrote {out} ({size / 1e3:.0f} kB)", json)
+    if found.failures:
+        fail("; ".join(f"{name}: {cause}" if name else f"the run failed: {cause}" for name, cause in found.failures.items()))
 
 
 def _run(file: Path, t1: float, dt: float) -> "ShownRun":

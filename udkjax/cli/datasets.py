@@ -1,19 +1,42 @@
-"""How commands write arrays to a NetCDF file, with what a reader needs to trust them."""
+"""How commands write arrays to a file of the kind that its name ends with, with what a reader needs to trust them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from udkjax.cli.common import refuse
 
 if TYPE_CHECKING:
+    import numpy as np
+    import xarray
     from numpy.typing import ArrayLike
 
+KINDS = (".nc", ".h5", ".csv", ".npz")  # of datasets; .h5 is NetCDF too, which is HDF5 within
+PICTURES = (".png", ".svg", ".pdf", ".jpg")
+FILES = (*KINDS, *PICTURES, ".html", ".json", ".toml")  # what no folder is called
 
-def check_target(out: Path | None) -> None:
-    """Refuse a file that has no folder."""
-    if out is not None and not out.parent.is_dir():
+# What the columns of a .csv are called, as measurements are: `body.crank.vx [m/s]`.
+CHANNELS = {"q": ("x", "y", "angle"), "v": ("vx", "vy", "omega"), "a": ("ax", "ay", "alpha")}
+
+
+def check_target(out: Path | None, kinds: Sequence[str] = KINDS, option: str = "--out") -> None:
+    """Refuse a file of no known kind, or one that has no folder."""
+    if out is None:
+        return
+    if out.suffix.lower() not in kinds:
+        refuse(f"{option} {out} ends with none of {', '.join(kinds)}")
+    if not out.parent.is_dir():
         refuse(f"there is no folder {out.parent} to write {out.name} to")
+
+
+def check_folder(out: Path) -> None:
+    """Refuse a folder that cannot be made, or that is called as a file is."""
+    if out.exists() and not out.is_dir():
+        refuse(f"--out {out} is no folder")
+    if not out.exists() and out.suffix.lower() in FILES:
+        refuse(f"--out {out}: a folder is written, of several files; give a name without {out.suffix}")
+    if not out.parent.is_dir():
+        refuse(f"there is no folder {out.parent} to make {out.name} in")
 
 
 def write(
@@ -34,7 +57,6 @@ def write(
     from udkjax.scene.bodies import COORDINATES
 
     with OptionalImport():
-        import h5netcdf  # noqa: F401  # the engine
         import xarray
     import numpy as np
 
@@ -42,4 +64,66 @@ def write(
     attributes = {"scene": scene, **{f"setting_{k}": v for k, v in settings.items() if v is not None}}
     attributes |= {f"version_{k}": v for k, v in versions().items()}
     labels = {"coordinate": list(COORDINATES)} if any("coordinate" in dims for dims, _, _ in variables.values()) else {}
-    xarray.Dataset(data, {**coordinates, **labels}, attributes).to_netcdf(out, engine="h5netcdf")
+    save(xarray.Dataset(data, {**coordinates, **labels}, attributes), out)
+
+
+def save(data: "xarray.Dataset", out: Path) -> None:
+    """Write a dataset in the kind that the name of the file ends with.
+
+    A .csv has the numbers alone, one row for each place along the first dimension; all others have the attributes, too.
+    """
+    kind = out.suffix.lower()
+    if kind == ".csv":
+        import csv
+
+        import numpy as np
+
+        columns = list(_columns(data))
+        with out.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow([heading for heading, _ in columns])
+            rows = zip(*(values.tolist() for _, values in columns), strict=True)
+            writer.writerows([["" if isinstance(x, float) and not np.isfinite(x) else x for x in row] for row in rows])
+    elif kind == ".npz":
+        import json
+
+        import numpy as np
+
+        arrays: dict[str, Any] = {str(name): np.asarray(values) for name, values in data.variables.items()}
+        with out.open("wb") as file:
+            np.savez_compressed(file, attributes=np.asarray(json.dumps(data.attrs, default=str)), **arrays)
+    else:
+        from udkjax.extras import OptionalImport
+
+        with OptionalImport():
+            import h5netcdf  # noqa: F401  # the engine
+
+        data.to_netcdf(out, engine="h5netcdf")
+
+
+def _columns(data: "xarray.Dataset") -> "Iterator[tuple[str, np.ndarray]]":
+    """Iterate over the columns of a table, each its heading and its values along the first dimension."""
+    import numpy as np
+
+    along = str(next(iter(data.data_vars.values())).dims[0])
+    count = data.sizes[along]
+    yield _heading(along, data[along].attrs.get("units", "")), np.asarray(data[along] if along in data.coords else range(count))
+    for name, variable in data.data_vars.items():
+        others = [str(dim) for dim in variable.dims if dim != along]
+        if along not in variable.dims:
+            variable = variable.expand_dims({along: count})
+        table = np.asarray(variable.transpose(along, *others)).reshape(count, -1)
+        labels = [[str(x) for x in np.asarray(variable[dim])] if dim in data.coords else None for dim in others]
+        units = str(variable.attrs.get("units", "")).split(", ", 2)
+        for k, place in enumerate(np.ndindex(*(variable.sizes[dim] for dim in others))):
+            words = [str(i) if known is None else known[i] for known, i in zip(labels, place, strict=True)]
+            if name in CHANNELS and others == ["body", "coordinate"]:
+                words = ["body", words[0], CHANNELS[str(name)][place[1]]]
+            else:
+                words = [str(name), *words]
+            unit = units[place[-1]] if others and others[-1] == "coordinate" and len(units) == 3 else ", ".join(units)
+            yield _heading(".".join(words), unit), table[:, k]
+
+
+def _heading(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name

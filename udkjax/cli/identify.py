@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from udkjax.cli.common import Json, Quiet, Scene, fail, load, plain, refuse, show
+from udkjax.cli.datasets import check_folder
 
 if TYPE_CHECKING:
     from udkjax import Estimate
@@ -78,10 +79,7 @@ def identify(
         quiet: do not show how far it is.
         json: write the results as JSON, as in estimate.json.
     """
-    if out.exists() and not out.is_dir():
-        refuse(f"--out {out} is no folder")
-    if not out.parent.is_dir():
-        refuse(f"there is no folder {out.parent} to make {out.name} in")
+    check_folder(out)
     mech, text = load(scene)
 
     import udkjax as udk

@@ -26,7 +26,7 @@ def inverse(
         t0: start (s).
         dt: time between two instants (s).
         drivers: who exerts: drivers or coordinates, such as body.crank.angle; by default the scene's drivers.
-        out: NetCDF file to write: effort and power (time, driver).
+        out: file to write (.nc, .h5, .csv or .npz): effort and power (time, driver).
         json: write the results as JSON.
     """
     if not 0 < dt <= t1 - t0 < math.inf:

@@ -37,7 +37,7 @@ def kinematics(
         count: how many values.
         rate: of the driver (rad/s, m/s), for velocities and accelerations.
         branches: find all ways to put it together for the first value, too.
-        out: NetCDF file to write: value, q, v and a (value, body, coordinate), status.
+        out: file to write (.nc, .h5, .csv or .npz): value, q, v and a (value, body, coordinate), status.
         json: write the results as JSON.
     """
     if count < 1:

@@ -14,7 +14,8 @@ def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None
         scene: the mechanism; its drivers hold.
         stable: about a stable position, downhill from the initial guess; otherwise about the nearest one.
         t: time of drivers and loads (s).
-        out: NetCDF file to write: omega2 (mode), shape (mode, body, coordinate), and the position q (body, coordinate).
+        out: file to write (.nc, .h5, .csv or .npz): omega2 (mode), shape (mode, body, coordinate), and the position q (body,
+            coordinate).
         json: write the results as JSON.
     """
     check_target(out)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from udkjax.cli.common import Json, Scene, fail, load, refuse, show
+from udkjax.cli.datasets import PICTURES, check_target, save
 from udkjax.extras import require
 
 # The names of udkjax.study.choices, which cannot be imported before a command is known: it imports JAX.
@@ -38,12 +39,13 @@ def simulate(
     plot: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Simulate a scene: write its motion (NetCDF) and a picture of it, and say how far both can be trusted.
+    """Simulate a scene: write its motion and a picture of it, and say how far both can be trusted.
 
     Args:
         scene: the mechanism.
         t1: end of the run (s).
-        out: NetCDF file to write: time, q and v (time, body, coordinate), settings, statistics and the scene itself.
+        out: file to write. NetCDF (.nc, or .h5) has time, q and v (time, body, coordinate), settings, statistics and the scene
+            itself, and so has .npz of NumPy; .csv has the time and a column for each coordinate and its rate.
         dt: time between two instants that are kept (s); the steps of the solver are its own.
         t0: start of the run (s).
         rtol: relative tolerance of a step.
@@ -57,7 +59,7 @@ def simulate(
         beta: Baumgarte's gain on the constraints (1/s).
         dt0: first step to try (s); by default it is chosen.
         max_steps: give up after so many steps.
-        plot: picture to write; by default beside the NetCDF file.
+        plot: picture to write (.png, .svg, .pdf or .jpg); by default a .png beside the file.
         json: write the results as JSON.
     """
     if not 0 < dt <= t1 - t0 < math.inf:
@@ -69,9 +71,8 @@ def simulate(
         refuse("--formulation partitioning keeps the constraints itself: take --stabilization projection or none")
     if plot == out:
         refuse(f"--out {out} and --plot {plot} are the same file")
-    for target in (out, plot):
-        if not target.parent.is_dir():
-            refuse(f"there is no folder {target.parent} to write {target.name} to")
+    check_target(out)
+    check_target(plot, PICTURES, "--plot")
     require("xarray", "h5netcdf")
     mech, text = load(scene)
 
@@ -103,7 +104,7 @@ def simulate(
 
     data = sol.to_xarray(mech)
     data.attrs |= {"scene": text, "scene_file": scene.name}
-    data.to_netcdf(out, engine="h5netcdf")
+    save(data, out)
     trajectory(mech, sol).savefig(plot, dpi=150)
     found = accuracy(mech, sol)
     results = {

@@ -24,7 +24,8 @@ def statics(
         starts: from how many positions to search; from more than one, all that are found are told.
         seed: of these positions.
         t: time of drivers and loads (s).
-        out: NetCDF file to write: q (equilibrium, body, coordinate), omega2 (equilibrium, mode), multiplier (equilibrium, row).
+        out: file to write (.nc, .h5, .csv or .npz): q (equilibrium, body, coordinate), omega2 (equilibrium, mode), multiplier
+            (equilibrium, row).
         json: write the results as JSON.
     """
     if starts < 1:

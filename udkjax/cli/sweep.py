@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from udkjax.cli.common import INTERRUPTED, Json, Quiet, Scene, fail, load, refuse, say, show
+from udkjax.cli.datasets import check_folder
 
 if TYPE_CHECKING:
     from udkjax import Mechanism
@@ -49,8 +50,8 @@ def sweep(
     """
     if out is None and not dry_run:
         refuse("--out FOLDER is missing (or --dry-run)")
-    if out is not None and not out.parent.is_dir():
-        refuse(f"there is no folder {out.parent} to make {out.name} in")
+    if out is not None:
+        check_folder(out)
     if not memory > 0:
         refuse(f"--memory {memory:g}: must be positive")
     if scheduler is not None and engine == "devices":

@@ -23,6 +23,7 @@ from udkjax.scene.fields import Numbers, names, number, optional_number
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.study.channels import channel_of
+from udkjax.study.holding import require_free
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)
@@ -88,12 +89,19 @@ def _drive(mechanism: Mechanism, driver: Drive, t: ArrayLike, held: Mapping[str,
         _require_determinate(mechanism, analysis, "all drivers")
         rate = analysis.scales.rate
         return Driven(mechanism.without_origin, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
+    names: dict[str, str] = {}  # of what is held, by the drivers that hold it
     for key, value in (held or {}).items():
-        mechanism = _with_driver(mechanism, *_element(mechanism, key), _constant(value))
+        holder, element = _element(mechanism, key)
+        names[holder] = f"{quote(key)}, which `held` gives"
+        mechanism = _with_driver(mechanism, holder, element, _constant(value))
     name, element = _element(mechanism, driver)
     found = _add_driver(mechanism, name, element, t)
-    analysis = analyse(_from_guess(found, name))
-    _require_determinate(found, analysis, driver if isinstance(driver, str) else element.coordinate)
+    known = _from_guess(found, name)
+    analysis = analyse(known)
+    called = driver if isinstance(driver, str) else f"the {element.coordinate} of {' and '.join(element.bodies)}"
+    if known.is_concrete and analysis.redundant_rows != ():
+        require_free(known, with_drivers(known, {}), name, called, names)
+    _require_determinate(found, analysis, called)
     row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
     return Driven(found.without_origin, analysis, name, row, analysis.scales.rows[row])
 

@@ -8,6 +8,7 @@ import pytest
 
 import udkjax as udk
 from tests.show.player.conftest import Motion
+from udkjax.show.player.animation import FailedRunWarning
 from udkjax.show.player.marks import body_points, corners_of, marks, to_ground
 from udkjax.show.player.measures import measures_of, rank_of, reaction_arrows, singular_values_over_time
 from udkjax.show.player.page import page
@@ -164,6 +165,10 @@ def test_a_run_that_failed_is_shown_as_far_as_it_came(slider_crank, run):
     broken = Motion(ts=run.ts, q=q, v=run.v, cause="not finite at t = 1.25 s")
     record, poses = run_record(slider_crank, broken, "", (), False, None)
     assert len(poses) == record["q"]["rows"] == 50 and "1.25 s" in record["note"]
+    with pytest.warns(FailedRunWarning, match="'slow' failed: not finite"):
+        assert "slow" in udk.animate(slider_crank, {"slow": broken}, measures=()).failures
+    with pytest.warns(FailedRunWarning, match="no position is known at"):  # of a motion that has no cause
+        udk.animate(slider_crank, Motion(ts=run.ts, q=q, v=run.v), measures=())
     with pytest.raises(ValueError, match="has no state to show: not finite"):
         run_record(slider_crank, Motion(ts=run.ts, q=np.nan * q, v=run.v, cause=broken.cause), "", (), False, None)
 

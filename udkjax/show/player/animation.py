@@ -1,5 +1,6 @@
 """`animate`: a mechanism in motion, to look at in a notebook or a browser, or to write to a file."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from udkjax.show.player.marks import Shapes
 from udkjax.show.player.measures import Measures, Trajectory
 from udkjax.show.player.packing import Json
 from udkjax.show.player.page import frame, page
-from udkjax.show.player.records import Traces, mode_record, motion_of, player_data, run_record
+from udkjax.show.player.records import Traces, failure_of, mode_record, motion_of, player_data, run_record
 
 if TYPE_CHECKING:
     from udkjax.show.player.widget import PlayerWidget
@@ -22,11 +23,15 @@ if TYPE_CHECKING:
 FRAME_HEIGHT = 560  # px, of the player inside another page
 
 
+class FailedRunWarning(UserWarning):
+    """A run that is shown has failed: the message says how."""
+
+
 class Animation:
     """What `animate` returns. In a notebook it shows itself: as a widget where anywidget is installed, else in a frame."""
 
-    def __init__(self, data: Json):
-        self.data = data
+    def __init__(self, data: Json, failures: Mapping[str, str] | None = None):
+        self.data, self.failures = data, dict(failures or {})  # how runs failed, by their labels
         self._motions = [motion_of(record) for record in data["runs"]]
 
     def html(self, theme: str | None = None, autoplay: bool = False) -> str:
@@ -124,6 +129,7 @@ def animate(
 
     Returns:
         An `Animation`, which shows itself in a notebook; `save("motion.html")` writes it, or a .gif, .mp4, .svg, .png or .dxf.
+        A run that failed is shown as far as it came; a `FailedRunWarning` and the page say how it ended.
 
     Raises:
         ValueError: a batch, a name that is not known, or a run without any state.
@@ -131,7 +137,7 @@ def animate(
     runs: dict[str, Trajectory | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
     if not runs:
         raise ValueError("there is no run to show")
-    found = []
+    found, failures = [], {}
     for label, run in runs.items():
         one = mechanism[label] if isinstance(mechanism, Mapping) else mechanism
         run = _Still(one) if run is None else run
@@ -141,7 +147,10 @@ def animate(
                 'give members of a batch one by one under labels, {"a": jax.tree.map(lambda x: x[0], batch)}'
             )
         found.append((one, *run_record(one, run, label, measures, reactions, traces, shapes)))
-    return Animation(player_data(title or found[0][0].name or "mechanism", found))
+        if failure := failure_of(run):
+            failures[label] = failure
+            warnings.warn(f"run {label!r} failed: {failure}" if label else f"the run failed: {failure}", FailedRunWarning, 2)
+    return Animation(player_data(title or found[0][0].name or "mechanism", found), failures)
 
 
 def animate_modes(

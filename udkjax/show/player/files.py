@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.extras import OptionalImport
+from udkjax.integrate.solution import Result
 from udkjax.scene import Mechanism, SceneError, loads
 
 with OptionalImport():
@@ -19,6 +20,7 @@ class RunFile(NamedTuple):
     ts: np.ndarray
     q: np.ndarray
     v: np.ndarray
+    result: Result | None  # None: the file does not say
     cause: str  # how it ended, in words
     others: dict[str, np.ndarray]  # further numbers over time, "name (unit)": they are measures
 
@@ -46,7 +48,8 @@ def read_run(path: Path) -> RunFile:
             raise ValueError(f"{path}: its bodies are not those of its scene")
         others = {_label(data[name]): np.asarray(data[name], float) for name in data.data_vars if data[name].dims == ("time",)}
         ts, q, v = (np.asarray(data[name], float) for name in ("time", "q", "v"))
-        return RunFile(mechanism, ts, q, v, str(data.attrs.get("cause", "")), others)
+        result = Result.__members__.get(str(data.attrs.get("result", "")))
+        return RunFile(mechanism, ts, q, v, result, str(data.attrs.get("cause", "")), others)
 
 
 def _label(variable: "xarray.DataArray") -> str:

@@ -26,6 +26,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from udkjax.equations import analyse
+from udkjax.integrate.solution import Result
 from udkjax.scene import Mechanism
 from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
 from udkjax.show.player.measures import Measures, Trajectory, measures_of, reaction_arrows
@@ -62,7 +63,8 @@ def run_record(
     alive = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
     count = int(np.argmin(alive)) if not alive.all() else len(ts)
     if count == 0:
-        raise ValueError(f"run {label!r} has no state to show" + _cause(solution, ": "))
+        cause = getattr(solution, "cause", "")
+        raise ValueError(f"run {label!r} has no state to show" + (f": {cause}" if cause else ""))
     shown = np.unique(np.linspace(0, count - 1, min(count, MOST_INSTANTS)).round().astype(int))
     length = float(analyse(mechanism).length)
     steps = np.tile([PRECISION * length, PRECISION * length, PRECISION], q.shape[1])
@@ -70,7 +72,7 @@ def run_record(
     poses = q[shown]
     record = {
         "label": label,
-        "note": _cause(solution) if count < len(ts) else "",
+        "note": failure_of(solution) or (getattr(solution, "cause", "") if count < len(ts) else ""),
         "bodies": list(mechanism.bodies),
         "marks": marks(mechanism, poses, shapes),
         "traces": trace_anchors(mechanism, poses, traces, length),
@@ -243,6 +245,12 @@ def _speed(duration: float) -> float:
     return min((s for s in SPEEDS if s >= 1 and duration / s <= longest), default=SPEEDS[-1])
 
 
-def _cause(solution: Trajectory, before: str = "") -> str:
-    cause = getattr(solution, "cause", "")
-    return f"{before}{cause}" if cause else ""
+def failure_of(solution: Trajectory) -> str:
+    """Say how a run failed, whatever of it can be shown; an empty text where it did not."""
+    result, cause = getattr(solution, "result", None), getattr(solution, "cause", "")
+    if isinstance(result, Result):
+        return "" if result.is_success else cause
+    known = np.isfinite(np.asarray(solution.q)).all((1, 2))
+    if known.all():
+        return ""
+    return cause or f"no position is known at {float(np.asarray(solution.ts)[np.argmin(known)]):g}: it is shown up to there"
