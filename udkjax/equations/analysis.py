@@ -26,6 +26,7 @@ from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.scales import Scales, known_scales, traced_scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import is_large, structure
+from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
 ANALYSIS_CACHE_SIZE = 256  # analyses that are stored; the one that was asked for longest ago makes room
@@ -71,6 +72,7 @@ class Analysis(eqx.Module):
         return self.scales.mass
 
 
+@checked
 def analyse(mechanism: Mechanism) -> Analysis:
     """Find the rank, the redundant rows and the scales of a mechanism; results are cached by structure and numbers.
 

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
 Arguments = ParamSpec("Arguments")
@@ -44,4 +45,4 @@ def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
         found["mechanism"] = mechanism.without_origin
         return program(*given.args, **given.kwargs)
 
-    return run
+    return checked(run)

@@ -15,6 +15,7 @@ from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
 Result = TypeVar("Result")
@@ -86,6 +87,7 @@ def accelerations(
 ) -> tuple[Float[Array, "bodies 3"], Float[Array, "m"]]: ...
 
 
+@checked
 def accelerations(
     mechanism: Mechanism | ConstrainedSystem,
     t: ArrayLike,
@@ -120,6 +122,7 @@ def accelerations(
     return _accelerations(mechanism, analysis, t, q, v, method, stabilization, formulation, multipliers)
 
 
+@checked
 def violation(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory) -> Float[Array, "T m"]:
     """Psi at each time of a solution.
 
@@ -133,6 +136,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory) 
     return _evaluate_along(mechanism, solution, _psi)
 
 
+@checked
 def energy(mechanism: Mechanism, solution: StateHistory) -> Energy:
     """T = v^T M v / 2 and V at each time of a solution.
 

@@ -29,6 +29,7 @@ from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, Point, between
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.drivers import Driver
@@ -44,6 +45,7 @@ ByBody = dict[str, dict[str, Array]]  # of a joint or driver, of a body
 COMPLIANCE_TOL = 1e-10
 
 
+@checked
 def reactions(
     mechanism: Mechanism,
     solution: StateHistory,
@@ -80,6 +82,7 @@ def reactions(
     return _name_by_body(mechanism, loads)
 
 
+@checked
 def unique_reactions(
     mechanism: Mechanism,
     solution: StateHistory,

@@ -29,6 +29,7 @@ from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large
 from udkjax.integrate import native_closing
 from udkjax.integrate.closure import close_by_jax, close_by_machine_code
+from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -72,6 +73,7 @@ class Closure(NamedTuple):
         return is_closed(scales, q.ravel(), v.ravel(), psi, psi_dot, xp)
 
 
+@checked
 def assemble(
     mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None, throw: bool = True, analysis: Analysis | None = None
 ) -> State:
@@ -196,6 +198,7 @@ class Check(NamedTuple):
     closed: bool
 
 
+@checked
 def check(mechanism: Mechanism) -> Check:
     """Count rows, rank and degrees of freedom, name redundant rows, and say how well the initial guess closes."""
     closure = close(mechanism)

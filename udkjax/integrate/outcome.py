@@ -18,9 +18,22 @@ class Run(eqx.Module):
 
     raw: IntegratorOutput
     ts: Float[Array, "T"]
+    usable: Bool[Array, ""]  # `usable` of its arguments
     closed: Bool[Array, ""]
     missed: Bool[Array, ""]  # the closed state takes rows that the method leaves out
     drift_tol: Float[Array, ""]
+
+
+def increases(ts: Float[Array, "T"]) -> Bool[Array, ""]:
+    """Tell whether output times are finite, and each after the one before."""
+    return jnp.all(jnp.diff(ts) > 0) & jnp.all(jnp.isfinite(ts))
+
+
+def usable(q: Array, v: Array, rtol: Array, atol: Array, drift_tol: Array, dt0: Array | None) -> Bool[Array, ""]:
+    """Tell whether numbers are what `simulate` lets in: of those that are traced when it is called it sees the shapes alone."""
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
+    tolerant = (rtol >= 0) & (atol >= 0) & (rtol + atol > 0) & (rtol + atol < jnp.inf) & (drift_tol > 0)
+    return finite & tolerant & (True if dt0 is None else (dt0 > 0) & (dt0 < jnp.inf))
 
 
 def outcome(run: Run, xp: ModuleType = jnp) -> tuple[Array, Array, Bool[Array, "T"]]:
@@ -32,7 +45,8 @@ def outcome(run: Run, xp: ModuleType = jnp) -> tuple[Array, Array, Bool[Array, "
     first = xp.arange(len(run.ts)) == 0
     code = xp.where(run.missed, Result.drift, code)
     code = xp.where(run.closed, code, Result.could_not_assemble)
-    started = run.closed & ~run.missed
+    code = xp.where(run.usable, code, Result.invalid_argument)
+    started = run.usable & run.closed & ~run.missed
     return code, xp.where(started, time, run.ts[0]), reached & (started | first)
 
 

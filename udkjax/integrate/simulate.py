@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
@@ -22,13 +22,14 @@ from udkjax.integrate.assembly import Closure, State, close, require_closed
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_engine import independent_row_count, integrate_known, reason_for_diffrax
-from udkjax.integrate.outcome import Run, counts, outcome
+from udkjax.integrate.outcome import Run, counts, increases, outcome, usable
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.native.steps import SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
-from udkjax.scene.fields import number
+from udkjax.scene.arguments import checked, describe, require_output_times
+from udkjax.scene.fields import number, optional_number
 from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ GEOMETRY_TRACED = (
 DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-3
 
 
+@checked
 def simulate(
     mechanism: Mechanism | ConstrainedSystem,
     ts: ArrayLike | Sequence[float],
@@ -119,12 +121,15 @@ def simulate(
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.
     """
-    ts = _times(ts)
+    require_output_times("ts", ts)
+    if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and not float(number(rtol)) and not float(number(atol)):
+        raise ValueError("rtol and atol must not both be 0: no step has no error")
+    ts = number(ts)
     if state is None and isinstance(mechanism, ConstrainedSystem):
         raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
     drift = number((DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE) if drift_tol is None else drift_tol)
     method = Auto() if method is None else method
-    settings = (number(rtol), number(atol), method, stabilization, drift, _step(dt0), formulation)
+    settings = (number(rtol), number(atol), method, stabilization, drift, optional_number(dt0), formulation)
     choices = (solver, _adjoint(adjoint), max_steps, _meter(progress))
 
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
@@ -154,7 +159,7 @@ def simulate(
         assert analysis is not None  # a mechanism has one
         more = (SMALLEST_STEP, isinstance(stabilization, Projection), solver, max_steps, max_events, engine)
         baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
-        given: Any = (number(rtol), number(atol), method, baumgarte, formulation, drift, _step(dt0), *more)
+        given: Any = (number(rtol), number(atol), method, baumgarte, formulation, drift, optional_number(dt0), *more)
         solution = simulate_events(mechanism, events, analysis, ts, state, closure, Choices(*given))
         return _required(solution, mechanism, closure, throw)
 
@@ -226,10 +231,16 @@ def _simulate(
         state, closed = closure.state, xp.asarray(closure.is_closed)
     else:
         closed = xp.array(True)
-    # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
-    loose_rtol, loose_atol = (xp.where(closed, tol, 1e3) for tol in (rtol, atol))
-    ulp = np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1]))
     q, v = xp.ravel(xp.asarray(state.q)), xp.ravel(xp.asarray(state.v))
+    good, given_ts = xp.array(True), ts
+    if xp is jnp:  # what is known has passed the door
+        good = usable(*stop_gradients((q, v, rtol, atol, drift_tol, dt0))) | ~closed  # pyright: ignore[reportArgumentType]
+    if isinstance(ts, Tracer):
+        in_order = increases(stop_gradients(ts))
+        good, ts = good & in_order, jnp.where(in_order, ts, jnp.arange(len(ts)))
+    # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
+    loose_rtol, loose_atol = (xp.where(good & closed, tol, 1e3) for tol in (rtol, atol))
+    ulp = np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1]))
     numbers: Any = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v, xp))
     problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, breakpoints=mechanism.breakpoints)
     why = "it was asked for" if engine == "diffrax" else reason_for_diffrax(problem, adjoint, meter)
@@ -244,7 +255,7 @@ def _simulate(
     missed = xp.array(False) if why or closure is None else closed & (closure.rank > independent_row_count(problem))
     later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
     q, v = xp.where(later, raw.q, q), xp.where(later, raw.v, v)
-    ends: Any = (raw, ts, closed, missed, drift_tol)
+    ends: Any = (raw, given_ts, good, closed, missed, drift_tol)
     seen = Run(*ends)
     code, time, reached = outcome(seen if xp is np else stop_gradients(seen), xp)
     q, v = (xp.where(reached[:, None], y, xp.nan).reshape(-1, *np.shape(state.q)) for y in (q, v))
@@ -258,7 +269,7 @@ def _simulate(
         ("first_step", "chosen" if dt0 is None else "given"),
         ("engine", f"diffrax: {why}" if why else "native"),
     )
-    arrays = jax.tree.map(jnp.asarray if xp is jnp else jax.device_put, (ts, q, v, code, time, stats, rtol, atol))
+    arrays = jax.tree.map(jnp.asarray if xp is jnp else jax.device_put, (given_ts, q, v, code, time, stats, rtol, atol))
     fields: Any = (*arrays, getattr(mechanism, "body_names", ()), chosen)
     return Solution(*fields), missed
 
@@ -277,26 +288,6 @@ def _units(analysis: Analysis | None, ts: Any, v: Any, xp: Any) -> tuple[Any, An
     scales = analysis.scales if xp is jnp else jax.tree.map(np.asarray, analysis.scales)
     units = scales.length, xp.maximum(xp.maximum(scales.rate, scales.size(v, xp)), 1 / (ts[-1] - ts[0]))
     return units if xp is np else stop_gradients(units)
-
-
-def _times(ts: ArrayLike | Sequence[float]) -> Float[Array, "T"]:
-    ts = number(ts)
-    if ts.ndim != 1 or len(ts) < 2:
-        raise ValueError(f"ts must be a vector of at least two output times, from the start on; its shape is {ts.shape}")
-    if not isinstance(ts, Tracer) and not np.all(np.diff(ts) > 0):  # by NumPy: while something else is traced, jnp would trace it
-        raise ValueError("ts must increase from each output time to the next")
-    return ts
-
-
-def _step(dt0: ArrayLike | None) -> Array | None:
-    if dt0 is None:
-        return None
-    dt0 = number(dt0)
-    if dt0.shape:
-        raise ValueError(f"dt0 is one time, in s; its shape is {dt0.shape}")
-    if not isinstance(dt0, Tracer) and not 0 < float(dt0) < jnp.inf:
-        raise ValueError(f"the first step dt0 must be positive, not {float(dt0)} s")
-    return dt0
 
 
 def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
@@ -320,5 +311,7 @@ def _meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":
         return None
     import diffrax
 
-    meter = diffrax.TextProgressMeter() if progress is True else progress
+    if not isinstance(progress, bool | diffrax.AbstractProgressMeter):
+        raise TypeError(f"progress must be True, False or a progress meter of diffrax's, {describe(progress)}")
+    meter: Any = diffrax.TextProgressMeter() if progress is True else progress
     return None if isinstance(meter, diffrax.NoProgressMeter) else meter

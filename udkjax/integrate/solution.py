@@ -31,6 +31,7 @@ class Result(IntEnum):
     event_limit = 8
     beyond_contact = 9
     event_impossible = 10
+    invalid_argument = 11
 
     @property
     def is_success(self) -> bool:
@@ -54,6 +55,8 @@ CAUSES = {
     Result.beyond_contact: "the run starts beyond a contact or limit, where its condition is negative already",
     Result.event_impossible: "an event asks for what the constraints do not allow: an impact in a direction in which they leave "
     "no motion, or a joint attached where it is open",
+    Result.invalid_argument: "an argument of this run is of no use: output times that do not increase, a state that is not "
+    "finite, or a tolerance or first step that is not positive",
 }
 
 

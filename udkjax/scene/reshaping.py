@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Body, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.fields import Number, Numbers, number
@@ -19,6 +20,7 @@ from udkjax.scene.mechanism import Mechanism
 PINS = (Revolute, Weld)  # joints that hold two points together
 
 
+@checked
 def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: ArrayLike, as_rod: bool = False) -> Mechanism:
     """Return the mechanism with another length of some bodies: the largest distance between two points where a body is attached.
 
@@ -62,6 +64,7 @@ def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
     return jnp.sqrt(jnp.max(square))
 
 
+@checked
 def with_angle(
     mechanism: Mechanism, bodies: Sequence[str] | str, angle: ArrayLike, angular_velocity: ArrayLike | None = None
 ) -> Mechanism:

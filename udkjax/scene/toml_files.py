@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, find_class, problems_of, suggestion
 from udkjax.scene.fields import Table
 from udkjax.scene.mechanism import Mechanism, name_elements
@@ -54,6 +55,7 @@ def loads(text: str) -> Mechanism:
     return _read(text, "")
 
 
+@checked
 def save(mechanism: Mechanism, path: str | os.PathLike[str]) -> None:
     """Write a mechanism to a TOML file, whole or not at all.
 
@@ -74,6 +76,7 @@ def save(mechanism: Mechanism, path: str | os.PathLike[str]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+@checked
 def dumps(mechanism: Mechanism) -> str:
     """Return the mechanism as the text of a TOML file; reading it gives the same numbers back, bit by bit.
 

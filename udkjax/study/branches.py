@@ -10,12 +10,14 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.analysis import Analysis
 from udkjax.integrate.assembly import State, close
+from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.drive import Drive, drive
 from udkjax.study.positions import distinct, random_positions
 
 
+@checked
 def branches(
     mechanism: Mechanism,
     driver: Drive,

@@ -13,6 +13,7 @@ from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
 from udkjax.integrate.assembly import State, close
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv import SVD
+from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.continuation import Curve, plus
@@ -48,6 +49,7 @@ class Equilibrium(eqx.Module):
         return self.balanced & jnp.all(self.omega2 > 0)
 
 
+@checked
 def equilibrium(
     mechanism: Mechanism, state: State | None = None, t: ArrayLike = 0.0, stable: bool = False, analysis: Analysis | None = None
 ) -> Equilibrium:
@@ -77,6 +79,7 @@ def equilibrium(
     return _equilibrium(rest_curve(mechanism, analysis), analysis, t, start, free, stable)
 
 
+@checked
 def equilibria(
     mechanism: Mechanism, starts: int = 64, seed: int = 0, t: ArrayLike = 0.0, state: State | None = None
 ) -> list[Equilibrium]:

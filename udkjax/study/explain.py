@@ -17,12 +17,14 @@ from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import State, assemble
 from udkjax.pinv import SVD
+from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.explanation import Explanation, Gauss
 
 RIVALS = 200  # feasible accelerations that a is compared with
 
 
+@checked
 def explain(
     mechanism: Mechanism, t: float = 0.0, state: State | None = None, stabilization: Baumgarte | None = None
 ) -> Explanation:

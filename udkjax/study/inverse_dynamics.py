@@ -22,6 +22,7 @@ from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD
+from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.drivers import Motion, Spline
 from udkjax.scene.fields import number, optional_number
@@ -78,6 +79,7 @@ class Effort(ForceElement):
         return self.law.breakpoints
 
 
+@checked
 def inverse_dynamics(
     mechanism: Mechanism,
     ts: Float[ArrayLike, "T"] | Sequence[float],
@@ -124,6 +126,7 @@ def inverse_dynamics(
     return InverseDynamics(ts, found, columns, {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}, residual)
 
 
+@checked
 def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
     """Return the mechanism whose drivers exert these efforts, each a natural cubic spline through the times, and hold nothing.
 

@@ -14,6 +14,7 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.march import can_march, march, march_at_once, psi_at_once
+from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
@@ -80,6 +81,7 @@ class Travel(eqx.Module):
     status: Int[Array, "2"]  # a `Reached` of each: `beyond_limit` where a toggle was found
 
 
+@checked
 def kinematics(
     mechanism: Mechanism,
     driver: Drive,
@@ -126,6 +128,7 @@ def kinematics(
     return _kinematics(driven, q, values, rate, acceleration, mechanism.body_names)
 
 
+@checked
 def travel(
     mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, ArrayLike] | None = None
 ) -> Travel:

@@ -7,6 +7,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float, Int
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.assembly import State
+from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.equilibrium import degrees_of_freedom, equilibrium
@@ -35,6 +36,7 @@ class Modes(eqx.Module):
         return -self.s.real / jnp.where(size > 0, size, 1.0)
 
 
+@checked
 def modes(mechanism: Mechanism, state: State | None = None, t: ArrayLike = 0.0, analysis: Analysis | None = None) -> Modes:
     """Return the modes about a position of rest: (s^2 N^T M N + s N^T C N + N^T K N) eta = 0, shape = N eta.
 

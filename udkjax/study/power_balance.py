@@ -22,6 +22,7 @@ from udkjax.equations.structure import evaluate_by_kind
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
@@ -55,6 +56,7 @@ class PowerBalance(NamedTuple):
         return jnp.max(jnp.abs(self.residual)) / jnp.where(size > 0, size, 1.0)
 
 
+@checked
 def power_balance(
     mechanism: Mechanism, solution: Trajectory, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
 ) -> PowerBalance:

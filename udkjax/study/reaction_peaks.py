@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from udkjax.equations.reactions import reactions
+from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Trajectory
 
@@ -46,6 +47,7 @@ class Envelope(NamedTuple):
 Peaks = dict[str, dict[str, Peak]]  # of a joint or driver, of a body
 
 
+@checked
 def reaction_peaks(mechanism: Mechanism, solution: Trajectory, **choices: Any) -> Peaks:
     """Return the peaks and root mean squares of all reactions over a run.
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.integrate.assembly import State
+from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.fields import Numbers, number
@@ -26,6 +27,7 @@ class Workspace(NamedTuple):
     reached: Bool[Array, "S T"]
 
 
+@checked
 def transmission_angle(mechanism: Mechanism, motion: Trajectory, joint: str) -> Float[Array, "T"]:
     """Return the angle (rad, 0 to pi) at a pin between the two links that it joins: acos(u . w / (|u| |w|)).
 
@@ -55,6 +57,7 @@ def transmission_angle(mechanism: Mechanism, motion: Trajectory, joint: str) -> 
     return jnp.arctan2(jnp.abs(u.x * w.y - u.y * w.x), u.dot(w))
 
 
+@checked
 def mechanical_advantage(mechanism: Mechanism, motion: Kinematics, output: str | Coordinate) -> Float[Array, "T"]:
     """Return what the output yields for one unit of effort at the driver: s_dot / o_dot, since power in is power out.
 
@@ -69,6 +72,7 @@ def mechanical_advantage(mechanism: Mechanism, motion: Kinematics, output: str |
     return motion.rate / jax.vmap(rate)(motion.q, motion.v)
 
 
+@checked
 def coupler_curve(
     mechanism: Mechanism,
     driver: str | Coordinate,
@@ -81,6 +85,7 @@ def coupler_curve(
     return kinematics(mechanism, driver, values, **choices).path(body, jnp.asarray(point))
 
 
+@checked
 def workspace(
     mechanism: Mechanism,
     drivers: Mapping[str, Float[ArrayLike, "S"]],

@@ -201,7 +201,7 @@ def test_several_runs_and_wrong_ones(slider_crank, run, closed_form):
     data = udk.animate(slider_crank, {"long": run, "short": short}, measures=()).data
     assert [r["label"] for r in data["runs"]] == ["long", "short"] and (data["start"], data["end"]) == (0.0, 2.0)
     batch = Motion(ts=run.ts, q=run.q[None], v=run.v[None])
-    with pytest.raises(ValueError, match="members of a batch one by one"):
+    with pytest.raises(ValueError, match="solution is a batch of 1 solutions: take one of them"):
         udk.animate(slider_crank, batch)
     with pytest.raises(ValueError, match="no run"):
         udk.animate(slider_crank, {})

@@ -115,7 +115,7 @@ def test_an_estimate_counts_as_made(candidates):
 
 
 def test_mistakes_are_told(candidates):
-    with pytest.raises(udk.IdentificationError, match="criterion must be one of D, A, E, is 'X'"):
+    with pytest.raises(ValueError, match='criterion must be one of "D", "A", "E", not the text "X"'):
         design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, "X")  # pyright: ignore[reportArgumentType]
     with pytest.raises(udk.IdentificationError, match="candidates: there is none"):
         design_experiment(scene(), [], NAMES, [CHANNEL], TS, NOISE)

@@ -112,7 +112,7 @@ def test_mistakes_are_named(linkage, axes, arguments, message):
 
 def test_all_mistakes_are_named_at_once(linkage):
     assert len(problems(linkage, {"a": [1.0], "b": [2.0]}, "c", derivatives=["d"], progress=True)) == 5
-    with pytest.raises(udk.SweepError, match="engine: there is no 'gpu'; known are auto, devices, dask"):
+    with pytest.raises(ValueError, match='engine must be one of "auto", "devices", "dask", not the text "gpu"'):
         udk.sweep(linkage, {"rtol": [1e-4]}, TS, engine="gpu")  # pyright: ignore[reportArgumentType]
 
 

@@ -21,6 +21,7 @@ from udkjax.integrate.events.hybrid import Hybrid
 from udkjax.integrate.events.phases import Phases, phases_of
 from udkjax.integrate.events.replay import EventRun, RunInput, run_events
 from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.outcome import increases, usable
 from udkjax.integrate.solution import Result, Solution
 from udkjax.pinv import Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
@@ -127,6 +128,8 @@ def _run(arrays: Given, static: Given) -> tuple[EventRun, tuple[str, ...]]:
     else:
         state, closed = closure.state, jnp.asarray(closure.is_closed)
     q, v = jnp.ravel(jnp.asarray(state.q)), jnp.ravel(jnp.asarray(state.v))
+    good, in_order = usable(*stop_gradients((q, v, choices.rtol, choices.atol, choices.drift_tol, choices.dt0))), increases(ts)
+    good, ts = (good & in_order) | ~closed, jnp.where(in_order, ts, jnp.arange(len(ts)))
     scales = phases.analyses[0].scales
     rate = jnp.maximum(jnp.maximum(scales.rate, scales.size(v)), 1 / (ts[-1] - ts[0]))
     length, rate = stop_gradients((scales.length, rate))
@@ -156,6 +159,7 @@ def _run(arrays: Given, static: Given) -> tuple[EventRun, tuple[str, ...]]:
         code = jnp.where(
             closed & (closure.rank > native_engine.independent_row_count(hybrid.problem_of_guess(0))), Result.drift, code
         )
+    code = jnp.where(good, code, Result.invalid_argument)
     return run_events(hybrid, RunInput(ts, q, v, code, choices.drift_tol), choices.max_events), reasons
 
 

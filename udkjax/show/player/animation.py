@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from udkjax.scene import Mechanism
+from udkjax.scene.arguments import checked, require_history, require_mechanism
 from udkjax.show.player import pictures
 from udkjax.show.player.marks import Shapes
 from udkjax.show.player.measures import Measures, Trajectory
@@ -139,13 +140,9 @@ def animate(
         raise ValueError("there is no run to show")
     found, failures = [], {}
     for label, run in runs.items():
-        one = mechanism[label] if isinstance(mechanism, Mapping) else mechanism
+        one = require_mechanism(mechanism[label] if isinstance(mechanism, Mapping) else mechanism)
         run = _Still(one) if run is None else run
-        if np.ndim(run.ts) != 1 or np.shape(run.q) != (len(run.ts), len(one.bodies), 3):
-            raise ValueError(
-                f"run {label!r} has q of shape {np.shape(run.q)}, not ({np.shape(run.ts)[-1]}, {len(one.bodies)}, 3): "
-                'give members of a batch one by one under labels, {"a": jax.tree.map(lambda x: x[0], batch)}'
-            )
+        require_history(f"solution[{label!r}]" if label else "solution", run, {"mechanism": one})
         found.append((one, *run_record(one, run, label, measures, reactions, traces, shapes)))
         if failure := failure_of(run):
             failures[label] = failure
@@ -153,6 +150,7 @@ def animate(
     return Animation(player_data(title or found[0][0].name or "mechanism", found), failures)
 
 
+@checked
 def animate_modes(
     mechanism: Mechanism,
     q: ArrayLike,

@@ -5,6 +5,7 @@ import numpy as np
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, unique_direction
 from udkjax.integrate.assembly import State, close, require_closed
+from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Trajectory
@@ -19,6 +20,7 @@ from udkjax.study.diagnosis.timeline import timeline
 MOST_FIXES = 64  # of a cure, one after another
 
 
+@checked
 def diagnose(
     mechanism: Mechanism,
     state: State | None = None,

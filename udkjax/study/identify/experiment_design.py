@@ -9,7 +9,7 @@ for. The best candidate has the largest det M (criterion "D"), the smallest trac
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from udkjax.deprecation import renamed_arguments, renamed_attributes
 from udkjax.integrate.assembly import State
+from udkjax.scene.arguments import checked
 from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
@@ -79,6 +80,7 @@ class Design:
         return "\n".join(rows)
 
 
+@checked
 def design_experiment(
     mechanism: Mechanism,
     candidates: Sequence[Candidate | Mapping[str, ArrayLike] | Start | State],
@@ -117,8 +119,6 @@ def design_experiment(
     """
     experiments = [_candidate(candidate, k) for k, candidate in enumerate(candidates)]
     problems = [] if experiments else ["candidates: there is none"]
-    if criterion not in get_args(Criterion):
-        problems.append(f"criterion must be one of {', '.join(get_args(Criterion))}, is {criterion!r}")
     if not 1 <= pick <= max(len(experiments), 1):
         problems.append(f"pick must be from 1 to {len(experiments)}, the number of candidates, is {pick}")
     if problems:

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from udkjax.deprecation import renamed_attributes
 from udkjax.integrate.solution import CAUSES, Result
+from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, differences, leave_out_far_steps, sizes
 from udkjax.study.identify import prediction
@@ -142,6 +143,7 @@ class GradientCheck:
         return f"GradientCheck(ok={self.ok}, {len(self.names)} directions, {len(self.series)} series)"
 
 
+@checked
 def check_gradients(
     mechanism: Mechanism,
     data: Data,

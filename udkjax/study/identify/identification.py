@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from udkjax.deprecation import renamed_arguments
 from udkjax.integrate.solution import CAUSES, Result
+from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History
@@ -31,6 +32,7 @@ ROUNDING = 1e-8  # of what a channel shows: smaller residuals are errors of the 
 
 
 @renamed_arguments(start="initial_state", starts="n_starts")
+@checked
 def identify(
     mechanism: Mechanism,
     data: Data,

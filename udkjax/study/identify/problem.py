@@ -9,7 +9,7 @@ followed by (x - mean) / sigma of each prior. Every number y that is there is on
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -19,6 +19,7 @@ from udkjax.equations.analysis import analyse
 from udkjax.integrate.assembly import AssemblyError, State, assemble
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result
+from udkjax.scene.arguments import argument_problems
 from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Quantity, channel_of
@@ -224,7 +225,7 @@ def build_problem(
         AssemblyError: the mechanism cannot be closed with the first guess, nor with any near it.
     """
     unknowns, records = _collect(
-        lambda: _check_settings(settings, strategy),
+        lambda: _check_settings(mechanism, settings),
         lambda: unknowns_of(mechanism, parameters),
         lambda: _with_initial_state(records_of(mechanism, data, noise, ignore), initial_state),
     )[1:]
@@ -251,15 +252,14 @@ def _with_initial_state(records: Sequence[Record], given: Start | Estimated | No
     return [record.with_start(start) for record in records]
 
 
-def _check_settings(settings: Mapping[str, Any], strategy: str) -> None:
+def _check_settings(mechanism: Mechanism, settings: Mapping[str, Any]) -> None:
     known = [name for name in inspect.signature(simulate).parameters if name not in DECIDED]
     problems = [
         f"{name}: no setting of simulate that can be given here{suggestion(name, known)}"
         for name in settings
         if name not in known
     ]
-    if strategy not in get_args(Strategy):
-        problems.append(f"strategy must be one of {', '.join(get_args(Strategy))}, is {strategy!r}")
+    problems += argument_problems(simulate, {"mechanism": mechanism, **settings})
     if problems:
         raise IdentificationError(problems)
 

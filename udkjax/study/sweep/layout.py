@@ -10,7 +10,9 @@ import numpy as np
 
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import State
+from udkjax.integrate.simulate import simulate
 from udkjax.pinv import Auto
+from udkjax.scene.arguments import argument_problems
 from udkjax.scene.checks import Mistakes, SceneError, abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
@@ -183,11 +185,16 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
                 owner[target] = column.name
 
 
-def check_settings(dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
-    """Return what is wrong between axes and settings: what is given twice, gains and thresholds that no choice has."""
+def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
+    """Return what is wrong with axes of settings: values of no use, what is given twice, gains that no choice has."""
     columns = [column for dimension in dimensions for column in dimension.columns]
     targets = {target: column for column in columns if not callable(column.of) for target in column.of}
     problems = [f"{name} is both a setting and an axis: leave one of them out" for name in settings if name in targets]
+
+    for target, column in targets.items():
+        for value in column.values if column.is_choice else np.unique(column.numbers) if target in NUMBERS else ():
+            wrong = argument_problems(simulate, {"mechanism": mechanism, target: value})
+            problems += [f"axis {quote(column.name)}: {text}" for text in wrong]
 
     def all_are(setting: str, kind: type | UnionType, wanted: str, cure: str) -> Iterator[str]:
         choices = targets[setting].values if setting in targets else (settings.get(setting),)

@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 
 from udkjax.equations.analysis import analyse
 from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.integrate.simulate import simulate
+from udkjax.scene.arguments import argument_problems, require_output_times
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import AxisChoice, AxisValues, Column, Design, Dimension, structure_of
 from udkjax.study.sweep.layout import Settings, SweepError, check_settings, check_tangents, lay_out
@@ -146,11 +148,16 @@ def make_plan(
 ) -> Plan:
     """Make the plan of a sweep; arguments as those of `udkjax.sweep`. Raises `SweepError`, which lists every mistake."""
     problems = [f"{name}: a sweep has no such setting" for name in settings if name in OUTSIDE]
-    if not isinstance(mechanism, Mechanism):
-        raise SweepError([f"mechanism: must be a Mechanism, is a {type(mechanism).__name__}"])
+    wrong = argument_problems(make_plan, {"mechanism": mechanism})
+    if wrong:
+        raise SweepError(wrong)
+    problems += argument_problems(simulate, {"mechanism": mechanism, **settings})
+    try:
+        require_output_times("ts", ts)
+    except (TypeError, ValueError) as error:
+        problems.append(str(error))
+        ts = (0.0, 1.0)
     ts = np.asarray(ts, float)
-    if ts.ndim != 1 or len(ts) < 2 or not np.all(np.diff(ts) > 0):
-        problems.append("ts: must be at least two output times (s), increasing from the start on")
     dimensions: tuple[Dimension, ...] = ()
     try:
         dimensions = lay_out(mechanism, axes, design)
@@ -159,7 +166,7 @@ def make_plan(
     targets = {target for d in dimensions for c in d.columns if not callable(c.of) for target in c.of}
     if targets & {"alpha", "beta"} and "stabilization" not in targets:
         settings.setdefault("stabilization", Baumgarte())  # who varies gains has some
-    problems += check_settings(dimensions, settings)
+    problems += check_settings(mechanism, dimensions, settings)
     problems += check_tangents(mechanism, dimensions, derivatives)
     measures: tuple[Measure, ...] = ()
     try:

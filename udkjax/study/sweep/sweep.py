@@ -2,11 +2,12 @@
 
 import os
 from collections.abc import Callable, Generator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 from numpy.typing import ArrayLike
 
 from udkjax.extras import require
+from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.progress import ProgressOption, report_progress
 from udkjax.study.sweep.axes import AxisValues, Design
@@ -14,7 +15,6 @@ from udkjax.study.sweep.cost import MEMORY, cut_chunks
 from udkjax.study.sweep.dataset import assemble
 from udkjax.study.sweep.executors import Done, compute_on_devices, dask_engine
 from udkjax.study.sweep.fingerprint import fingerprint
-from udkjax.study.sweep.layout import SweepError
 from udkjax.study.sweep.measures import MeasureChoice, Reference
 from udkjax.study.sweep.plan import Chunk, Plan, make_plan
 from udkjax.study.sweep.program import RESULT
@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # neither is needed before a sweep has results, or a cluster
 Engine = Literal["auto", "devices", "dask"]
 
 
+@checked
 def sweep(
     mechanism: Mechanism,
     axes: Mapping[str, AxisValues],
@@ -82,8 +83,6 @@ def sweep(
         StoreError: `out` cannot be written to, or holds another sweep.
         ClusterError: there is no client, or its workers cannot do it.
     """
-    if engine not in get_args(Engine):
-        raise SweepError([f"engine: there is no {engine!r}; known are {', '.join(get_args(Engine))}"])
     require("xarray")
     plan = make_plan(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
     compute = _engine(engine, client)

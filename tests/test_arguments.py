@@ -1,0 +1,214 @@
+"""The door: what public functions cannot use is refused by name, before anything is computed; traced, it is data."""
+
+import inspect
+from types import SimpleNamespace
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+
+TS = np.linspace(0.0, 0.2, 3)
+MECH: Any = udk.library.parallelogram()
+OTHER: Any = udk.library.compound_pendulum()
+N = len(MECH.body_names)
+Q = np.asarray(MECH.q0)
+WRONG_SHAPES = [(1, 3), (3,), (2, 3), (3, N), (N + 1, 3), (400, 3), (N, 2), (2, N, 3), (), (0, 3)]
+
+
+def functions_of(parameter: str) -> list[str]:
+    """The public functions with such a parameter."""
+    found = [name for name in udk.__all__ if inspect.isfunction(getattr(udk, name))]
+    found = [name for name in found if parameter in inspect.signature(getattr(udk, name)).parameters]
+    assert found
+    return found
+
+
+def call(name: str, **given: Any) -> Any:
+    """Call a public function with the arguments given, and for all others that it needs with some that fit."""
+    fitting = {
+        "mechanism": MECH,
+        "ts": TS,
+        "t": 0.0,
+        "q": Q,
+        "v": 0 * Q,
+        "solution": SimpleNamespace(ts=TS, q=np.stack([Q] * 3), v=np.zeros((3, N, 3))),
+        "motion": SimpleNamespace(ts=TS, q=np.stack([Q] * 3), v=np.zeros((3, N, 3))),
+        "driver": "body.link1.angle",
+        "values": [0.0, 0.1],
+        "value": 0.1,
+        "axes": {"rtol": [1e-6]},
+        "shapes": np.ones((1, N, 3)),
+        "body": "coupler",
+        "drivers": {"body.link1.angle": [0.0], "body.link2.angle": [0.0]},
+    }
+    needed = [p.name for p in inspect.signature(getattr(udk, name)).parameters.values() if p.default is p.empty]
+    missing = {p: fitting.get(p) for p in needed if p not in ("choices", "settings")}
+    return getattr(udk, name)(**(missing | given))
+
+
+def message(function, *arguments: Any, **given: Any) -> str:
+    """The text of the TypeError or ValueError that a call raises."""
+    with pytest.raises((TypeError, ValueError)) as error:
+        function(*arguments, **given)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("name", functions_of("mechanism"))
+def test_what_is_no_mechanism_is_refused(name):
+    if name == "animate":  # takes several, too
+        return
+    for wrong in ("scene.toml", udk.Mechanism, None, 3.0, {"a": MECH}):
+        assert "mechanism must be a Mechanism" in message(call, name, mechanism=wrong)
+
+
+@pytest.mark.parametrize("name", functions_of("state"))
+def test_a_state_of_a_wrong_shape_or_type_is_refused(name):
+    for shape in WRONG_SHAPES:
+        text = message(call, name, state=udk.State(np.full(shape, 7.0), np.zeros(shape)))
+        assert "state.q must have the shape" in text and str((N, 3)) in text and str(shape) in text
+    assert "state.v must have the shape" in message(call, name, state=udk.State(Q, np.zeros((1, 3))))
+    for wrong in ((Q, 0 * Q), Q, udk.State, "rest"):
+        assert "state must be a State, such as udk.State(q, v)" in message(call, name, state=wrong)
+    bad = Q.copy()
+    bad[1, 0] = np.nan
+    assert f'state.q[1, 0] is nan (x of "{MECH.body_names[1]}")' in message(call, name, state=udk.State(bad, 0 * Q))
+    with pytest.raises(ValueError, match=r"state.q must have the shape"):  # traced
+        jax.eval_shape(lambda q: call(name, state=udk.State(q, q)), jnp.zeros((1, 3)))
+
+
+@pytest.mark.parametrize("name", [*functions_of("q"), *(f"equations.{x}" for x in ("psi", "psi_q", "force", "potential_energy"))])
+def test_coordinates_of_a_wrong_shape_or_type_are_refused(name):
+    function = getattr(udk.equations, name.split(".")[1]) if "." in name else getattr(udk, name)
+    known = {"mechanism": MECH, "t": 0.0, "q": Q, "v": 0 * Q, "shapes": np.ones((1, N, 3))}
+    known = {p: x for p, x in known.items() if p in inspect.signature(function).parameters}
+    for shape in WRONG_SHAPES:
+        assert f"q must have the shape {(N, 3)}" in message(function, **(known | {"q": np.zeros(shape)}))
+    for wrong in ("q", None, [[1.0], [1.0, 2.0]], 1j * Q, Q > 0, udk.SVD()):
+        assert message(function, **(known | {"q": wrong})).startswith("q must be")
+    assert "q[0, 2] is inf (angle of" in message(function, **(known | {"q": Q + np.array([0, 0, np.inf])}))
+    if "t" in known:
+        assert "t must be" in message(function, **(known | {"t": np.zeros(2)}))
+
+
+NUMBERS = {
+    "rtol": [-1e-8, np.nan, np.inf, [1e-8, 1e-6], np.full(50, 1e-8), "1e-8", True, 1j],
+    "atol": [-1e-8, np.nan, np.inf, [1e-8, 1e-8], "small"],
+    "drift_tol": [-1.0, 0.0, np.nan, [1e-6, 1e-6], "tight"],
+    "dt0": [-1.0, 0.0, np.nan, np.inf, [1e-3, 1e-3], "short"],
+    "max_steps": [0, -1, 1.5, "many", True, [10, 10]],
+    "max_events": [0, -1, 1.5, "many"],
+    "ts": [[0.0], 0.0, [], [0.0, 0.0], [1.0, 0.0], [0.0, np.nan], [0.0, np.inf], [[0.0, 1.0]], "0 to 1", [0.0, 1j]],
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_of_a_wrong_shape_sign_or_type_are_refused(name):
+    for wrong in NUMBERS[name]:
+        if wrong is not None:
+            assert name in message(udk.simulate, **({"mechanism": MECH, "ts": TS} | {name: wrong}))
+
+
+CHOICES = [
+    ("stabilization", udk.Projection, "stabilization=udk.Projection()"),
+    ("stabilization", "projection", "stabilization=udk.Projection()"),
+    ("stabilization", 5.0, "a Baumgarte, such as udk.Baumgarte(alpha, beta)"),
+    ("method", udk.SVD, "method=udk.SVD()"),
+    ("method", "SVD", "method=udk.SVD()"),
+    ("method", "greville", "method=udk.Greville()"),
+    ("method", udk.Projection(), "method must be a Pseudoinverse"),
+    ("formulation", udk.Augmented, "formulation=udk.Augmented()"),
+    ("formulation", udk.SVD(), "formulation must be a Formulation"),
+    ("engine", "Diffrax", 'engine must be one of "auto", "native", "diffrax", not the text "Diffrax"; did you mean "diffrax"?'),
+    ("engine", None, "engine must be one of"),
+    ("solver", diffrax.Tsit5, "solver must be an instance"),
+    ("solver", "Tsit5", "solver=diffrax.Tsit5()"),
+    ("solver", udk.SVD(), "solver must be an instance"),
+    ("adjoint", diffrax.ForwardMode, "adjoint must be an instance"),
+    ("throw", "no", "throw must be True or False"),
+    ("progress", print, "progress must be True, False or a progress meter"),
+    ("analysis", "rank 11", "analysis must be an Analysis"),
+    ("analysis", OTHER, "analysis must be an Analysis"),
+]
+
+
+@pytest.mark.parametrize(("name", "wrong", "text"), CHOICES, ids=[f"{x[0]}-{k}" for k, x in enumerate(CHOICES)])
+def test_choices_of_a_wrong_type_are_refused(name, wrong, text):
+    assert text in message(udk.simulate, MECH, TS, **{name: wrong})
+
+
+def test_thresholds_and_gains_of_no_use_are_refused():
+    wrongs: list[Any] = [[1e-3, 1e-4], -1.0, np.nan]
+    for wrong in wrongs:
+        assert "method.rank_tol must be" in message(udk.simulate, MECH, TS, method=udk.SVD(wrong))
+        assert "method.branch_tol must be" in message(udk.accelerations, MECH, 0.0, Q, 0 * Q, method=udk.Auto(branch_tol=wrong))
+        assert "stabilization.alpha must be" in message(udk.simulate, MECH, TS, stabilization=udk.Baumgarte(wrong))
+
+
+def test_a_batch_of_mechanisms_is_refused_and_mapped_over_it_is_not():
+    batch = jax.tree.map(lambda *x: np.stack(x), OTHER, OTHER)
+    for name in functions_of("mechanism"):
+        if name not in ("animate", "save", "dumps"):
+            assert "mechanism is a batch of mechanisms" in message(call, name, mechanism=batch)
+    assert jax.vmap(lambda m: udk.accelerations(m, 0.0, OTHER.q0, OTHER.v0))(batch).shape == (2, 1, 3)
+
+
+def test_the_analysis_of_another_mechanism_is_refused_and_that_of_other_numbers_is_not():
+    assert "analysis is that of another mechanism" in message(udk.simulate, MECH, TS, analysis=udk.analyse(OTHER))
+    lighter = MECH.with_parameters({"body.coupler.mass": 1.0})
+    assert udk.simulate(lighter, TS, analysis=udk.analyse(MECH)).result.is_success
+
+
+@pytest.mark.parametrize("name", [x for x in functions_of("solution") if x != "animate"])
+def test_the_solution_of_another_mechanism_or_of_a_batch_is_refused(name):
+    if inspect.signature(getattr(udk, name)).parameters["solution"].default is None:
+        assert "solution" in message(call, name, solution=7.0)
+    other = udk.simulate(OTHER, TS)
+    assert 'solution is of another mechanism: its bodies are "rod"' in message(call, name, solution=other)
+    batch = SimpleNamespace(ts=np.stack([TS] * 2), q=np.zeros((2, 3, N, 3)), v=np.zeros((2, 3, N, 3)))
+    assert "solution is a batch of 2 solutions" in message(call, name, solution=batch)
+    cut = SimpleNamespace(ts=TS, q=np.zeros((2, N, 3)), v=np.zeros((2, N, 3)))
+    assert "solution must have ts (T,), q and v (T, bodies, 3)" in message(call, name, solution=cut)
+    for wrong in (udk.Solution, "run.nc", Q):
+        assert "solution must have times and states" in message(call, name, solution=wrong)
+
+
+def test_settings_of_studies_are_those_of_simulate():
+    for wrong in ({"rtol": -1.0}, {"method": "SVD"}, {"stabilization": udk.Projection}, {"dt0": np.nan}):
+        name = next(iter(wrong))
+        assert name in message(udk.sweep, MECH, {"body.coupler.mass": [1.0]}, TS, **wrong)
+    for axis in ({"rtol": [1e-6, np.nan]}, {"drift_tol": [0.0, 1.0]}, {"max_steps": [0]}):
+        assert next(iter(axis)) in message(udk.sweep, MECH, axis, TS)
+    record = {"t": TS, "body.link1.angle": np.zeros(3)}
+    assert "method must be" in message(udk.identify, MECH, record, "body.link1.mass", method=udk.SVD)
+
+
+@pytest.mark.parametrize("events", [False, True])
+def test_what_turns_out_to_be_of_no_use_is_the_result_of_a_member(events):
+    """Traced numbers are known by their shapes alone: the run that they spoil says so, and no other."""
+    listed = udk.Event(lambda t, at: at["rod"].angle - 10.0, udk.Log()) if events else None
+    state = udk.assemble(OTHER)
+
+    def run(ts, rtol, q, drift_tol):
+        given = udk.State(q, state.v)
+        found = udk.simulate(OTHER, ts, given, rtol=rtol, drift_tol=drift_tol, events=listed, throw=False)
+        return found.code, found.q, found.ts
+
+    rows = [
+        (TS, 1e-8, state.q, 1e-6),
+        (TS[::-1], 1e-8, state.q, 1e-6),
+        (TS * np.nan, 1e-8, state.q, 1e-6),
+        (TS, -1e-8, state.q, 1e-6),
+        (TS, np.nan, state.q, 1e-6),
+        (TS, 1e-8, state.q * np.nan, 1e-6),
+        (TS, 1e-8, state.q, -1e-6),
+    ]
+    code, q, ts = jax.jit(jax.vmap(run))(*(np.stack([np.asarray(row[k]) for row in rows]) for k in range(4)))
+    assert code.tolist() == [udk.Result.successful, *[udk.Result.invalid_argument] * (len(rows) - 1)]
+    np.testing.assert_allclose(q[0], udk.simulate(OTHER, TS, state).q, rtol=1e-12)
+    assert np.isnan(q[1:, 1:]).all()
+    np.testing.assert_array_equal(ts, np.stack([row[0] for row in rows]))
