@@ -16,11 +16,9 @@ from udkjax.extras import EXTRAS
 
 ROOT = Path(udkjax.__file__).parent
 
-GROUND_FLOOR = {"deprecation", "extras", "html"}  # every floor may import them
+GROUND_FLOOR = {"annotations", "deprecation", "extras", "printing"}  # every floor may import them
 BELOW = {
-    "deprecation": set(),
-    "extras": set(),
-    "html": set(),
+    **{module: set() for module in GROUND_FLOOR},
     "expressions": set(),
     "pinv": {"expressions"},
     "scene": set(),
@@ -129,7 +127,7 @@ def test_the_public_names_are_there_and_type_checkers_know_them():
     everything = {}
     exec("from udkjax import *", everything)
     assert set(udkjax.__all__) <= set(everything)
-    assert set(udkjax.__all__) <= set(dir(udkjax))
+    assert {*udkjax.__all__, "__version__"} == set(dir(udkjax))
     assert callable(udkjax.simulate) and callable(udkjax.assemble) and udkjax.library.__name__ == "udkjax.scene.library"
     with pytest.raises(AttributeError, match="no attribute 'simulat'"):
         udkjax.simulat  # noqa: B018

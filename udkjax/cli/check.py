@@ -13,17 +13,13 @@ def check(scene: Scene, /, json: Json = False) -> None:
         json: write the results as JSON.
     """
     mech, _ = load(scene)
-    from udkjax.equations import analyse
     from udkjax.integrate.assembly import check as checked
     from udkjax.show.summary import check_summary
 
-    found, scales = checked(mech), analyse(mech)
+    found = checked(mech)
     results = {
         **found._asdict(),
         "redundant": [{"constraint": name, "row": row} for name, row in found.redundant],
-        "length": scales.length,
-        "time": scales.time,
-        "mass": scales.mass,
     }
     show(results, check_summary(mech, found), json)
     if not found.closed:

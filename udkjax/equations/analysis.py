@@ -26,13 +26,14 @@ from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.scales import Scales, known_scales, traced_scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import is_large, structure
+from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbers
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
 ANALYSIS_CACHE_SIZE = 256  # analyses that are stored; the one that was asked for longest ago makes room
 
 
-class Analysis(eqx.Module):
+class Analysis(PrintsTable):
     """The result of `analyse`. A pytree: its scales are arrays, everything else is static."""
 
     scales: Scales
@@ -40,6 +41,23 @@ class Analysis(eqx.Module):
     row_names: tuple[tuple[str, int], ...] = eqx.field(static=True)  # of Psi: the constraint and the row within it
     # Rows of Psi to leave out; None where they are not known: the guess cannot be closed or moved, or all numbers are traced.
     redundant_rows: tuple[int, ...] | None = eqx.field(static=True)
+
+    def _table(self) -> PrintedTable:
+        rows = {
+            "coordinates": self.coordinates,
+            "constraint rows": len(self.row_names),
+            "rank": "not known" if self.rank is None else self.rank,
+            "degrees of freedom": "not known" if self.degrees_of_freedom is None else self.degrees_of_freedom,
+            "redundant rows": ", ".join(f"{name} (row {row + 1})" for name, row in self.redundant) or "none",
+        }
+        if self.redundant_rows is None:
+            rows["redundant rows"] = "not known"
+        scales = self.scales
+        rows["length, mass"] = f"{format_numbers(scales.length, 'm')}, {format_numbers(scales.mass, 'kg')}"
+        rows["time"] = format_numbers(self.time if has_numbers(scales.rate) else scales.rate, "s")
+        return PrintedTable("analysis", list(rows.items()))
+
+    _shapes = _table
 
     @property
     def redundant(self) -> tuple[tuple[str, int], ...]:

@@ -21,10 +21,11 @@ from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
 from udkjax.pinv.rule import exceeds
+from udkjax.printing import PrintsLine
 from udkjax.scene.fields import number
 
 
-class Formulation(eqx.Module):
+class Formulation(PrintsLine):
     """A method to find the accelerations of a system, for `simulate(..., formulation=...)`."""
 
     __getattr__ = renamed_attributes("Formulation", of="formulate")

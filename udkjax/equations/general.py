@@ -11,10 +11,11 @@ from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, 
 from udkjax.equations.scales import RANK_TOL
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
+from udkjax.printing import PrintsLine
 from udkjax.scene.fields import number, optional_number
 
 
-class ConstrainedSystem(eqx.Module):
+class ConstrainedSystem(PrintsLine):
     """M(q) a = F(t, q, v) + constraint forces, subject to Psi(t, q) = 0 and phi(t, q, v) = 0.
 
     `mass(q)` returns M (n, n), symmetric positive definite; `force(t, q, v)` returns F (n,); `constraint(t, q)` returns Psi (m,),

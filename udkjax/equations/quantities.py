@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.annotations import Scalar
 from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, StateHistory, Vector
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
@@ -15,17 +16,21 @@ from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
 Result = TypeVar("Result")
 
 
+@prints_table
 class Energy(NamedTuple):
     """Energies (J) at each time. Potential: of gravity, zero at the origin, and of the force elements that have one."""
 
     kinetic: Float[Array, "T"]
     potential: Float[Array, "T"]
+
+    _units = units(kinetic="J", potential="J")
 
     @property
     def total(self) -> Float[Array, "T"]:
@@ -61,7 +66,7 @@ def equations_of(
 @overload
 def accelerations(
     mechanism: Mechanism | ConstrainedSystem,
-    t: ArrayLike,
+    t: Scalar,
     q: Float[ArrayLike, "bodies 3"],
     v: Float[ArrayLike, "bodies 3"],
     method: Pseudoinverse | None = None,
@@ -75,7 +80,7 @@ def accelerations(
 @overload
 def accelerations(
     mechanism: Mechanism | ConstrainedSystem,
-    t: ArrayLike,
+    t: Scalar,
     q: Float[ArrayLike, "bodies 3"],
     v: Float[ArrayLike, "bodies 3"],
     method: Pseudoinverse | None = None,
@@ -90,7 +95,7 @@ def accelerations(
 @checked
 def accelerations(
     mechanism: Mechanism | ConstrainedSystem,
-    t: ArrayLike,
+    t: Scalar,
     q: Float[ArrayLike, "bodies 3"],
     v: Float[ArrayLike, "bodies 3"],
     method: Pseudoinverse | None = None,

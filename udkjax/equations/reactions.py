@@ -19,8 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
+from udkjax.annotations import Scalar
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.abstract_system import StateHistory, Time
 from udkjax.equations.analysis import analyse
@@ -53,7 +54,7 @@ def reactions(
     stabilization: Baumgarte | None = None,
     frame: Axes = "ground",
     about: About = "centre",
-    compliances: Mapping[str, ArrayLike] | None = None,
+    compliances: Mapping[str, Scalar] | None = None,
 ) -> dict[str, dict[str, Float[Array, "T 3"]]]:
     """Return the load -Psi_q^T lambda of each joint and driver on each of its bodies: `reactions(mech, sol)["A"]["link1"]`.
 
@@ -88,7 +89,7 @@ def unique_reactions(
     solution: StateHistory,
     frame: Axes = "ground",
     about: About = "centre",
-    rank_tol: ArrayLike = STATIC_RANK_TOL,
+    rank_tol: Scalar = STATIC_RANK_TOL,
 ) -> dict[str, dict[str, Bool[Array, "T 3"]]]:
     """Decide which components of `reactions` equilibrium alone determines: those with c^T N = 0.
 
@@ -186,7 +187,7 @@ def _joint_point(element: Constraint, k: int, frames: list[Frame]) -> Point | No
     return frames[holder].point(points[holder])
 
 
-def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, ArrayLike]) -> Float[Array, "m"]:
+def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, Scalar]) -> Float[Array, "m"]:
     known, counts = mechanism.constraints, {}
     for name, _ in analyse(mechanism).row_names:
         counts[name] = counts.get(name, 0) + 1

@@ -6,7 +6,6 @@ See analysis.py for what they mean. They are computed alike by NumPy, where all 
 from functools import reduce
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, is_large, numbers_as_scalars, numbers_as_vector
 from udkjax.expressions import ScalarProgram
+from udkjax.printing import PrintsTable, units
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -37,7 +37,7 @@ class GuessTerms(NamedTuple):
     gamma: NumericArray
 
 
-class Scales(eqx.Module):
+class Scales(PrintsTable):
     """The units of lengths, rates, masses and rows of Psi; arrays without derivatives."""
 
     length: Float[Array, ""]  # m
@@ -45,6 +45,8 @@ class Scales(eqx.Module):
     rate: Float[Array, ""]  # 1/s; 0 where nothing moves and nothing pulls
     mass: Float[Array, ""]  # kg
     rows: Float[Array, "m"]  # m, rad or whatever the row is in
+
+    _units = units(length="m", arm="m", rate="1/s", mass="kg")
 
     @property
     def weights(self) -> Float[Array, "m"]:

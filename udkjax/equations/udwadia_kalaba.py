@@ -21,16 +21,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from udkjax.annotations import Scalar
 from udkjax.equations import constraints, loads
 from udkjax.equations.constraints import State, vector
 from udkjax.pinv import Plus, Pseudoinverse
+from udkjax.printing import PrintsLine
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
 Weights = Float[ArrayLike, "m"] | None
 
 
-class Baumgarte(eqx.Module):
+class Baumgarte(PrintsLine):
     """Feed the violation back: Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0, alpha and beta in 1/s.
 
     Gains of 2 to 5 hold the drift that redundancy and rounding excite; the hundreds of the literature make the problem stiff.
@@ -39,11 +41,11 @@ class Baumgarte(eqx.Module):
     alpha: Float[Array, ""]
     beta: Float[Array, ""]
 
-    def __init__(self, alpha: ArrayLike = 5.0, beta: ArrayLike = 5.0):
+    def __init__(self, alpha: Scalar = 5.0, beta: Scalar = 5.0):
         self.alpha, self.beta = number(alpha), number(beta)
 
 
-def D(mechanism: Mechanism, t: ArrayLike, q: State, w: Weights = None) -> Float[Array, "m n"]:
+def D(mechanism: Mechanism, t: Scalar, q: State, w: Weights = None) -> Float[Array, "m n"]:
     """D = Psi_q M^(-1/2).
 
     Args:
@@ -58,7 +60,7 @@ def D(mechanism: Mechanism, t: ArrayLike, q: State, w: Weights = None) -> Float[
     return weigh(w, constraints.psi_q(mechanism, t, q) * inverse_sqrt_mass(mechanism))
 
 
-def a_F(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
+def a_F(mechanism: Mechanism, t: Scalar, q: State, v: State) -> Float[Array, "n"]:
     """a_F = M^(-1) F: the accelerations without constraints.
 
     Args:
@@ -74,7 +76,7 @@ def a_F(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, 
 
 
 def b(
-    mechanism: Mechanism, t: ArrayLike, q: State, v: State, baumgarte: Baumgarte | None = None, w: Weights = None
+    mechanism: Mechanism, t: Scalar, q: State, v: State, baumgarte: Baumgarte | None = None, w: Weights = None
 ) -> Float[Array, "m"]:
     """b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy.
 
@@ -98,7 +100,7 @@ def b(
 
 def accelerations(
     mechanism: Mechanism,
-    t: ArrayLike,
+    t: Scalar,
     q: State,
     v: State,
     method: Pseudoinverse,
@@ -125,7 +127,7 @@ def accelerations(
 
 def multipliers(
     mechanism: Mechanism,
-    t: ArrayLike,
+    t: Scalar,
     q: State,
     v: State,
     method: Pseudoinverse,
@@ -151,7 +153,7 @@ def multipliers(
 
 
 def project(
-    mechanism: Mechanism, t: ArrayLike, q: State, v: State, method: Pseudoinverse, w: Weights = None, steps: int = 2
+    mechanism: Mechanism, t: Scalar, q: State, v: State, method: Pseudoinverse, w: Weights = None, steps: int = 2
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """Return a state to the manifold Psi = 0, Psi_dot = 0 by the smallest change in the metric of M.
 
@@ -181,7 +183,7 @@ def project(
 
 
 def tangent_part(
-    mechanism: Mechanism, t: ArrayLike, q: State, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
+    mechanism: Mechanism, t: Scalar, q: State, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
 ) -> Float[Array, "n"]:
     """(I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: its part within the manifold, which a projection leaves.
 

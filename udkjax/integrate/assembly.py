@@ -18,8 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseRows
@@ -29,12 +30,14 @@ from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large
 from udkjax.integrate import native_closing
 from udkjax.integrate.closure import close_by_jax, close_by_machine_code
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
 from udkjax.scene.arguments import checked
+from udkjax.scene.description import poses_table
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
 
-class State(eqx.Module):
+class State(PrintsTable):
     """Coordinates and velocities of all bodies: x, y (m) and angle (rad), and their rates, each (bodies, 3).
 
     Of a `ConstrainedSystem`: (n,) each.
@@ -43,8 +46,15 @@ class State(eqx.Module):
     q: Float[Array, "bodies 3"] | Float[Array, "n"]
     v: Float[Array, "bodies 3"] | Float[Array, "n"]
 
-    def __init__(self, q: ArrayLike, v: ArrayLike):
+    def __init__(self, q: Numbers, v: Numbers):
         self.q, self.v = number(q), number(v)
+
+    _units = units(q="m, m, rad", v="m/s, m/s, rad/s")
+
+    def _table(self) -> PrintedTable:
+        if np.ndim(self.q) == 2 and np.shape(self.q)[1] == 3:
+            return poses_table("state", (), self.q, self.v)
+        return fields_table(self, self._units if np.ndim(self.q) > 2 else {}, f"states {np.shape(self.q)}")
 
 
 class AssemblyError(ValueError):
@@ -75,7 +85,7 @@ class Closure(NamedTuple):
 
 @checked
 def assemble(
-    mechanism: Mechanism, t: ArrayLike = 0.0, state: State | None = None, throw: bool = True, analysis: Analysis | None = None
+    mechanism: Mechanism, t: Scalar = 0.0, state: State | None = None, throw: bool = True, analysis: Analysis | None = None
 ) -> State:
     """Close a mechanism at time t (s), from `state` or from the initial guess of its bodies.
 
@@ -104,7 +114,7 @@ _cache: dict[int, CachedClosure] = {}
 
 def close(
     mechanism: Mechanism,
-    t: ArrayLike = 0.0,
+    t: Scalar = 0.0,
     state: State | None = None,
     analysis: Analysis | None = None,
 ) -> Closure:
@@ -144,7 +154,7 @@ def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, 
     return SparseRows(mechanism).assemble(t, q, v)
 
 
-def _close(mechanism: Mechanism, analysis: Analysis, t: ArrayLike, state: State | None) -> Closure:
+def _close(mechanism: Mechanism, analysis: Analysis, t: Scalar, state: State | None) -> Closure:
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
     close = close_by_machine_code if native_closing.can_close(mechanism) else close_by_jax
@@ -183,6 +193,7 @@ def require_closed(mechanism: Mechanism, closure: Closure) -> None:
     raise AssemblyError(f"{cause}. {cure[0].upper()}{cure[1:]}.", closure.state)
 
 
+@prints_table
 class Check(NamedTuple):
     """What there is to know of a mechanism's constraints before it moves."""
 
@@ -196,6 +207,12 @@ class Check(NamedTuple):
     residual_before: float  # the largest |Psi| (m, rad) as given, and assembled
     residual_after: float
     closed: bool
+    length: float  # m; characteristic, as in `analyse`
+    time: float  # s
+    mass: float  # kg
+
+    def _table(self) -> PrintedTable:
+        return PrintedTable("mechanism, checked", list(check_lines(self).items()))
 
 
 @checked
@@ -218,4 +235,24 @@ def check(mechanism: Mechanism) -> Check:
         residual_before=float(jnp.abs(before).max(initial=0.0)),
         residual_after=float(jnp.abs(closure.psi).max(initial=0.0)),
         closed=closed,
+        length=float(found.length),
+        time=float(found.time),
+        mass=float(found.mass),
     )
+
+
+def check_lines(found: Check) -> dict[str, str]:
+    """Return what `check` found as texts by title."""
+    lines = {
+        "bodies": f"{found.bodies}",
+        "coordinates": f"{found.coordinates}",
+        "constraint rows": f"{found.rows}",
+        "rank": f"{found.rank}",
+        "degrees of freedom": f"{found.degrees_of_freedom}",
+        "redundant rows": ", ".join(f"{name} (row {row + 1})" for name, row in found.redundant) or "none",
+    }
+    if found.dependent:
+        lines["depend on each other"] = ", ".join(found.dependent)
+    lines["length, time, mass"] = f"{found.length:.3g} m, {found.time:.3g} s, {found.mass:.3g} kg"
+    before, after = (format_number(x, "m or rad", found.length) for x in (found.residual_before, found.residual_after))
+    return {**lines, "closure, as given": before, "closure, assembled": after + ("" if found.closed else ": it does not close")}

@@ -1,6 +1,5 @@
 """Projection: return states to the constraint manifold."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -8,9 +7,10 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.native.steps import NORMAL_ERROR_WEIGHT
+from udkjax.printing import PrintsLine
 
 
-class Projection(eqx.Module):
+class Projection(PrintsLine):
     """Project positions and velocities after each step, by the smallest change in the mass metric (the default stabilization)."""
 
 

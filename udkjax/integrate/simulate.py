@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import ArrayLike
 
+from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
@@ -50,17 +50,17 @@ DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-3
 @checked
 def simulate(
     mechanism: Mechanism | ConstrainedSystem,
-    ts: ArrayLike | Sequence[float],
+    ts: Numbers | Sequence[float],
     state: State | Closure | None = None,
-    rtol: ArrayLike = 1e-8,
-    atol: ArrayLike = 1e-8,
+    rtol: Scalar = 1e-8,
+    atol: Scalar = 1e-8,
     method: Pseudoinverse | None = None,
     stabilization: Projection | Baumgarte | None = Projection(),
     solver: "diffrax.AbstractSolver | None" = None,
     adjoint: "diffrax.AbstractAdjoint | None" = None,
     max_steps: int = MAX_STEPS,
-    drift_tol: ArrayLike | None = None,
-    dt0: ArrayLike | None = None,
+    drift_tol: Scalar | None = None,
+    dt0: Scalar | None = None,
     formulation: Formulation | None = None,
     throw: bool = True,
     progress: Any = None,

@@ -2,22 +2,23 @@
 
 import json
 import sys
-from enum import IntEnum
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.extras import OptionalImport
-from udkjax.html import html_table
 from udkjax.integrate.events.event import Events
+from udkjax.printing import PrintedTable, PrintsTable, PrintsWords, units
 from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.mechanism import Mechanism
 
 
-class Result(IntEnum):
+class Result(PrintsWords):
     """How a simulation ended."""
 
     successful = 0
@@ -37,6 +38,9 @@ class Result(IntEnum):
     def is_success(self) -> bool:
         """Whether the run went as far as it should: to its last time, or to an event that ends it."""
         return self in (Result.successful, Result.event_stop, Result.at_rest)
+
+    def __str__(self) -> str:
+        return self.label if self is Result.successful else f"{self.label}: {CAUSES[self]}"
 
 
 CAUSES = {
@@ -60,6 +64,9 @@ CAUSES = {
 }
 
 
+_ORDER = "steps rejected right_hand_sides projections events"  # of counts in texts: jit sorts the names
+
+
 class SimulationError(RuntimeError):
     """A simulation did not reach its end. `solution` is what it got."""
 
@@ -68,7 +75,7 @@ class SimulationError(RuntimeError):
         self.solution = solution
 
 
-class Solution(eqx.Module):
+class Solution(PrintsTable):
     """States of a mechanism at the output times, how the run ended, and what it took.
 
     `q` and `v` are (T, bodies, 3): x, y (m) and angle (rad) and their rates; not a number after the time of a failure. `code` is
@@ -102,26 +109,28 @@ class Solution(eqx.Module):
     @property
     def cause(self) -> str:
         """How the run ended, in words."""
-        return f"{self.result.name.replace('_', ' ')} at t = {float(self.time):.6g} s: {CAUSES[self.result]}"
+        return f"{self.result.label} at t = {float(self.time):.6g} s: {CAUSES[self.result]}"
 
-    def _repr_html_(self) -> str:
-        if any(isinstance(leaf, Tracer) for leaf in (self.code, self.q)):
-            return html_table("a simulation", (), [("result", "traced")])
+    _units = units(ts="s", q="m, m, rad", v="m/s, m/s, rad/s", time="s")
+
+    def _table(self) -> PrintedTable:
         codes, counts = np.unique(np.asarray(self.code), return_counts=True)
-        ended = ", ".join(
-            f"{count} {Result(int(code)).name.replace('_', ' ')}" for code, count in zip(codes, counts, strict=True)
-        )
-        ts = np.asarray(self.ts)
+        ended = ", ".join(f"{n} {Result(int(code)).label}" for code, n in zip(codes, counts, strict=True))
+        ts, several = np.asarray(self.ts), np.ndim(self.code) > 0
         rows = {
-            "result": ended if np.ndim(self.code) else self.cause,
+            "result": ended if several else self.cause,
             "times": f"{ts.shape[-1]}, from {ts.min():g} to {ts.max():g} s",
-            "bodies": ", ".join(self.bodies),
-            **{name.replace("_", " "): f"{int(np.sum(value)):,}" for name, value in self.stats.items()},
+            "work": format_work({name: np.sum(value) for name, value in self.stats.items()}),
             "rtol, atol": f"{np.max(np.asarray(self.rtol)):g}, {np.max(np.asarray(self.atol)):g}",
-            **{name.replace("_", " "): value for name, value in self.choices},
+            **{name.replace("_", " "): value for name, value in self.choices if name in ("method", "solver", "engine")},
         }
-        members = f" of {np.size(self.code)} members" if np.ndim(self.code) else ""
-        return html_table(f"a simulation{members}", (), list(rows.items()))
+        if several:
+            rows["bodies"] = ", ".join(self.bodies)
+            return PrintedTable(f"simulation of {np.size(self.code)} members", list(rows.items()))
+        q = np.asarray(self.q).reshape(len(ts), -1, np.shape(self.q)[-1])
+        for k, body in enumerate(self.bodies):
+            rows[body] = f"from {format_pose(q[0, k], size_of(q))} to {format_pose(q[-1, k], size_of(q))}"
+        return PrintedTable("simulation", list(rows.items()))
 
     def to_xarray(self, mechanism: Mechanism | None = None) -> Any:
         """Return an xarray Dataset: q and v over time, body, coordinate, with units, versions, settings, result and statistics.
@@ -154,6 +163,13 @@ class Solution(eqx.Module):
             data.attrs["parameters"] = json.dumps({k: np.asarray(v).tolist() for k, v in mechanism.parameters().items()})
             data.attrs["scene"] = scene_text(mechanism)
         return data
+
+
+def format_work(stats: Mapping[str, ArrayLike]) -> str:
+    """Return what a run took as text; a count of -1 is not known."""
+    words = {name: name.replace("_", " ") for name in stats} | {"right_hand_sides": "right-hand sides"}
+    counts = {name: int(np.asarray(count)) for name, count in stats.items() if name != "accepted"}
+    return ", ".join(f"{counts[name]:,} {words[name]}" for name in sorted(counts, key=_ORDER.find) if counts[name] >= 0)
 
 
 def scene_text(mechanism: Mechanism) -> str:

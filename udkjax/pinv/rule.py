@@ -17,6 +17,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from udkjax.annotations import Numbers, Scalar
+from udkjax.printing import PrintsLine
+
 # Accelerators round float32 products to ten bits unless told otherwise.
 dot = partial(jnp.matmul, precision="highest")
 
@@ -38,7 +41,7 @@ class LeastSquaresSolution(NamedTuple):
     rank: Int[Array, ""]
 
 
-def number(value: ArrayLike | None) -> Float[Array, ""] | None:
+def number(value: Scalar | None) -> Float[Array, ""] | None:
     """Make an array leaf of a number: a Python float as a field would be static, and each new value would compile anew."""
     dtype = jnp.result_type(float)
     if isinstance(value, float | int | np.number):
@@ -46,7 +49,7 @@ def number(value: ArrayLike | None) -> Float[Array, ""] | None:
     return None if value is None else jnp.asarray(value, dtype=dtype)
 
 
-class Pseudoinverse(eqx.Module):
+class Pseudoinverse(PrintsLine):
     """A method to apply the Moore-Penrose pseudoinverse D^+ of an (m, n) operator D, truncated at a numerical rank.
 
     With `relative=True` a number counts as zero if it is at most `rank_tol` times the method's scale of D (the largest singular
@@ -66,7 +69,7 @@ class Pseudoinverse(eqx.Module):
             raise ValueError("an absolute rank threshold has no default: give rank_tol, in the units of the matrix")
 
     @classmethod
-    def absolute(cls, rank_tol: ArrayLike, **choices: object) -> Self:
+    def absolute(cls, rank_tol: Scalar, **choices: object) -> Self:
         """Threshold in the units of D, whatever its size. The paper's own rule takes the tolerance of the integration."""
         return cls(rank_tol=rank_tol, relative=False, **choices)
 
@@ -128,7 +131,7 @@ class Pseudoinverse(eqx.Module):
 class Dense(Pseudoinverse):
     """A method whose operator is a real matrix."""
 
-    def admit(self, D: ArrayLike) -> Float[Array, "m n"]:
+    def admit(self, D: Numbers) -> Float[Array, "m n"]:
         D = jnp.asarray(D)
         if D.ndim != 2 or 0 in D.shape:
             name = type(self).__name__

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from udkjax.printing import PrintsLine, one_line
 from udkjax.scene.fields import POSITIVE, Number, array_namespace, number
 
 GROUND = "ground"
@@ -13,7 +14,7 @@ COORDINATES = ("x", "y", "angle")  # of a body, in the order in which q and v ho
 Vector = Float[Array, "2"] | Sequence[Number]  # two components
 
 
-class Body(eqx.Module):
+class Body(PrintsLine):
     """A rigid body in the plane; its frame has its origin at the centre of mass.
 
     `position`, `angle`, `velocity` and `angular_velocity` are the initial guess that `assemble` closes.
@@ -36,6 +37,9 @@ class Point(NamedTuple):
 
     x: Number
     y: Number
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def dot(self, other: "Point") -> Number:
         """Return the scalar product with another vector."""
@@ -62,6 +66,9 @@ class Frame(NamedTuple):
     vx: Number = None  # pyright: ignore[reportAssignmentType]  # m/s
     vy: Number = None  # pyright: ignore[reportAssignmentType]  # m/s
     omega: Number = None  # pyright: ignore[reportAssignmentType]  # rad/s
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     @classmethod
     def at(cls, position: Vector, angle: Number) -> "Frame":

@@ -1,20 +1,21 @@
-"""A mechanism as an HTML table."""
+"""A mechanism and poses of its bodies as tables of numbers with their units."""
 
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import ArrayLike
 
-from udkjax.html import html_table
+from udkjax.printing import PrintedTable, format_number, format_numbers, has_numbers
 from udkjax.scene.number_fields import Sections
+from udkjax.scene.schema import numbers_in
+from udkjax.scene.units import field_unit
 
-NUMBERS_IN_FULL = 4  # numbers that are written out; of more, their shape
+LEFT_OUT = ("velocity", "angular_velocity")  # where they are zero
 
 
-def mechanism_html(mechanism: Sections, frame_names: Callable[..., Sequence[str]]) -> str:
-    """Return a mechanism as an HTML table: one row an element, with its type, its bodies (`frame_names`) and its numbers."""
+def mechanism_table(mechanism: Sections, frame_names: Callable[..., Sequence[str]]) -> PrintedTable:
+    """Return the table of a mechanism, where `frame_names` returns the bodies of an element."""
     groups = {"body": mechanism.bodies, "joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
     rows = [
         (
@@ -22,23 +23,52 @@ def mechanism_html(mechanism: Sections, frame_names: Callable[..., Sequence[str]
             name,
             type(element).__name__,
             "" if section == "body" else ", ".join(frame_names(element)),
-            _format_numbers(element),
+            _format_element(element),
         )
         for section, elements in groups.items()
         for name, element in elements.items()
     ]
-    counts = ", ".join(f"{len(elements)} {section}" for section, elements in groups.items() if elements)
-    title = f"{mechanism.name or 'mechanism'} ({counts}; gravity {_format_number(mechanism.gravity)} m/s²)"
-    return html_table(title, ("section", "name", "type", "bodies", "numbers"), rows)
+    counts = ", ".join(
+        f"{len(elements)} {section if len(elements) == 1 else 'bodies' if section == 'body' else f'{section}s'}"
+        for section, elements in groups.items()
+        if elements
+    )
+    title = f"{mechanism.name or 'mechanism'} ({counts}; gravity {format_numbers(mechanism.gravity, 'm/s²')})"
+    return PrintedTable(title, rows, ("section", "name", "type", "bodies", "numbers"))
 
 
-def _format_numbers(element: eqx.Module) -> str:
-    return ", ".join(f"{name} {_format_number(value)}" for name, value in vars(element).items() if eqx.is_array(value))
+def _format_element(element: eqx.Module) -> str:
+    driven, shown = getattr(element, "coordinate", ""), []
+    for path, value, _ in numbers_in(element):
+        if value is None or (path[-1] in LEFT_OUT and has_numbers(value) and not np.any(np.asarray(value))):
+            continue
+        owner = element
+        for field in path[:-1]:
+            owner = getattr(owner, field)
+        unit = field_unit(type(owner).__name__, path[-1], driven)
+        shown.append(f"{' '.join(path)} {format_numbers(value, unit)}".replace("_", " "))
+    return ", ".join(shown)
 
 
-def _format_number(value: Array) -> str:
-    if isinstance(value, Tracer):
-        return "traced"
-    if np.size(value) > NUMBERS_IN_FULL:
-        return f"of shape {np.shape(value)}"
-    return np.array2string(np.asarray(value), precision=4, separator=", ", floatmode="maxprec").replace("\n", "")
+def format_pose(pose: np.ndarray, size: float) -> str:
+    """Return x, y (m) and angle (rad) of a body as text; what is rounding beside `size` (m) or one radian prints as 0."""
+    x, y = (format_number(value, scale=size) for value in pose[:2])
+    return f"({x}, {y}) m, {format_number(pose[2], 'rad', 1.0)}"
+
+
+def size_of(q: ArrayLike) -> float:
+    """Return the largest finite coordinate x or y (m) of poses (..., 3)."""
+    lengths = np.abs(np.asarray(q, float)[..., :2])
+    return float(np.max(lengths, where=np.isfinite(lengths), initial=0.0))
+
+
+def poses_table(title: str, names: Sequence[str], q: ArrayLike, v: ArrayLike | None = None) -> PrintedTable:
+    """Return the table of the coordinates, and velocities, (bodies, 3) of bodies; without names they are counted."""
+    arrays = [np.asarray(x, float) for x in ((q,) if v is None else (q, v))]
+    heads = ["body", "x (m)", "y (m)", "angle (rad)", "vx (m/s)", "vy (m/s)", "omega (rad/s)"][: 1 + 3 * len(arrays)]
+    scales = [scale for x in arrays for scale in (size_of(x), size_of(x), float(np.nanmax(np.abs(x[..., 2]), initial=0.0)))]
+    rows = [
+        [names[k] if names else str(k), *map(format_number, np.concatenate([x[k] for x in arrays]), [""] * len(scales), scales)]
+        for k in range(len(arrays[0]))
+    ]
+    return PrintedTable(title, rows, heads)

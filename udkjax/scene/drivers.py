@@ -8,13 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import between
 from udkjax.scene.fields import KNOTS, NOT_EMPTY, Number, number, number_or_guess
 from udkjax.scene.joints import Constraint, fill
 from udkjax.scene.splines import natural_spline
 
 
-class Motion(eqx.Module):
+class Motion(PrintsLine):
     """A motion law. Subclass it to write one of your own: `__call__` maps the time (s) to a value (rad, m).
 
     A law that is smooth in pieces names the times where they meet in `breakpoints`; its value and rate are continuous there.

@@ -14,8 +14,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-Number: TypeAlias = Array | float  # one number, which may be traced
-Numbers: TypeAlias = ArrayLike | Sequence[object]  # a number, an array, or nested lists of numbers
+from udkjax.annotations import Number as Number
+from udkjax.annotations import Numbers as Numbers
+
 Table: TypeAlias = Mapping[str, object]  # {key: value} of one element, as in a scene file
 
 

@@ -7,13 +7,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Frame, Point, between
 from udkjax.scene.fields import BODY, NOT_NEGATIVE, POSITIVE, REVOLUTE, Number, names, number, optional_number
 
 Load = tuple[Number, Number, Number]  # force x, force y (N), torque about the centre of mass (N m), in ground axes
 
 
-class ForceElement(eqx.Module):
+class ForceElement(PrintsLine):
     """A force element. Subclass it and write `potential` or `loads`; the other one stays None, and costs nothing.
 
     One that is smooth in pieces of time names the times where they meet in `breakpoints`; its loads may jump there.

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.deprecation import renamed_attributes, renamed_methods
+from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import BODY, POSITIVE, PROFILE_ANGLES, PROFILE_RADII, Number, Numbers, names, number, number_or_guess
 from udkjax.scene.splines import count_knots, periodic_spline, wrap
 
 
-class Constraint(eqx.Module):
+class Constraint(PrintsLine):
     """Anything that holds Psi(t, q) = 0: a joint or a driver. A subclass writes `residual`, nothing more."""
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
@@ -198,7 +199,7 @@ class Rack(Joint):
         return along.dot(Point(two.x - one.x, two.y - one.y)) + self.radius * (two.angle - one.angle)
 
 
-class Profile(eqx.Module):
+class Profile(PrintsLine):
     """A cam's outline: a closed curve, radius over polar angle, by a periodic cubic spline. The first point is not repeated."""
 
     angle: Float[Array, "n"] = eqx.field(converter=number, metadata=PROFILE_ANGLES)  # rad, increasing, less than one turn

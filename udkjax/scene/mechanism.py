@@ -13,9 +13,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.deprecation import renamed_attributes
+from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
 from udkjax.scene.checks import SceneEntry, SceneError, check_hashable, problems_of
-from udkjax.scene.description import mechanism_html
+from udkjax.scene.description import mechanism_table
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Numbers, StaticValue, number
 from udkjax.scene.forces import ForceElement, Friction
@@ -42,7 +43,7 @@ class Origin:
         return self is other or (isinstance(other, Origin) and self._key == other._key)
 
 
-class Mechanism(eqx.Module):
+class Mechanism(PrintsTable):
     """Bodies, joints, drivers and force elements, each under its name, and gravity.
 
     Data alone: what follows from it, such as which rows are redundant, is for `udkjax.analyse` to find. A pytree whose leaves
@@ -158,8 +159,10 @@ class Mechanism(eqx.Module):
     def _numbers(self) -> list[Array]:
         return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
 
-    def _repr_html_(self) -> str:
-        return mechanism_html(self, self.frames_of)
+    def _table(self) -> PrintedTable:
+        return mechanism_table(self, self.frames_of)
+
+    _shapes = _table  # traced numbers are named as such, element by element
 
     def parameters(self) -> dict[str, Array]:
         """Return every number of the scene under its name, such as `body.link1.mass`; absent ones (a damping) are left out."""

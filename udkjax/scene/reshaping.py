@@ -8,8 +8,9 @@ guess has it: along a tree of pins, which holds each body once, no pin opens. Th
 from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from udkjax.annotations import Scalar
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Body, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
@@ -21,7 +22,7 @@ PINS = (Revolute, Weld)  # joints that hold two points together
 
 
 @checked
-def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: ArrayLike, as_rod: bool = False) -> Mechanism:
+def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: Scalar, as_rod: bool = False) -> Mechanism:
     """Return the mechanism with another length of some bodies: the largest distance between two points where a body is attached.
 
     All attachments of these bodies, to joints, drivers and forces, are scaled about their centres of mass, so that these stay
@@ -66,7 +67,7 @@ def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
 
 @checked
 def with_angle(
-    mechanism: Mechanism, bodies: Sequence[str] | str, angle: ArrayLike, angular_velocity: ArrayLike | None = None
+    mechanism: Mechanism, bodies: Sequence[str] | str, angle: Scalar, angular_velocity: Scalar | None = None
 ) -> Mechanism:
     """Return the mechanism with another initial angle, and angular velocity, of some bodies.
 

@@ -1,29 +1,20 @@
 """What the command line says about a mechanism and about a run."""
 
-from udkjax.equations.analysis import analyse
 from udkjax.integrate import Solution
+from udkjax.integrate.assembly import Check, check_lines
+from udkjax.integrate.solution import format_work
+from udkjax.printing import align_columns
 from udkjax.scene import Mechanism
 from udkjax.study.accuracy import Accuracy
 from udkjax.study.row_labels import row_label
 from udkjax.study.wording import plural
 
 
-def check_summary(mech: Mechanism, check) -> str:
+def check_summary(mech: Mechanism, found: Check) -> str:
     """Describe what `udkjax.integrate.assembly.check` found in a mechanism."""
-    lines = {
-        "bodies": f"{check.bodies}",
-        "coordinates": f"{check.coordinates}",
-        "constraint rows": f"{check.rows} in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}",
-        "rank": f"{check.rank}",
-        "degrees of freedom": f"{check.degrees_of_freedom}",
-        "redundant rows": ", ".join(row_label(mech, *row) for row in check.redundant) or "none",
-    }
-    if check.dependent:
-        lines["depend on each other"] = ", ".join(check.dependent)
-    found = analyse(mech)
-    lines["length, time, mass"] = f"{float(found.length):.3g} m, {float(found.time):.3g} s, {float(found.mass):.3g} kg"
-    lines["closure, as given"] = f"{float(check.residual_before):.2e}"
-    lines["closure, assembled"] = f"{float(check.residual_after):.2e}" + ("" if check.closed else ": it does not close")
+    lines = check_lines(found)
+    lines["constraint rows"] += f" in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}"
+    lines["redundant rows"] = ", ".join(row_label(mech, *row) for row in found.redundant) or "none"
     return table(mech.name or "mechanism", lines)
 
 
@@ -31,22 +22,11 @@ def run_summary(mech: Mechanism, sol: Solution, accuracy: Accuracy, seconds: flo
     """Describe how a run ended, what it took and how far it can be trusted."""
     lines = {
         "result": sol.cause if sol.result else sol.result.name,
-        "work": work(sol),
+        "work": format_work(sol.stats),
         **trust(accuracy),
         "time": f"{seconds:.2f} s, {compiling:.2f} s of it to compile",
     }
     return table(f"{mech.name or 'mechanism'}, {float(sol.ts[0]):g} to {float(sol.ts[-1]):g} s, {len(sol.ts)} instants", lines)
-
-
-def work(sol: Solution) -> str:
-    """Describe what a run took; a count of -1 is not known."""
-    named = {
-        "steps": "steps",
-        "rejected": "rejected",
-        "right_hand_sides": "right-hand sides",
-        "projections": "projections",
-    }
-    return ", ".join(f"{int(sol.stats[key])} {name}" for key, name in named.items() if int(sol.stats.get(key, -1)) >= 0)
 
 
 def trust(accuracy: Accuracy) -> dict[str, str]:
@@ -62,5 +42,4 @@ def trust(accuracy: Accuracy) -> dict[str, str]:
 
 def table(title: str, lines: dict[str, str]) -> str:
     """Lay out names and values below a title."""
-    width = max(map(len, lines), default=0)
-    return "\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in lines.items())])
+    return "\n".join([title, *align_columns(list(lines.items()))])

@@ -6,8 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis
 from udkjax.integrate.assembly import State, close
 from udkjax.scene.arguments import checked
@@ -21,10 +22,10 @@ from udkjax.study.positions import distinct, random_positions
 def branches(
     mechanism: Mechanism,
     driver: Drive,
-    value: ArrayLike,
+    value: Scalar,
     starts: int = 400,
     seed: int = 0,
-    held: Mapping[str, ArrayLike] | None = None,
+    held: Mapping[str, Scalar] | None = None,
 ) -> Float[Array, "k bodies 3"]:
     """Return the positions that close a mechanism, Psi(s, q) = 0, for one value s of its driver: its assembly branches.
 

@@ -14,7 +14,6 @@ Source: Allgower, Georg, Introduction to Numerical Continuation Methods (2003), 
 """
 
 from collections.abc import Callable
-from enum import IntEnum
 from typing import NamedTuple
 
 import equinox as eqx
@@ -27,6 +26,7 @@ from udkjax.equations.constraints import gamma, psi
 from udkjax.equations.position_closure import ROUNDING_UNITS
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
+from udkjax.printing import PrintsWords
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.drive import Driven
 from udkjax.study.sequential import sequential
@@ -40,7 +40,7 @@ TRIALS = 2000  # steps besides those to the values asked for: some hundred turns
 SAME = 8.0  # units of rounding within which a value is that of a toggle
 
 
-class Reached(IntEnum):
+class Reached(PrintsWords):
     """What became of one value of a driver."""
 
     closed = 0

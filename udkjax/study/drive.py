@@ -12,10 +12,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
+from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
+from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.drivers import Driver, Motion, Polynomial
@@ -30,7 +32,7 @@ DRIVEN = get_args(CoordinateName)
 STILL = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # the ground
 
 
-class Coordinate(eqx.Module):
+class Coordinate(PrintsLine):
     """A coordinate of body 2 relative to body 1 that may be driven, as those of a `Driver`.
 
     `angle`: theta2 - theta1 (rad), which counts turns; `x`, `y`: point 2 from point 1 in body 1's frame (m); `distance` (m).
@@ -49,7 +51,7 @@ class Value(Motion):
 
     origin: Float[Array, ""] = eqx.field(converter=number, default=0.0)
 
-    def __call__(self, t: ArrayLike) -> Float[Array, ""]:
+    def __call__(self, t: Scalar) -> Float[Array, ""]:
         return self.origin + t
 
 
@@ -67,12 +69,17 @@ class Driven(NamedTuple):
         """Whether s is an angle."""
         return bool(self.name) and self.mechanism.drivers[self.name].coordinate == "angle"
 
+    @property
+    def value_unit(self) -> str:
+        """The unit of s."""
+        return "rad" if self.is_angle else "m" if self.name else "s"
+
     def value(self, q: Float[Array, "n"] | Float[Array, "bodies 3"]) -> Float[Array, ""]:
         """Return the value of the coordinate (rad, m) in a position."""
         return psi(self.mechanism, 0.0, q)[self.row]
 
 
-def drive(mechanism: Mechanism, driver: Drive, t: ArrayLike = 0.0, held: Mapping[str, ArrayLike] | None = None) -> Driven:
+def drive(mechanism: Mechanism, driver: Drive, t: Scalar = 0.0, held: Mapping[str, Scalar] | None = None) -> Driven:
     """Return the mechanism driven by one coordinate; other drivers hold the value that they have at time t (s).
 
     `held` gives other values, of drivers or of further coordinates, by their names. Raises `SceneError` where there is no such
@@ -83,7 +90,7 @@ def drive(mechanism: Mechanism, driver: Drive, t: ArrayLike = 0.0, held: Mapping
         return _drive(*given)
 
 
-def _drive(mechanism: Mechanism, driver: Drive, t: ArrayLike, held: Mapping[str, ArrayLike] | None) -> Driven:
+def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Scalar] | None) -> Driven:
     if driver is None:
         analysis = analyse(mechanism)
         _require_determinate(mechanism, analysis, "all drivers")
@@ -175,7 +182,7 @@ def choose_name(name: str, taken: Container[str]) -> str:
     return name
 
 
-def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: ArrayLike) -> Mechanism:
+def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Scalar) -> Mechanism:
     """Return the mechanism with a driver of this name that goes along its own value; all others hold theirs."""
     known = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
@@ -238,7 +245,7 @@ def _constant(value: Numbers) -> Polynomial:
     return Polynomial(jnp.stack([number(value)]))
 
 
-def _value_or(x: ArrayLike, otherwise: float) -> ArrayLike:
+def _value_or(x: Scalar, otherwise: float) -> Scalar:
     return otherwise if isinstance(x, Tracer) else x
 
 

@@ -1,19 +1,24 @@
 """Static equilibria: positions where the loads and the constraints' forces balance, F = Psi_q^T lambda, stable or not."""
 
+import math
 from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
+from udkjax.annotations import Scalar
 from udkjax.equations import loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
 from udkjax.integrate.assembly import State, close
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv import SVD
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, format_numbers, units
 from udkjax.scene.arguments import checked
+from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.continuation import Curve, plus
@@ -29,7 +34,7 @@ NEUTRAL = 1e-10  # of the largest stiffness: one below it resists nothing
 Trial: TypeAlias = tuple[Array, Array, Array, Array]  # the part of a step, how many were tried, whether it is better, q
 
 
-class Equilibrium(eqx.Module):
+class Equilibrium(PrintsTable):
     """A position of rest. `balanced` says whether it is one; `omega2` tells whether it is stable."""
 
     q: Float[Array, "bodies 3"]
@@ -37,6 +42,24 @@ class Equilibrium(eqx.Module):
     omega2: Float[Array, "f"]  # (rad/s)^2: stiffness over mass along free directions, ascending; negative: it moves away
     residual: Float[Array, ""]  # what is left of the loads along free directions, relative to them
     balanced: Bool[Array, ""]
+    bodies: tuple[str, ...] = eqx.field(static=True, default=())
+
+    _units = units(q="m, m, rad", multipliers="N or N m", omega2="(rad/s)²")
+
+    def _table(self) -> PrintedTable:
+        if np.ndim(self.balanced):
+            title = f"{np.size(self.balanced)} positions, of which {int(np.sum(self.stable))} are stable"
+            return fields_table(self, self._units, title)
+        kind = ("unstable", "stable")[int(self.stable)] if self.balanced else "not at rest: loads are left over"
+        frequencies = ", ".join(_format_rate(float(x)) for x in np.asarray(self.omega2))
+        rows = [
+            ("omega²", format_numbers(self.omega2, "(rad/s)²")),
+            ("frequency", frequencies or "no degree of freedom"),
+            ("loads left over", f"{format_number(self.residual, scale=1.0)} of them"),
+        ]
+        poses = [format_pose(pose, size_of(self.q)) for pose in np.asarray(self.q)]
+        rows += zip(self.bodies or map(str, range(len(poses))), poses, strict=True)
+        return PrintedTable(f"position of rest, {kind}", rows)
 
     @property
     def state(self) -> State:
@@ -49,9 +72,14 @@ class Equilibrium(eqx.Module):
         return self.balanced & jnp.all(self.omega2 > 0)
 
 
+def _format_rate(omega2: float) -> str:
+    omega = math.sqrt(abs(omega2))
+    return f"{omega:.6g} rad/s ({omega / (2 * math.pi):.6g} Hz)" if omega2 >= 0 else f"exp({omega:.6g} t)"
+
+
 @checked
 def equilibrium(
-    mechanism: Mechanism, state: State | None = None, t: ArrayLike = 0.0, stable: bool = False, analysis: Analysis | None = None
+    mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, stable: bool = False, analysis: Analysis | None = None
 ) -> Equilibrium:
     """Return a position of rest, N^T F = 0 on Psi = 0, near a given one: N spans the directions that constraints leave free.
 
@@ -81,7 +109,7 @@ def equilibrium(
 
 @checked
 def equilibria(
-    mechanism: Mechanism, starts: int = 64, seed: int = 0, t: ArrayLike = 0.0, state: State | None = None
+    mechanism: Mechanism, starts: int = 64, seed: int = 0, t: Scalar = 0.0, state: State | None = None
 ) -> list[Equilibrium]:
     """Return the different equilibria found from `starts` positions: the given one and random ones of the same mechanism.
 
@@ -127,7 +155,8 @@ def _equilibrium(
     at = linearize(curve.mechanism, analysis, free, t, q)
     left = _left(curve.mechanism, at, t, q)
     closed = curve.is_closed(jnp.append(q, t) / curve.units)
-    return Equilibrium(q.reshape(-1, 3), at.multipliers, omega2(at), left, closed & (left <= BALANCED))
+    balanced, bodies = closed & (left <= BALANCED), curve.mechanism.body_names
+    return Equilibrium(q.reshape(-1, 3), at.multipliers, omega2(at), left, balanced, bodies)
 
 
 def _left(mechanism: Mechanism, at: Linearization, t: Float[Array, ""], q: Float[Array, "n"]) -> Float[Array, ""]:

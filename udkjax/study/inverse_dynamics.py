@@ -10,18 +10,22 @@ With N a basis of the null space of J, N^T (M a - F) = (C N)^T f: one equation f
 that, f is of least weighted norm, sum_i w_i f_i^2.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Literal, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.annotations import Scalar
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.drivers import Motion, Spline
@@ -34,7 +38,7 @@ from udkjax.study.free_directions import free_part
 from udkjax.study.kinematics import Kinematics, kinematics
 
 
-class InverseDynamics(eqx.Module):
+class InverseDynamics(PrintsTable):
     """What each driver exerts along its coordinate on a prescribed motion."""
 
     ts: Float[Array, "T"]  # s
@@ -44,6 +48,26 @@ class InverseDynamics(eqx.Module):
     residual: Float[
         Array, "T"
     ]  # the largest part of M a - F that neither joints nor drivers exert, relative to the largest of it
+
+    _units = units(ts="s", efforts="N m or N", powers="W")
+
+    def _table(self) -> PrintedTable:
+        if np.ndim(self.ts) != 1:
+            return fields_table(self, self._units, "inverse dynamics, batched")
+        ts, rows = np.asarray(self.ts), []
+        for name, effort in self.efforts.items():
+            x = np.asarray(effort)
+            if not np.isfinite(x).any():
+                rows.append((name, "the motion is not possible", "", ""))
+                continue
+            k, mean_square = int(np.nanargmax(np.abs(x))), np.nanmean(x**2)
+            power = np.asarray(self.powers[name])
+            span = " to ".join(format_number(end(power)) for end in (np.nanmin, np.nanmax))
+            rows.append((name, f"{format_number(x[k])} at {ts[k]:.6g} s", f"{format_number(math.sqrt(mean_square))}", span))
+        left = float(np.nanmax(np.asarray(self.residual), initial=0.0))
+        rows.append(("left over", f"{format_number(left, scale=1.0)} of the loads", "", ""))
+        heads = "driver", "peak (N m or N)", "root mean square", "power (W)"
+        return PrintedTable(f"inverse dynamics at {len(ts)} times from {ts[0]:g} to {ts[-1]:g} s", rows, heads)
 
     @property
     def power(self) -> Float[Array, "T"]:
@@ -85,7 +109,7 @@ def inverse_dynamics(
     ts: Float[ArrayLike, "T"] | Sequence[float],
     motion: AcceleratedTrajectory | None = None,
     drivers: Sequence[str | Coordinate] | None = None,
-    weights: Mapping[str, ArrayLike] | None = None,
+    weights: Mapping[str, Scalar] | None = None,
 ) -> InverseDynamics:
     """Return what the drivers must exert at the times ts (s) on a prescribed motion: M a - F = J^T mu + C^T f.
 

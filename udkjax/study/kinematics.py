@@ -10,12 +10,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.march import can_march, march, march_at_once, psi_at_once
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, Frame
+from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.continuation import Curve, Points, Reached, derivatives, follow, no_points, plus
@@ -27,7 +30,7 @@ TURN = 2.0 * np.pi  # rad
 Rows: TypeAlias = Float[Array, "T n"]
 
 
-class Kinematics(eqx.Module):
+class Kinematics(PrintsTable):
     """Positions over the values of a driver, and velocities and accelerations there; not a number where it does not get.
 
     `status` is a `Reached` for each value. `limit` is the value at the toggle that ended it (not a number where none did), and
@@ -43,6 +46,24 @@ class Kinematics(eqx.Module):
     limit: Float[Array, ""]
     limit_q: Float[Array, "bodies 3"]
     bodies: tuple[str, ...] = eqx.field(static=True)
+    unit: str = eqx.field(static=True, default="")  # of the values
+
+    _units = units(q="m, m, rad", v="m/s, m/s, rad/s", a="m/s², m/s², rad/s²", limit_q="m, m, rad")
+
+    def _table(self) -> PrintedTable:
+        status, counts = np.unique(np.asarray(self.status), return_counts=True)
+        became = ", ".join(f"{n} {Reached(int(code))}" for code, n in zip(status, counts, strict=True))
+        if np.ndim(self.status) > 1:
+            return fields_table(self, self._units, f"kinematics of {len(self.status)} members: {became}")
+        rows = [("values", format_numbers(self.values, self.unit)), ("became", became)]
+        if np.isfinite(np.asarray(self.limit)):
+            rows.append(("toggle at", format_numbers(self.limit, self.unit)))
+        q, good = np.asarray(self.q), np.flatnonzero(np.asarray(self.reached))
+        if good.size:
+            size, ends = size_of(q), zip(q[good[0]], q[good[-1]], strict=True)
+            poses = [f"from {format_pose(first, size)} to {format_pose(last, size)}" for first, last in ends]
+            rows += zip(self.bodies, poses, strict=True)
+        return PrintedTable("kinematics", rows)
 
     @property
     def reached(self) -> Bool[Array, "T"]:
@@ -68,7 +89,7 @@ class Kinematics(eqx.Module):
         return jnp.stack(self.frame(body).point(number(point)), -1)
 
 
-class Travel(eqx.Module):
+class Travel(PrintsTable):
     """Between which values (rad, m) a coordinate can be driven; infinite where nothing ends it.
 
     `lower_q` and `upper_q` are the positions at the toggles; not a number where there is none.
@@ -79,6 +100,28 @@ class Travel(eqx.Module):
     lower_q: Float[Array, "bodies 3"]
     upper_q: Float[Array, "bodies 3"]
     status: Int[Array, "2"]  # a `Reached` of each: `beyond_limit` where a toggle was found
+    unit: str = eqx.field(static=True, default="")
+
+    _units = units(lower_q="m, m, rad", upper_q="m, m, rad")
+
+    def _table(self) -> PrintedTable:
+        if np.ndim(self.lower):
+            given = {"lower": self.unit, "upper": self.unit, **self._units}
+            return fields_table(self, given, f"travel of {np.size(self.lower)} members")
+        rows = []
+        for name, value, code in zip(("lower", "upper"), (self.lower, self.upper), np.asarray(self.status), strict=True):
+            at = format_numbers(value, self.unit)
+            rows.append(
+                (
+                    name,
+                    f"{at}, a toggle"
+                    if np.isfinite(value)
+                    else "no limit"
+                    if code == Reached.closed
+                    else f"{Reached(int(code))}",
+                )
+            )
+        return PrintedTable("travel", rows)
 
 
 @checked
@@ -89,7 +132,7 @@ def kinematics(
     state: State | None = None,
     rate: Float[ArrayLike, "*T"] = 1.0,
     acceleration: Float[ArrayLike, "*T"] = 0.0,
-    held: Mapping[str, ArrayLike] | None = None,
+    held: Mapping[str, Scalar] | None = None,
 ) -> Kinematics:
     """Return the positions Psi(s, q) = 0 of a mechanism over the values s of a driver, one after another on one branch.
 
@@ -129,9 +172,7 @@ def kinematics(
 
 
 @checked
-def travel(
-    mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, ArrayLike] | None = None
-) -> Travel:
+def travel(mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, Scalar] | None = None) -> Travel:
     """Return between which values a coordinate can be driven: the toggles on either side, ds/dsigma = 0, to rounding.
 
     Args and errors are those of `kinematics`. An angle that makes a whole turn has no limits. `lower` and `upper` have exact
@@ -156,7 +197,7 @@ def _at_once(
     a = ddq * per**2 + dq * np.broadcast_to(acceleration, values.shape)[:, None, None]
     status, nowhere = np.zeros(len(values), int), np.full((len(bodies), 3), np.nan)
     arrays = values, at, dq * per, a, rate, status, np.nan, nowhere
-    return Kinematics(*[jnp.asarray(x) for x in arrays], bodies=bodies)
+    return Kinematics(*[jnp.asarray(x) for x in arrays], bodies=bodies, unit=driven.value_unit)
 
 
 def is_known(tree: PyTree) -> bool:
@@ -178,22 +219,23 @@ def _kinematics(
     v = points.dq * rate[:, None]
     a = points.ddq * rate[:, None] ** 2 + points.dq * acceleration[:, None]
     q, v, a = (jnp.reshape(x, (len(values), -1, 3)) for x in (points.q, v, a))
-    return Kinematics(values, q, v, a, rate, points.status, points.limit, points.limit_q.reshape(-1, 3), bodies)
+    limit_q, unit = points.limit_q.reshape(-1, 3), driven.value_unit
+    return Kinematics(values, q, v, a, rate, points.status, points.limit, limit_q, bodies, unit)
 
 
 @eqx.filter_jit
-def _travel(driven: Driven, q: Float[Array, "n"], far: ArrayLike) -> Travel:
+def _travel(driven: Driven, q: Float[Array, "n"], far: Scalar) -> Travel:
     s = driven.value(q)
     ways = jnp.array([-1.0, 1.0])
     down_up = jax.vmap(lambda way: _solve(driven, s, q, jax.lax.stop_gradient(s + way * far)[None], False))(ways)
     down, up = (jax.tree.map(lambda x, k=k: x[k], down_up) for k in (0, 1))
     lower, upper = (jnp.where(p.status[0] == Reached.beyond_limit, p.limit, way * jnp.inf) for p, way in ((down, -1), (up, 1)))
     lower_q, upper_q = (p.limit_q.reshape(-1, 3) for p in (down, up))
-    return Travel(lower, upper, lower_q, upper_q, jnp.stack([down.status[0], up.status[0]]))
+    return Travel(lower, upper, lower_q, upper_q, jnp.stack([down.status[0], up.status[0]]), driven.value_unit)
 
 
 def _start(
-    mechanism: Mechanism, driver: Drive, start: ArrayLike, state: State | None, held: Mapping[str, ArrayLike] | None
+    mechanism: Mechanism, driver: Drive, start: Scalar, state: State | None, held: Mapping[str, Scalar] | None
 ) -> tuple[Driven, Float[Array, "n"]]:
     """Return the mechanism driven, and the closed position that it starts from; at time `start`, if that drives it."""
     driven = drive(mechanism, driver, 0.0, held)
@@ -206,7 +248,7 @@ def _start(
     return driven, q
 
 
-def _assemble(mechanism: Mechanism, t: ArrayLike, state: State | None, analysis: Analysis) -> Float[Array, "n"]:
+def _assemble(mechanism: Mechanism, t: Scalar, state: State | None, analysis: Analysis) -> Float[Array, "n"]:
     return jnp.ravel(assemble(mechanism, t, state, throw=False, analysis=analysis).q)
 
 

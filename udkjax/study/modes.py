@@ -1,12 +1,17 @@
 """Vibration about a position of rest: frequencies, damping and mode shapes of the linearized mechanism."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Complex, Float, Int
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
 
+from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.assembly import State
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -14,7 +19,7 @@ from udkjax.study.equilibrium import degrees_of_freedom, equilibrium
 from udkjax.study.linearization import linearize
 
 
-class Modes(eqx.Module):
+class Modes(PrintsTable):
     """Small motions about a position of rest: q = q0 + shape exp(s t), or without damping q0 + shape cos(omega t)."""
 
     omega2: Float[Array, "f"]  # (rad/s)^2 without damping, ascending; negative: it moves away as exp(sqrt(-omega2) t)
@@ -23,6 +28,21 @@ class Modes(eqx.Module):
     damped_shapes: Complex[Array, "2f bodies 3"]  # of s, of unit length
     q: Float[Array, "bodies 3"]
     residual: Float[Array, ""]  # N/sqrt(kg): what is left of the loads along free directions: zero at rest
+    bodies: tuple[str, ...] = eqx.field(static=True, default=())
+
+    _units = units(omega2="(rad/s)²", s="1/s", q="m, m, rad", residual="N/sqrt(kg)")
+
+    def _table(self) -> PrintedTable:
+        if np.ndim(self.omega2) > 1:
+            return fields_table(self, self._units, f"modes of {np.shape(self.omega2)[0]} members")
+        rows = []
+        for k, x in enumerate(np.asarray(self.omega2)):
+            omega, turns = math.sqrt(abs(float(x))), np.abs(np.asarray(self.shapes[k, :, 2]))
+            kind = f"{omega:.6g} rad/s, {omega / (2 * math.pi):.6g} Hz" if x >= 0 else f"grows as exp({omega:.6g} t)"
+            most = int(np.argmax(turns))
+            rows.append((f"mode {k + 1}", f"{kind}; mostly {self.bodies[most] if self.bodies else f'body {most}'}"))
+        rows += [("s, damped", format_numbers(self.s, "1/s")), ("damping", format_numbers(self.damping))]
+        return PrintedTable("modes about a position of rest", rows)
 
     @property
     def frequencies(self) -> Float[Array, "f"]:
@@ -37,7 +57,7 @@ class Modes(eqx.Module):
 
 
 @checked
-def modes(mechanism: Mechanism, state: State | None = None, t: ArrayLike = 0.0, analysis: Analysis | None = None) -> Modes:
+def modes(mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, analysis: Analysis | None = None) -> Modes:
     """Return the modes about a position of rest: (s^2 N^T M N + s N^T C N + N^T K N) eta = 0, shape = N eta.
 
     C = -F_v and K = -F_q + (lambda^T Psi)_qq: preload, gravity and the constraints' curvature are in it. Pure, jittable and
@@ -77,7 +97,13 @@ def _modes(mechanism: Mechanism, analysis: Analysis, free: int, t: Float[Array, 
     damped = (jax.lax.stop_gradient(N) @ vectors[:free, _order(values)]).T
     damped = damped / jnp.linalg.norm(damped, axis=1, keepdims=True)
     return Modes(
-        omega2, shapes, unit * s, damped.reshape(2 * free, -1, 3), q.reshape(-1, 3), jnp.max(jnp.abs(at.force), initial=0.0)
+        omega2,
+        shapes,
+        unit * s,
+        damped.reshape(2 * free, -1, 3),
+        q.reshape(-1, 3),
+        jnp.max(jnp.abs(at.force), initial=0.0),
+        mechanism.body_names,
     )
 
 

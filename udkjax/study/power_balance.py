@@ -13,6 +13,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations import constraints, loads
@@ -22,6 +23,7 @@ from udkjax.equations.structure import evaluate_by_kind
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.printing import PrintedTable, format_number, prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
@@ -29,6 +31,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Trajectory
 
 
+@prints_table
 class PowerBalance(NamedTuple):
     """Powers (W) at each output time. What they do not explain of the energies' rates is `residual`."""
 
@@ -37,6 +40,22 @@ class PowerBalance(NamedTuple):
     joints: dict[str, Float[Array, "T"]]  # of both bodies together: zero, to rounding and what the velocities violate
     kinetic: Float[Array, "T"]  # dT/dt
     potential: Float[Array, "T"]  # dV/dt
+
+    _units = units(drivers="W", forces="W", joints="W", kinetic="W", potential="W")
+
+    def _table(self) -> PrintedTable:
+        parts = {
+            **{f"driver {name}": power for name, power in self.drivers.items()},
+            **{f"force {name}": power for name, power in self.forces.items()},
+            "rate of kinetic energy": self.kinetic,
+            "rate of potential energy": self.potential,
+            "supplied": self.supplied,
+            "residual": self.residual,
+        }
+        size = max(float(np.nanmax(np.abs(power), initial=0.0)) for power in parts.values())
+        rows = [(name, *(format_number(end(x), "W", size) for end in (np.nanmin, np.nanmax))) for name, x in parts.items()]
+        rows.append(("residual over the largest", format_number(self.relative, scale=1.0), ""))
+        return PrintedTable("balance of powers", rows, ("power", "least", "largest"))
 
     @property
     def supplied(self) -> Float[Array, "T"]:

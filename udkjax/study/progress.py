@@ -6,7 +6,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
+
+from typing_extensions import TypeAliasType
 
 PATIENCE = 2.0  # s: a computation that takes no longer needs no line to say so
 TERMINAL_INTERVAL, FILE_INTERVAL = 0.2, 15.0  # s between two states of a line that is written over, and of one that cannot be
@@ -43,7 +45,7 @@ class Progress:
         return f"{self.what}:{part} ({self.seconds:.0f} s{left}){f' {self.message}' if self.message else ''}"
 
 
-ProgressOption: TypeAlias = Callable[[Progress], object] | bool | Literal["auto"] | None
+ProgressOption = TypeAliasType("ProgressOption", Callable[[Progress], object] | bool | Literal["auto"] | None)
 
 
 class Report:

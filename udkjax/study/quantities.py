@@ -2,16 +2,17 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
+from typing_extensions import TypeAliasType
 
+from udkjax.annotations import Scalar
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.scene.reshaping import with_angle, with_length
 
-Setter: TypeAlias = Callable[[Mechanism, ArrayLike], Mechanism]  # (mechanism, value) -> mechanism
+Setter = TypeAliasType("Setter", Callable[[Mechanism, Scalar], Mechanism])  # (mechanism, value) -> mechanism
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Length:
     bodies: tuple[str, ...]
     as_rod: bool = False
 
-    def __call__(self, mechanism: Mechanism, value: ArrayLike) -> Mechanism:
+    def __call__(self, mechanism: Mechanism, value: Scalar) -> Mechanism:
         return with_length(mechanism, self.bodies, value, self.as_rod)
 
     def __str__(self) -> str:
@@ -34,7 +35,7 @@ class Angle:
 
     bodies: tuple[str, ...]
 
-    def __call__(self, mechanism: Mechanism, value: ArrayLike) -> Mechanism:
+    def __call__(self, mechanism: Mechanism, value: Scalar) -> Mechanism:
         return with_angle(mechanism, self.bodies, value)
 
 
@@ -44,7 +45,7 @@ class Scaled:
 
     factors: Mapping[str, float]
 
-    def __call__(self, mechanism: Mechanism, value: ArrayLike) -> Mechanism:
+    def __call__(self, mechanism: Mechanism, value: Scalar) -> Mechanism:
         return mechanism.with_parameters({name: factor * jnp.asarray(value) for name, factor in self.factors.items()})
 
 

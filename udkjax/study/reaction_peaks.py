@@ -17,11 +17,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from udkjax.equations.reactions import reactions
+from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Trajectory
 
+UNITS = units(force="N", rms_force="N", torque="N m", rms_torque="N m", force_time="s", torque_time="s")
 
+
+@prints_table
 class Peak(NamedTuple):
     """Of one joint and body over a run: the largest force and torque, when they occur, and the roots of mean squares."""
 
@@ -32,7 +36,10 @@ class Peak(NamedTuple):
     rms_force: Float[Array, ""]  # N
     rms_torque: Float[Array, ""]  # N m
 
+    _units = UNITS
 
+
+@prints_table
 class Envelope(NamedTuple):
     """Of one joint and body over load cases: the largest peaks, and in which case they occur."""
 
@@ -42,6 +49,8 @@ class Envelope(NamedTuple):
     torque: Float[Array, ""]  # N m
     torque_case: Int[Array, ""]
     torque_time: Float[Array, ""]  # s
+
+    _units = UNITS
 
 
 Peaks = dict[str, dict[str, Peak]]  # of a joint or driver, of a body

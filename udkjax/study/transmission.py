@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.integrate.assembly import State
+from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
 from udkjax.scene.checks import SceneError, quote
@@ -20,11 +21,14 @@ from udkjax.study.drive import Coordinate, value_of
 from udkjax.study.kinematics import Kinematics, kinematics
 
 
+@prints_table
 class Workspace(NamedTuple):
     """Where a point gets, (S, T, 2) in m, over the values of a first driver (S,) and a second one (T,)."""
 
     points: Float[Array, "S T 2"]
     reached: Bool[Array, "S T"]
+
+    _units = units(points="m")
 
 
 @checked

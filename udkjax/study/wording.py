@@ -26,12 +26,6 @@ def ratio(values: Sequence[float] | np.ndarray) -> str:
     return " : ".join(f"{v / values[0]:.4g}" for v in values)
 
 
-def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table, its columns below each other."""
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return ["  " + "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip() for row in cells]
-
-
 def format_value(value: float, error: float) -> str:
     """Return a value with as many digits as its standard error allows, and one more."""
     if not (math.isfinite(error) and error > 0 and value):

@@ -9,10 +9,10 @@ import xarray
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.scene.units import conversion_factor
 from udkjax.study.channels import Quantity
 from udkjax.study.identify.record_reader import records_of
 from udkjax.study.identify.records import IdentificationError, Record, Start
-from udkjax.study.units import conversion_factor
 
 DEG = math.pi / 180
 

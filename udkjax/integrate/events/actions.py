@@ -5,11 +5,12 @@ from typing import Literal
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from udkjax.printing import PrintsLine
 from udkjax.scene.fields import number
 from udkjax.scene.joints import Joint
 
 
-class Action(eqx.Module):
+class Action(PrintsLine):
     """The base of all actions."""
 
 

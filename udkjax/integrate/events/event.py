@@ -17,17 +17,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
+from udkjax.annotations import Scalar
 from udkjax.integrate.events.actions import Action, Attach, Impact, Lock, Stop
 from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_of, joint_coordinate, require_name
+from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.fields import Number, number, optional_number
 from udkjax.scene.mechanism import Mechanism
 
 
-class Event(eqx.Module):
+class Event(PrintsLine):
     """Where `condition(t, frames)`, a scalar, crosses zero, `action` happens.
 
     `frames` maps the name of each body, and "ground", to its frame: x, y, angle, cos, sin, vx, vy, omega, `point`, `velocity`.
@@ -36,7 +38,7 @@ class Event(eqx.Module):
     whose condition is zero at the start, and falling, happens at once.
     """
 
-    condition: Callable[[Number, Frames], ArrayLike]
+    condition: Callable[[Number, Frames], Scalar]
     action: Action = Stop()
     direction: int = eqx.field(static=True, default=0)
     name: str = eqx.field(static=True, default="")
@@ -46,7 +48,7 @@ class Event(eqx.Module):
         return [self]
 
 
-class JointLimit(eqx.Module):
+class JointLimit(PrintsLine):
     """A stop at the `lower` or `upper` end of a joint's travel, or both: an `Impact` at each.
 
     Of a revolute joint the coordinate is theta2 - theta1 (rad), of a prismatic joint or a slot how far point 2 is from point 1
@@ -73,7 +75,7 @@ class JointLimit(eqx.Module):
         return found
 
 
-class Contact(eqx.Module):
+class Contact(PrintsLine):
     """A point of a body hits a line, fixed to the ground or to another body, that it cannot pass: an `Impact`, without friction.
 
     The line goes through the point `through` of the body `on`; the `normal`, of any length, is on the side that is allowed. Both
@@ -102,7 +104,7 @@ class Contact(eqx.Module):
         return [Event(gap, Impact(self.restitution, self.at_rest), -1, name)]
 
 
-class Events(eqx.Module):
+class Events(PrintsTable):
     """The events of a run in their order: times (s), states before and after, and which each was.
 
     Where numbers are traced, or in a batch, there are `max_events` of each, padded with NaN, and -1 for `index`.
@@ -116,6 +118,16 @@ class Events(eqx.Module):
     v_after: Float[Array, "events bodies 3"]
     count: Int[Array, ""]
     names: tuple[str, ...] = eqx.field(static=True)
+
+    _units = units(time="s")
+
+    def _table(self) -> PrintedTable:
+        if np.ndim(self.count):
+            counts = {name: np.asarray(count) for name, count in self.counts.items() if np.any(count)}
+            rows = [(name, f"{count.sum()} in {np.sum(count > 0)} members") for name, count in counts.items()]
+            return PrintedTable(f"events of {np.size(self.count)} members", rows)
+        known = [(t, int(k)) for t, k in zip(np.asarray(self.time), np.asarray(self.index), strict=True) if k >= 0]
+        return PrintedTable(f"events: {int(self.count)}", [(f"{t:.9g} s", self.names[k]) for t, k in known])
 
     def of(self, name: str) -> Float[Array, "k"]:
         """Return the times (s) of the events of one name, of a single run."""

@@ -14,9 +14,9 @@ from jaxtyping import Float
 
 from udkjax.deprecation import renamed_attributes
 from udkjax.extras import OptionalImport
-from udkjax.html import html_table
 from udkjax.integrate.assembly import State
 from udkjax.integrate.solution import scene_text, versions
+from udkjax.printing import PrintedTable, align_columns, html_table
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
@@ -28,7 +28,7 @@ from udkjax.study.identify.records import IdentificationError, dataset_of_fit, l
 from udkjax.study.identify.uncertainty import Uncertainty
 from udkjax.study.identify.unknowns import apply_values
 from udkjax.study.whiteness import Whiteness
-from udkjax.study.wording import format_value, join_names, plural, table_lines
+from udkjax.study.wording import format_value, join_names, plural
 
 if TYPE_CHECKING:
     import xarray
@@ -199,14 +199,14 @@ class Estimate:
     def __str__(self) -> str:
         facts = self._facts()
         width = max(map(len, facts))
-        lines = [self._head(), *table_lines(self._cells()), *(f"  {name:<{width}}  {text}" for name, text in facts.items())]
+        lines = [self._head(), *align_columns(self._cells()), *(f"  {name:<{width}}  {text}" for name, text in facts.items())]
         return "\n".join([*lines, self.message])
 
     def _repr_html_(self) -> str:
         heads, *cells = self._cells()
         facts = [f"{name}: {text}" for name, text in self._facts().items()]
         remarks = "".join(f"<br>{html.escape(text)}" for text in [*facts, *self.message.splitlines()])
-        return html_table(self._head(), heads, cells) + f"<p>{remarks.removeprefix('<br>')}</p>"
+        return html_table(PrintedTable(self._head(), cells, heads)) + f"<p>{remarks.removeprefix('<br>')}</p>"
 
     def __repr__(self) -> str:
         return f"Estimate({', '.join(f'{name}: {value:.6g}' for name, value in self.parameters.items())})"

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from udkjax.deprecation import renamed_attributes
 from udkjax.integrate.solution import CAUSES, Result
+from udkjax.printing import align_columns
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, differences, leave_out_far_steps, sizes
@@ -29,7 +30,7 @@ from udkjax.study.identify.prediction import TIGHT, Tolerances
 from udkjax.study.identify.problem import Problem, Residuals, build_problem
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
-from udkjax.study.wording import join_names, table_lines
+from udkjax.study.wording import join_names
 
 AGREEMENT = 3.0  # floors: a floor is a sum of sizes, each of which was measured once
 USEFUL = 0.1  # of the derivative's size: where the floor is higher, agreement says little
@@ -295,4 +296,4 @@ def _table(check: GradientCheck) -> str:
         where = [check.labels[s]] if several else []
         cells.append((name, *where, f"{size:.3g} {check.units[s]}".rstrip(), *relative, f"{check.step[d, s]:.0e}", verdict))
     title = f"{check.title}: derivatives against differences, at a tolerance of {check.tol[0]:.1g}"
-    return "\n".join([title, *table_lines(cells), check.message])
+    return "\n".join([title, *align_columns(cells), check.message])

@@ -3,9 +3,10 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from udkjax.deprecation import renamed_arguments
 from udkjax.scene.checks import SceneError, quote, suggestion
@@ -14,10 +15,10 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import owner_of, parameters_of, split_index
 from udkjax.scene.reshaping import length_of
 from udkjax.scene.schema import keys
+from udkjax.scene.units import units_of
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.unknowns import Target, Transform, Unknown, Unknowns
 from udkjax.study.quantities import Length, Setter, parameter_value
-from udkjax.study.units import units_of
 
 
 def length(*bodies: str, as_rod: bool = False) -> Length:
@@ -56,8 +57,8 @@ class Parameter:
     share: Literal["value", "scale"] = "value"
 
 
-OneAsked: TypeAlias = str | Length | Parameter | Setter
-Asked: TypeAlias = OneAsked | Sequence[OneAsked]
+OneAsked = TypeAliasType("OneAsked", str | Length | Parameter | Setter)
+Asked = TypeAliasType("Asked", OneAsked | Sequence[OneAsked])
 
 
 class _Part(NamedTuple):

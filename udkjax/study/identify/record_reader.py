@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 
 from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.units import conversion_factor
 from udkjax.study.channels import Channel, Quantity, channel_of
 from udkjax.study.identify.records import ByChannel, IdentificationError, Key, Noise, Record, key_of
 from udkjax.study.identify.tables import NOISE, RECORD, TIME, Column, Table, TableData, quantities_by_name, read_tables
-from udkjax.study.units import conversion_factor
 
 Data: TypeAlias = "Record | TableData | Sequence[Record | TableData]"
 MOST_SHOWN = 3  # mistakes of one kind in a column; the others are counted

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar, get_args
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from udkjax.deprecation import renamed_arguments
 from udkjax.extras import OptionalImport
@@ -22,7 +23,9 @@ Estimated = Literal["nothing", "position", "velocity", "both"]
 Key: TypeAlias = str | Quantity  # channels go by their names, a user's own by itself
 T = TypeVar("T")
 ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[Key, T]
-Noise: TypeAlias = ByChannel[ArrayLike] | ByChannel[ArrayLike | None] | float | None  # standard deviations, or one for all
+Noise = TypeAliasType(
+    "Noise", ByChannel[ArrayLike] | ByChannel[ArrayLike | None] | float | None
+)  # standard deviations, or one for all
 
 
 class IdentificationError(Mistakes):

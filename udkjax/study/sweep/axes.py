@@ -15,8 +15,8 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, PyTree
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.integrate.assembly import State
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.choices import Choice
@@ -42,7 +42,7 @@ class Distribution(Protocol):
 
 AxisChoice: TypeAlias = "Mechanism | State | int | Choice"
 # Numbers (n, ...) or choices; for a design a range or a distribution.
-Values: TypeAlias = "Distribution | State | ArrayLike | Sequence[AxisChoice]"
+Values: TypeAlias = "Distribution | State | Numbers | Sequence[AxisChoice]"
 
 
 class Axis:
@@ -199,7 +199,7 @@ def scale_to_range(values: Values, unit: Float[np.ndarray, "n"]) -> Float[np.nda
     """Map points of the unit interval to a range (low, high) or a frozen distribution of scipy.stats; None: it is neither."""
     if hasattr(values, "ppf"):
         return np.asarray(cast(Distribution, values).ppf(unit), float)
-    ends = np.asarray(cast(ArrayLike, values), float)
+    ends = np.asarray(cast(Numbers, values), float)
     if ends.shape != (2,) or not ends[0] < ends[1]:
         return None
     return ends[0] + (ends[1] - ends[0]) * unit

@@ -10,13 +10,13 @@ from jaxtyping import Int, PyTree
 
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.units import units_of
 from udkjax.study.sweep.axes import Column, Dimension
 from udkjax.study.sweep.executors import program
 from udkjax.study.sweep.layout import SweepError
 from udkjax.study.sweep.measures import Label, guess_label
 from udkjax.study.sweep.plan import Group, Plan, Variable
 from udkjax.study.sweep.program import END, RESULT, STEPS, lane_steps
-from udkjax.study.units import units_of
 
 if TYPE_CHECKING:
     import xarray

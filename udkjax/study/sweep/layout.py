@@ -16,6 +16,7 @@ from udkjax.scene.arguments import argument_problems
 from udkjax.scene.checks import Mistakes, SceneError, abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
+from udkjax.scene.units import NUMBERS, units_of
 from udkjax.study.sweep.axes import (
     CHOICES,
     Axis,
@@ -29,7 +30,6 @@ from udkjax.study.sweep.axes import (
     labels_of,
     scale_to_range,
 )
-from udkjax.study.units import NUMBERS, units_of
 
 Settings: TypeAlias = Mapping[str, Any]  # arguments of `simulate`, of as many types as it has
 MEMBER = "member"  # the dimension of a design

@@ -2,13 +2,15 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
+from typing_extensions import TypeAliasType
 
+from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.quantities import energy, violation
 from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.textbook import prepare
@@ -17,11 +19,11 @@ from udkjax.pinv import SVD, Auto, Pseudoinverse
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 
-UserMeasure: TypeAlias = Callable[[Mechanism, Solution], ArrayLike | Mapping[str, ArrayLike]]
-OneMeasure: TypeAlias = str | UserMeasure
-MeasureChoice: TypeAlias = OneMeasure | Sequence[OneMeasure] | Mapping[str, OneMeasure]
+UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, Scalar]])
+OneMeasure = TypeAliasType("OneMeasure", str | UserMeasure)
+MeasureChoice = TypeAliasType("MeasureChoice", OneMeasure | Sequence[OneMeasure] | Mapping[str, OneMeasure])
 # Coordinates (T, bodies, 3) that runs are compared with, or a function (mechanism, ts) of them.
-Reference: TypeAlias = Solution | ArrayLike | Callable[[Mechanism, Array], ArrayLike] | None
+Reference = TypeAliasType("Reference", Solution | Numbers | Callable[[Mechanism, Array], Numbers] | None)
 
 NOT_REACHED = -1  # the rank at output times that a run has not reached
 

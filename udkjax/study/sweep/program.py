@@ -24,10 +24,10 @@ from udkjax.integrate.solvers import forward_mode, is_explicit
 from udkjax.pinv import Auto, Elimination
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.units import NUMBERS
 from udkjax.study.machine import CHUNKED, MEMBERS
 from udkjax.study.quantities import parameter_value
 from udkjax.study.sweep.plan import Group, Plan, stack_choices
-from udkjax.study.units import NUMBERS
 
 T = TypeVar("T")
 Outputs = dict[str, Array]

@@ -5,8 +5,7 @@ import re
 from typing import NamedTuple
 
 from udkjax.scene.checks import quote
-from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import owner_of, parameters_of, split_index
+from udkjax.scene.number_fields import Sections, owner_of, parameters_of, split_index
 
 # The settings of a run that are numbers: one program serves all their values.
 NUMBERS = {
@@ -53,7 +52,7 @@ _OF_TYPE = {
 _FOLLOWS = ("amplitude", "offset", "values")  # a motion law has the unit of the coordinate that it drives
 
 
-def units_of(mechanism: Mechanism, name: str) -> str:
+def units_of(mechanism: Sections, name: str) -> str:
     """Return the unit of a parameter or of a setting; an empty text where it is not known."""
     if name in NUMBERS:
         return NUMBERS[name]
@@ -63,11 +62,15 @@ def units_of(mechanism: Mechanism, name: str) -> str:
         return ""
     if not found.path:
         return _FIELDS[name.partition("[")[0]]
-    element = owner_of(mechanism, found)
-    field = found.path[-1]
+    driven = getattr(mechanism.drivers.get(found.owner), "coordinate", "")
+    return field_unit(type(owner_of(mechanism, found)).__name__, found.path[-1], driven)
+
+
+def field_unit(type_name: str, field: str, driven: str = "") -> str:
+    """Return the unit of a field of a class of the scene; of a motion law's, by the coordinate that it drives."""
     if field in _FOLLOWS:
-        return "rad" if getattr(mechanism.drivers.get(found.owner), "coordinate", "") == "angle" else "m"
-    return _OF_TYPE.get((type(element).__name__, field), _FIELDS.get(field, ""))
+        return "rad" if driven == "angle" else "m"
+    return _OF_TYPE.get((type_name, field), _FIELDS.get(field, ""))
 
 
 # --- units of data
