@@ -127,6 +127,36 @@ def test_batches_of_derivatives(f, slopes):
         assert_allclose(jax.jit(mode(total))(xs), one_by_one, rtol=1e-7)
 
 
+def test_a_number_that_a_batch_shares():
+    """The gradient of a sum over a batch, and of a batch of batches, is the sum of the gradients."""
+    mechanism, rates = udk.library.compound_pendulum(), jnp.linspace(-1.0, 1.0, 4)
+    start = udk.assemble(mechanism)
+
+    def angle(gravity, rate):
+        state = udk.State(start.q, start.v + rate * jnp.array([0.0, 0.0, 1.0]))
+        return udk.simulate(mechanism.with_parameters({"gravity[1]": gravity}), TS, state, throw=False).q[-1, 0, 2]
+
+    def total(gravity):
+        return jnp.sum(jax.vmap(jax.vmap(partial(angle, gravity)))(rates.reshape(2, 2)))
+
+    found, each = jax.jit(lambda g: (jax.grad(total)(g), jax.vmap(jax.grad(angle), (None, 0))(g, rates)))(-9.0)
+    assert np.abs(each).min() > 1e-3
+    assert_allclose(found, each.sum(), rtol=1e-9)
+
+
+def test_both_engines_start_beside_the_manifold_alike():
+    """They project the start: second derivatives take first ones of both, also along directions that open the loops."""
+    state, opening = linkage_at(-0.8), 1e-4 * np.eye(4, 3)
+
+    def slope(engine):
+        run = partial(udk.simulate, LINKAGE, TS, rtol=1e-10, atol=1e-10, drift_tol=1.0, engine=engine)
+        there, back = (run(udk.State(state.q + sign * opening, state.v)).q[1:] for sign in (1, -1))
+        return (there - back) / 2e-4
+
+    native = slope("native")
+    assert_allclose(slope("diffrax"), native, atol=2e-5 * np.abs(native).max())  # 5e-4 where one of them does not
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", [udk.BDF(), udk.Verner65()], ids=["BDF", "Verner65"])
 def test_other_solvers_have_both_modes(solver, slopes):

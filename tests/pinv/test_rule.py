@@ -232,3 +232,13 @@ def test_the_rule_serves_any_operator():
         np.testing.assert_allclose(compiled(derivative(sparse))(d, b), compiled(derivative(dense))(d, b), atol=1e-12)
     assert isinstance(ForScaled().plus(Scaled(d, where)), Plus)
     np.testing.assert_allclose(ForScaled()(Scaled(d, where)) @ b, sparse(d, b))
+
+
+def test_a_vector_that_a_batch_shares():
+    """The cotangent of one right-hand side for many matrices is the sum of those of each, however batches are nested."""
+    many, b, method = jnp.asarray(rng.normal(size=(2, 3, 4, 5))), jnp.arange(4.0), SVD()
+    size = lambda a, b: jnp.sum(method.solve(a, b).x ** 2)  # noqa: E731
+    total = lambda b: jnp.sum(jax.vmap(jax.vmap(size, (0, None)), (0, None))(many, b))  # noqa: E731
+    each = jax.vmap(jax.grad(size, 1), (0, None))
+    found, slopes = compiled(lambda b: (jax.grad(total)(b), each(many.reshape(6, 4, 5), b)))(b)
+    np.testing.assert_allclose(found, slopes.sum(0), rtol=1e-12)

@@ -14,7 +14,7 @@ from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.outcome import status_at_end
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.integrate.projection import project_all, violation
+from udkjax.integrate.projection import project, project_all, violation
 from udkjax.integrate.solvers import is_explicit
 from udkjax.integrate.solvers.counting import NOT_KNOWN, CountingController, evaluations
 from udkjax.native.steps import DONE, GROW, SAFETY, SHRINK, STEP_LIMIT, STEP_TOO_SMALL
@@ -25,6 +25,8 @@ def integrate_by_diffrax(
 ) -> IntegratorOutput:
     """Integrate one problem with any solver of diffrax (default Dopri8), in reverse mode by checkpoints unless said otherwise."""
     ts, y0 = problem.ts, jnp.concatenate([problem.q, problem.v])
+    if problem.projected:  # machine code does so, and its derivatives are combined with those of this engine
+        y0 = project(problem.equations, ts[0], y0)
     run = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
         Constrained(problem.solver or diffrax.Dopri8(), problem.projected),

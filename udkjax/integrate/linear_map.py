@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.integrate.traced_numbers import Mask, replaced, select
+from udkjax.pinv.linear_primitive import linear_primitive
 
 
 class Function(eqx.Module):
@@ -170,7 +171,7 @@ def _transpose(inputs, cotangent):
     return jax.tree.map(lambda _: None, linear), _bind(linear.T, cotangent)
 
 
-_linear_p = eqxi.create_vprim("derivative_of_a_run", eqxi.filter_primitive_def(_apply), _shape, _derivative, _transpose)
+_linear_p = linear_primitive("derivative_of_a_run", _apply, _shape, _derivative, _transpose)
 
 
 def _bind(linear: Linear, vector: Array) -> Array:

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from udkjax.annotations import Numbers, Scalar
+from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.printing import PrintsLine
 
 # Accelerators round float32 products to ten bits unless told otherwise.
@@ -251,7 +252,7 @@ def _transpose(inputs, cotangent):
     return jtu.tree_map(lambda _: None, plus), _bind(plus.T, cotangent)
 
 
-_apply_p = eqxi.create_vprim("pseudoinverse", eqxi.filter_primitive_def(_apply), _shape_of_apply, _derivative, _transpose)
+_apply_p = linear_primitive("pseudoinverse", _apply, _shape_of_apply, _derivative, _transpose)
 
 
 def _bind(plus: Plus, b: Float[Array, "m"]) -> Float[Array, "n"]:

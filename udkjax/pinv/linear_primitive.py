@@ -1,0 +1,58 @@
+"""Primitives of JAX that are linear in their last argument: an operator, and the vector that it is applied to."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+
+def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Callable, transpose: Callable) -> Primitive:
+    """Make a primitive of four rules for one operator and one vector; batches map them.
+
+    `equinox.internal.create_vprim` does so, but its transpose does not sum the cotangents of a vector that all operators of a
+    batch share: here such a vector is broadcast before, and the transpose of that is the sum.
+
+    Args:
+        name: As programs of JAX print it.
+        apply: (operator, vector) -> vector.
+        shape: The same for shapes.
+        derivative: The rule of forward mode.
+        transpose: The rule of reverse mode, of the vector.
+
+    Returns:
+        The primitive, for `equinox.internal.filter_primitive_bind`.
+    """
+    rule = eqxi.filter_primitive_def(apply)
+    member = eqxi.create_vprim(name, rule, shape, derivative, transpose)
+
+    def batch(inputs: Sequence[Array], axes: Sequence[int | None], **params: object) -> tuple[list[Array], list[int]]:
+        *operator, vector = inputs
+        size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
+        if axes[-1] is None:
+            vector = jnp.broadcast_to(vector + sum(map(_zero, operator)), (size, *vector.shape))
+            axes = (*axes[:-1], 0)
+        found = jax.vmap(partial(member.bind, **params), in_axes=tuple(axes))(*operator, vector)
+        return found, [0] * len(found)
+
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(rule)
+    primitive.def_abstract_eval(shape)
+    ad.primitive_jvps[primitive] = derivative
+    ad.primitive_transposes[primitive] = transpose
+    batching.primitive_batchers[primitive] = batch
+    mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=True))
+    return primitive
+
+
+def _zero(x: Array) -> Array | float:
+    """Return a zero that is batched wherever x is, by the `vmap`s around this one as well; XLA folds it."""
+    if jnp.size(x) == 0:
+        return 0.0
+    first = jnp.ravel(x)[0]
+    return jax.lax.select(first == first, 0.0, 0.0)
