@@ -62,6 +62,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import Cam as Cam
     from udkjax.scene import Constraint as Constraint
     from udkjax.scene import Distance as Distance
+    from udkjax.scene import Drawing as Drawing
     from udkjax.scene import Driver as Driver
     from udkjax.scene import Force as Force
     from udkjax.scene import ForceElement as ForceElement
@@ -69,6 +70,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import Friction as Friction
     from udkjax.scene import Gear as Gear
     from udkjax.scene import Joint as Joint
+    from udkjax.scene import Link as Link
     from udkjax.scene import Mechanism as Mechanism
     from udkjax.scene import Motion as Motion
     from udkjax.scene import Point as Point
@@ -149,7 +151,7 @@ _MODULES = {"pinv": "udkjax.pinv", "equations": "udkjax.equations", "library": "
 _NAMES = {
     "udkjax.scene": """
         load loads save dumps with_length with_angle SceneError
-        Mechanism Body GROUND Frame Point Constraint Joint Driver Motion ForceElement
+        Drawing Link Mechanism Body GROUND Frame Point Constraint Joint Driver Motion ForceElement
         Revolute Prismatic Slot Weld Distance Angle Gear Rack Cam
         Polynomial Sine Spline Profile
         Spring TorsionSpring Force Torque Friction""",

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
 from udkjax.scene import dumps, loads
@@ -85,9 +86,11 @@ WHERE = 'joint "A" (joint[0])'
 
 
 MISTAKES = [
-    (BODY, "format: missing; write format = 1"),
-    ("format = 2\n" + BODY, "format: this version of udkjax reads format 1, not 2"),
-    ("format = true\n" + BODY, "format: this version of udkjax reads format 1, not true"),
+    (BODY, "format: missing; write format = 2 for a drawing, with pins, or format = 1 for bodies and joints"),
+    ("format = 3\n" + BODY, "format: this version of udkjax reads formats 1 and 2, not 3"),
+    ("format = true\n" + BODY, "format: this version of udkjax reads formats 1 and 2, not true"),
+    (HEAD + BODY + JOINT + "axis = [0, 0]\n", 'joint "A" (joint[0]).axis: unknown key'),
+    (HEAD + BODY + JOINT.replace("revolute", "slot") + "axis = [0, 0]\n", 'joint "A" (joint[0]).axis: must be a number, is ['),
     (HEAD, "body: a mechanism needs at least one body"),
     (HEAD + "gravty = [0, 0]\n" + BODY, 'gravty: unknown key; did you mean "gravity"?'),
     (HEAD + "gravity = 9.81\n" + BODY, "gravity: must be a list of 2 numbers, is 9.81"),
@@ -160,6 +163,12 @@ MISTAKES = [
 def test_mistakes_are_named(text, expected):
     found = problems(text)
     assert any(problem.startswith(expected) for problem in found), found
+
+
+def test_an_axis_may_be_a_vector():
+    text = HEAD + BODY + JOINT.replace("revolute", "slot") + "axis = [1, -1]\n"
+    angles = [udk.loads(text).joints["A"].axis, udk.Slot(("ground", "a"), [(0, 0), (0, 0)], axis=(1.0, -1.0)).axis]
+    assert_allclose(angles, -np.pi / 4, rtol=1e-15)
 
 
 def test_all_mistakes_of_a_file_at_once():

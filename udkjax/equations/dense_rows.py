@@ -51,7 +51,7 @@ class DenseRows:
     def __init__(self, mechanism: Mechanism, scales: Scales):
         self.scales = jax.tree.map(np.asarray, scales)
         self._programs = scene_programs(mechanism)
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(mechanism)]
+        leaves = [np.asarray(leaf) for leaf in mechanism.numbers]
         self._constants = self._programs.prologue([*map(float, numbers_as_scalars(leaves)), 0.0, 0.0])
         self.count, self.size = self._programs.pattern.shape
         self.names = self._programs.equations.row_names

@@ -89,7 +89,7 @@ def _small_scene_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, x
     """Return the terms of a small scene at the initial guess, by its programs."""
     programs = scene_programs(mechanism)
     rows, columns = programs.pattern.shape
-    given = [*numbers_as_scalars(jax.tree.leaves(mechanism)), 0.0, 0.0]
+    given = [*numbers_as_scalars(mechanism.numbers), 0.0, 0.0]
     constants = programs.prologue([*map(float, given)] if xp is np else given)
 
     def run(program: ScalarProgram, v: NumericArray) -> NumericArray:
@@ -113,7 +113,7 @@ def _large_scene_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, x
     """Return the terms of a large scene at the initial guess, by its loops."""
     programs = loop_programs(mechanism)
     row, column, *_ = programs.d_entries
-    numbers = xp.asarray(numbers_as_vector(jax.tree.leaves(mechanism)))
+    numbers = xp.asarray(numbers_as_vector(mechanism.numbers))
     _, rate, values = programs.geometry(numbers, xp)(0.0, q, 0 * v)
     psi_q = values * xp.sqrt(mass_of(mechanism, xp))[column]
     free, b = programs.loads(numbers, xp)(0.0, q, v)

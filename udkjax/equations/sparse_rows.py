@@ -115,7 +115,7 @@ class SparseRows:
         self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
         self._stretch = self.metric / root
         self.driver_time_step = driver_time_step(self.scales)
-        self._evaluate = programs.geometry(np.asarray(numbers_as_vector(jax.tree.leaves(mechanism))), np)
+        self._evaluate = programs.geometry(np.asarray(numbers_as_vector(mechanism.numbers)), np)
 
     @cached_property
     def _order(self) -> list[int]:

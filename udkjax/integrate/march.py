@@ -76,7 +76,7 @@ def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q
     scales, n = analysis.scales, analysis.coordinates
     approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
     settings = {"length": scales.length, "omega": unit, "rtol": 1.0, "atol": 1.0, "smallest": 1.0}
-    numbers = [xp.ravel(x) for x in jax.tree.leaves(_of_unit_masses(mechanism, scales.length, xp))]
+    numbers = [xp.ravel(x) for x in _of_unit_masses(mechanism, scales.length, xp).numbers]
     given = {
         "numbers": xp.concatenate([*numbers, xp.asarray([DEPENDENT, 0.0])]),
         "ts": xp.concatenate([approach, values]),

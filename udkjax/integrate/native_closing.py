@@ -80,7 +80,7 @@ def _inputs(
     """Those of a run of the closing code, of one member: by JAX without derivatives, by NumPy as they are."""
     settings = {"length": scales.length, "fallback_tol": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
     given = {
-        "numbers": numbers_as_vector([*jax.tree.leaves(mechanism), tol**2 if is_large(mechanism) else 0.0, 0.0]),
+        "numbers": numbers_as_vector([*mechanism.numbers, tol**2 if is_large(mechanism) else 0.0, 0.0]),
         "ts": numbers_as_vector([t, t]),
         "q": q,
         "v": v,

@@ -7,11 +7,17 @@ from udkjax.scene.bodies import Frame as Frame
 from udkjax.scene.bodies import Point as Point
 from udkjax.scene.bodies import between as between
 from udkjax.scene.checks import SceneError as SceneError
+from udkjax.scene.drawing import Drawing as Drawing
+from udkjax.scene.drawing import Link as Link
 from udkjax.scene.drivers import Driver as Driver
 from udkjax.scene.drivers import Motion as Motion
 from udkjax.scene.drivers import Polynomial as Polynomial
 from udkjax.scene.drivers import Sine as Sine
 from udkjax.scene.drivers import Spline as Spline
+from udkjax.scene.files import dumps as dumps
+from udkjax.scene.files import load as load
+from udkjax.scene.files import loads as loads
+from udkjax.scene.files import save as save
 from udkjax.scene.forces import Force as Force
 from udkjax.scene.forces import ForceElement as ForceElement
 from udkjax.scene.forces import Friction as Friction
@@ -33,7 +39,3 @@ from udkjax.scene.joints import Weld as Weld
 from udkjax.scene.mechanism import Mechanism as Mechanism
 from udkjax.scene.reshaping import with_angle as with_angle
 from udkjax.scene.reshaping import with_length as with_length
-from udkjax.scene.toml_files import dumps as dumps
-from udkjax.scene.toml_files import load as load
-from udkjax.scene.toml_files import loads as loads
-from udkjax.scene.toml_files import save as save

@@ -48,6 +48,7 @@ class SceneEntry(NamedTuple):
     cls: type | None
     table: Table
     problem: str = ""  # the reason why the class is not known
+    element: object = None  # where it is made already
 
     @property
     def where(self) -> str:
@@ -58,7 +59,7 @@ class SceneEntry(NamedTuple):
 
 def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
     """Return every mistake of a scene, in the order of its entries."""
-    found = list(_check_number("gravity", ["2"], gravity, {}, {}))
+    found = gravity_mistakes(gravity)
     bodies = [entry for entry in entries if entry.section == "body"]
     if not bodies:
         found.append("body: a mechanism needs at least one body")
@@ -82,6 +83,11 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
         else:
             found.extend(check_table(entry.where, entry.cls, entry.table, known))
     return found
+
+
+def gravity_mistakes(gravity: object) -> list[str]:
+    """Return what is wrong with the acceleration of gravity."""
+    return list(_check_number("gravity", ["2"], gravity, {}, {}))
 
 
 def check_table(where: str, cls: type, table: Table, known: KnownNames) -> Iterator[str]:
@@ -198,7 +204,7 @@ def _check_references(path: str, kind: str | None, value: object, known: KnownNa
         if not isinstance(name, str):
             continue
         if name not in named:
-            what = "body" if kind == "body" else "revolute joint"
+            what = {"revolute": "revolute joint"}.get(kind, kind)
             yield f"{place}: no {what} named {quote(name)}{suggestion(name, named)}"
         elif kind == "revolute" and not issubclass(named[name] or Revolute, Revolute):
             yield f"{place}: {quote(name)} must be a revolute joint"

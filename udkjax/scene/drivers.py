@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.printing import PrintsLine
-from udkjax.scene.bodies import between
-from udkjax.scene.fields import KNOTS, NOT_EMPTY, Number, number, number_or_guess
+from udkjax.scene.bodies import Point, between
+from udkjax.scene.fields import KNOTS, NOT_EMPTY, Number, direction, number, number_or_guess
 from udkjax.scene.joints import Constraint, fill
 from udkjax.scene.splines import natural_spline
 
@@ -73,12 +73,14 @@ class Driver(Constraint):
     """Prescribe one `coordinate` of body 2 relative to body 1. 1 row: the coordinate minus motion(t).
 
     `angle`: theta2 - theta1 (rad). `x`, `y`: point 2 from point 1, along the axes of body 1's frame (m): with point 1 at the
-    origin, the default, the coordinates of point 2 in that frame. `distance`: between the points (m), which must not meet.
+    origin, the default, the coordinates of point 2 in that frame; `axis` turns these axes in it, by an angle (rad) or as a
+    vector. `distance`: between the points (m), which must not meet.
     """
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
     motion: Motion
     points: Float[Array, "2 2"] = eqx.field(converter=number_or_guess, default=None)
+    axis: Float[Array, ""] | None = eqx.field(converter=direction, default=None)  # of x, for `x` and `y`; None: that of body 1
 
     def residual(self, t, *frames):
         one, two = frames
@@ -87,7 +89,11 @@ class Driver(Constraint):
         d = between(self.points, one, two)
         if self.coordinate == "distance":
             return [d.norm() - self.motion(t)]
-        return [getattr(one.local(d), self.coordinate) - self.motion(t)]
+        d = one.local(d)
+        if self.axis is not None:
+            c, s = jnp.cos(self.axis), jnp.sin(self.axis)
+            d = Point(c * d.x + s * d.y, c * d.y - s * d.x)
+        return [getattr(d, self.coordinate) - self.motion(t)]
 
     @property
     def breakpoints(self):

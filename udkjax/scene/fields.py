@@ -4,9 +4,10 @@ A class of this folder is its own schema: its fields are the keys of the scene f
 shape, and the metadata below state what else must hold. Files and Python are checked by the same declarations (`checks.py`).
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
-from typing import Literal, NamedTuple, TypeAlias, TypedDict
+from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +47,24 @@ def optional_number(value: Numbers | None) -> Float[Array, "..."] | None:
 def number_or_guess(value: Numbers | None) -> Float[Array, "..."]:
     """Like `number`; None stands for the value in the initial guess, which the mechanism fills in (`Constraint.complete`)."""
     return None if value is None else number(value)  # pyright: ignore[reportReturnType]
+
+
+def direction(value: Numbers | None) -> Float[Array, ""]:
+    """Like `number`: a direction in the plane as an angle (rad), which may be given as a vector (x, y); None stays None."""
+    if value is None:
+        return None  # pyright: ignore[reportReturnType]
+    found = number(value)
+    if found.shape != (2,):
+        return found
+    xp = np if not isinstance(found, Tracer) else jnp
+    x, y = xp.asarray(found)
+    return number(xp.arctan2(y, x))
+
+
+def vector_as_angle(value: Any) -> Any:
+    """Return the angle (rad) of a vector of two numbers in a table; anything else as it is, for others to refuse."""
+    is_vector = isinstance(value, list | tuple) and len(value) == 2 and all(type(x) in (int, float) for x in value) and any(value)
+    return math.atan2(value[1], value[0]) if is_vector else value
 
 
 def names(value: Sequence[str] | str) -> tuple[str, ...]:
@@ -96,7 +115,7 @@ class FieldMetadata(TypedDict, total=False):
 
     require: tuple[Requirement, ...]
     at_least: int  # entries
-    names: Literal["body", "revolute"]  # the field holds names: of bodies, or of revolute joints
+    names: Literal["body", "revolute", "pin", "link", "slide"]  # the field holds names: of bodies, of revolute joints, ...
 
 
 _POSITIVE = Requirement("must be > 0", lambda v: v > 0)
@@ -112,3 +131,7 @@ PROFILE_RADII: FieldMetadata = {"require": (_POSITIVE,), "at_least": 3}
 NOT_EMPTY: FieldMetadata = {"at_least": 1}
 BODY: FieldMetadata = {"names": "body"}  # the field names one or several bodies
 REVOLUTE: FieldMetadata = {"names": "revolute"}  # the field names a revolute joint
+PIN: FieldMetadata = {"names": "pin"}  # of a drawing: one or several
+LINK: FieldMetadata = {"names": "link"}  # of a drawing, or the ground, or a body: one or several
+SLIDE: FieldMetadata = {"names": "slide"}  # of a drawing
+OUTLINE: FieldMetadata = {"at_least": 3}

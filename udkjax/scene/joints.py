@@ -2,8 +2,8 @@
 
 Conventions that hold throughout: `bodies` names the bodies that the joint connects, in the order in which `residual` gets
 their frames; `points` are the attachments, each in its body's own frame (m); `axis` is the direction of a line in body 1's
-frame (rad); angles are in rad, anticlockwise; rows come in the order in which `residual` returns them. A number that is None
-when a joint is made ("as in the initial guess") is filled in by the mechanism.
+frame, an angle (rad) or a vector (x, y); angles are in rad, anticlockwise; rows come in the order in which `residual` returns
+them. A number that is None when a joint is made ("as in the initial guess") is filled in by the mechanism.
 """
 
 from abc import abstractmethod
@@ -17,7 +17,18 @@ from jaxtyping import Array, Float
 from udkjax.deprecation import renamed_attributes, renamed_methods
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame, Point, between
-from udkjax.scene.fields import BODY, POSITIVE, PROFILE_ANGLES, PROFILE_RADII, Number, Numbers, names, number, number_or_guess
+from udkjax.scene.fields import (
+    BODY,
+    POSITIVE,
+    PROFILE_ANGLES,
+    PROFILE_RADII,
+    Number,
+    Numbers,
+    direction,
+    names,
+    number,
+    number_or_guess,
+)
 from udkjax.scene.splines import count_knots, periodic_spline, wrap
 
 
@@ -82,7 +93,7 @@ class Prismatic(Joint):
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
-    axis: Float[Array, ""] = eqx.field(converter=number)
+    axis: Float[Array, ""] = eqx.field(converter=direction)
     angle: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None)
 
     def residual(self, t, *frames):
@@ -97,7 +108,7 @@ class Slot(Joint):
     """A pin of body 2 slides along a line of body 1, free to turn. 1 row: its distance from the line, as in `Prismatic`."""
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
-    axis: Float[Array, ""] = eqx.field(converter=number)
+    axis: Float[Array, ""] = eqx.field(converter=direction)
 
     def residual(self, t, *frames):
         return [_lateral_distance(self.axis, self.points, *frames)]
@@ -185,7 +196,7 @@ class Rack(Joint):
     """
 
     radius: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)
-    axis: Float[Array, ""] = eqx.field(converter=number)
+    axis: Float[Array, ""] = eqx.field(converter=direction)
     constant: Float[Array, ""] = eqx.field(init=False, default_factory=lambda: None)
 
     def residual(self, t, *frames):
@@ -214,7 +225,8 @@ class Profile(PrintsLine):
         return count_knots(wrap(angle, self.angle[0], 2 * jnp.pi), self.angle)
 
 
-def _profile(value: Profile | Mapping[str, Numbers]) -> Profile:
+def as_profile(value: Profile | Mapping[str, Numbers]) -> Profile:
+    """Return a profile, which may be given as a table."""
     return value if isinstance(value, Profile) else Profile(**value)
 
 
@@ -225,7 +237,7 @@ class Cam(Joint):
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
-    profile: Profile = eqx.field(converter=_profile)
+    profile: Profile = eqx.field(converter=as_profile)
 
     def residual(self, t, *frames):
         d = self._arm(*frames)

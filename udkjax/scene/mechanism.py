@@ -1,5 +1,6 @@
 """A mechanism: the pytree of everything that exists in a scene, checked, with named access to every number."""
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from types import MappingProxyType
@@ -21,7 +22,7 @@ from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Numbers, StaticValue, number
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.joints import AnyConstraint, Constraint, Joint
-from udkjax.scene.number_fields import parameters_of, replace_numbers
+from udkjax.scene.number_fields import groups_of, parameters_in, parameters_of, replace_numbers, split_index, value_of
 from udkjax.scene.schema import table_of, type_name
 
 Element = TypeVar("Element", bound=eqx.Module)
@@ -41,6 +42,23 @@ class Origin:
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, Origin) and self._key == other._key)
+
+
+class AbstractDrawing(eqx.Module):
+    """What a mechanism was made from, with numbers of its own that decide on those of the bodies: pins, widths, densities."""
+
+    @property
+    @abstractmethod
+    def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]:
+        """The elements that hold the drawing's numbers, by section and name."""
+
+    @abstractmethod
+    def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "AbstractDrawing":
+        """Return the drawing with other numbers in its elements; raise `SceneError` where they make no mechanism."""
+
+    @abstractmethod
+    def mechanism(self) -> "Mechanism":
+        """Return the mechanism that is drawn."""
 
 
 class Mechanism(PrintsTable):
@@ -66,6 +84,8 @@ class Mechanism(PrintsTable):
     _joints: tuple[Joint, ...]
     _drivers: tuple[Driver, ...]
     _forces: tuple[ForceElement, ...]
+    drawing: AbstractDrawing | None = None  # that it was made from
+    changed: tuple[str, ...] = eqx.field(static=True, default=())  # numbers that do not follow from the drawing any more
 
     def __init__(
         self,
@@ -76,6 +96,8 @@ class Mechanism(PrintsTable):
         gravity: Numbers = (0.0, -9.81),
         name: str = "",
         origin: Origin | None = None,
+        drawing: AbstractDrawing | None = None,
+        changed: tuple[str, ...] = (),
     ):
         forces = forces or {}
         given = {
@@ -91,7 +113,8 @@ class Mechanism(PrintsTable):
         self.joint_names, self._joints = _unzip([(key, _complete(c, known)) for key, c in found["joint"]])
         self.driver_names, self._drivers = _unzip([(key, _complete(c, known)) for key, c in found["driver"]])
         self.force_names, self._forces = _unzip(found["force"])
-        self.origin = origin if any(isinstance(leaf, Tracer) for leaf in self._numbers) else None
+        self.origin = origin if any(isinstance(leaf, Tracer) for leaf in self.numbers) else None
+        self.drawing, self.changed = drawing, changed
 
     @property
     def bodies(self) -> Mapping[str, Body]:
@@ -140,23 +163,24 @@ class Mechanism(PrintsTable):
 
     @property
     def without_origin(self) -> "Mechanism":
-        """The same mechanism without its `origin`: a program compiled for it serves every origin."""
-        if self.origin is None:
+        """The same mechanism without its `origin` and its `drawing`: a program compiled for it serves all of them."""
+        if self.origin is None and self.drawing is None:
             return self
         copy = object.__new__(type(self))
-        for field, value in vars(self).items():
-            object.__setattr__(copy, field, None if field == "origin" else value)
+        for field, value in (vars(self) | {"origin": None, "drawing": None, "changed": ()}).items():
+            object.__setattr__(copy, field, value)
         return copy
 
     @property
     def is_concrete(self) -> bool:
         """Whether no number is traced."""
-        return not any(isinstance(leaf, Tracer) for leaf in self._numbers)
+        return not any(isinstance(leaf, Tracer) for leaf in self.numbers)
 
     __getattr__ = renamed_attributes("Mechanism", bare="without_origin", is_known="is_concrete")
 
     @property
-    def _numbers(self) -> list[Array]:
+    def numbers(self) -> list[Array]:
+        """All numbers of the equations, in the order in which programs take them: leaves without those of the drawing."""
         return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
 
     def _table(self) -> PrintedTable:
@@ -174,12 +198,35 @@ class Mechanism(PrintsTable):
         `values` maps names as in `parameters`, or those of one entry (`joint.A.points[1][0]`), to values of exactly the same
         shape: a batch of values belongs inside `vmap`. A mechanism with traced values remembers the known numbers that it was
         made from (`origin`), so that their analysis serves it. A number that was absent is then there. Numbers that a joint
-        once took from the initial guess stay as they are; the constants of gears and racks follow the guess. Raises `SceneError`.
+        once took from the initial guess stay as they are; the constants of gears and racks follow the guess.
+
+        Numbers of a drawing (`pin.A`, `link.crank.width`) change all that follows from them. A number that follows from the
+        drawing (`body.crank.mass`) may be changed as well, and keeps its value when the drawing changes. Raises `SceneError`.
         """
-        new, gravity = replace_numbers(self, values)
         traced = any(isinstance(value, Tracer) for value in jax.tree.leaves(dict(values)))
         origin = Origin(self) if traced and self.is_concrete else self.origin
-        return Mechanism(new["body"], new["joint"], new["driver"], new["force"], gravity, self.name, origin)
+        base, own, changed = self, values, ()
+        if self.drawing is not None:
+            base, own, changed = self._drawn_again(self.drawing, values)
+        new, gravity = replace_numbers(groups_of(base), base.gravity, own, parameters_of(base), self.name)
+        elements = new["body"], new["joint"], new["driver"], new["force"]
+        return Mechanism(*elements, gravity, self.name, origin, base.drawing, changed)
+
+    def _drawn_again(self, drawing: AbstractDrawing, values: Mapping[str, Numbers]) -> tuple[Any, dict[str, Numbers], Any]:
+        """Return the mechanism of the drawing with its share of the values, the other values, and the names of these."""
+        drawn, known = parameters_in(drawing.groups), parameters_of(self)
+        of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in (*drawn, "gravity")}
+        own = {name: value for name, value in values.items() if name not in of_drawing}
+        whole = {split_index(name, known)[0] for name in own} & set(own)  # an array that is given takes its entries with it
+        before = [name for name in self.changed if name not in own and split_index(name, known)[0] not in whole]
+        changed = (*before, *own)
+        if not of_drawing:
+            return self, own, changed
+        replace_numbers(groups_of(self), self.gravity, own, known, self.name)  # all mistakes in names before anything else
+        drawn["gravity"] = known["gravity"]
+        groups, gravity = replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name)
+        own = {name: value_of(known, name) for name in before} | own
+        return drawing.with_groups(groups, gravity).mechanism(), own, changed
 
 
 def attached_bodies(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:

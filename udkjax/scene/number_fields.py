@@ -12,6 +12,14 @@ from udkjax.scene.fields import Numbers, number
 from udkjax.scene.schema import numbers_in
 
 _SECTIONS = {"body": "bodies", "joint": "joints", "driver": "drivers", "force": "forces"}
+Groups = dict[str, dict[str, Any]]  # elements by section and name
+
+
+class Drawn(Protocol):
+    """What a drawing holds: its elements, by section (pin, link, motor, ...) and name."""
+
+    @property
+    def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]: ...
 
 
 class Sections(Protocol):
@@ -28,6 +36,8 @@ class Sections(Protocol):
     def drivers(self) -> Mapping[str, eqx.Module]: ...
     @property
     def forces(self) -> Mapping[str, eqx.Module]: ...
+    @property
+    def drawing(self) -> Drawn | None: ...
 
 
 class NumberField(NamedTuple):
@@ -41,25 +51,59 @@ class NumberField(NamedTuple):
 
 
 def parameters_of(mechanism: Sections) -> dict[str, NumberField]:
-    """Return every number of a mechanism by name, absent ones too."""
-    found = {"gravity": NumberField("", "", (), mechanism.gravity, mechanism.gravity.shape)}
-    for section, plural in _SECTIONS.items():
-        for owner, element in getattr(mechanism, plural).items():
+    """Return every number of a mechanism by name, absent ones too; first those of the drawing that it was made from."""
+    found = {} if mechanism.drawing is None else parameters_in(mechanism.drawing.groups)
+    gravity = {"gravity": NumberField("", "", (), mechanism.gravity, mechanism.gravity.shape)}
+    return gravity | found | parameters_in(groups_of(mechanism))
+
+
+def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, NumberField]:
+    """Return every number of some elements by name; that of a pin's position is the pin's: `pin.A`."""
+    found = {}
+    for section, elements in groups.items():
+        for owner, element in elements.items():
             for path, value, shape in numbers_in(element):
-                found[".".join((section, owner, *path))] = NumberField(section, owner, path, value, shape)
+                name = (section, owner) if section == "pin" and path == ("position",) else (section, owner, *path)
+                found[".".join(name)] = NumberField(section, owner, path, value, shape)
     return found
+
+
+def groups_of(mechanism: Sections) -> Groups:
+    """Return the elements of a mechanism by section and name."""
+    return {section: dict(getattr(mechanism, plural)) for section, plural in _SECTIONS.items()}
 
 
 def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
     """Return the element that holds a number, or the motion law or profile within the element."""
-    element = getattr(mechanism, _SECTIONS[parameter.section])[parameter.owner]
-    return _at(element, parameter.path[:-1])
+    plural = _SECTIONS.get(parameter.section)
+    groups = mechanism.drawing.groups if plural is None and mechanism.drawing is not None else {}
+    elements = groups[parameter.section] if plural is None else getattr(mechanism, plural)
+    return _at(elements[parameter.owner], parameter.path[:-1])
 
 
-def replace_numbers(mechanism: Sections, values: Mapping[str, Numbers]) -> tuple[dict[str, dict[str, Any]], Array]:
-    """Return the elements of a mechanism by section and name, and gravity, with the values in; raise `SceneError`."""
-    known, problems = parameters_of(mechanism), []
-    groups, gravity = {section: dict(getattr(mechanism, plural)) for section, plural in _SECTIONS.items()}, mechanism.gravity
+def replace_numbers(
+    groups: Mapping[str, Mapping[str, Any]],
+    gravity: Array,
+    values: Mapping[str, Numbers],
+    known: Mapping[str, NumberField],
+    name: str,
+) -> tuple[Groups, Array]:
+    """Return elements by section and name, and gravity, with the values in.
+
+    Args:
+        groups: The elements.
+        gravity: The acceleration of gravity (m/s^2).
+        values: Numbers by their names, or those of entries.
+        known: The numbers that there are, as `parameters_of` finds them.
+        name: That of the scene, for the message of an error.
+
+    Returns:
+        The elements and gravity.
+
+    Raises:
+        SceneError: A name is unknown, or a value does not fit.
+    """
+    groups, problems, scene = {section: dict(elements) for section, elements in groups.items()}, [], name
     # Whole arrays before their entries, whatever the order of the keys: jit sorts them.
     for given in sorted(values, key=lambda name: name not in known and name.count("[")):
         name, index = split_index(given, known)
@@ -76,8 +120,16 @@ def replace_numbers(mechanism: Sections, values: Mapping[str, Numbers]) -> tuple
         else:
             gravity = new
     if problems:
-        raise SceneError(problems, mechanism.name)
+        raise SceneError(problems, scene)
     return groups, gravity
+
+
+def value_of(known: Mapping[str, NumberField], name: str) -> Array:
+    """Return the value of a number, or of one of its entries, by its name."""
+    owner, index = split_index(name, known)
+    value = known[owner].value
+    assert value is not None  # only what is there has been set
+    return value[index] if index else value
 
 
 def _fit(

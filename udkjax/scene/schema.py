@@ -80,6 +80,15 @@ def table_of(element: eqx.Module) -> dict[str, object]:
     return {name: value for name, value in table.items() if value is not None}
 
 
+def build(annotation: Any, value: object) -> Any:
+    """Make an element, and the modules within it, of a table that has been checked."""
+    if not isinstance(value, dict):
+        return value
+    cls = CLASSES_BY_TYPE["motion"][value["type"]] if "type" in value else annotation
+    expected = keys(cls)
+    return cls(**{name: build(expected[name].annotation, item) for name, item in value.items() if name != "type"})
+
+
 def numbers_in(element: eqx.Module) -> Iterator[tuple[tuple[str, ...], jax.Array | None, tuple[int, ...] | None]]:
     """Iterate over paths, values and shapes of an element's numbers.
 

@@ -1,4 +1,8 @@
-"""Units: of parameters and of the settings of a run, and those in which data may be written."""
+"""One table of units: of parameters and of the settings of a run, of data, and of numbers with units in drawings.
+
+pint knows more units, but importing it and reading its definitions takes 0.2 s of every command, and to it a radian is a pure
+number: a frequency in 1/s would pass for an angular velocity. Here an angle is a dimension of its own.
+"""
 
 import math
 import re
@@ -40,6 +44,14 @@ _FIELDS = {
     "frequency": "rad/s",
     "phase": "rad",
     "times": "s",
+    "density": "kg/m3",
+    "width": "m",
+    "thickness": "m",
+    "centre": "m",
+    "outline": "m",
+    "direction": "rad",
+    "speed": "rad/s",
+    "force": "N",
 }
 _OF_TYPE = {
     ("Spring", "stiffness"): "N/m",
@@ -48,8 +60,9 @@ _OF_TYPE = {
     ("TorsionSpring", "damping"): "N m s/rad",
     ("Friction", "velocity"): "rad/s",
     ("Profile", "angle"): "rad",
+    ("SlideMotor", "speed"): "m/s",
 }
-_FOLLOWS = ("amplitude", "offset", "values")  # a motion law has the unit of the coordinate that it drives
+FOLLOWS = ("amplitude", "offset", "values")  # a motion law has the unit of the coordinate that it drives
 
 
 def units_of(mechanism: Sections, name: str) -> str:
@@ -63,12 +76,13 @@ def units_of(mechanism: Sections, name: str) -> str:
     if not found.path:
         return _FIELDS[name.partition("[")[0]]
     driven = getattr(mechanism.drivers.get(found.owner), "coordinate", "")
-    return field_unit(type(owner_of(mechanism, found)).__name__, found.path[-1], driven)
+    owner = owner_of(mechanism, found)
+    return field_unit(getattr(owner, "measured_as", type(owner).__name__), found.path[-1], driven)
 
 
 def field_unit(type_name: str, field: str, driven: str = "") -> str:
     """Return the unit of a field of a class of the scene; of a motion law's, by the coordinate that it drives."""
-    if field in _FOLLOWS:
+    if field in FOLLOWS:
         return "rad" if driven == "angle" else "m"
     return _OF_TYPE.get((type_name, field), _FIELDS.get(field, ""))
 
@@ -126,7 +140,31 @@ _USUAL = (
     "N, kN",
     "N m, N mm, kN m",
     "kg, g",
+    "kg/m3, g/cm3",
+    "N/m, N/mm",
+    "N s/m, N s/mm",
+    "N m/rad, N m/deg",
 )
+
+
+def read_quantity(text: str, wanted: str) -> float:
+    """Return a text such as "60 rpm" as a number in `wanted`, which are SI units.
+
+    Raises:
+        ValueError: it is no number with a unit, or its unit is unknown or of another dimension.
+    """
+    match = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
+    if match is None:
+        raise ValueError(f"must be a number, or a text with a number and its unit, is {quote(text)}")
+    number, units = match.groups()
+    if not units and wanted:
+        raise ValueError(f"{quote(text)} has no unit; it is measured in {_usual_units(wanted)}")
+    return float(number) * (conversion_factor(units, wanted) if wanted else 1.0)
+
+
+def _usual_units(wanted: str) -> str:
+    goal = _read(wanted)
+    return next((some for some in _USUAL if _read(some.partition(",")[0]).dimension == goal.dimension), wanted)
 
 
 def conversion_factor(units: str, wanted: str) -> float:
@@ -145,8 +183,7 @@ def conversion_factor(units: str, wanted: str) -> float:
     goal = _read(wanted)
     given = _GRAVITY if units.strip() == "g" and goal.dimension == _ACCELERATION else _read(units)
     if given.dimension != goal.dimension:
-        usual = next((some for some in _USUAL if _read(some.partition(",")[0]).dimension == goal.dimension), wanted)
-        raise ValueError(f"{quote(units)} does not fit; it is measured in {usual}")
+        raise ValueError(f"{quote(units)} does not fit; it is measured in {_usual_units(wanted)}")
     return given.size / goal.size
 
 

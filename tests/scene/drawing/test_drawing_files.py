@@ -1,0 +1,297 @@
+"""Format 2 of scene files: units, round trips, and mistakes by name."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax.scene as udk
+from udkjax.scene.units import read_quantity
+
+HEAD = "format = 2\n"
+MM = HEAD + 'units = {length = "mm", angle = "deg"}\n'
+PINS = "[pins]\nO = [0, 0]\nA = [30, 40]\nB = [100, 50]\nC = [120, 0]\n"
+CRANK = '[[link]]\nname = "crank"\npins = ["O", "A"]\nmass = 1\n'
+ROD = '[[link]]\nname = "rod"\npins = ["A", "B"]\ndensity = 7850\nwidth = 10\nthickness = 5\n'
+ROCKER = '[[link]]\nname = "rocker"\npins = ["C", "B"]\nmass = "0.5 kg"\n'
+GROUND = 'ground = ["O", "C"]\n'
+LINKS = CRANK + ROD + ROCKER
+EVERYTHING = (
+    MM
+    + GROUND
+    + PINS
+    + 'D = ["3 cm", -20]\nE = [-50, 10]\nF = [-50, 40]\n[velocities]\nA = ["-40 mm/s", "0.03 m/s"]\n'
+    + LINKS
+    + """
+[[link]]
+name = "block"
+pins = ["D"]
+mass = 2
+width = 20
+[[link]]
+name = "plate"
+pins = ["B", "E", "F"]
+outline = [[-60, 0], [110, 0], [110, 60], [-60, 50]]
+density = "7.85 g/cm3"
+thickness = 2
+[[slide]]
+link = "block"
+direction = 30
+[[slot]]
+pin = "A"
+along = ["O", "A"]
+on = "plate"
+[[gear]]
+links = ["crank", "rocker"]
+teeth = [20, 40]
+[[cam]]
+pins = ["E", "D"]
+profile = {angle = [0, 120, 240], radius = [20, 25, 30]}
+links = ["plate", "block"]
+[[motor]]
+pin = "O"
+motion = {type = "sine", amplitude = 30, frequency = "2 rad/s"}
+[[motor]]
+slide = "slide1"
+motion = {type = "polynomial", coefficients = [0, "10 mm/s", "0.2 m/s2"]}
+[[motor]]
+name = "brake"
+pin = "C"
+torque = "-2 N m"
+[[spring]]
+between = ["O", "B"]
+stiffness = "2.5 kN/m"
+length = 100
+[[damper]]
+pin = "C"
+damping = "0.1 N m s/rad"
+[[load]]
+link = "rod"
+force = [0, -3]
+[[body]]
+name = "bob"
+mass = 1
+inertia = "20 kg mm2"
+position = [30, 10]
+[[joint]]
+name = "string"
+type = "slot"
+bodies = ["rod", "bob"]
+points = [[0, 0], [0, 0]]
+axis = [0, 1]
+[[driver]]
+name = "lead"
+bodies = ["ground", "bob"]
+coordinate = "x"
+motion = {type = "spline", times = [0, 1], values = [30, 35]}
+[[force]]
+type = "friction"
+joint = "A"
+torque = "10 N mm"
+velocity = "1 deg/s"
+"""
+)
+
+
+def problems(text):
+    with pytest.raises(udk.SceneError) as info:
+        udk.loads(text)
+    return info.value.problems
+
+
+def test_everything_comes_back_in_its_units():
+    mech = udk.loads(EVERYTHING)
+    text = udk.dumps(mech)
+    again = udk.loads(text)
+    assert udk.dumps(again) == text
+    assert 'units = {length = "mm", angle = "deg"}' in text and "A = [30.0, 40.0]" in text and "direction = 30.0" in text
+    assert jax.tree.structure(again) == jax.tree.structure(mech)
+    for a, b in zip(jax.tree.leaves(mech), jax.tree.leaves(again), strict=True):
+        assert np.array_equal(a, b)
+
+
+def test_numbers_are_read_in_their_units():
+    found = udk.loads(EVERYTHING).parameters()
+    expected = {
+        "pin.D": [0.03, -0.02],
+        "pin.A.velocity": [-0.04, 0.03],
+        "link.rod.width": 0.01,
+        "link.rod.density": 7850,
+        "link.plate.density": 7850,
+        "slide.slide1.direction": np.pi / 6,
+        "motor.motor1.motion.amplitude": np.pi / 6,
+        "motor.motor2.motion.coefficients": [0, 0.01, 0.2],
+        "spring.spring1.stiffness": 2500,
+        "body.bob.inertia": 2e-5,
+        "body.bob.position": [0.03, 0.01],
+        "joint.string.axis": np.pi / 2,
+        "driver.lead.motion.values": [0.03, 0.035],
+        "force.friction1.torque": 0.01,
+        "force.friction1.velocity": np.pi / 180,
+    }
+    for name, value in expected.items():
+        assert_allclose(found[name], value, rtol=1e-14, err_msg=name)
+
+
+def test_what_a_drawing_no_longer_says_is_written_by_hand():
+    mech = udk.loads(MM + GROUND + PINS + LINKS)
+    heavier = mech.with_parameters({"body.crank.mass": 2.0})
+    assert udk.dumps(mech).startswith("format = 2") and udk.dumps(heavier).startswith("format = 1")
+    assert udk.loads(udk.dumps(heavier)).bodies["crank"].mass == 2.0
+    assert udk.dumps(mech.with_parameters({"link.crank.mass": 2.0})).startswith("format = 2")
+
+
+def test_the_text_of_a_drawing_without_units_is_in_si_units():
+    drawing = udk.Drawing({"O": (0, 0), "A": (1 / 3, 0.1)}, {"bar": udk.Link(["O", "A"], mass=1)}, ground=["O"], name="bar")
+    text = udk.dumps(drawing)
+    assert "units" not in text and f"A = [{1 / 3!r}, 0.1]" in text
+    assert udk.dumps(udk.loads(text)) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("60 rpm", "rad/s", 2 * np.pi),
+        ("-1.5e-3 kN/mm", "N/m", -1500.0),
+        ("9 kg", "kg", 9.0),
+        (".5 N m/deg", "N m/rad", 90 / np.pi),
+    ],
+)
+def test_quantities(text, unit, value):
+    assert_allclose(read_quantity(text, unit), value, rtol=1e-15)
+
+
+MISTAKES = [
+    # units
+    (
+        MM + GROUND + PINS + LINKS.replace('"0.5 kg"', '"0.5 m"'),
+        'link "rocker" (link[2]).mass: "m" does not fit; it is measured in kg, g',
+    ),
+    (
+        MM + GROUND + PINS + LINKS.replace('"0.5 kg"', '"0.5 stone"'),
+        'link "rocker" (link[2]).mass: "stone" is no unit known here',
+    ),
+    (MM + GROUND + PINS + LINKS.replace('"0.5 kg"', '"half"'), 'link "rocker" (link[2]).mass: must be a number, or a text'),
+    (MM + GROUND + PINS + LINKS.replace('"0.5 kg"', '"5"'), 'link "rocker" (link[2]).mass: "5" has no unit'),
+    (MM + GROUND + PINS.replace("[0, 0]", '[0, "1 s"]') + LINKS, 'pins.O[1]: "s" does not fit; it is measured in m, mm, cm'),
+    (
+        MM + "gravity = [0, -9.81]\n" + GROUND + PINS + LINKS,
+        "gravity[1]: -9.81 of what? length is in mm here: write it with its unit",
+    ),
+    (
+        MM + GROUND + PINS + LINKS + '[[motor]]\npin = "O"\nspeed = 5',
+        'motor "motor1" (motor[0]).speed: 5 of what? angle is in deg here',
+    ),
+    (HEAD + 'units = {lenght = "mm"}\n' + GROUND + PINS + LINKS, 'units.lenght: unknown quantity; did you mean "length"?'),
+    (HEAD + 'units = {length = "kg"}\n' + GROUND + PINS + LINKS, 'units.length: "kg" does not fit'),
+    # names
+    (HEAD + GROUND + PINS.replace("[pins]", "[pin]") + LINKS, 'pin: unknown key; did you mean "pins"?'),
+    (HEAD + GROUND + PINS + LINKS.replace("[[link]]", "[[links]]"), "links: unknown key; write [[link]]"),
+    (
+        HEAD + GROUND + PINS + LINKS.replace('"C", "B"', '"C", "b"'),
+        'link "rocker" (link[2]).pins[1]: no pin named "b"; did you mean "B"?',
+    ),
+    (HEAD + GROUND.replace("O", "Q") + PINS + LINKS, 'ground[0]: no pin named "Q"'),
+    (HEAD + GROUND + PINS + LINKS.replace('"rocker"', '"rod"'), 'link "rod" (link[2]).name: taken by another link'),
+    (HEAD + GROUND + PINS + LINKS.replace('"rocker"', '"ground"'), 'link "ground" (link[2]).name: "ground" is the fixed frame'),
+    (HEAD + GROUND + PINS + LINKS + '[[motor]]\nname = "A"\npin = "O"\nspeed = 1', 'motor "A" (motor[0]).name: taken by pin "A"'),
+    (HEAD + GROUND + PINS + LINKS.replace('name = "rod"\n', ""), "link[1].name: missing"),
+    (HEAD + GROUND + PINS + LINKS.replace("width", "widht"), 'link "rod" (link[1]).widht: unknown key; did you mean "width"?'),
+    # who meets whom
+    (HEAD + GROUND + PINS + "S = [1, 1]\n" + LINKS, "pins.S: no link uses it"),
+    (HEAD + GROUND.replace("]", ', "S"]') + PINS + "S = [1, 1]\n" + LINKS, 'ground[2]: no link reaches pin "S"'),
+    (HEAD + GROUND + PINS + LINKS.replace('["O", "A"]', "[]"), 'link "crank" (link[0]).pins: a link needs at least one pin'),
+    (
+        HEAD + GROUND + PINS + "S = [9, 9]\n" + LINKS + '[[link]]\nname = "x"\npins = ["S"]\nmass = 1',
+        'link "x" (link[3]).width: a link of one',
+    ),
+    (HEAD + GROUND + PINS + LINKS.replace('["O", "A"]', '["A", "A"]'), 'link "crank" (link[0]).pins: names a pin twice'),
+    (HEAD + GROUND + PINS + LINKS.replace("width = 10\n", ""), 'link "rod" (link[1]).width: missing'),
+    (HEAD + GROUND + PINS + LINKS.replace("thickness = 5\n", ""), 'link "rod" (link[1]).thickness: missing'),
+    (
+        HEAD + GROUND + PINS + LINKS.replace("density = 7850\n", ""),
+        'link "rod" (link[1]): give a density, with a thickness, or a mass',
+    ),
+    (
+        HEAD + GROUND + PINS + "S = [200, 9]\nT = [200, 90]\n" + LINKS + '[[link]]\nname = "x"\npins = ["S", "T"]\nmass = 1',
+        'link "x" (link[3]).pins: no other link and no ground shares one of them',
+    ),
+    (
+        HEAD + GROUND.replace('"C"', '"C", "A"') + PINS + LINKS + '[[motor]]\npin = "A"\nspeed = 1',
+        'motor "motor1" (motor[0]).pin: at "A" there must meet two links, or one and the ground; there are ground, crank, rod; '
+        'say which two, such as of = ["ground", "crank"]',
+    ),
+    (
+        HEAD + GROUND + PINS + LINKS + '[[motor]]\npin = "O"',
+        'motor "motor1" (motor[0]).speed: give one of speed, motion and torque',
+    ),
+    (
+        HEAD + GROUND + PINS + LINKS + '[[motor]]\npin = "O"\nof = ["crank", "rod"]\nspeed = 1',
+        'motor "motor1" (motor[0]).of: "rod" is not at pin "O", where there are ground, crank',
+    ),
+    (
+        HEAD + GROUND + PINS + LINKS + '[[spring]]\nbetween = ["O", "C"]\nstiffness = 1',
+        'spring "spring1" (spring[0]).between: both pins are on "ground"',
+    ),
+    (HEAD + GROUND + PINS + LINKS + '[[load]]\npin = "O"', 'load "load1" (load[0]).force: give a force, or a torque'),
+    (HEAD + GROUND + PINS + LINKS + '[[slide]]\nlink = "rod"', 'slide "slide1" (slide[0]).along: give two pins, or a direction'),
+    (
+        HEAD + GROUND + PINS + LINKS + '[[slot]]\npin = "O"\ndirection = 1\nlink = "rod"',
+        'slot "slot1" (slot[0]).link: "rod" has no pin "O"',
+    ),
+    (
+        HEAD + GROUND + PINS + LINKS + '[[gear]]\nlinks = ["rod", "crank"]\nteeth = [1, 2]',
+        'gear "gear1" (gear[0]).links: "rod" must share',
+    ),
+    (
+        HEAD + GROUND + PINS + LINKS + '[[gear]]\nlinks = ["crank", "rocker"]\nradii = [50, 50]',
+        'gear "gear1" (gear[0]).radii: wheels of these radii are 100 m apart, and their centres 120 m',
+    ),
+    # geometry
+    (HEAD + GROUND + PINS.replace("[100, 50]", "[30, 40]") + LINKS, 'pins.B: is at the same place as pin "A"'),
+    (HEAD + GROUND + PINS.replace("[100, 50]", "[100, 50e3]") + LINKS, "pins.B: is 5e+04 m away from the other pins"),
+    (
+        HEAD + GROUND + PINS + LINKS.replace('["C", "B"]', '["C", "A", "B"]').replace('mass = "0.5', 'width = 10\nmass = "0.5'),
+        'link "rocker" (link[2]).pins: "A" is 68.7 m off the bar from "C" to "B"',
+    ),
+    (
+        HEAD + GROUND + PINS + "S = [60, 80]\n" + LINKS.replace('["O", "A"]', '["O", "A", "S"]'),
+        'link "crank" (link[0]).pins: the corners lie on one line, and enclose no area',
+    ),
+    (
+        HEAD + GROUND + PINS + LINKS.replace('["O", "A"]', '["O", "B", "A", "C"]'),
+        'link "crank" (link[0]).pins: the polygon crosses itself',
+    ),
+    (
+        HEAD + GROUND + PINS + LINKS + "outline = [[500, 500], [600, 500], [600, 600]]",
+        'link "rocker" (link[2]).outline: crosses none of the pins "C", "B"',
+    ),
+    (
+        HEAD + GROUND + PINS + LINKS + '[[slot]]\npin = "B"\nalong = ["O", "C"]',
+        'slot "slot1" (slot[0]).pin: "B" is 50 m off the line through "O" and "C"',
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "expected"), MISTAKES, ids=[expected for _, expected in MISTAKES])
+def test_mistakes_are_named(text, expected):
+    found = problems(text)
+    assert any(problem.startswith(expected) for problem in found), found
+
+
+def test_all_mistakes_at_once_and_none_twice():
+    text = MM + 'ground = ["O", "c"]\n' + PINS.replace("[30, 40]", '["3 kg", 40]') + LINKS.replace("width = 10", "width = -1")
+    assert problems(text) == [
+        'ground[1]: no pin named "c"; did you mean "C"?',
+        'pins.A[0]: "kg" does not fit; it is measured in m, mm, cm',
+        'link "rod" (link[1]).width: must be >= 0, is -0.001',
+    ]
+
+
+def test_a_file_of_a_wrong_drawing_is_named(tmp_path):
+    path = Path(tmp_path / "wrong.toml")
+    path.write_text(HEAD + PINS + CRANK)
+    with pytest.raises(udk.SceneError, match=r"wrong\.toml"):
+        udk.load(path)

@@ -1,0 +1,183 @@
+"""A drawing: a mechanism as it stands on paper, pins in world coordinates and links through them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from udkjax.scene.bodies import Body
+from udkjax.scene.checks import SceneEntry, SceneError, quote, suggestion
+from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, SECTIONS, known_elements, placement_of, read_drawing
+from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
+from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
+from udkjax.scene.drawing.link import Link, Pin
+from udkjax.scene.drawing.mistakes import joint_names, where
+from udkjax.scene.drawing.quantities import Units
+from udkjax.scene.drivers import Driver
+from udkjax.scene.fields import Numbers, number
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.joints import Joint, Revolute
+from udkjax.scene.mechanism import AbstractDrawing, Mechanism, name_elements
+from udkjax.scene.schema import table_of
+
+Table = Mapping[str, Any]
+
+
+class Drawing(AbstractDrawing):
+    """Pins, links through them, and what else is drawn, each under its name; `mechanism()` makes it a `Mechanism`.
+
+    At each pin that k links share, the ground counted, there are k - 1 revolutes, named as the pin: `B`, and `B-2` for a third
+    link. Links become bodies of the same names, whose frames have their origins at the centres of mass and their x axes in the
+    direction from the first pin to the second. All numbers are leaves, as in a mechanism: those of pins are parameters (`pin.A`).
+
+    Args:
+        pins: World coordinates of each pin (m).
+        links: The links: `Link`s, or tables of their keys.
+        ground: The pins that are fixed.
+        slides: Links that slide along a line without turning on it. These and what follows, by name or as a list: tables of the
+            keys that files have for them, such as `{"pin": "O2", "speed": 6.28}`, or elements of `udkjax.scene.drawing`.
+        slots: Pins that are guided by a line.
+        gears: Pairs of links that mesh.
+        cams: Pins that stay on the profile of a link.
+        motors: Motions, or torques, of a link on another one.
+        springs: Springs between pins, or torsion springs at pins.
+        dampers: Dampers, likewise.
+        loads: Constant forces and torques on links.
+        bodies: Bodies as a `Mechanism` has them, besides the links.
+        joints: Joints, likewise. They may name links, in whose frames their points are.
+        drivers: Drivers, likewise.
+        forces: Force elements, likewise.
+        velocities: Initial velocities of pins (m/s); the others are at rest. A link moves as its first two pins do.
+        gravity: The acceleration of gravity, by default 9.81 m/s^2 along -y.
+        name: The name of the mechanism.
+        units: Those of plain numbers, such as `{"length": "mm"}`; SI units and radians where it says nothing. A number may be a
+            text with its unit, such as "60 rpm".
+
+    Raises:
+        SceneError: The drawing is wrong; the error lists every mistake. Numbers that are traced are not looked at.
+    """
+
+    name: str = eqx.field(static=True)
+    gravity: Float[Array, "2"]  # m/s^2
+    ground: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True)  # that it was written in
+    _names: tuple[tuple[str, ...], ...] = eqx.field(static=True)  # of the elements of each section
+    _elements: tuple[tuple[Any, ...], ...]
+
+    def __init__(
+        self,
+        pins: Mapping[str, Pin | Numbers],
+        links: Mapping[str, Link | Table],
+        ground: Sequence[str] = (),
+        slides: "Mapping[str, Slide | Table] | Sequence[Slide | Table] | None" = None,
+        slots: "Mapping[str, PinInSlot | Table] | Sequence[PinInSlot | Table] | None" = None,
+        gears: "Mapping[str, GearPair | Table] | Sequence[GearPair | Table] | None" = None,
+        cams: "Mapping[str, CamPair | Table] | Sequence[CamPair | Table] | None" = None,
+        motors: "Mapping[str, Motor | Table] | Sequence[Motor | Table] | None" = None,
+        springs: "Mapping[str, PinSpring | Table] | Sequence[PinSpring | Table] | None" = None,
+        dampers: "Mapping[str, PinDamper | Table] | Sequence[PinDamper | Table] | None" = None,
+        loads: "Mapping[str, Load | Table] | Sequence[Load | Table] | None" = None,
+        bodies: Mapping[str, Body] | None = None,
+        joints: Mapping[str, Joint] | None = None,
+        drivers: Mapping[str, Driver] | None = None,
+        forces: Mapping[str, ForceElement] | Sequence[ForceElement] | None = None,
+        velocities: Mapping[str, Numbers] | None = None,
+        gravity: Numbers | None = None,
+        name: str = "",
+        units: Mapping[str, str] | None = None,
+    ):
+        given = {"pin": _pins(pins, velocities or {}), "link": links, "slide": slides, "slot": slots, "gear": gears, "cam": cams}
+        given |= {"motor": motors, "spring": springs, "damper": dampers, "load": loads}
+        given |= {"body": bodies, "joint": joints, "driver": drivers, "force": forces}
+        unknown = [
+            f"velocities.{pin}: no pin named {quote(pin)}{suggestion(pin, pins)}" for pin in velocities or {} if pin not in pins
+        ]
+        entries = [entry for section, group in given.items() for entry in _entries(section, group)]
+        found = read_drawing(entries, ground, gravity, Units(units))
+        if unknown or found.problems:
+            raise SceneError([*unknown, *found.problems], name)
+        self.name, self.gravity, self.ground = name, number(found.gravity), tuple(ground)
+        self.units = tuple((units or {}).items())
+        self._names = tuple(tuple(found.groups[section]) for section in (*DRAWN, *BY_HAND))
+        self._elements = tuple(tuple(found.groups[section].values()) for section in (*DRAWN, *BY_HAND))
+
+    @property
+    def groups(self) -> dict[str, dict[str, Any]]:
+        """All elements by section (pin, link, motor, ...) and name."""
+        sections = zip((*DRAWN, *BY_HAND), self._names, self._elements, strict=True)
+        return {section: dict(zip(names, elements, strict=True)) for section, names, elements in sections}
+
+    @property
+    def pins(self) -> dict[str, Float[Array, "2"]]:
+        """The world coordinates of the pins by name (m)."""
+        return {name: pin.position for name, pin in self.groups["pin"].items()}
+
+    @property
+    def links(self) -> dict[str, Link]:
+        """The links by name."""
+        return self.groups["link"]
+
+    def mechanism(self) -> Mechanism:
+        """Return the mechanism that is drawn; its numbers follow from those of the drawing, and may be traced."""
+        groups = known_elements(self.groups)
+        placement = placement_of(groups, self.ground)
+        bodies = {name: drawn.body for name, drawn in placement.drawn.items()} | groups["body"]
+        joints: dict[str, Joint] = {}
+        for name, (pin, *pair) in joint_names(placement, list(groups["pin"])).items():
+            joints[name] = Revolute(tuple(pair), placement.points(pair, [placement.places[pin]] * 2))
+        parts = {name: element.parts(placement) for s in SECTIONS if s != "motor" for name, element in groups[s].items()}
+        motors = {name: motor.parts(placement) for name, motor in groups["motor"].items()}
+        joints |= {name: part.joint for name, part in parts.items() if part.joint is not None}
+        drivers = {name: part.driver for name, part in motors.items() if part.driver is not None}
+        forces = {name: part.force for name, part in (*parts.items(), *motors.items()) if part.force is not None}
+        own = self.groups
+        joints, drivers, forces = joints | own["joint"], drivers | own["driver"], forces | own["force"]
+        return Mechanism(bodies, joints, drivers, forces, self.gravity, self.name, drawing=self)
+
+    def _in(self, units: Mapping[str, str]) -> "Drawing":
+        """Return the same drawing, to be written in other units."""
+        found = object.__new__(Drawing)
+        for field, value in (vars(self) | {"units": tuple(units.items())}).items():
+            object.__setattr__(found, field, value)
+        return found
+
+    def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
+        """Return the drawing with other numbers in its elements; raise `SceneError` where they make no mechanism."""
+        entries = [entry for section, group in groups.items() for entry in _entries(section, group)]
+        found = read_drawing(entries, self.ground, gravity, Units())
+        if found.problems:
+            raise SceneError(found.problems, self.name)
+        return eqx.tree_at(
+            lambda d: (d.gravity, d._elements),
+            self,
+            (gravity, tuple(tuple(found.groups[s].values()) for s in (*DRAWN, *BY_HAND))),
+        )
+
+
+def _pins(pins: Mapping[str, Any], velocities: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: pin if isinstance(pin, Pin) else {"position": pin, **({"velocity": velocities[name]} if name in velocities else {})}
+        for name, pin in pins.items()
+    }
+
+
+def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> list[SceneEntry]:
+    """Return the entries of a section; elements of a list without names are called by the section and counted."""
+    cls = (DRAWN | BY_HAND)[section]
+    if isinstance(group, Mapping):
+        items = list(group.items())
+    elif section == "force":
+        items = list(zip(name_elements(group or []), group or [], strict=True))
+    else:
+        items = [(f"{section}{k + 1}", item) for k, item in enumerate(group or [])]
+    found = []
+    for k, (name, item) in enumerate(items):
+        if isinstance(item, cls):
+            found.append(SceneEntry(section, k, name, type(item), table_of(item), element=item))
+        elif isinstance(item, Mapping) and section in DRAWN:
+            found.append(SceneEntry(section, k, name, cls, item))
+        else:
+            problem = f"{where(section, k, name)}: must be a table or of class {cls.__name__}, is a {type(item).__name__}"
+            found.append(SceneEntry(section, k, name, None, {}, problem))
+    return found

@@ -1,0 +1,132 @@
+"""Reads the elements of a drawing from tables, and finds every mistake: of units, keys, names, of who meets whom, of geometry."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from udkjax.scene.bodies import GROUND, Body, Frame
+from udkjax.scene.checks import SceneEntry, abbreviate, check_table, gravity_mistakes, quote, suggestion
+from udkjax.scene.drawing.drawn_element import DrawnElement
+from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
+from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
+from udkjax.scene.drawing.link import Link, Pin, with_known_numbers
+from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, shape_mistakes, where
+from udkjax.scene.drawing.placement import PinLayout, Placement
+from udkjax.scene.drawing.quantities import Units, without_failed
+from udkjax.scene.drivers import Driver
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.joints import Joint, Revolute
+from udkjax.scene.schema import build
+
+Table = Mapping[str, Any]
+SECTIONS: Mapping[str, type[DrawnElement]] = {
+    "slide": Slide,
+    "slot": PinInSlot,
+    "gear": GearPair,
+    "cam": CamPair,
+    "motor": Motor,
+    "spring": PinSpring,
+    "damper": PinDamper,
+    "load": Load,
+}
+DRAWN = {"pin": Pin, "link": Link, **SECTIONS}
+BY_HAND = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}  # as in a mechanism
+
+
+class DrawingElements(NamedTuple):
+    """What was read of a drawing, and what is wrong with it."""
+
+    groups: dict[str, dict[str, Any]]
+    gravity: Any
+    problems: list[str]
+
+
+def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, units: Units) -> DrawingElements:
+    """Read elements of a drawing and find every mistake: of units, keys and shapes, of names, of who meets whom, of geometry."""
+    problems = list(units.problems)
+    if gravity is None:
+        gravity = (0.0, -9.81)
+    elif isinstance(gravity, str | list | tuple):
+        gravity = units.convert("gravity", gravity, "m/s2", problems)
+    problems += [] if gravity is None else gravity_mistakes(gravity)
+    named = {s: {str(e.name): e.cls for e in entries if e.section == s} for s in (*DRAWN, *BY_HAND)}
+    bodies = {GROUND: None, **named["link"], **named["body"]}
+    known: dict[str, Any] = {"pin": named["pin"], "link": bodies, "body": bodies, "slide": named["slide"]}
+    fixed: Sequence[str] = ground if isinstance(ground, list | tuple) and all(isinstance(p, str) for p in ground) else ()
+    if not named["link"] and not named["body"]:
+        problems.append("link: a drawing needs at least one link")
+    if fixed != ground:
+        problems.append(f"ground: must be a list of pins, is {abbreviate(ground)}")
+    problems += [
+        f"ground[{k}]: no pin named {quote(p)}{suggestion(p, named['pin'])}" for k, p in enumerate(fixed) if p not in named["pin"]
+    ]
+    groups: dict[str, dict[str, Any]] = {section: {} for section in (*DRAWN, *BY_HAND)}
+    for section in groups:
+        if section == "body":  # what names joints comes last: they are known now, where the pins and links are right
+            layout = PinLayout(groups["link"], fixed, groups["slide"])
+            known["revolute"] = dict.fromkeys(joint_names(layout, list(groups["pin"])), Revolute)
+            known["revolute"] |= named["joint"]
+        for entry in entries:
+            if entry.section == section:
+                _read_element(entry, known, units, groups[section], problems)
+    if any(len(groups[s]) < len(named[s]) for s in ("pin", "link")) or any(pin not in named["pin"] for pin in fixed):
+        return DrawingElements(groups, gravity, problems)
+    layout = PinLayout(groups["link"], fixed, groups["slide"])
+    problems += layout_mistakes(layout, groups, fixed)
+    if not any(isinstance(x, Tracer) for x in jax.tree.leaves((groups["pin"], groups["link"]))):
+        drawn = known_elements(groups)
+        problems += shape_mistakes({name: pin.position for name, pin in drawn["pin"].items()}, drawn["link"])
+        if not problems:
+            problems += gap_mistakes(placement_of(drawn, fixed), drawn)
+    return DrawingElements(groups, gravity, problems)
+
+
+def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, group: dict[str, Any], problems: list[str]) -> None:
+    """Add an element to its group, or what is wrong with it to the problems."""
+    place = entry.where if entry.section != "pin" else where("pin", entry.index, str(entry.name))
+    if not isinstance(entry.name, str) or not entry.name:
+        given = "missing" if entry.name is None else f"must be a non-empty string, is {abbreviate(entry.name)}"
+        problems.append(f"{place}.name: {given}")
+    elif entry.name in group:
+        problems.append(f"{place}.name: taken by another {entry.section}; names must be unique")
+    if entry.cls is None:
+        problems.append(entry.problem)
+        return
+    failed: list[str] = []
+    table, cls = entry.table, entry.cls
+    if not isinstance(entry.element, cls):
+        variant, law = units_of_element(cls, table)
+        table = units.convert_table(place, cls, table, failed, variant, law)
+    found = [*failed, *without_failed(check_table(place, cls, table, known), failed)]
+    if entry.section == "pin":
+        found = [problem.replace(f"{place}.position", place, 1) for problem in found]
+    problems += found
+    if not found and isinstance(entry.name, str):
+        group.setdefault(entry.name, entry.element if isinstance(entry.element, cls) else build(cls, table))
+
+
+def units_of_element(cls: type, table: Table) -> tuple[str, str]:
+    """Return the name by which the units of an element's numbers are known, and the unit of its motion law."""
+    if cls in (PinSpring, PinDamper):
+        return ("TorsionSpring" if "pin" in table else "Spring"), ""
+    if cls is Motor:
+        return ("SlideMotor", "m") if "slide" in table else ("Motor", "rad")
+    return cls.__name__, "rad" if table.get("coordinate") == "angle" else "m"
+
+
+def placement_of(groups: Mapping[str, Mapping[str, Any]], ground: Sequence[str]) -> Placement:
+    """Return the placement of a drawing's elements, whose numbers are NumPy's or traced."""
+    links = groups["link"]
+    places = {name: pin.position for name, pin in groups["pin"].items()}
+    speeds = {name: np.zeros(2) if pin.velocity is None else pin.velocity for name, pin in groups["pin"].items()}
+    drawn = {name: link.body(places, speeds) for name, link in links.items()}
+    frames = {name: Frame.at(body.position, body.angle) for name, body in groups["body"].items()}
+    return Placement(PinLayout(links, ground, groups["slide"]), places, drawn, frames)
+
+
+def known_elements(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return elements with NumPy's arrays for all numbers that are not traced, in their order: JAX sorts the keys of a dict."""
+    return {section: {name: with_known_numbers(x) for name, x in group.items()} for section, group in groups.items()}

@@ -1,0 +1,113 @@
+"""Drawings as the tables of a TOML file, version 2 of the scene format, and back; reading gives the same numbers, bit by bit."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, suggestion
+from udkjax.scene.drawing.drawing import Drawing
+from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, read_drawing, units_of_element
+from udkjax.scene.drawing.link import Pin
+from udkjax.scene.drawing.quantities import Units
+from udkjax.scene.fields import Table
+from udkjax.scene.mechanism_tables import check_classes, check_known, key_lines, read_section, type_key
+from udkjax.scene.schema import table_of
+
+LISTS = tuple(section for section in DRAWN if section != "pin")  # sections of tables in double brackets
+PLURALS = {
+    **{section: f"{section}s" for section in LISTS},
+    "body": "bodies",
+    "joint": "joints",
+    "driver": "drivers",
+    "force": "forces",
+}
+
+
+def drawing_of_tables(scene: Mapping[str, Any], source: str) -> Drawing:
+    """Return the drawing of the tables of a file; raise `SceneError`, with the name of the file."""
+    problems = list(_check_head(scene))
+    entries = list(_read_pins(scene, problems))
+    for section in LISTS:
+        entries.extend(_read_list(section, scene.get(section, []), problems))
+    for section in BY_HAND:
+        entries.extend(read_section(section, scene.get(section, []), problems))
+    ground, gravity, units = scene.get("ground", []), scene.get("gravity"), scene.get("units", {})
+    found = read_drawing(entries, ground, gravity, Units(units))
+    problems.extend(found.problems)
+    if problems:
+        raise SceneError(problems, source)
+    named: dict[str, Any] = {plural: found.groups[section] for section, plural in PLURALS.items()}
+    try:
+        return Drawing(found.groups["pin"], ground=ground, gravity=found.gravity, name=scene.get("name", ""), **named)._in(units)
+    except SceneError as error:
+        raise SceneError(error.problems, source) from None
+
+
+def _check_head(scene: Table) -> Iterator[str]:
+    """Iterate over the mistakes at the top of a file."""
+    if not isinstance(scene.get("name", ""), str):
+        yield f"name: must be a string, is {abbreviate(scene['name'])}"
+    expected = ("format", "name", "units", "gravity", "ground", "pins", "velocities", *LISTS, *BY_HAND)
+    for key in scene:
+        if key not in expected:
+            near = f"; write [[{key[:-1]}]]" if key[:-1] in expected and key.endswith("s") else suggestion(key, expected)
+            yield f"{key}: unknown key{near}"
+
+
+def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneEntry]:
+    tables = {key: scene.get(key, {}) for key in ("pins", "velocities")}
+    for key, table in tables.items():
+        if not isinstance(table, dict):
+            problems.append(f"{key}: must be a table, such as [{key}] with A = [0, 1] below, is {abbreviate(table)}")
+            return
+    pins, velocities = tables.values()
+    problems += [f"velocities.{name}: no pin of this name{suggestion(name, pins)}" for name in velocities if name not in pins]
+    for k, (name, place) in enumerate(pins.items()):
+        speed = {"velocity": velocities[name]} if name in velocities else {}
+        yield SceneEntry("pin", k, name, Pin, {"position": place, **speed})
+
+
+def _read_list(section: str, tables: object, problems: list[str]) -> Iterator[SceneEntry]:
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        problems.append(f"{section}: must be a list of tables; write [[{section}]] above each")
+        return
+    for k, table in enumerate(tables):
+        name = table.get("name", None if section == "link" else f"{section}{k + 1}")
+        yield SceneEntry(section, k, name, DRAWN[section], {key: value for key, value in table.items() if key != "name"})
+
+
+def drawing_text(drawing: Drawing) -> str:
+    """Return a drawing as the text of a TOML file, in the units that it was drawn in; raise `SceneError` where that cannot be."""
+    check_known(drawing, drawing.name)
+    units, groups = Units(dict(drawing.units)), drawing.groups
+    problems = [
+        problem
+        for section in BY_HAND
+        for name, element in groups[section].items()
+        for problem in check_classes(f'{section} "{name}"', type(element), table_of(element))
+    ]
+    problems += [
+        problem
+        for name, motor in groups["motor"].items()
+        if motor.motion is not None
+        for problem in check_classes(f'motor "{name}".motion', type(motor.motion), {})
+    ]
+    if problems:
+        raise SceneError(problems, drawing.name)
+    head: dict[str, Any] = {"format": 2, **({"name": drawing.name} if drawing.name else {})}
+    if drawing.units:
+        head["units"] = dict(drawing.units)
+    head["gravity"] = [units.write(x, "m/s2") for x in np.asarray(drawing.gravity).tolist()]
+    lines = key_lines(head | ({"ground": list(drawing.ground)} if drawing.ground else {}))
+    tables = {name: units.write_table(pin) for name, pin in groups["pin"].items()}
+    for title, key in (("pins", "position"), ("velocities", "velocity")):
+        written = {name: table[key] for name, table in tables.items() if key in table}
+        lines += ["", f"[{title}]", *key_lines(written)] if written else []
+    for section in (*LISTS, *BY_HAND):
+        for name, element in groups[section].items():
+            table = units.write_table(element, *units_of_element(type(element), table_of(element)))
+            kind = type_key(type(element)) if section in BY_HAND else {}
+            table = {key: value for key, value in table.items() if value not in ((), "") and value is not False}
+            lines += ["", f"[[{section}]]", *key_lines({"name": name, **kind, **table})]
+    return "\n".join(lines) + "\n"

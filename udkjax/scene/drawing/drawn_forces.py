@@ -1,0 +1,230 @@
+"""What moves the links of a drawing, and pulls at them: motors, springs, dampers, loads."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.checks import quote
+from udkjax.scene.drawing.drawn_element import DrawnElement, Parts, pair_mistakes
+from udkjax.scene.drawing.placement import PinLayout, Placement
+from udkjax.scene.drivers import Driver, Motion, Polynomial, Sine, Spline
+from udkjax.scene.fields import (
+    LINK,
+    NOT_NEGATIVE,
+    PIN,
+    SLIDE,
+    Number,
+    array_namespace,
+    names,
+    number,
+    optional_number,
+)
+from udkjax.scene.forces import Force, Spring, Torque, TorsionSpring
+
+
+class Motor(DrawnElement):
+    """A motor turns the second of two links at a `pin`, or moves a `slide`: at a `speed`, by a `motion`, or by a `torque`.
+
+    A speed and a motion count from the drawn position.
+    """
+
+    pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
+    slide: str | None = eqx.field(static=True, default=None, metadata=SLIDE)
+    of: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=LINK)  # needed where more than two meet
+    speed: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)  # rad/s; of a slide: m/s
+    motion: Motion | None = None  # rad or m, from the drawn position
+    torque: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)  # N m
+
+    @property
+    def measured_as(self):
+        return "SlideMotor" if self.slide is not None else "Motor"
+
+    def mistakes(self, layout):
+        if (self.pin is None) == (self.slide is None):
+            yield "pin: give a pin, or a slide"
+        elif self.pin is not None:
+            yield from pair_mistakes(layout, self.pin, self.of)
+        if sum(x is not None for x in (self.speed, self.motion, self.torque)) != 1:
+            yield "speed: give one of speed, motion and torque"
+        elif self.slide is not None and self.torque is not None:
+            yield "torque: a slide does not turn: write a [[load]] with a force"
+
+    def parts(self, placement):
+        if self.slide is not None:
+            slide = placement.slides[self.slide]
+            pair, place = (slide.on, slide.link), placement.places[placement.links[slide.link].pins[0]]
+            axis = placement.direction(slide.on, slide.along, slide.direction)
+            return Parts(driver=Driver(pair, "x", self._law(0.0), placement.points(pair, (place, place)), axis))
+        assert self.pin is not None
+        pair = placement.pair(self.pin, self.of)
+        if self.torque is not None:
+            return Parts(force=Torque(pair, self.torque))
+        return Parts(driver=Driver(pair, "angle", self._law(placement.angle_between(*pair))))
+
+    def _law(self, start: Number) -> Motion:
+        if self.motion is not None:
+            return shift_motion(self.motion, start)
+        assert self.speed is not None
+        return Polynomial(array_namespace(start, self.speed).stack([start, self.speed]))
+
+
+class PinSpring(DrawnElement):
+    """A spring `between` two pins, unloaded at its `length`; or a torsion spring at a `pin`, unloaded at its `angle`.
+
+    Both are unloaded as drawn unless told otherwise; an angle counts from there.
+    """
+
+    stiffness: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)  # N/m; of torsion: N m/rad
+    between: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=PIN)
+    pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
+    of: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=LINK)  # needed where more than two meet
+    damping: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=NOT_NEGATIVE)
+    length: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=NOT_NEGATIVE)  # m
+    angle: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)  # rad
+
+    @property
+    def measured_as(self):
+        return "Spring" if self.pin is None else "TorsionSpring"
+
+    def mistakes(self, layout):
+        yield from _mistakes_of_ends(layout, self.between, self.pin, self.of)
+        if self.pin is not None and self.length is not None:
+            yield "length: a spring at a pin has an angle"
+        if self.between and self.angle is not None:
+            yield "angle: a spring between pins has a length"
+
+    def parts(self, placement):
+        if self.pin is not None:
+            pair = placement.pair(self.pin, self.of)
+            free = placement.angle_between(*pair) + (0.0 if self.angle is None else self.angle)
+            return Parts(force=TorsionSpring(pair, self.stiffness, self.damping, free))
+        length = placement.distance(*self.between) if self.length is None else self.length
+        return Parts(force=_spring_between(placement, self.between, self.stiffness, length, self.damping))
+
+    @property
+    def anchors(self):
+        return self.between
+
+
+class PinDamper(DrawnElement):
+    """A damper `between` two pins, or of the turning at a `pin`."""
+
+    damping: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)  # N s/m; of turning: N m s/rad
+    between: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=PIN)
+    pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
+    of: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=LINK)  # needed where more than two meet
+
+    @property
+    def measured_as(self):
+        return "Spring" if self.pin is None else "TorsionSpring"
+
+    def mistakes(self, layout):
+        yield from _mistakes_of_ends(layout, self.between, self.pin, self.of)
+
+    def parts(self, placement):
+        if self.pin is not None:
+            return Parts(force=TorsionSpring(placement.pair(self.pin, self.of), 0.0, self.damping))
+        return Parts(force=_spring_between(placement, self.between, 0.0, 0.0, self.damping))
+
+    @property
+    def anchors(self):
+        return self.between
+
+
+class Load(DrawnElement):
+    """A constant `force` at a pin or at a link's centre of mass, or a constant `torque` on a link."""
+
+    pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
+    link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # beside a pin: which of its links
+    force: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None)  # N
+    torque: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)  # N m, from the ground
+    frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")  # whose axes the force has
+
+    def mistakes(self, layout):
+        if (self.force is None) == (self.torque is None):
+            yield "force: give a force, or a torque"
+        if self.torque is not None and (self.link is None or self.pin is not None):
+            yield "torque: name the link that it is on, and no pin"
+        elif not self._body(layout):
+            yield "pin: give a pin of a link, or a link"
+        elif self._body(layout) == GROUND:
+            yield f'link: "{GROUND}" does not move; name a link'
+        elif self.pin is not None and self.link is not None and self.link not in layout.members(self.pin):
+            yield f"link: {quote(self.link)} has no pin {quote(self.pin)}"
+
+    def parts(self, placement):
+        body = self._body(placement)
+        if self.torque is not None:
+            return Parts(force=Torque((GROUND, body), self.torque))
+        assert self.force is not None
+        point = (0.0, 0.0) if self.pin is None else placement.local(body, placement.places[self.pin])
+        vector = self.force
+        if self.frame == "body":  # drawn in world coordinates, and turning with the body from then on
+            vector = _turn_back(self.force, placement.angle(body))
+        return Parts(force=Force(body, vector, point, self.frame))
+
+    def _body(self, layout: PinLayout) -> str:
+        if self.link is not None or self.pin is None:
+            return self.link or ""
+        return next((m for m in layout.members(self.pin) if m != GROUND), "")
+
+
+def shift_motion(motion: Motion, start: Number) -> Motion:
+    """Return a motion law that begins at another value: motion(t) + start."""
+    if isinstance(motion, Polynomial):
+        xp = array_namespace(motion.coefficients, start)
+        first = xp.zeros(len(motion.coefficients))
+        first = xp.concatenate([xp.stack([start]), first[1:]])
+        return Polynomial(motion.coefficients + first)
+    if isinstance(motion, Sine):
+        return replace(motion, offset=motion.offset + start)
+    if isinstance(motion, Spline):
+        return replace(motion, values=motion.values + start)
+    return ShiftedMotion(motion, start)
+
+
+class ShiftedMotion(Motion):
+    """A motion law of the user's own that begins at another value."""
+
+    motion: Motion
+    start: Float[Array, ""] = eqx.field(converter=number)
+
+    def __call__(self, t):
+        return self.motion(t) + self.start
+
+    @property
+    def breakpoints(self):
+        return self.motion.breakpoints
+
+
+def _turn_back(vector: Array, angle: Number) -> Array:
+    xp = array_namespace(vector, angle)
+    c, s = xp.cos(angle), xp.sin(angle)
+    return xp.stack([c * vector[0] + s * vector[1], c * vector[1] - s * vector[0]])
+
+
+def _spring_between(
+    placement: Placement, between: tuple[str, ...], stiffness: Number, length: Number, damping: Number | None
+) -> Spring:
+    ends = placement.ends(between)
+    return Spring(ends, placement.points(ends, [placement.places[pin] for pin in between]), stiffness, length, damping)
+
+
+def _mistakes_of_ends(layout: PinLayout, between: tuple[str, ...], pin: str | None, of: tuple[str, ...]) -> Iterator[str]:
+    """Iterate over what is wrong with an element between two pins, or at one."""
+    if bool(between) == (pin is not None):
+        yield "between: give two pins, or one pin to turn at"
+    elif pin is not None:
+        yield from pair_mistakes(layout, pin, of)
+    elif len(between) != 2 or between[0] == between[1]:
+        yield "between: must name two pins"
+    else:
+        one, two = map(layout.members, between)
+        yield from (
+            f"between: no link has pin {quote(p)}, nor the ground" for p, m in zip(between, (one, two), strict=True) if not m
+        )
+        yield from (f"between: both pins are on {quote(m)}, so their distance never changes" for m in one if m in two)

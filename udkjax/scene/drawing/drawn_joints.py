@@ -1,0 +1,147 @@
+"""What joins the links of a drawing besides its pins: slides, slots, gears, cams."""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.checks import quote
+from udkjax.scene.drawing.drawn_element import DrawnElement, Parts, line_mistakes
+from udkjax.scene.drawing.placement import PinLayout, Placement
+from udkjax.scene.fields import (
+    LINK,
+    PIN,
+    POSITIVE,
+    Number,
+    array_namespace,
+    direction,
+    names,
+    optional_number,
+)
+from udkjax.scene.joints import Cam, Gear, Prismatic, Profile, Slot, as_profile
+
+
+class Slide(DrawnElement):
+    """A `link` slides along a line of another one, or the ground, and does not turn on it."""
+
+    link: str = eqx.field(static=True, metadata=LINK)
+    along: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=PIN)  # two pins
+    direction: Float[Array, ""] | None = eqx.field(converter=direction, default=None)  # rad, or a vector; in place of `along`
+    on: str = eqx.field(static=True, default=GROUND, metadata=LINK)
+
+    def mistakes(self, layout):
+        yield from line_mistakes(self.along, self.direction)
+        if self.link not in layout.links:
+            yield f"link: {quote(self.link)} is no link with a pin to slide by"
+        if self.on == self.link:
+            yield f"on: {quote(self.on)} is connected to itself"
+
+    def parts(self, placement):
+        place = placement.places[placement.links[self.link].pins[0]]
+        axis = placement.direction(self.on, self.along, self.direction)
+        pair = (self.on, self.link)
+        return Parts(joint=Prismatic(pair, placement.points(pair, (place, place)), axis, placement.angle_between(*pair)))
+
+    @property
+    def anchors(self):
+        return self.along
+
+
+class PinInSlot(DrawnElement):
+    """A `pin` is guided by a line of a link, or of the ground: through two pins, or through itself in a direction."""
+
+    pin: str = eqx.field(static=True, metadata=PIN)
+    along: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=PIN)  # two pins
+    direction: Float[Array, ""] | None = eqx.field(converter=direction, default=None)  # rad, or a vector; in place of `along`
+    on: str = eqx.field(static=True, default=GROUND, metadata=LINK)
+    link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # that is guided; needed where `on` shares the pin
+
+    def mistakes(self, layout):
+        yield from line_mistakes(self.along, self.direction)
+        if not self._guided(layout):
+            yield f"pin: {quote(self.pin)} is on no link but {quote(self.on)}, whose slot it should slide in"
+        if self.link is not None and self.link not in layout.members(self.pin):
+            yield f"link: {quote(self.link)} has no pin {quote(self.pin)}"
+
+    def parts(self, placement):
+        pair = (self.on, self._guided(placement))
+        pin = placement.places[self.pin]
+        points = placement.points(pair, (placement.places[self.along[0]] if self.along else pin, pin))
+        return Parts(joint=Slot(pair, points, placement.direction(self.on, self.along, self.direction)))
+
+    def _guided(self, layout: PinLayout) -> str:
+        return self.link or next((m for m in layout.members(self.pin) if m != self.on), "")
+
+    @property
+    def anchors(self):
+        return self.along
+
+
+class GearPair(DrawnElement):
+    """Two wheels mesh. Their centres are the pins by which they turn on the `carrier`; `teeth`, or `radii`, give the ratio."""
+
+    links: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=LINK)
+    teeth: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, metadata=POSITIVE)
+    radii: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, metadata=POSITIVE)  # m
+    internal: bool = eqx.field(static=True, default=False)
+    carrier: str = eqx.field(static=True, default=GROUND, metadata=LINK)
+
+    def mistakes(self, layout):
+        if len(self.links) != 2 or self.links[0] == self.links[1]:
+            yield "links: must name two links"
+            return
+        if (self.teeth is None) == (self.radii is None):
+            yield "teeth: give teeth, or radii"
+        for wheel in self.links:
+            if layout.centre(wheel, self.carrier) is None:
+                yield (
+                    f"links: {quote(wheel)} must share one pin, its centre, with {quote(self.carrier)}, on which it turns; "
+                    "carrier = names another link to turn on"
+                )
+
+    def parts(self, placement):
+        radii = self.radii
+        if radii is None:  # such that the wheels touch
+            assert self.teeth is not None
+            one, two = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
+            radii = self.teeth * (placement.distance(one, two) / self._apart(self.teeth))
+        return Parts(joint=Gear(self.links, radii, self.internal, self.carrier))
+
+    def misfit(self, placement: Placement) -> tuple[float, float] | None:
+        """Return how far the centres are apart and how far the radii ask them to be (m); None where they are not asked."""
+        if self.radii is None:
+            return None
+        one, two = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
+        return float(placement.distance(one, two)), float(self._apart(self.radii))
+
+    def _apart(self, sizes: Array) -> Number:
+        difference = array_namespace(sizes).abs(sizes[0] - sizes[1])
+        return difference if self.internal else sizes[0] + sizes[1]
+
+
+class CamPair(DrawnElement):
+    """A follower, the second pin, stays on the `profile` of a cam around the first one.
+
+    The polar angle of the profile counts from the direction of the cam's x axis: from its first pin towards its second, or the
+    world's x axis for a cam of one pin.
+    """
+
+    pins: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=PIN)
+    profile: Profile = eqx.field(converter=as_profile)
+    links: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=LINK)  # cam and follower
+
+    def mistakes(self, layout):
+        if len(self.pins) != 2:
+            yield "pins: must name two pins, the centre of the cam and the follower"
+            return
+        pair = self._pair(layout)
+        if len(pair) != 2 or any(p not in layout.members(pin) for p, pin in zip(pair, self.pins, strict=False)):
+            yield "links: name two, the cam with the first pin and the follower with the second"
+
+    def parts(self, placement):
+        pair = self._pair(placement)
+        return Parts(joint=Cam(pair, placement.points(pair, [placement.places[pin] for pin in self.pins]), self.profile))
+
+    def _pair(self, layout: PinLayout) -> tuple[str, ...]:
+        """The links, or the only moving ones of the pins."""
+        found = [[m for m in layout.members(pin) if m != GROUND] for pin in self.pins]
+        return self.links or tuple(members[0] for members in found if len(members) == 1)

@@ -1,0 +1,225 @@
+"""What is wrong with a drawing as a whole: names that are taken, pins and links that hang on nothing, shapes that are none."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations, pairwise
+from typing import Any
+
+import numpy as np
+
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.checks import quote
+from udkjax.scene.drawing.drawn_element import DrawnElement
+from udkjax.scene.drawing.drawn_joints import GearPair, PinInSlot
+from udkjax.scene.drawing.link import Link
+from udkjax.scene.drawing.placement import PinLayout, Placement
+from udkjax.scene.drawing.shapes import Points, twice_area
+
+Groups = Mapping[str, Mapping[str, Any]]
+
+# Of the largest distance between two pins: below, what is drawn apart is drawn at one place, and an area is none.
+SAME_PLACE = 1e-9
+# Of the distances among the other pins: farther away, a pin is in another unit. Usual units of length differ by ten (cm and mm),
+# which no drawing shows, or by 25 (mm and inches) to 1,000; pins of a mechanism by less.
+FAR = 100.0
+# Of the largest distance between two pins: a gap that assembly closes as drawing to scale would leave it.
+DRAWN_GAP = 0.01
+
+
+def where(section: str, index: int, name: str) -> str:
+    """Return the path of an entry of a drawing, as in error messages."""
+    return f"pins.{name}" if section == "pin" else f"{section} {quote(name)} ({section}[{index}])"
+
+
+def joint_names(layout: PinLayout, pins: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+    """Return the revolutes of a drawing, one less than the links that share a pin: by name the pin and the two links."""
+    found = {}
+    for pin in pins:
+        first, *others = layout.members(pin) or ("",)
+        for k, other in enumerate(others):
+            found[pin if k == 0 else f"{pin}-{k + 1}"] = (pin, first, other)
+    return found
+
+
+def layout_mistakes(layout: PinLayout, groups: Groups, ground: Sequence[str]) -> Iterator[str]:
+    """Iterate over what is wrong with who meets whom; all names are known."""
+    elements = {s: g for s, g in groups.items() if g and isinstance(next(iter(g.values())), DrawnElement)}
+    yield from _taken_names(layout, groups)
+    anchors = {pin for group in elements.values() for element in group.values() for pin in element.anchors}
+    used = {pin for link in layout.links.values() for pin in link.pins}
+    for k, pin in enumerate(ground):
+        if pin not in used | anchors:
+            yield f"ground[{k}]: no link reaches pin {quote(pin)}"
+    for pin in groups["pin"]:
+        if pin not in used and pin not in ground:
+            yield f"pins.{pin}: no link uses it"
+    attached = _attached(layout, groups)
+    for k, (name, link) in enumerate(layout.links.items()):
+        place = where("link", k, name)
+        yield from (f"{place}{problem}" for problem in _link_mistakes(link))
+        if name not in attached:
+            yield f"{place}.pins: no other link and no ground shares one of them: the link hangs on nothing"
+    for section, group in elements.items():
+        for k, (name, element) in enumerate(group.items()):
+            yield from (f"{where(section, k, name)}.{problem}" for problem in element.mistakes(layout))
+
+
+def _taken_names(layout: PinLayout, groups: Groups) -> Iterator[str]:
+    """Iterate over names that two elements of the mechanism would have."""
+    motors = groups["motor"]
+    spaces = (
+        ("link", "body"),
+        ("slide", "slot", "gear", "cam", "motor", "joint", "driver"),
+        ("motor", "spring", "damper", "load", "force"),
+    )
+    for space in spaces:
+        owner = (
+            {name: f'pin "{pin}"' for name, (pin, *_) in joint_names(layout, list(groups["pin"])).items()}
+            if "slide" in space
+            else {}
+        )
+        for section in space:
+            for k, name in enumerate(groups[section]):
+                if section == "motor" and (motors[name].torque is None) == ("force" in space):
+                    continue
+                if name in owner:
+                    yield f"{where(section, k, name)}.name: taken by {owner[name]}; names must be unique"
+                elif "link" in space and name == GROUND:
+                    yield f'{where(section, k, name)}.name: "{GROUND}" is the fixed frame; choose another name'
+                owner.setdefault(name, f"{section}[{k}]")
+
+
+def _attached(layout: PinLayout, groups: Groups) -> set[str]:
+    """Return the links that something holds or pulls at."""
+    found = {name for pin in groups["pin"] if len(m := layout.members(pin)) > 1 for name in m}
+    for section in ("slide", "slot", "cam", "gear", "spring", "damper", "load", "joint", "driver", "force"):
+        for element in groups[section].values():
+            pins = (getattr(element, "pin", None), *getattr(element, "pins", ()), *getattr(element, "between", ()))
+            named = (getattr(element, name, None) for name in ("link", "on", "body"))
+            found |= {*named, *getattr(element, "links", ()), *getattr(element, "bodies", ())}
+            found |= {name for pin in pins if pin for name in layout.members(pin)}
+    return {name for name in found if name}
+
+
+def _link_mistakes(link: Link) -> Iterator[str]:
+    """Iterate over what is wrong with a link by itself, its numbers aside."""
+    if not link.pins:
+        yield ".pins: a link needs at least one pin"
+        return
+    if len(set(link.pins)) < len(link.pins):
+        yield ".pins: names a pin twice"
+    if (link.density is None) == (link.mass is None):
+        yield ": give a density, with a thickness, or a mass" + (", not both" if link.mass is not None else "")
+    elif link.density is not None and link.thickness is None:
+        yield ".thickness: missing; a mass by density needs it"
+    elif link.kind == "disc" and link.width is None and (link.density is not None or link.inertia is None):
+        cure = "or an outline" if link.density is not None else "an outline, or its inertia"
+        yield f".width: a link of one pin is a disc: give its diameter, the width, {cure}"
+    elif link.kind == "bar" and link.width is None and link.density is not None:
+        yield ".width: missing; the mass of a bar by density needs it"
+
+
+def shape_mistakes(places: Mapping[str, Points], links: Mapping[str, Link]) -> Iterator[str]:
+    """Iterate over pins and shapes that cannot be meant; all numbers are known, and finite."""
+    size = extent(list(places.values()))
+    for one, two in combinations(places, 2):
+        if np.linalg.norm(places[two] - places[one]) <= SAME_PLACE * size:
+            yield f"pins.{two}: is at the same place as pin {quote(one)}: give all links there one pin, or move it"
+    yield from _far_pins(places)
+    for k, (name, link) in enumerate(links.items()):
+        yield from (f"{where('link', k, name)}{problem}" for problem in _shape_mistakes(places, link))
+
+
+def extent(points: Sequence[Points]) -> float:
+    """Return the largest distance between two points (m)."""
+    p = np.array(points).reshape(-1, 2)
+    return float(np.max(np.linalg.norm(p[:, None] - p[None], axis=-1), initial=0.0))
+
+
+def _far_pins(places: Mapping[str, Points]) -> Iterator[str]:
+    if len(places) < 3:
+        return
+    for name, place in places.items():
+        rest = [other for key, other in places.items() if key != name]
+        away, size = min(np.linalg.norm(place - other) for other in rest), extent(rest)
+        if away > FAR * size > 0:
+            yield (
+                f"pins.{name}: is {away:.3g} m away from the other pins, which are within {size:.3g} m of each other: "
+                "is its unit the one that is meant?"
+            )
+
+
+def _shape_mistakes(places: Mapping[str, Points], link: Link) -> Iterator[str]:
+    if not link.pins or len(set(link.pins)) < len(link.pins):
+        return  # which is said already
+    if link.inertia is not None and link.centre is not None and link.mass is not None and link.outline is None:
+        return  # which asks for no shape
+    points = [places[pin] for pin in link.pins]
+    if link.kind == "bar" and len(points) > 2:
+        start, way = points[0], points[-1] - points[0]
+        for pin, point in list(zip(link.pins, points, strict=True))[1:-1]:
+            off = abs(way[0] * (point - start)[1] - way[1] * (point - start)[0]) / max(np.linalg.norm(way), 1e-300)
+            half = 0.5 * float(np.asarray(link.width))
+            if off > max(half, DRAWN_GAP * np.linalg.norm(way)):
+                yield (
+                    f".pins: {quote(pin)} is {off:.3g} m off the bar from {quote(link.pins[0])} to {quote(link.pins[-1])}: "
+                    "leave out the width for a plate, give an outline, or put the ends of the bar first and last"
+                )
+    elif link.kind in ("plate", "outline"):
+        key, corners = ("pins", np.array(points)) if link.kind == "plate" else ("outline", np.asarray(link.outline))
+        if _crosses_itself(corners):
+            yield f".{key}: the polygon crosses itself: give its corners in their order around it"
+        elif abs(twice_area(corners)) <= SAME_PLACE * extent(list(corners)) ** 2:
+            cure = "; a bar has a width" if key == "pins" else ""
+            yield f".{key}: the corners lie on one line, and enclose no area{cure}"
+        elif key == "outline" and not any(_reaches(corners, point) for point in points):
+            yield f".outline: crosses none of the pins {', '.join(map(quote, link.pins))}"
+
+
+def _crosses_itself(corners: np.ndarray) -> bool:
+    """Tell whether two sides of a polygon that are not neighbours cross."""
+    sides = [*pairwise(corners), (corners[-1], corners[0])]
+
+    def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> float:
+        return np.sign((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
+
+    return any(
+        side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0 for (a, b), (c, d) in combinations(sides, 2)
+    )
+
+
+def _reaches(corners: np.ndarray, point: Points) -> bool:
+    """Tell whether a point is within a polygon, or as near to it as drawing to scale would leave it."""
+    near = DRAWN_GAP * extent(list(corners))
+    inside = False
+    for a, b in [*pairwise(corners), (corners[-1], corners[0])]:
+        way, arm = b - a, point - a
+        share = np.clip(way @ arm / max(way @ way, 1e-300), 0.0, 1.0)
+        if np.linalg.norm(arm - share * way) <= near:
+            return True
+        if (a[1] > point[1]) != (b[1] > point[1]) and point[0] < a[0] + way[0] * arm[1] / way[1]:
+            inside = not inside
+    return inside
+
+
+def gap_mistakes(placement: Placement, groups: Groups) -> Iterator[str]:
+    """Iterate over slots and gears that do not fit as drawn; all numbers are known."""
+    size = extent(list(placement.places.values()))
+    for k, (name, slot) in enumerate(groups["slot"].items()):
+        off = _off_line(placement, slot) if slot.along else 0.0
+        if off > DRAWN_GAP * size:
+            line = " and ".join(map(quote, slot.along))
+            yield f"{where('slot', k, name)}.pin: {quote(slot.pin)} is {off:.3g} m off the line through {line}, its slot"
+    for k, (name, gear) in enumerate(groups["gear"].items()):
+        assert isinstance(gear, GearPair)
+        misfit = gear.misfit(placement)
+        if misfit is not None and abs(misfit[0] - misfit[1]) > DRAWN_GAP * misfit[0]:
+            yield (
+                f"{where('gear', k, name)}.radii: wheels of these radii are {misfit[1]:.4g} m apart, and their centres "
+                f"{misfit[0]:.4g} m: give teeth, or move a pin"
+            )
+
+
+def _off_line(placement: Placement, slot: PinInSlot) -> float:
+    start, end = (placement.places[pin] for pin in slot.along)
+    way, arm = end - start, placement.places[slot.pin] - start
+    return float(abs(way[0] * arm[1] - way[1] * arm[0]) / np.linalg.norm(way))

@@ -1,0 +1,89 @@
+"""Which links meet at which pins, and where they are: what elements of a drawing are attached to."""
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+from jaxtyping import Array, Float
+
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
+from udkjax.scene.drawing.link import DrawnBody, Link
+from udkjax.scene.drawing.shapes import Points
+from udkjax.scene.fields import Number, array_namespace
+
+
+class SlidingLink(Protocol):
+    """A slide: a link, and the line of another one that it slides along, which two pins or a direction (rad) give."""
+
+    link: str
+    on: str
+    along: tuple[str, ...]
+    direction: Array | None
+
+
+class PinLayout:
+    """Which links meet at which pins: names alone."""
+
+    def __init__(self, links: Mapping[str, Link], ground: Sequence[str], slides: Mapping[str, SlidingLink]):
+        self.links, self.ground, self.slides = links, ground, slides
+
+    def members(self, pin: str) -> tuple[str, ...]:
+        """Return the ground, where the pin is fixed, and the links that share it, in their order."""
+        fixed = (GROUND,) if pin in self.ground else ()
+        return (*fixed, *(name for name, link in self.links.items() if pin in link.pins))
+
+    def pair(self, pin: str, of: Sequence[str]) -> tuple[str, ...]:
+        """Return the two members of a pin that an element is between: those `of` which it is, or the only two."""
+        return tuple(of) or self.members(pin)
+
+    def ends(self, between: Sequence[str]) -> tuple[str, ...]:
+        """Return the first member of each of two pins: a force at a pin moves all of its links alike."""
+        return tuple(self.members(pin)[0] for pin in between)
+
+    def centre(self, wheel: str, carrier: str) -> str | None:
+        """Return the pin by which a wheel turns on its carrier; None where that is not one pin."""
+        pins = self.ground if wheel == GROUND else self.links[wheel].pins if wheel in self.links else ()
+        shared = [pin for pin in pins if carrier in self.members(pin)]
+        return shared[0] if len(shared) == 1 else None
+
+
+class Placement(PinLayout):
+    """A layout with the places of its pins (m) and links; bodies that are not drawn have frames alone."""
+
+    def __init__(
+        self, layout: PinLayout, places: Mapping[str, Points], drawn: Mapping[str, DrawnBody], frames: Mapping[str, Frame]
+    ):
+        super().__init__(layout.links, layout.ground, layout.slides)
+        self.places, self.drawn = places, drawn
+        self._frames = {GROUND: GROUND_FRAME} | {name: body.frame for name, body in drawn.items()} | dict(frames)
+
+    def angle(self, body: str) -> Number:
+        """Return the angle of a body (rad)."""
+        return self._frames[body].angle
+
+    def angle_between(self, one: str, two: str) -> Number:
+        """Return the angle of body 2 relative to body 1 (rad)."""
+        return self.angle(two) - self.angle(one)
+
+    def local(self, body: str, place: Points) -> Float[Array, "2"]:
+        """Return a place in the frame of a body (m)."""
+        frame = self._frames[body]
+        x, y = frame.local((place[0] - frame.x, place[1] - frame.y))
+        return array_namespace(x, y).stack([x, y])
+
+    def points(self, bodies: Sequence[str], places: Sequence[Points]) -> Float[Array, "2 2"]:
+        """Return two places, each in the frame of its body (m)."""
+        found = [self.local(body, place) for body, place in zip(bodies, places, strict=True)]
+        return array_namespace(*found).stack(found)
+
+    def distance(self, one: str, two: str) -> Number:
+        """Return how far two pins are apart (m)."""
+        way = self.places[two] - self.places[one]
+        return array_namespace(way).sqrt(way @ way)
+
+    def direction(self, on: str, along: Sequence[str], direction: Number | None) -> Number:
+        """Return the direction of a line in the frame of a body (rad): that from pin to pin, or one in world coordinates."""
+        if along:
+            way = self.places[along[1]] - self.places[along[0]]
+            direction = array_namespace(way).arctan2(way[1], way[0])
+        assert direction is not None  # one of them is given
+        return direction - self.angle(on)

@@ -1,0 +1,183 @@
+"""Numbers of tables with their units: texts such as "12 mm", and plain numbers in the units that a file chooses."""
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, get_origin
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from udkjax.scene.checks import abbreviate, quote, suggestion
+from udkjax.scene.fields import Table, vector_as_angle
+from udkjax.scene.joints import Profile
+from udkjax.scene.schema import CLASSES_BY_TYPE, keys, table_of, type_name
+from udkjax.scene.units import FOLLOWS, conversion_factor, field_unit, read_quantity
+
+# Quantities that a file may choose a unit of, and their SI units, which are the choice where it says nothing.
+KINDS = {
+    "length": "m",
+    "angle": "rad",
+    "mass": "kg",
+    "time": "s",
+    "force": "N",
+    "torque": "N m",
+    "density": "kg/m3",
+    "inertia": "kg m2",
+    "velocity": "m/s",
+    "angular_velocity": "rad/s",
+    "acceleration": "m/s2",
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "torsional_stiffness": "N m/rad",
+    "torsional_damping": "N m s/rad",
+}
+_KIND_OF = {unit: kind for kind, unit in KINDS.items()}
+VECTORS = ("axis", "direction")  # angles that may be given as vectors
+
+
+class Units:
+    """The units of the plain numbers of a file.
+
+    A quantity that a file says nothing about is in SI units. But where one of its parts has another unit (a stiffness in a file
+    of millimetres) a plain number could mean either, and is refused: it needs its unit. A density is in kg/m^3, as in tables.
+    """
+
+    def __init__(self, chosen: object = None):
+        self.problems: list[str] = []
+        self.chosen: dict[str, str] = {}
+        if chosen is not None and not isinstance(chosen, Mapping):
+            self.problems.append(f'units: must be a table such as {{length = "mm"}}, is {abbreviate(chosen)}')
+            return
+        for kind, unit in (chosen or {}).items():
+            if kind not in KINDS:
+                known = suggestion(kind, KINDS) or "; there are " + ", ".join(KINDS)
+                self.problems.append(f"units.{kind}: unknown quantity{known}")
+            elif not isinstance(unit, str):
+                self.problems.append(f"units.{kind}: must be a unit, such as {quote(KINDS[kind])}, is {abbreviate(unit)}")
+            else:
+                try:
+                    conversion_factor(unit, KINDS[kind])
+                    self.chosen[kind] = unit
+                except ValueError as problem:
+                    self.problems.append(f"units.{kind}: {problem}")
+
+    def convert(self, path: str, value: object, unit: str, problems: list[str]) -> object:
+        """Return a number, a text with its unit, or nested lists of them, in SI units; None where it is added to the problems."""
+        if isinstance(value, list | tuple):
+            found = [self.convert(f"{path}[{i}]", item, unit, problems) for i, item in enumerate(value)]
+            return None if any(x is None for x in found) else found
+        try:
+            if isinstance(value, str):
+                return read_quantity(value, unit)
+            return self._plain(value, unit)
+        except ValueError as problem:
+            problems.append(f"{path}: {problem}")
+            return None
+
+    def _plain(self, value: object, unit: str) -> object:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not unit:
+            return value
+        factor = self._factor(unit)
+        if factor is None and value:
+            kind = _KIND_OF.get(unit)
+            which = " and ".join(f"{k} is in {u}" for k, u in self._changed(unit).items())
+            under = f", or choose a unit for {kind} under units" if kind else ""
+            example = quote(f"{value} {unit}")
+            raise ValueError(f"{value} of what? {which} here: write it with its unit, such as {example}{under}")
+        return value if factor in (None, 1.0) else value * factor
+
+    def _factor(self, unit: str) -> float | None:
+        """Return what a plain number of a quantity in this SI unit is multiplied by; None where it could mean several things."""
+        kind = _KIND_OF.get(unit, "")
+        if kind in self.chosen:
+            return conversion_factor(self.chosen[kind], unit)
+        return None if kind != "density" and self._changed(unit) else 1.0
+
+    def _changed(self, unit: str) -> dict[str, str]:
+        """Return the units of this file for parts of an SI unit, where they are others."""
+        parts = [_KIND_OF.get(part, "") for part in re.findall(r"[A-Za-z]+", unit)]
+        return {k: self.chosen[k] for k in parts if k in self.chosen and conversion_factor(self.chosen[k], KINDS[k]) != 1.0}
+
+    def write(self, value: float, unit: str) -> float | str:
+        """Return what to write for a number in SI units, so that it is read as the same number, bit by bit."""
+        factor = self._factor(unit) if unit else 1.0
+        if factor == 1.0 or value == 0.0:
+            return value
+        if factor is not None:
+            for digits in range(1, 18):
+                written = float(f"{value / factor:.{digits}g}")
+                if written * factor == value:
+                    return written
+        return f"{value!r} {unit}"
+
+    def write_table(self, element: eqx.Module, variant: str = "", law: str = "") -> dict[str, object]:
+        """Return an element as a table whose numbers are read as the same ones."""
+        cls, found = type(element), {}
+        for name, value in table_of(element).items():
+            if isinstance(value, eqx.Module):
+                kind = {} if isinstance(value, Profile) else {"type": type_name(type(value))}
+                found[name] = {**kind, **self.write_table(value, law=law)}
+            elif not eqx.is_array(value):
+                found[name] = value
+            elif name == "coefficients":
+                found[name] = [self.write(x, _per_power(law, k)) for k, x in enumerate(np.asarray(value).tolist())]
+            else:
+                unit = _unit(cls, name, variant, law)
+                found[name] = jax.tree.map(lambda x, unit=unit: self.write(x, unit), np.asarray(value).tolist())
+        return found
+
+    def convert_table(
+        self, path: str, cls: type, table: Table, problems: list[str], variant: str = "", law: str = ""
+    ) -> dict[str, Any]:
+        """Return the table of an element of a class in SI units; what is wrong with a number is added to the problems.
+
+        `variant` is the name by which the units of its fields are known, by default that of the class; `law` that of a motion.
+        """
+        expected, found = keys(cls), {}
+        for name, value in table.items():
+            place = f"{path}.{name}"
+            if name not in expected or not _is_number(expected[name].annotation):
+                found[name] = self._nested(place, expected[name].annotation, value, problems, law) if name in expected else value
+                continue
+            unit = _unit(cls, name, variant, law)
+            if name in VECTORS and isinstance(value, list | tuple):
+                found[name] = vector_as_angle(value)
+                continue
+            if name == "coefficients" and isinstance(value, list | tuple):
+                parts = [self.convert(f"{place}[{k}]", x, _per_power(law, k), problems) for k, x in enumerate(value)]
+                found[name] = None if any(x is None for x in parts) else parts
+            else:
+                found[name] = self.convert(place, value, unit, problems)
+        return found
+
+    def _nested(self, path: str, annotation: Any, value: object, problems: list[str], law: str) -> object:
+        """Return the table of a motion law or of a profile in SI units; anything else as it is."""
+        if not isinstance(value, Mapping) or not (isinstance(annotation, type) and issubclass(annotation, eqx.Module)):
+            return value
+        cls = Profile if annotation is Profile else CLASSES_BY_TYPE["motion"].get(str(value.get("type")))
+        return value if cls is None else self.convert_table(path, cls, value, problems, law=law)
+
+
+def without_failed(found: Iterable[str], failed: Iterable[str]) -> list[str]:
+    """Return the mistakes of tables without those of numbers that are reported already."""
+    fields = {_field(problem) for problem in failed}
+    return [problem for problem in found if _field(problem) not in fields]
+
+
+def _field(problem: str) -> str:
+    return re.sub(r"(\[\d+\])+$", "", problem.partition(": ")[0])
+
+
+def _unit(cls: type, field: str, variant: str, law: str) -> str:
+    """Return the SI unit of a number of an element."""
+    return law if field in FOLLOWS else field_unit(variant or cls.__name__, field)
+
+
+def _per_power(unit: str, power: int) -> str:
+    """Return the SI unit of a coefficient of a polynomial in time."""
+    return unit + ("" if power == 0 else "/s" if power == 1 else f"/s{power}")
+
+
+def _is_number(annotation: Any) -> bool:
+    return hasattr(annotation, "dim_str") and get_origin(annotation) is not Literal

@@ -1,0 +1,111 @@
+"""Scene files: mechanisms and drawings as TOML, versions 1 and 2 of the format, read and written."""
+
+import os
+import tomllib
+from pathlib import Path
+
+from udkjax.scene import mechanism_tables as tables
+from udkjax.scene.arguments import checked
+from udkjax.scene.checks import SceneError, abbreviate
+from udkjax.scene.drawing import Drawing
+from udkjax.scene.drawing.drawing_tables import drawing_of_tables, drawing_text
+from udkjax.scene.mechanism import Mechanism
+
+DRAWN_VERSION = 2
+
+
+def load(path: str | os.PathLike[str]) -> Mechanism:
+    """Read a mechanism from a TOML file of format 1, or of format 2: a drawing.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The mechanism; that of a drawing has it as `drawing`.
+
+    Raises:
+        SceneError: The scene is wrong; the error lists every mistake in it.
+        OSError: The file cannot be read.
+    """
+    try:
+        return _read(Path(path).read_text(encoding="utf-8"), os.fspath(path))
+    except UnicodeDecodeError as error:
+        raise SceneError([f"not a text file in UTF-8 ({error})"], os.fspath(path)) from None
+
+
+def loads(text: str) -> Mechanism:
+    """Read a mechanism from the text of a TOML file, as `load` does.
+
+    Args:
+        text: The text.
+
+    Returns:
+        The mechanism.
+
+    Raises:
+        SceneError: The scene is wrong; the error lists every mistake in it.
+    """
+    return _read(text, "")
+
+
+@checked
+def save(mechanism: Mechanism | Drawing, path: str | os.PathLike[str]) -> None:
+    """Write a mechanism to a TOML file, whole or not at all: one that was drawn as a drawing, as in `dumps`.
+
+    Args:
+        mechanism: The scene.
+        path: The file; an older one is replaced.
+
+    Raises:
+        SceneError: The format cannot hold the mechanism, as in `dumps`.
+        OSError: The file cannot be written.
+    """
+    text, path = dumps(mechanism), Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@checked
+def dumps(mechanism: Mechanism | Drawing) -> str:
+    """Return the mechanism as the text of a TOML file; reading it gives the same numbers back, bit by bit.
+
+    A drawing, or a mechanism made from one, is written in format 2, in the units that it was drawn in; unless it has numbers that
+    do not follow from the drawing any more (`with_parameters({"body.crank.mass": ...})`): these need format 1.
+
+    Args:
+        mechanism: The scene.
+
+    Returns:
+        The text.
+
+    Raises:
+        SceneError: The format cannot hold the mechanism: classes of the user's own, traced numbers, batches of numbers.
+    """
+    drawing = mechanism if isinstance(mechanism, Drawing) else mechanism.drawing
+    if isinstance(mechanism, Mechanism) and (mechanism.changed or not isinstance(drawing, Drawing)):
+        return tables.mechanism_text(mechanism)
+    assert isinstance(drawing, Drawing)
+    return drawing_text(drawing)
+
+
+def _read(text: str, source: str) -> Mechanism:
+    try:
+        scene = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError([f"not valid TOML: {error}"], source) from None
+    version = scene.get("format")
+    if version == tables.FORMAT_VERSION and version is not True:
+        return tables.mechanism_of_tables(scene, source)
+    if version == DRAWN_VERSION:
+        return drawing_of_tables(scene, source).mechanism()
+    if version is None:
+        formats = (
+            f"write format = {DRAWN_VERSION} for a drawing, with pins, or format = {tables.FORMAT_VERSION} for bodies and joints"
+        )
+        raise SceneError([f"format: missing; {formats}"], source)
+    known = f"{tables.FORMAT_VERSION} and {DRAWN_VERSION}"
+    raise SceneError([f"format: this version of udkjax reads formats {known}, not {abbreviate(version)}"], source)

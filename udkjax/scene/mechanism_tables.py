@@ -1,0 +1,133 @@
+"""Mechanisms as the tables of a TOML file, format 1, and back; reading gives the same numbers, bit by bit."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, find_class, problems_of, suggestion
+from udkjax.scene.fields import Table, vector_as_angle
+from udkjax.scene.mechanism import Mechanism, name_elements
+from udkjax.scene.number_fields import groups_of
+from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
+
+FORMAT_VERSION = 1
+
+
+def mechanism_text(mechanism: Mechanism) -> str:
+    """Return a mechanism as the text of a TOML file; raise `SceneError` where the format cannot hold it."""
+    check_known(mechanism, mechanism.name)
+    entries = [
+        SceneEntry(section, index, name, type(element), table_of(element))
+        for section, elements in groups_of(mechanism).items()
+        for index, (name, element) in enumerate(elements.items())
+    ]
+    problems = [problem for entry in entries for problem in check_classes(entry.where, entry.cls or object, entry.table)]
+    problems.extend(problems_of(entries, mechanism.gravity))
+    if problems:
+        raise SceneError(problems, mechanism.name)
+    title = {"name": mechanism.name} if mechanism.name else {}
+    lines = key_lines({"format": FORMAT_VERSION, **title, "gravity": mechanism.gravity})
+    for entry in entries:
+        lines += ["", f"[[{entry.section}]]", *key_lines({"name": entry.name, **type_key(entry.cls or object), **entry.table})]
+    return "\n".join(lines) + "\n"
+
+
+def check_known(tree: eqx.Module, name: str) -> None:
+    """Raise `SceneError` where numbers are traced: a file cannot hold them."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree)):
+        raise SceneError(["its numbers are traced: write it outside of jit, vmap and grad"], name)
+
+
+def mechanism_of_tables(scene: Mapping[str, Any], source: str) -> Mechanism:
+    """Return the mechanism of the tables of a file; raise `SceneError`, with the name of the file."""
+    entries, problems = [], list(_check_head(scene))
+    for section in SECTIONS:
+        entries.extend(read_section(section, scene.get(section, []), problems))
+    entries = [e._replace(table={k: vector_as_angle(x) if k == "axis" else x for k, x in e.table.items()}) for e in entries]
+    gravity = scene.get("gravity", [0.0, -9.81])
+    problems.extend(problems_of(entries, gravity))
+    if problems:
+        raise SceneError(problems, source)
+    made: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
+    for entry in entries:
+        made[entry.section][entry.name] = build(entry.cls, entry.table)
+    return Mechanism(made["body"], made["joint"], made["driver"], made["force"], gravity, scene.get("name", ""))
+
+
+def _check_head(scene: Table) -> Iterator[str]:
+    """Iterate over the mistakes at the top of a file."""
+    if not isinstance(scene.get("name", ""), str):
+        yield f"name: must be a string, is {abbreviate(scene['name'])}"
+    expected = ("format", "name", "gravity", *SECTIONS)
+    yield from (f"{key}: unknown key{suggestion(key, expected)}" for key in scene if key not in expected)
+
+
+def read_section(section: str, tables: object, problems: list[str]) -> Iterator[SceneEntry]:
+    """Iterate over the entries of one section, their names and types read; adds to `problems` if it is not a section at all."""
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        problems.append(f"{section}: must be a list of tables; write [[{section}]] above each")
+        return
+    names: Sequence[object] = [table.get("name") for table in tables]
+    if section == "force":
+        names = name_elements([str(table.get("type")) for table in tables], names)
+    for index, (name, table) in enumerate(zip(names, tables, strict=True)):
+        entry = SceneEntry(
+            section,
+            index,
+            name,
+            CLASSES_WITHOUT_TYPE.get(section),
+            {key: value for key, value in table.items() if key != "name"},
+        )
+        if section in CLASSES_BY_TYPE:
+            cls, problem = find_class(entry.where, CLASSES_BY_TYPE[section], table)
+            table = {key: value for key, value in entry.table.items() if key != "type"}
+            entry = entry._replace(cls=cls, problem=problem, table=table)
+        yield entry
+
+
+def check_classes(where: str, cls: type, table: Table) -> Iterator[str]:
+    """Iterate over the classes in an element that a file cannot name."""
+    if not is_in_format(cls):
+        yield f"{where}: a scene file has no type for the class {cls.__name__}; keep this scene in Python"
+    for name, value in table.items():
+        if isinstance(value, eqx.Module):
+            yield from check_classes(f"{where}.{name}", type(value), table_of(value))
+
+
+def type_key(cls: type) -> dict[str, str]:
+    """Return the key by which a file names the class of an element, where it needs one."""
+    return {} if cls in CLASSES_WITHOUT_TYPE.values() else {"type": type_name(cls)}
+
+
+# tomli-w writes each number of a list on a line of its own: 174 lines for the paper's linkage, where these are 75.
+def key_lines(table: Table) -> list[str]:
+    """Return a table as lines of TOML, one a key."""
+    return [f"{key if re.fullmatch('[A-Za-z0-9_-]+', key) else _string(key)} = {toml(value)}" for key, value in table.items()]
+
+
+def toml(value: object) -> str:
+    """Return a value as TOML; a float's shortest text that reads back as the same float."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return _string(value)
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(toml(item) for item in value)}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(key_lines(value))}}}"
+    if isinstance(value, eqx.Module):
+        return f"{{{', '.join(key_lines({**type_key(type(value)), **table_of(value)}))}}}"
+    return toml(np.asarray(value, dtype=float).tolist())
+
+
+def _string(text: str) -> str:
+    """Return a TOML basic string."""
+    escaped = re.sub(r'[\\"]', lambda match: "\\" + match[0], text)
+    return '"' + re.sub(r"[\x00-\x1f\x7f]", lambda match: f"\\u{ord(match[0]):04x}", escaped) + '"'
