@@ -62,7 +62,8 @@ def test_the_example_file_is_the_library_s(name):
 
 
 def test_every_example_is_in_the_library():
-    assert {path.stem for path in (ROOT / "examples").glob("*.toml")} == set(library.__all__) == set(MECHANISMS)
+    drawings = {"six_bar"}  # that are files alone
+    assert {path.stem for path in (ROOT / "examples").glob("*.toml")} - drawings == set(library.__all__) == set(MECHANISMS)
 
 
 def test_numbers_may_be_traced():
