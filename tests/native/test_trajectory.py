@@ -368,7 +368,7 @@ def test_results_tell_how_runs_end():
         (pendulum, {"max_steps": 5}, "step_limit", None),
         (pendulum, {"max_steps": 1}, "step_limit", 1),
         (pendulum, {"rtol": 1e-30, "atol": 1e-30}, "step_too_small", None),
-        (pendulum, {"state": apart, "stabilization": None}, "drift", 1),
+        (pendulum, {"state": apart, "stabilization": None}, "initial_state_open", 1),
         (blowing(), {}, "not_finite", None),
     ]
     for mechanism, choices, result, until in runs:

@@ -140,6 +140,25 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
     return tuple(dict.fromkeys(names))
 
 
+def ordinary_position(mechanism: Mechanism) -> np.ndarray | None:
+    """Return a closed position beside the initial guess, which may be singular; None where that cannot be closed.
+
+    All numbers are known. The step is random, so that what holds there holds in general.
+    """
+    rows = kinematic_rows(mechanism)
+    q = np.asarray(mechanism.q0, float).ravel()
+    random = np.random.default_rng(0).standard_normal(rows.size)
+    if not rows.count:
+        return q
+    start = rows.close(0.0, q)
+    if start is None:
+        return None
+    step = rows.metric * start.tangent_part(random)
+    size = rows.scales.size(step, np)
+    moved = rows.close(0.0, start.q + LONGEST_STEP * step / size) if size > 0 else None
+    return start.q if moved is None else moved.q
+
+
 def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> PositionRows:
     """Psi and D of a mechanism with known numbers: `KinematicRows`, or for large scenes `SparseRows`."""
     if not (is_large(mechanism) if large is None else large):

@@ -24,11 +24,12 @@ from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseRows
-from udkjax.equations.position_closure import CLOSED_TOL, is_closed
+from udkjax.equations.position_closure import is_closed
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large
 from udkjax.integrate import native_closing
+from udkjax.integrate.causes.open_rows import explain_open
 from udkjax.integrate.closure import close_by_jax, close_by_machine_code
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
 from udkjax.scene.arguments import checked
@@ -96,7 +97,7 @@ def assemble(
     """
     closure = close(mechanism, t, state, analysis=analysis)
     if throw:
-        require_closed(mechanism, closure)
+        require_closed(mechanism, closure, t, state)
     return closure.state
 
 
@@ -169,28 +170,15 @@ def _is_known(tree: PyTree) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def require_closed(mechanism: Mechanism, closure: Closure) -> None:
-    """Raise an `AssemblyError` where a closure is not closed; traced values pass."""
+def require_closed(mechanism: Mechanism, closure: Closure, t: Scalar = 0.0, guess: State | None = None) -> None:
+    """Raise an `AssemblyError` where a closure at time t (s) from a guess is not closed; traced values pass."""
     closed = closure.is_closed
     if isinstance(closed, Tracer) or closed:
         return
-    names = analyse(mechanism).row_names
+    names = [name for name, _ in analyse(mechanism).row_names]
     psi, psi_dot, rows = (np.asarray(x) for x in (closure.psi, closure.psi_dot, closure.scales.rows))
-    open_position = bool(np.max(np.abs(psi) / rows) > CLOSED_TOL) or not np.all(np.isfinite(psi))
-    residual = psi if open_position else psi_dot
-    worst: dict[str, tuple[float, float]] = {}  # over the row's scale, and as it is
-    for (name, _), r, unit in zip(names, residual, rows, strict=True):
-        worst[name] = max(worst.get(name, (0.0, 0.0)), (abs(float(r)) / float(unit), abs(float(r))))
-    largest = max(size for size, _ in worst.values())
-    listed = sorted((n for n in worst if not worst[n][0] <= CLOSED_TOL * largest), key=lambda n: -worst[n][0])
-    text = ", ".join(f'"{n}" ({worst[n][1]:.2g})' for n in listed[:8]) + (", ..." if len(listed) > 8 else "")
-    if open_position:
-        cause = f"the mechanism cannot be closed near its initial guess; open (m, rad): {text}"
-        cure = "check the points and lengths of these joints, or bring the initial positions and angles closer to a closed state"
-    else:
-        cause = f"no velocities satisfy all constraints in this position; left over (m/s, rad/s): {text}"
-        cure = "a driver asks for a motion that the joints forbid here: start elsewhere, or change the driver's motion"
-    raise AssemblyError(f"{cause}. {cure[0].upper()}{cure[1:]}.", closure.state)
+    q = np.asarray(mechanism.q0 if guess is None else guess.q).ravel()
+    raise AssemblyError(explain_open(mechanism, np.asarray(t).item(), q, names, psi, psi_dot, rows), closure.state)
 
 
 @prints_table

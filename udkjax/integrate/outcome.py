@@ -73,7 +73,8 @@ def _drift(run: Run, code: Array, xp: ModuleType) -> tuple[Array, Array, Bool[Ar
     lost = run.raw.reached & ~(run.raw.violation <= run.drift_tol)
     drifted, first = xp.any(lost), xp.argmax(lost)
     reached = run.raw.reached & (~drifted | (xp.arange(len(run.ts)) <= first))
-    return xp.where(drifted, Result.drift, code), xp.where(drifted, run.ts[first], run.raw.t), reached
+    code = xp.where(drifted, xp.where(first == 0, Result.initial_state_open, Result.drift), code)
+    return code, xp.where(drifted, run.ts[first], run.raw.t), reached
 
 
 def counts(raw: IntegratorOutput, projected: bool, outputs: int, xp: ModuleType = jnp) -> dict[str, Int[Array, ""]]:

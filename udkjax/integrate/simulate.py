@@ -19,6 +19,7 @@ from udkjax.equations.partitioning import PartitionedSystem
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
+from udkjax.integrate.causes.explained import explained
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_engine import independent_row_count, integrate_known, reason_for_diffrax
@@ -143,6 +144,8 @@ def simulate(
         bare = mechanism.without_origin
         if state is None and closure is None:
             closure = close(mechanism, start, analysis=analysis)
+        if throw and closure is not None:
+            require_closed(mechanism, closure, start)  # before anything runs
 
     if events is not None:
         if not isinstance(mechanism, Mechanism) or choices[1] is not None or choices[3] is not None:
@@ -161,32 +164,38 @@ def simulate(
         baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
         given: Any = (number(rtol), number(atol), method, baumgarte, formulation, drift, optional_number(dt0), *more)
         solution = simulate_events(mechanism, events, analysis, ts, state, closure, Choices(*given))
-        return _required(solution, mechanism, closure, throw)
+        if not _has_failed(solution) or not mechanism.is_concrete or int(solution.stats["events"]):
+            return _required(solution, throw)  # events may have changed what moved
+        return _required(explained(solution, mechanism, analysis, drift), throw)
 
-    def run(analysis: Analysis | None) -> tuple[Solution, Any]:
+    def run(analysis: Analysis | None) -> tuple[Solution, Any, Any]:
         return _run(bare, analysis, ts, state, closure, *settings, *choices, engine)
 
-    solution, missed = run(analysis)
+    solution, missed, end = run(analysis)
     if isinstance(solution.code, Tracer):
         return solution
     if isinstance(mechanism, Mechanism) and missed and mechanism.is_concrete:
-        solution, _ = run(analyse(mechanism))  # the analysis was of other numbers, in which a row depended
-    return _required(solution, mechanism, closure, throw)
+        analysis = analyse(mechanism)
+        solution, _, end = run(analysis)  # the analysis was of other numbers, in which a row depended
+    if isinstance(mechanism, Mechanism) and mechanism.is_concrete and _has_failed(solution):
+        solution = explained(solution, mechanism, analysis, drift, end)
+    return _required(solution, throw)
 
 
-def _required(solution: Solution, mechanism: Any, closure: Closure | None, throw: bool) -> Solution:
+def _has_failed(solution: Solution) -> bool:
+    """Whether a single run, of known numbers, has not reached its end."""
+    return not isinstance(solution.code, Tracer) and not solution.result.is_success
+
+
+def _required(solution: Solution, throw: bool) -> Solution:
     """A solution; raise what a run that failed raises."""
-    if not throw or isinstance(solution.code, Tracer):
-        return solution
-    if isinstance(mechanism, Mechanism) and closure is not None:
-        require_closed(mechanism, closure)
-    if not solution.result.is_success:
+    if throw and _has_failed(solution):
         raise SimulationError(solution.cause, solution)
     return solution
 
 
 def _run(mechanism, analysis, ts, state, closure, *settings) -> Any:
-    """Return the solution, and whether it takes rows that the method leaves out.
+    """Return the solution, whether it takes rows that the method leaves out, and the last state (t, (q, v)) of the integrator.
 
     Machine code is called at once where all numbers are known, by NumPy; everything else is traced.
     """
@@ -271,7 +280,7 @@ def _simulate(
     )
     arrays = jax.tree.map(jnp.asarray if xp is jnp else jax.device_put, (given_ts, q, v, code, time, stats, rtol, atol))
     fields: Any = (*arrays, getattr(mechanism, "body_names", ()), chosen)
-    return Solution(*fields), missed
+    return Solution(*fields), missed, (raw.t, raw.y)
 
 
 def _by_numpy(leaf: Any) -> Any:

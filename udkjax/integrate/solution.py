@@ -33,6 +33,7 @@ class Result(PrintsWords):
     beyond_contact = 9
     event_impossible = 10
     invalid_argument = 11
+    initial_state_open = 12
 
     @property
     def is_success(self) -> bool:
@@ -43,16 +44,19 @@ class Result(PrintsWords):
         return self.label if self is Result.successful else f"{self.label}: {CAUSES[self]}"
 
 
+# What is true of every run that ended so. `Solution.cause` says more of a single run, where more is found.
 CAUSES = {
     Result.successful: "the end time was reached",
     Result.step_limit: "the limit on steps was reached; raise `max_steps`, loosen the tolerances, or look for what is stiff",
-    Result.step_too_small: "the step fell to the rounding of time: the right-hand side jumps or grows without bound here, "
-    "or the tolerance is below what its rounding errors allow",
-    Result.not_finite: "a number that is not finite appeared; look at the loads and motions of the scene at this time "
-    "(and, with `Augmented()`, at its redundant joints: plain LU cannot do with them)",
-    Result.drift: "the constraints are violated by more than `drift_tol`: stabilize (`Projection()`), or, where the numbers "
-    "of the scene make rows independent that its analysis found redundant, analyse it anew or take method=SVD()",
-    Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for the joints that stay open",
+    Result.step_too_small: "the step fell to the rounding of time: the right-hand side jumps or grows without bound here, a "
+    "driver is at the end of its reach, or the tolerance is below what its rounding errors allow",
+    Result.not_finite: "a number that is not finite appeared; look at the initial state, and at the loads and motions of the "
+    "scene at this time (and, with `Augmented()`, at its redundant joints: plain LU cannot do with them)",
+    Result.drift: "the constraints are violated by more than `drift_tol`: drivers ask for what the joints do not allow, or no "
+    "`Projection()` stabilizes the run, or rows that its analysis found redundant are independent with the present numbers",
+    Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for what stays open",
+    Result.initial_state_open: "the initial state that was given violates the constraints by more than `drift_tol`; `assemble` "
+    "closes it",
     Result.event_stop: "an event stopped the run",
     Result.at_rest: 'a contact whose impacts have at_rest="stop" came to rest',
     Result.event_limit: "there were more events than `max_events`: raise it, or look for what makes them follow so closely",
@@ -93,6 +97,7 @@ class Solution(PrintsTable):
     bodies: tuple[str, ...] = eqx.field(static=True)
     choices: tuple[tuple[str, str], ...] = eqx.field(static=True)  # `settings`, hashable
     events: Events | None = None  # `Events`, where there were any to look for
+    found_cause: Any = eqx.field(static=True, default=None, repr=False)  # `FoundCause` of a single run that failed
 
     @property
     def settings(self) -> dict[str, str]:
@@ -108,8 +113,9 @@ class Solution(PrintsTable):
 
     @property
     def cause(self) -> str:
-        """How the run ended, in words."""
-        return f"{self.result.label} at t = {float(self.time):.6g} s: {CAUSES[self.result]}"
+        """How the run ended, in words; why a single run failed is looked for when this is first read, for up to a second."""
+        found = self.found_cause and self.found_cause.text(int(self.code), float(self.time))
+        return f"{self.result.label} at t = {float(self.time):.6g} s: {found or CAUSES[self.result]}"
 
     _units = units(ts="s", q="m, m, rad", v="m/s, m/s, rad/s", time="s")
 

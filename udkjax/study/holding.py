@@ -5,8 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from udkjax.equations.dense_rows import NEGLIGIBLE_SHARE
-from udkjax.equations.position_closure import LONGEST_STEP
-from udkjax.equations.redundancy import PositionRows, kinematic_rows
+from udkjax.equations.redundancy import kinematic_rows, ordinary_position
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.wording import join_names
@@ -27,7 +26,7 @@ def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, nam
     Raises:
         SceneError: it names the drivers that hold the coordinate.
     """
-    rows, q = kinematic_rows(driven), _ordinary_position(bare)
+    rows, q = kinematic_rows(driven), ordinary_position(bare)
     if q is None:
         return
     D = rows.at(0.0, q)[2]
@@ -43,19 +42,3 @@ def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, nam
         raise SceneError([f"{driver} cannot be driven: the joints leave it no motion"], driven.name)
     cure = "drive that, or take it out of the scene" if len(holding) == 1 else "drive one of them, or take one out of the scene"
     raise SceneError([f"{driver} is held by {join_names(holding)}: {cure}"], driven.name)
-
-
-def _ordinary_position(mechanism: Mechanism) -> np.ndarray | None:
-    """Return a closed position beside the initial guess, which may be singular itself; None where that cannot be closed."""
-    rows: PositionRows = kinematic_rows(mechanism)
-    q = np.asarray(mechanism.q0, float).ravel()
-    random = np.random.default_rng(0).standard_normal(rows.size)
-    if not rows.count:
-        return q
-    start = rows.close(0.0, q)
-    if start is None:
-        return None
-    step = rows.metric * start.tangent_part(random)
-    size = rows.scales.size(step, np)
-    moved = rows.close(0.0, start.q + LONGEST_STEP * step / size) if size > 0 else None
-    return start.q if moved is None else moved.q

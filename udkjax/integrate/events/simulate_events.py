@@ -22,6 +22,7 @@ from udkjax.integrate.events.phases import Phases, phases_of
 from udkjax.integrate.events.replay import EventRun, RunInput, run_events
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.outcome import increases, usable
+from udkjax.integrate.projection import violation
 from udkjax.integrate.solution import Result, Solution
 from udkjax.pinv import Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
@@ -155,6 +156,10 @@ def _run(arrays: Given, static: Given) -> tuple[EventRun, tuple[str, ...]]:
     if choices.engine == "native" and any(reasons):
         raise ValueError(f'engine="native" cannot: {next(filter(None, reasons))}. engine="auto" takes diffrax instead')
     code = jnp.where(closed, Result.successful, Result.could_not_assemble)
+    if closure is None:
+        y = jnp.concatenate([q, v])
+        is_open = ~(violation(hybrid.problem_of_guess(0).equations, ts[0], y) <= choices.drift_tol)
+        code = jnp.where(is_open, Result.initial_state_open, code)
     if not reasons[0] and closure is not None:  # the closed state may take rows that the analysis says are redundant
         code = jnp.where(
             closed & (closure.rank > native_engine.independent_row_count(hybrid.problem_of_guess(0))), Result.drift, code

@@ -1,0 +1,142 @@
+"""Why runs fail, in words that are true: each against what is known of the scene."""
+
+import pickle
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax import Result
+
+CRANK, COUPLER, ROCKER, GROUND = 1.0, 1.5, 1.2, 2.2  # not Grashof's: the crank has limits
+START = np.pi / 3
+TOGGLE = np.arccos((CRANK**2 + GROUND**2 - (COUPLER + ROCKER) ** 2) / (2 * CRANK * GROUND))
+TS = np.linspace(0.0, 1.0, 11)
+
+
+def four_bar(scale=1.0, **drivers):
+    lengths = tuple(scale * x for x in (CRANK, COUPLER, ROCKER))
+    mech = udk.library.four_bar(START, lengths=lengths, ground=scale * GROUND)
+    driven = {n: udk.Driver(["ground", "crank"], "angle", udk.Polynomial(c)) for n, c in drivers.items()}
+    return udk.Mechanism(dict(mech.bodies), dict(mech.joints), driven, gravity=mech.gravity)
+
+
+def failed(mech, ts=TS, *arguments, **choices):
+    solution = udk.simulate(mech, ts, *arguments, throw=False, **choices)
+    assert not solution.result.is_success
+    return solution
+
+
+class Push(udk.ForceElement):
+    """A force along x by a law of time and velocity."""
+
+    law: Callable = eqx.field(static=True)
+
+    def loads(self, t, frame):
+        return [(self.law(t, frame), 0.0, 0.0)]
+
+
+def stone(law):
+    return udk.Mechanism({"stone": udk.Body(1.0, 1.0, [0.3, 0.2], 0.1, [1.0, 0.5], 0.2)}, forces={"wind": Push("stone", law)})
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return udk.library.compound_pendulum()
+
+
+@pytest.mark.parametrize(
+    ("scale", "choices", "ts"),
+    [
+        (1.0, {}, TS),
+        (1e-6, {}, TS),
+        (1e3, {}, [0.0, 0.9]),  # long after it
+        (1.0, {"stabilization": None}, TS),
+    ],
+)
+def test_a_driver_beyond_the_reach_of_its_linkage(scale, choices, ts):
+    solution = failed(four_bar(scale, motor=[START, 2.0]), ts, **choices)
+    assert 'driver "motor" asks for' in solution.cause
+    assert f"the linkage reaches {TOGGLE:.5g}" in solution.cause.replace(f"{TOGGLE:.6g}", f"{TOGGLE:.5g}")
+    assert f"at {(TOGGLE - START) / 2:.4g}" in solution.cause and "pins B, C, D in line" in solution.cause
+    assert "Projection" not in solution.cause
+
+
+def test_the_reach_of_a_length_and_the_error_of_a_run():
+    """A ram between two links of 1 m each: they are in line at 2 m."""
+    link = lambda angle, at: udk.Body(1.0, 0.1, at, angle)  # noqa: E731
+    tip = np.array([np.cos(1.0), np.sin(1.0)])
+    bodies = {"a": link(1.0, tip / 2), "b": link(-1.0, tip * [1.5, 0.5])}
+    joints = {
+        "P": udk.Revolute(["ground", "a"], [[0.0, 0.0], [-0.5, 0.0]]),
+        "Q": udk.Revolute(["a", "b"], [[0.5, 0.0], [-0.5, 0.0]]),
+        "R": udk.Slot(["ground", "b"], [[0.0, 0.0], [0.5, 0.0]], axis=0.0),
+    }
+    ends = [[0.0, 0.0], [0.5, 0.0]]
+    ram = udk.Driver(["ground", "b"], "distance", udk.Polynomial([2 * np.cos(1.0), 1.5]), ends)
+    with pytest.raises(udk.SimulationError, match=r'"ram" asks for 2\.\d+ m at .*; the linkage reaches 2 m, at 0\.61') as caught:
+        udk.simulate(udk.Mechanism(bodies, joints, {"ram": ram}), TS)
+    assert caught.value.solution.result == Result.drift
+
+
+def test_drivers_that_contradict_each_other():
+    later = failed(four_bar(one=[START, 0.2], two=[START, 0.2, 0.5]))
+    assert 'drivers "one" and "two" contradict each other' in later.cause
+    with pytest.raises(udk.AssemblyError, match=r'drivers "one" and "two" ask for a motion that the others forbid'):
+        udk.simulate(four_bar(one=[START, 0.2], two=[START, 0.4]), TS)
+    with pytest.raises(udk.AssemblyError, match=r'Without drivers it closes: driver "one" asks for 9 rad at 0 s, and is at 1\.0'):
+        udk.simulate(four_bar(one=[9.0, 0.2]), TS)
+
+
+@pytest.mark.parametrize("events", [None, pytest.param(udk.JointLimit("pin", upper=9.0), marks=pytest.mark.slow)])
+def test_initial_states_that_are_open_or_not_finite(pendulum, events):
+    """Singly and in a batch."""
+    state = udk.assemble(pendulum)
+    q = jnp.stack([state.q, state.q.at[0, 0].add(0.1), state.q.at[0, 1].set(jnp.nan), state.q])
+    v = jnp.stack([state.v, state.v, state.v, state.v.at[0, 2].set(jnp.inf)])
+    codes = [Result.successful, Result.initial_state_open, Result.invalid_argument, Result.invalid_argument]
+    run = lambda q, v: udk.simulate(pendulum, TS, udk.State(q, v), events=events)  # noqa: E731
+    batch = jax.jit(jax.vmap(run))(q, v)
+    assert batch.code.tolist() == codes and np.all(batch.time[1:] == 0.0)
+    single = failed(pendulum, TS, udk.State(q[1], v[1]), events=events)
+    assert 'the initial state is open (m, rad): "pin" (0.1)' in single.cause
+
+
+def test_what_nothing_stabilizes_says_so_and_what_is_left_out_too(pendulum):
+    loose = failed(pendulum, rtol=1e-4, atol=1e-4, stabilization=None, drift_tol=1e-6)
+    assert '"pin"' in loose.cause and "stabilize them, by Projection()" in loose.cause
+    mech = udk.library.parallelogram(-0.8)
+    state = udk.assemble(mech)
+    bent = mech.with_parameters({"joint.A2.points[0][0]": 1.01})
+    open_state = failed(bent, TS, state, analysis=udk.analyse(mech))
+    assert open_state.result == Result.initial_state_open and '"A2" (0.01)' in open_state.cause
+
+
+LAWS = {
+    "grows": (lambda t, _: 1.0 / (0.55 - t) ** 2, {}, 'force "wind" grows without bound'),
+    "not finite": (lambda t, _: jnp.where(t < 0.45, 0.1, jnp.nan), {}, 'force "wind" gives what is not a number from about 0.45'),
+    "dry": (lambda t, f: -50.0 * jnp.sign(f.vx), {"max_steps": 3000}, 'force "wind" jumps with the velocity'),
+    "stiff": (lambda t, f: -1e7 * f.vx, {"max_steps": 500}, 'force "wind" damps at a rate of 1e+07 1/s'),
+    "slow": (lambda t, f: -f.x, {"max_steps": 2}, "steps made .* % of the way; at this pace"),
+    "rounding": (lambda t, f: -f.x, {"rtol": 1e-30, "atol": 1e-30}, "are below rounding"),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_loads_that_a_run_cannot_follow_are_named(name):
+    law, choices, words = LAWS[name]
+    with pytest.raises(udk.SimulationError, match=words.replace("+", r"\+")):
+        udk.simulate(stone(law), TS, **choices)
+
+
+def test_a_cause_belongs_to_its_solution_alone():
+    """It is static: solutions have one structure, and one that is made of others does not say what is not true of it."""
+    one, other = failed(four_bar(motor=[START, 2.0])), udk.simulate(four_bar(motor=[START, 0.1]), TS)
+    assert jax.tree.structure(one) == jax.tree.structure(failed(four_bar(motor=[START, 3.0])))
+    moved = eqx.tree_at(lambda s: s.time, one, 0.1)
+    assert "motor" in one.cause and "motor" not in moved.cause and "end time" in other.cause
+    assert pickle.loads(pickle.dumps(one.found_cause)).text(int(one.code), float(one.time)) in one.cause

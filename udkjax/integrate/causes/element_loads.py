@@ -1,0 +1,85 @@
+"""What single force elements exert at a state: which of them is not a number, grows without bound, jumps, or is stiff."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.equations.constraints import vector
+from udkjax.equations.structure import evaluate_by_kind
+from udkjax.scene.bodies import Frame
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.mechanism import Mechanism
+
+State = tuple[float, np.ndarray, np.ndarray]  # t (s), q and v (n,)
+
+
+class ElementLoads(NamedTuple):
+    """Of each force element at each state: its load, and the fastest rates (1/s) of its dampers and springs."""
+
+    names: tuple[str, ...]
+    size: np.ndarray  # (states, elements): of the acceleration that it gives its bodies, in L / s^2 and rad / s^2
+    jump: np.ndarray  # (states, elements): the largest change of it from the first state, in the same units
+    damping: np.ndarray  # (states, elements), 1/s
+    stiffness: np.ndarray  # (states, elements), 1/s
+
+
+def element_loads(mechanism: Mechanism, length: float, states: Sequence[State]) -> ElementLoads:
+    """Evaluate the loads of each force element at several states."""
+    names, count = mechanism.force_names, len(mechanism.forces)
+    ts, qs, vs = (np.stack([np.asarray(s[k], float) for s in states]) for k in range(3))
+    shape = len(states), count
+    size, jump, damping, stiffness = (np.zeros(shape) for _ in range(4))
+    for kind, (load, by_q, by_v) in _evaluate(mechanism.without_origin, ts, qs, vs) if count else ():
+        loads, by_q, by_v = (np.asarray(x) for x in (load, by_q, by_v))  # (states, elements, 3k), (.., 3k, 3k)
+        body = np.array([[b.mass, b.mass, b.inertia] for b in mechanism.bodies.values()], float)
+        moving = body[kind.bodies.T].reshape(len(kind.members), -1)  # (elements, 3k)
+        unit = np.tile([length, length, 1.0], moving.shape[1] // 3)
+        a = loads / moving / unit
+        size[:, kind.members] = np.abs(a).max(-1, initial=0.0)
+        jump[:, kind.members] = np.abs(a - a[:1]).max(-1, initial=0.0)
+        root = np.sqrt(moving)
+        for found, matrix, power in ((stiffness, by_q, 0.5), (damping, by_v, 1.0)):
+            scaled = np.nan_to_num(matrix / root[:, :, None] / root[:, None, :], posinf=0.0, neginf=0.0)
+            found[:, kind.members] = np.linalg.norm(scaled, 2, axis=(-2, -1)) ** power if moving.shape[1] else 0.0
+    return ElementLoads(tuple(names), size, jump, damping, stiffness)
+
+
+def _evaluate(mechanism: Mechanism, ts: np.ndarray, qs: np.ndarray, vs: np.ndarray) -> list:
+    """Return kinds of elements with loads (states, elements, 3k) and their derivatives by q and v of the moving bodies."""
+    kinds: list = []
+
+    def at(t: Array, q: Array, v: Array) -> list:
+        found = evaluate_by_kind(lambda e, *frames: _load(e, t, frames), mechanism, [*mechanism.forces.values()], q, v)
+        kinds[:] = [kind for kind, _ in found]
+        return [x for _, x in found]
+
+    results = jax.jit(jax.vmap(at))(ts, qs.reshape(len(ts), -1, 3), vs.reshape(len(ts), -1, 3))
+    return list(zip(kinds, results, strict=True))
+
+
+def _load(element: ForceElement, t: Array, frames: Sequence[Frame]) -> tuple[Array, Array, Array]:
+    moving = [k for k, frame in enumerate(frames) if isinstance(frame.x, Array)]
+
+    def placed(q: Array, v: Array) -> list[Frame]:
+        found = list(frames)
+        for k, (x, y, angle), (vx, vy, omega) in zip(moving, q.reshape(-1, 3), v.reshape(-1, 3), strict=True):
+            found[k] = Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
+        return found
+
+    def load(q: Array, v: Array) -> Array:
+        total = jnp.zeros(len(q))
+        found = element.loads(t, *placed(q, v))
+        if found is not None:
+            total = total + jnp.concatenate([jnp.zeros(0), *(vector(list(found[k])) for k in moving)])
+        potential = lambda q: element.potential(t, *placed(q, v))  # noqa: E731
+        if jax.eval_shape(potential, q) is not None:
+            total = total - jax.grad(lambda q: jnp.sum(jnp.asarray(potential(q))))(q)
+        return total
+
+    q = jnp.concatenate([jnp.zeros(0), *(jnp.stack(frames[k][:3]) for k in moving)])
+    v = jnp.concatenate([jnp.zeros(0), *(jnp.stack(frames[k][5:]) for k in moving)])
+    return load(q, v), jax.jacfwd(load, 0)(q, v), jax.jacfwd(load, 1)(q, v)

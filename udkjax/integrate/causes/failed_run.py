@@ -1,0 +1,73 @@
+"""A run that failed, as its cause is looked for."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from udkjax.equations import constraints
+from udkjax.equations.analysis import Analysis
+from udkjax.equations.redundancy import PositionRows, kinematic_rows
+from udkjax.integrate.causes.open_rows import name_open_rows
+from udkjax.integrate.solution import Result
+from udkjax.scene.mechanism import Mechanism
+
+
+@dataclass(frozen=True, eq=False)
+class FailedRun:
+    """What is known of a single run of a mechanism of known numbers that failed."""
+
+    mechanism: Mechanism
+    analysis: Analysis
+    result: Result
+    time: float  # s
+    ts: np.ndarray  # (T,)
+    q: np.ndarray  # (T, n); not a number where it was not reached
+    v: np.ndarray
+    end: tuple[float, np.ndarray, np.ndarray] | None  # the last state of the integrator, where it is known
+    steps: int
+    rtol: float
+    atol: float
+    drift_tol: float
+    is_projected: bool
+    is_explicit: bool  # the solver
+    drops_rows: bool  # the method leaves out the rows that the analysis found redundant
+    formulation: str
+
+    @cached_property
+    def rows(self) -> PositionRows:
+        """Psi and D of the mechanism."""
+        return kinematic_rows(self.mechanism)
+
+    @property
+    def row_scales(self) -> np.ndarray:
+        """What Psi is measured by, row by row."""
+        return np.asarray(self.rows.scales.rows, float)
+
+    @cached_property
+    def states(self) -> list[tuple[float, np.ndarray, np.ndarray]]:
+        """The states (t, q, v) that count, the last one first: of the integrator, then the outputs before the failure."""
+        known = np.isfinite(self.q).all(1) & np.isfinite(self.v).all(1)
+        good = [k for k in range(len(self.ts)) if known[k] and (self.result != Result.drift or self.ts[k] < self.time)]
+        listed = [(float(self.ts[k]), self.q[k], self.v[k]) for k in reversed(good)]
+        if self.end is None or self.result == Result.drift or not all(np.all(np.isfinite(x)) for x in self.end):
+            return listed
+        return [self.end, *listed]
+
+    def psi(self, t: float, q: np.ndarray) -> np.ndarray:
+        """Psi (m,), in m or rad."""
+        return self.rows.at(t, q)[0]
+
+    def psi_dot(self, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Psi_dot (m,), in m/s or rad/s."""
+        return np.asarray(constraints.psi_dot(self.mechanism.without_origin, t, q, v))
+
+    def decomposed(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the left singular vectors and the singular values of D, with rows of length one."""
+        D = self.rows.at(t, q)[2]
+        D = np.asarray(D if isinstance(D, np.ndarray) else D.toarray())
+        return np.linalg.svd(D, full_matrices=False)[:2] if np.all(np.isfinite(D)) else (D, np.full(len(D), np.nan))
+
+    def open_rows(self, t: float, q: np.ndarray) -> str:
+        """Name what is open at a position, the widest first, with its residual (m, rad)."""
+        return name_open_rows([name for name, _ in self.rows.names], self.psi(t, q), self.row_scales, self.drift_tol)

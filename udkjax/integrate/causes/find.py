@@ -1,0 +1,233 @@
+"""Find why a run failed, and say it with the place, the time and the cure."""
+
+from collections.abc import Hashable
+
+import numpy as np
+
+from udkjax.integrate.causes.element_loads import ElementLoads, element_loads
+from udkjax.integrate.causes.failed_run import FailedRun
+from udkjax.integrate.causes.open_rows import MOST_NAMED, explain_open, name_not_finite
+from udkjax.integrate.causes.reach import explain_reach
+from udkjax.integrate.solution import Result
+
+BESIDE = 1e-9  # of the span: between two instants so close only what jumps changes much
+# Of the span: where the integrator, which tries steps ten times as long as those before, may have met what is not finite.
+AHEAD = (0.0, *np.geomspace(1e-6, 0.1, 80))
+JUMP = 1e-3  # of a load: what it changes by over `BESIDE`, if it jumps; a smooth one by a millionth of that
+GROWN = 1e6  # times as large as before: a load that grows without bound
+NEAR_REACH = 1e-2  # of the span: how far from its end a run may be by a dead point
+STIFF = 0.1  # rate times step: explicit methods of any order lose stability between 1 and 10
+SINGULAR = 1e-4  # of the largest singular value of D with rows of length one
+ROUNDING = 1e-15  # tolerances below it are not to be met
+RATES = ("vx", "vy", "omega")
+
+
+class FoundCause:
+    """The cause of a failed run, which is looked for when it is asked for.
+
+    All compare as equal: a solution that holds one has the structure of every other. So it tells the cause only of a solution
+    with the code and the time that it was made for.
+    """
+
+    def __init__(self, run: FailedRun | None, text: str | None = None):
+        self._run, self._text = run, text
+        self._key = None if run is None else (int(run.result), run.time)
+
+    def text(self, code: int, time: float) -> str | None:
+        """Return the cause of a run that ended with this code at this time (s); None of another run."""
+        if (code, time) != self._key:
+            return None
+        if self._text is None and self._run is not None:
+            with np.errstate(all="ignore"):
+                self._text = find_cause(self._run)
+            self._run = None
+        return self._text
+
+    def __eq__(self, other: Hashable) -> bool:
+        return isinstance(other, FoundCause)
+
+    def __hash__(self) -> int:
+        return 0
+
+    def __getstate__(self) -> dict:
+        text = None if self._key is None else self.text(*self._key)
+        return {"_run": None, "_text": text, "_key": self._key}
+
+
+def find_cause(run: FailedRun) -> str | None:
+    """Return why a run failed, or None where no more is found than its result says."""
+    wrong = " and ".join(
+        text for text in (name_not_finite(run.mechanism, run.q[0]), name_not_finite(run.mechanism, run.v[0], RATES)) if text
+    )
+    if wrong:
+        return f"the initial state is not finite: {wrong}"
+    match run.result:
+        case Result.could_not_assemble:
+            return _explain_open_guess(run)
+        case Result.initial_state_open:
+            text = run.open_rows(run.ts[0], run.q[0])
+            return f"the initial state is open (m, rad): {text}; `assemble` closes it, and so does a run that is given none"
+        case Result.drift:
+            return _explain_drift(run)
+        case Result.not_finite:
+            return _explain_not_finite(run)
+        case Result.step_too_small:
+            return _explain_small_step(run)
+        case Result.step_limit:
+            return _explain_many_steps(run)
+    return None
+
+
+def _explain_open_guess(run: FailedRun) -> str | None:
+    mechanism, t, q, v = run.mechanism, float(run.ts[0]), run.q[0], run.v[0]
+    psi, psi_dot = run.rows.at(t, q)[0], run.psi_dot(t, q, v)
+    names = [name for name, _ in run.rows.names]
+    return explain_open(mechanism, t, np.asarray(mechanism.q0).ravel(), names, psi, psi_dot, run.row_scales)
+
+
+def _explain_drift(run: FailedRun) -> str | None:
+    k = int(np.argmin(np.abs(run.ts - run.time)))
+    q, left_out = run.q[k], sorted({run.rows.names[i][0] for i in run.analysis.redundant_rows or ()})
+    text = run.open_rows(run.time, q)
+    anew = "analyse the mechanism with its present numbers, or take method=SVD()"
+    if not text:
+        return f"the constraints take rows that the method leaves out as redundant, of {', '.join(left_out)}: {anew}"
+    reach = explain_reach(run, run.time)
+    if reach:
+        return reach
+    size = float(np.max(np.abs(run.psi(run.time, q)) / run.row_scales))
+    open_by = f"open (m, rad): {text}, {size:.2g} of the scene's scales, more than drift_tol={run.drift_tol:g}"
+    if not run.is_projected:
+        return f"{open_by}; nothing returns the states to the constraints: stabilize them, by Projection()"
+    if run.drops_rows and any(f'"{name}"' in text for name in left_out):
+        return f"{open_by}; rows of {', '.join(left_out)} are left out as redundant, and they are not: {anew}"
+    if run.rows.close(run.time, q) is None:
+        return f"{open_by}; no position near it closes"
+    return f"{open_by}; it can be closed nearby: {_near_singular(run) or 'loosen drift_tol, or tighten rtol and atol'}"
+
+
+def _explain_not_finite(run: FailedRun) -> str | None:
+    text = _not_finite_ahead(run)
+    if text:
+        return text
+    if run.formulation == "Augmented" and (run.analysis.redundant_rows or _rank(run) < run.rows.count):
+        return (
+            f"`Augmented()` solves its equations by plain LU, and they are singular: {run.rows.count} rows of rank {_rank(run)}; "
+            "take another formulation"
+        )
+    return _near_singular(run)
+
+
+def _explain_small_step(run: FailedRun) -> str | None:
+    if run.rtol < ROUNDING and run.atol < ROUNDING:
+        return f"rtol={run.rtol:g} and atol={run.atol:g} are below rounding, which no step can meet: raise one of them"
+    return _not_finite_ahead(run) or _reach_at_end(run) or _violent_load(run) or _near_singular(run) or _stiff(run)
+
+
+def _explain_many_steps(run: FailedRun) -> str | None:
+    text = _reach_at_end(run) or _violent_load(run) or _stiff(run) or _near_singular(run)
+    if text:
+        return f"the limit of {run.steps} steps was reached: {text}"
+    done = (run.time - run.ts[0]) / (run.ts[-1] - run.ts[0])
+    if not done > 0:
+        return None
+    return (
+        f"{run.steps} steps made {100 * done:.3g} % of the way; at this pace {run.steps / done:.2g} are needed: "
+        "raise `max_steps`, or loosen the tolerances"
+    )
+
+
+def _not_finite_ahead(run: FailedRun) -> str:
+    """Name the elements whose numbers are not finite at the end of the run or a little later."""
+    t, q, v = run.states[0]
+    span = float(run.ts[-1] - run.ts[0])
+    states = [(t + share * span, q + share * span * v, v) for share in AHEAD]
+    loads = _loads(run, states)
+    for k, (at, position, _) in enumerate(states):
+        psi, length, _ = run.rows.at(at, position) if run.rows.count else (np.zeros(0), np.zeros(0), None)
+        bad = ~(np.isfinite(psi) & np.isfinite(length))
+        owners = {run.rows.names[i][0] for i in np.flatnonzero(bad)}
+        named = [f'{"driver" if name in run.mechanism.drivers else "joint"} "{name}"' for name in sorted(owners)]
+        named += [f'force "{name}"' for name, size in zip(loads.names, loads.size[k], strict=True) if not np.isfinite(size)]
+        if named:
+            return f"{', '.join(named)} gives what is not a number from about {at:.6g} s on: look at its law there"
+    return ""
+
+
+def _violent_load(run: FailedRun) -> str:
+    """Name the force element that jumps at the end of the run, or that has grown without bound."""
+    t, q, v = run.states[0]
+    span, speed = float(run.ts[-1] - run.ts[0]), float(run.analysis.scales.size(v, np))
+    scales = run.analysis.scales
+    unit = np.tile([float(scales.length), float(scales.length), 1.0], len(q) // 3)
+    turn = 1e-6 * max(speed, float(scales.rate)) * unit
+    back, ahead = ((t + way * BESIDE * span, q + way * BESIDE * span * v, v) for way in (-1, 1))
+    loads = _loads(run, [back, (t, q, v), ahead, (t, q, v - turn), (t, q, v + turn), *run.states[1:][::-1][:2]])
+    size, names = np.nan_to_num(loads.size, nan=0.0, posinf=1e300), loads.names
+    before, now = size[5:].max(0, initial=0.0), size[1]
+    slow = max(float(scales.rate), 1 / span) ** 2
+    for k, name in enumerate(names):
+        if now[k] > GROWN * max(before[k], slow):
+            return f'force "{name}" grows without bound: here it is {now[k] / max(before[k], slow):.1g} times what it was'
+    largest = size.max(0)
+    # Once from behind to ahead, once from slower to faster.
+    time_jump = np.abs(loads.jump[2])
+    speed_jump = np.abs(_loads(run, [(t, q, v - turn), (t, q, v + turn)]).jump[1])
+    for k, name in enumerate(names):
+        if time_jump[k] > JUMP * max(largest[k], slow):
+            return f'force "{name}" jumps at {t:.6g} s: give its `breakpoints`, smooth it, or make the jump an event'
+        if speed_jump[k] > JUMP * max(largest[k], slow) and speed_jump[k] > 0.5 * largest[k]:
+            return f'force "{name}" jumps with the velocity: smooth it over a small speed, as `Friction` does'
+    return ""
+
+
+def _stiff(run: FailedRun) -> str:
+    """Name the force element that keeps the steps of an explicit solver short."""
+    t, q, v = run.states[0]
+    if not run.is_explicit or run.steps < 1 or not t > run.ts[0]:
+        return ""
+    loads = _loads(run, [(t, q, v)])
+    step = (t - float(run.ts[0])) / run.steps
+    if not loads.names:
+        return ""
+    damping, stiffness = loads.damping[0], loads.stiffness[0]
+    k = int(np.argmax(np.maximum(damping, stiffness)))
+    rate, what = (damping[k], "damps") if damping[k] >= stiffness[k] else (stiffness[k], "swings")
+    if not STIFF < rate * step < 1 / STIFF**2:
+        return ""
+    return (
+        f'force "{loads.names[k]}" {what} at a rate of {rate:.2g} 1/s, which holds an explicit solver to steps of {step:.2g} s: '
+        "take an implicit one, such as solver=diffrax.Kvaerno5(), or make it softer"
+    )
+
+
+def _reach_at_end(run: FailedRun) -> str:
+    """Say what drivers ask for, if the run ended where the mechanism cannot follow."""
+    t, span = run.states[0][0], float(run.ts[-1] - run.ts[0])
+    return explain_reach(run, min(float(run.ts[-1]), t + NEAR_REACH * span)) if t < run.ts[-1] else ""
+
+
+def _near_singular(run: FailedRun) -> str:
+    """Say that the run ended beside a singular configuration, with the joints that take part."""
+    t, q, _ = run.states[0]
+    rank = run.analysis.rank
+    if rank is None or not rank:
+        return ""
+    u, sigma = run.decomposed(t, q)
+    if not sigma[rank - 1] < SINGULAR * sigma[0]:
+        return ""
+    involved = np.abs(u[:, rank - 1]) > 0.1 * np.abs(u[:, rank - 1]).max()
+    names = list(dict.fromkeys(name for (name, _), part in zip(run.rows.names, involved, strict=True) if part))
+    share = sigma[rank - 1] / sigma[0]
+    listed = ", ".join(names[:MOST_NAMED])
+    return f"it is beside a singular configuration of {listed} (smallest singular value {share:.1g} of the largest)"
+
+
+def _rank(run: FailedRun) -> int:
+    t, q, _ = run.states[0]
+    sigma = run.decomposed(t, q)[1]
+    return int(np.sum(sigma > SINGULAR * sigma[0]))
+
+
+def _loads(run: FailedRun, states: list) -> ElementLoads:
+    return element_loads(run.mechanism, float(run.analysis.scales.length), states)

@@ -1,0 +1,93 @@
+"""Which constraints are open in a state, and what keeps a mechanism from being closed."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.equations.redundancy import kinematic_rows
+from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.mechanism import Mechanism
+
+MOST_NAMED = 8  # names in one sentence
+
+
+def name_open_rows(names: Sequence[str], residual: np.ndarray, scales: np.ndarray, tol: float) -> str:
+    """Name the constraints whose residuals exceed `tol` of their scales, the widest first, with the residual."""
+    worst: dict[str, tuple[float, float]] = {}  # over the row's scale, and as it is
+    for name, r, unit in zip(names, np.abs(residual), scales, strict=True):
+        if not r / unit <= tol:  # also what is not a number
+            worst[name] = max(worst.get(name, (0.0, 0.0)), (float(np.nan_to_num(r / unit, nan=np.inf)), float(r)))
+    listed = sorted(worst, key=lambda name: -worst[name][0])
+    text = ", ".join(f'"{name}" ({worst[name][1]:.2g})' for name in listed[:MOST_NAMED])
+    return text + (", ..." if len(listed) > MOST_NAMED else "")
+
+
+def name_not_finite(mechanism: Mechanism, x: np.ndarray, labels: Sequence[str] = COORDINATES) -> str:
+    """Name the entries of q or v (n,) that are not finite; an empty text where all are."""
+    bad = [(body, label) for body in mechanism.body_names for label in labels]
+    named = [f'{label} of "{body}"' for (body, label), value in zip(bad, x, strict=True) if not np.isfinite(value)]
+    return ", ".join(named[:MOST_NAMED]) + (", ..." if len(named) > MOST_NAMED else "")
+
+
+def explain_open(
+    mechanism: Mechanism,
+    t: float,
+    guess: np.ndarray,
+    names: Sequence[str],
+    psi: np.ndarray,
+    psi_dot: np.ndarray,
+    scales: np.ndarray,
+) -> str:
+    """Say why an assembly at time t (s) has failed: what is open, and whether drivers, joints or the guess are the reason.
+
+    Args:
+        mechanism: the mechanism, of known numbers.
+        t: the time (s).
+        guess: the positions (n,) that it was closed from.
+        names: the constraint of each row.
+        psi: what is left of Psi (m,), in m or rad.
+        psi_dot: what is left of Psi_dot (m,), in m/s or rad/s.
+        scales: those of the rows.
+    """
+    is_open = bool(np.max(np.abs(psi) / scales) > CLOSED_TOL) or not np.all(np.isfinite(psi))
+    residual = psi if is_open else psi_dot
+    sizes = np.nan_to_num(np.abs(residual) / scales, nan=np.inf)
+    text = name_open_rows(names, residual, scales, CLOSED_TOL * float(min(sizes.max(), 1e300)))
+    if not is_open:
+        drivers = [name for name in dict.fromkeys(names) if name in mechanism.drivers and f'"{name}"' in text]
+        who = f"driver{'s' * (len(drivers) > 1)} {' and '.join(map(_quote, drivers))} ask{'s' * (len(drivers) < 2)} for"
+        return (
+            f"no velocities satisfy all constraints in this position; left over (m/s, rad/s): {text}. "
+            f"{who if drivers else 'They ask for'} a motion that the others forbid here: start elsewhere, or change it."
+        )
+    wrong = name_not_finite(mechanism, guess)
+    if wrong:
+        return f"the initial guess is not finite: {wrong}."
+    cause = f"the mechanism cannot be closed near its initial guess; open (m, rad): {text}. "
+    closed = _close_without_drivers(mechanism, guess) if mechanism.drivers else None
+    if closed is None:
+        return cause + (
+            "Check the points and lengths of these joints, or bring the initial positions and angles closer to a closed state."
+        )
+    left = np.asarray(kinematic_rows(mechanism).at(t, closed)[0])  # where the joints are closed, only drivers are open
+    asked = []
+    for name, driver in mechanism.drivers.items():
+        off = float(left[list(names).index(name)])
+        if abs(off) > CLOSED_TOL * float(scales[list(names).index(name)]):
+            value, unit = float(driver.motion(t)), "rad" if driver.coordinate == "angle" else "m"
+            asked.append(f'driver "{name}" asks for {value:.6g} {unit} at {t:.6g} s, and is at {value + off:.6g} {unit}')
+    return f"{cause}Without drivers it closes: {'; '.join(asked)}. Change the drivers' motion, or bring the guess closer to it."
+
+
+def _close_without_drivers(mechanism: Mechanism, guess: np.ndarray) -> np.ndarray | None:
+    """Return a closed position of the joints alone, or None."""
+    rows = kinematic_rows(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
+    if not rows.count:
+        return guess
+    found = rows.close(0.0, guess)
+    return None if found is None else found.q
+
+
+def _quote(name: str) -> str:
+    return f'"{name}"'

@@ -1,0 +1,160 @@
+"""How far drivers can lead a mechanism: where its constraints cannot be closed any more, and why.
+
+The position is followed in small steps of time from the last good state until a step cannot be closed, and the time between is
+halved. Rows that then ask for what no displacement gives are in the left null space of D: of a dead point they are new there; of
+drivers that contradict each other, or the joints, they depend on each other in every position.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.equations.dense_rows import NEGLIGIBLE_SHARE
+from udkjax.equations.redundancy import kinematic_rows, ordinary_position
+from udkjax.integrate.causes.failed_run import FailedRun
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.drivers import Driver
+from udkjax.scene.joints import Revolute
+from udkjax.scene.mechanism import Mechanism
+
+STEPS = 32  # from the last good state to the time of the failure
+HALVINGS = 34  # of the last of them: 1e-12 of it
+NEW = 1e-2  # of the largest singular value of D: those below belong to the dead point; the position is known to 1e-5 or so
+SHARE = 1e-3  # of the largest row of a combination: a row below has no part in it
+IN_LINE = 1e-3  # rad
+TRIED = 4  # states from which one looks
+FARTHEST = 1.0  # rad, characteristic lengths: a position farther from the one before is on another branch
+
+
+class Reach(NamedTuple):
+    """The last position that closes, and the rows that ask for more."""
+
+    t: float  # s
+    q: np.ndarray  # (n,)
+    owners: frozenset[str]  # constraints whose rows cannot go on together
+
+
+def explain_reach(run: FailedRun, until: float) -> str:
+    """Say what drivers ask for up to a time (s) that the mechanism cannot do; an empty text where it can."""
+    mechanism = run.mechanism
+    if not mechanism.drivers:
+        return ""
+    found = _find_reach(run, until)
+    if found is None:
+        return ""
+    names = [name for name in mechanism.driver_names if name in found.owners]
+    if not names:
+        return ""
+    opposed = _opposed(mechanism, names)
+    asked = " and ".join(f'driver "{name}" asks for {_value(mechanism.drivers[name], until)}' for name in names)
+    where = f"at {until:.6g} s"
+    if opposed and len(names) > 1:
+        listed = " and ".join(f'"{name}"' for name in names)
+        return f"drivers {listed} contradict each other: {asked} {where}; take one out, or change its motion"
+    if opposed:
+        return f"{asked} {where}, where the joints leave its coordinate no motion; take it out, or free the coordinate"
+    reached = " and ".join(_value(mechanism.drivers[name], found.t) for name in names)
+    point = _dead_point(mechanism, found, names)
+    return f"{asked} {where}; the linkage reaches {reached}, at {found.t:.6g} s ({point})"
+
+
+def _find_reach(run: FailedRun, until: float) -> Reach | None:
+    """Return where the constraints stop closing before a time, or None where they close all the way or nowhere."""
+    rows, size = run.rows, run.rows.scales.size
+    first = next((p for p in (rows.close(t, q) for t, q, _ in run.states[:TRIED] if t < until) if p is not None), None)
+    if first is None:
+        return None
+    t, q, before = first.t, first.q, None
+
+    def close(at: float) -> np.ndarray | None:
+        guess = q if before is None else q + (q - before[1]) * (at - t) / (t - before[0])
+        for start in (guess, q):
+            p = rows.close(at, start)
+            if p is not None and size(p.q - q, np) < FARTHEST:
+                return p.q
+        return None
+
+    high = None
+    for at in np.linspace(t, until, STEPS + 1)[1:]:
+        there = close(float(at))
+        if there is None:
+            high = float(at)
+            break
+        before, (t, q) = (t, q), (float(at), there)
+    if high is None:
+        return None
+    before = None  # beside a dead point the way behind leads astray
+    for _ in range(HALVINGS):
+        middle = 0.5 * (t + high)
+        there = close(middle) if t < middle < high else None
+        if there is None:
+            high = middle
+        else:
+            t, q = middle, there
+    return Reach(t, q, _demanding(run, t, q, until))
+
+
+def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozenset[str]:
+    """Return the constraints that ask, after a time, for what no displacement gives: the part of their demand outside of D."""
+    rows = run.rows
+    psi, length, D = rows.at(t, q)
+    u, sigma, _ = np.linalg.svd(_dense(D))
+    null = np.ones(len(u), bool)
+    null[: len(sigma)] = sigma <= NEW * sigma[0]
+    N = u[:, null]
+    demand = N @ (N.T @ ((rows.at(until, q)[0] - psi) / length))
+    involved = np.abs(demand) > SHARE * np.abs(demand).max(initial=0.0)
+    return frozenset(name for (name, _), part in zip(rows.names, involved, strict=True) if part)
+
+
+def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
+    """Whether the rows of drivers depend on the others in an ordinary position, too."""
+    q = ordinary_position(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
+    if q is None:
+        return False
+    rows = kinematic_rows(mechanism)
+    D = _dense(rows.at(0.0, q)[2])
+    own = np.array([owner in names[-1:] for owner, _ in rows.names])
+    left = D[own][0] - D[~own].T @ np.linalg.lstsq(D[~own].T, D[own][0], rcond=None)[0]
+    return float(np.linalg.norm(left)) < NEGLIGIBLE_SHARE  # rows have length one
+
+
+def _dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
+    """Say what a dead point looks like: the pins of links that lie in line, or the joints that hold together."""
+    index = {name: k for k, name in enumerate(mechanism.body_names)}
+    frames = found.q.reshape(-1, 3)
+    driven = {GROUND, *(body for name in drivers for body in mechanism.drivers[name].bodies)}
+
+    def place(name: str) -> np.ndarray:
+        joint = mechanism.joints[name]
+        body, point = next((b, np.asarray(p, float)) for b, p in zip(joint.bodies, joint.points, strict=True) if b in index)
+        x, y, angle = frames[index[body]]
+        c, s = np.cos(angle), np.sin(angle)
+        return np.array([x + c * point[0] - s * point[1], y + s * point[0] + c * point[1]])
+
+    pins = {name for name in found.owners & set(mechanism.joints) if isinstance(mechanism.joints[name], Revolute)}
+    links = {body: [p for p in mechanism.joints if p in pins and body in mechanism.joints[p].bodies] for body in index}
+    links = {body: ends for body, ends in links.items() if len(ends) == 2 and body not in driven}
+    lines: list[list[str]] = []
+    for one, (a, b) in links.items():
+        for other, ends in links.items():
+            shared = {a, b} & set(ends)
+            if one >= other or len(shared) != 1:
+                continue
+            (middle,) = shared
+            chain = [*({a, b} - shared), middle, *(set(ends) - shared)]
+            u, w = place(chain[1]) - place(chain[0]), place(chain[2]) - place(chain[1])
+            if abs(u[0] * w[1] - u[1] * w[0]) <= IN_LINE * np.linalg.norm(u) * np.linalg.norm(w):
+                lines.append(chain if index[one] < index[other] else chain[::-1])
+    if lines:
+        return "dead point: " + " and ".join(f"pins {', '.join(line)} in line" for line in lines)
+    joints = [name for name in mechanism.joints if name in found.owners]
+    return f"a dead point of {', '.join(joints)}" if joints else "a dead point"
+
+
+def _value(driver: Driver, t: float) -> str:
+    return f"{float(driver.motion(t)):.6g} {'rad' if driver.coordinate == 'angle' else 'm'}"
+
+
+def _dense(D) -> np.ndarray:
+    return np.asarray(D if isinstance(D, np.ndarray) else D.toarray())
