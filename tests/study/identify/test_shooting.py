@@ -7,12 +7,13 @@ import pytest
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
+from udkjax.study.identify.growing_records import fit_growing_records
 from udkjax.study.identify.identification import identify
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import Record
-from udkjax.study.identify.search import explains, fit_growing_parts, search
+from udkjax.study.identify.search import explains, search
 from udkjax.study.identify.shooting import MultipleShooting, cut_records, fit_pieces
 
 TOL = 1e-10, 1e-10
@@ -96,7 +97,7 @@ def test_chaos():
         first = truth.with_parameters({names[0]: factors[0], names[2]: values[2] * factors[2]})
         first = udk.with_length(first, "upper", factors[1])
         whole = Problem(first, unknowns_of(first, names), [record])
-        along = fit_growing_parts(whole, np.zeros((1, 3)), TOL, Minimizer())
+        along = fit_growing_records(whole, np.zeros(3), TOL, Minimizer())
         assert along.cost[0] > 1e3 * q.size  # half of it would be noise
         estimate = identify(first, record, names, progress=False)
         assert estimate.ways[-1] == "records in pieces" and isinstance(estimate.problem, MultipleShooting)

@@ -36,13 +36,6 @@ def solver_named(name: str) -> "diffrax.AbstractSolver":
     return solver()
 
 
-def forward_mode() -> "diffrax.AbstractAdjoint":
-    """Return the adjoint with which `simulate` is differentiated forward."""
-    import diffrax
-
-    return diffrax.ForwardMode()
-
-
 def is_explicit(solver: "diffrax.AbstractSolver | None") -> bool:
     """Whether a solver is an explicit Runge-Kutta method with one tableau; None is the default, which is."""
     if solver is None:

@@ -4,7 +4,8 @@ records, tables, record_reader                     measurements, whatever they c
 parameters, unknowns                               what is to be found
 prediction, problem, shooting                      what would be measured, and how far it is from what was
 loop_consistency                                   whether parameters fit the mechanism's loops
-least_squares, optimizer, search                   minimization, from guesses that lead to the minimum
+least_squares, optimizer                           minimization
+growing_records, search                            from guesses that lead to the minimum
 uncertainty, profile_likelihood                    how well the parameters are known
 gradient_check                                     whether derivatives are right
 identification, estimate, experiment_design        what users call, and what they get

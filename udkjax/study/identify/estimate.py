@@ -129,7 +129,7 @@ class Estimate:
         lines += self.uncertainty.messages
         lines += [f"{name} is at one of its bounds" for name in self.at_bounds]
         lines += [found.text(prefixes[k] + channel) for (k, channel), found in self.whiteness.items() if not found.white]
-        if self.guesses > 1 and self.agreeing == 1:
+        if self.guesses > 1 and self.agreeing == 1 and not all(found.white for found in self.whiteness.values()):
             lines.append(f"only one of {self.guesses} first guesses led here: there may be a better minimum")
         return "\n".join(lines) or "every parameter is known from the records"
 

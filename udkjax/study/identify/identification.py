@@ -55,8 +55,9 @@ def identify(
 
     With y what was measured and yhat(z) what the mechanism shows, sum ((yhat(z) - y) / sigma)^2 is minimized by
     Levenberg-Marquardt with exact forward derivatives, through the closure of all loops. Where the first guess does not lead to a
-    fit that explains the records, it is looked for along growing parts of them, and from other guesses; where these do not lead
-    to one either, as along chaotic motion, the records are cut into pieces that are held together.
+    fit that explains the records, as it is wrong by a swing somewhere, they are fitted as they grow, each time as far as what is
+    known by then predicts them; then from other guesses, up to a factor of 2.5 away. Where none leads to a fit, as along chaotic
+    motion, the records are cut into pieces that are held together.
 
     Args:
         mechanism: the scene, with first guesses.
@@ -68,7 +69,7 @@ def identify(
             the residuals of the fit.
         initial_state: the `Start` of every record, or what of it is to be estimated ("position", "velocity", "both"); by default
             the records' own, and for those of tables the scene's.
-        n_starts: how many more first guesses may be tried; 0: none.
+        n_starts: how many more first guesses may be followed, the best of eight times as many; 0: none.
         guesses: first guesses (B, P) to try besides the first, in place of `n_starts`.
         loss: "least_squares"; "huber", for which single wrong numbers count less; or a function of the weighted residuals (R,) by
             JAX (standard errors stay those of squares).

@@ -1,13 +1,18 @@
-"""Least squares by optimistix, stepped from the host.
+"""Least squares by Levenberg-Marquardt, or by a method of optimistix, stepped from the host.
 
-Each step asks for residuals and their Jacobian at one trial point of every fit that goes on; the method, compiled once for a
-number of unknowns, sees them as a linear function. It sees no more of them than the triangle of their QR factors, which has the
-same sums of squares, gradients and steps.
+Each step asks for residuals and their Jacobian at one trial point of every fit that goes on. The methods see no more of them than
+the triangle of their QR factors, which has the same sums of squares, gradients and steps. With J = U S V^T and the damping d,
+
+    z_next = z - V (S^2 + d)^-1 S U^T r,
+
+and d falls where the cost decreases as promised, and rises where it does not.
+
+Source: J. J. More, The Levenberg-Marquardt algorithm, 1978.
 """
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
@@ -30,13 +35,13 @@ FEW_STEPS, SOME_STEPS, STEPS = 15, 30, 60
 # Cosine of the angle between residuals and what the unknowns can change of them, at which a fit has settled: times the root of
 # their number it is a Gauss-Newton step in standard errors, of which a thousandth changes nothing either.
 ORTHOGONAL = 1e-5
-# What residuals are multiplied by, over the largest singular value of J: the method's first damping is 1 / FIRST_DAMPING^2 of its
-# square. Where a minimum is near there is none to speak of. Of FIRST_DAMPING from 10 to 1000 and factors of 3.5 or 10, with these
-# the most fits from 50 % off settle along the whole record.
-FIRST_DAMPING, NO_DAMPING = 30.0, 1e8
+# The first damping, of the square of the largest singular value of J. Where a minimum is near there is none to speak of. Of first
+# dampings from 1e-2 to 1e-6 and factors of 3.5 or 10, with these the most fits from 50 % off settle along the whole record.
+FIRST_DAMPING, NO_DAMPING = 1e-3, 1e-16
 TINY = 1e-300  # in the place of a zero that is divided by: quotients stay finite
 SHORT_STEP = 0.3  # of an unknown: where the first Gauss-Newton step is no longer, a minimum is taken to be near
-GOOD_DECREASE, DAMPING_FACTOR = 0.75, 10.0  # part of the decrease promised from which on the damping falls, and by how much
+# Part of the decrease promised from which on the damping falls, and by how much; and by how much it rises after a refused step.
+GOOD_DECREASE, LESS_DAMPING, MORE_DAMPING = 0.75, 0.1, 4.0
 MOST_REFUSED = 8  # steps one after another, before a fit is given up
 
 Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
@@ -77,11 +82,11 @@ def minimize_squares(
     minimum already, up to the tolerance of the integration.
     """
     sets, K = z.shape
-    start, step = _compiled_step(method, K, sets)
-    state, y, at, trial = start, jnp.asarray(z), z.copy(), z.copy()
+    steps_by: _Steps = _LevenbergMarquardt() if method is None else _OptimistixSteps(method, K, sets)
+    at, trial = z.copy(), z.copy()
     going, ended, refused = np.ones(sets, bool), np.zeros(sets, bool), np.zeros(sets, int)
-    best = np.full(sets, np.inf)
-    unit = np.ones(sets)
+    best, bold = np.full(sets, np.inf), np.zeros(sets, bool)
+    largest = np.ones(sets)
     reduced = np.zeros((sets, K + 1, K + 1))
     history: History = []
     for count in range(steps):
@@ -93,16 +98,17 @@ def minimize_squares(
             for k, r, J, ok in zip(asked, found.r, found.J, found.ok, strict=True):
                 if ok:
                     costs[k], triangles[k] = 0.5 * r @ r, _triangular_factor(r, J)
-        better = costs < best
-        if count == 0:
-            going &= np.isfinite(costs)
-            largest = np.array([max(np.linalg.norm(t[:-1, :-1], 2), TINY) for t in triangles])
-            bold = undamped | (_gauss_newton(triangles)[0] <= SHORT_STEP)
-            unit = np.where(bold, NO_DAMPING, FIRST_DAMPING) / largest
+        better, before = costs < best, best
         refused = np.where(better, 0, refused + 1)
         at, best = np.where(better[:, None], trial, at), np.where(better, costs, best)
         reduced = np.where(better[:, None, None], triangles, reduced)
-        size, cosine = _gauss_newton(reduced)
+        linear = _Linear.of(reduced)
+        size, cosine = linear.gauss_newton()
+        if count == 0:
+            going &= np.isfinite(costs)
+            largest = np.maximum(linear.singular.max(1, initial=0.0), TINY)
+            bold = undamped | (size <= SHORT_STEP)
+            steps_by.begin(largest**2 * np.where(bold, NO_DAMPING, FIRST_DAMPING), at)
         ended |= going & ((size <= settled) | (cosine <= ORTHOGONAL) | ((size <= FINE_STEP) & (refused >= 2)))
         leader = int(np.argmin(best))
         history.append((float(best[leader]), float(size[leader])))
@@ -112,20 +118,103 @@ def minimize_squares(
             break
         again = bold & (refused == 1) & ~np.asarray(undamped)
         if again.any():  # no minimum was near, after all: from the best point on with damped steps
-            bold, unit = bold & ~again, np.where(again, FIRST_DAMPING / largest, unit)
-            state = jax.tree.map(lambda x, y, w=again: np.where(w.reshape(-1, *[1] * (x.ndim - 1)), y, x), state, start)
-            trial, triangles, costs = (
-                np.where(again.reshape(-1, *[1] * (x.ndim - 1)), y, x)
-                for x, y in ((trial, at), (triangles, reduced), (costs, best))
-            )
-            y = np.where(again[:, None], at, y)
-        # What cannot be computed is a step to be refused: it costs a hundred times more than where we are.
-        bad = ~np.isfinite(costs)
-        seen = np.where(bad[:, None, None], 0.0, triangles * unit[:, None, None])
-        seen[bad, -1, -1] = 10.0 * unit[bad] * np.sqrt(2.0 * best[bad] + 1.0)
-        y, state, following = step(state, y, trial, seen)
-        trial = np.array(following)
+            bold = bold & ~again
+            steps_by.begin(largest**2 * FIRST_DAMPING, at, again)
+            trial, costs, triangles = at.copy(), np.where(again, best, costs), np.where(again[:, None, None], reduced, triangles)
+        trial = steps_by.next(_Trial(trial, costs, triangles, np.where(again, np.inf, before)), at, best, linear)
     return Fit(at, best, ended, history)
+
+
+class _Trial(NamedTuple):
+    """What a step has led to: points, costs (infinite where nothing can be computed), triangles; and the best costs before."""
+
+    z: np.ndarray
+    cost: np.ndarray
+    triangles: np.ndarray
+    before: np.ndarray
+
+
+class _Linear(NamedTuple):
+    """Residuals of B fits around their best points, as singular values and vectors of J; `part` is U^T r."""
+
+    part: Float[np.ndarray, "B K"]
+    singular: Float[np.ndarray, "B K"]
+    vt: Float[np.ndarray, "B K K"]
+    size: Float[np.ndarray, "B"]  # of r
+
+    @classmethod
+    def of(cls, triangles: Float[np.ndarray, "B K+1 K+1"]) -> "_Linear":
+        u, s, vt = np.linalg.svd(triangles[:, :-1, :-1])
+        part = np.einsum("bij,bi->bj", u, triangles[:, :-1, -1])
+        return cls(part, s, vt, np.linalg.norm(triangles[:, :, -1], axis=1))
+
+    def gauss_newton(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the largest entry of each Gauss-Newton step in directions that show, and the part of r that it removes."""
+        s = self.singular
+        shows = s > INVISIBLE * s.max(1, initial=0.0)[:, None]
+        step = np.einsum("bji,bj->bi", self.vt, np.where(shows, self.part / np.where(shows, s, 1.0), 0.0))
+        cosine = np.linalg.norm(self.part, axis=1) / np.maximum(self.size, TINY)
+        seen = shows.any(1)
+        return np.where(seen, np.abs(step).max(1, initial=0.0), np.inf), np.where(seen, cosine, np.inf)
+
+    def damped(self, damping: Float[np.ndarray, "B"]) -> tuple[np.ndarray, np.ndarray]:
+        """Return each step with a damping, and the decrease of the cost that it promises."""
+        s, d = self.singular, damping[:, None]
+        left = d / np.maximum(s**2 + d, TINY)  # of the residuals along each direction
+        coefficients = -s * self.part / np.maximum(s**2 + d, TINY)
+        return np.einsum("bji,bj->bi", self.vt, coefficients), 0.5 * np.sum(self.part**2 * (1.0 - left**2), axis=1)
+
+
+class _Steps(Protocol):
+    """Proposes trial points, one for each fit."""
+
+    def begin(self, damping: np.ndarray, z: np.ndarray, which: np.ndarray | None = None) -> None:
+        """Begin (those fits again) with a first damping, at points z."""
+        ...
+
+    def next(self, trial: _Trial, at: np.ndarray, best: np.ndarray, linear: _Linear) -> np.ndarray:
+        """Return the next points to try: `at` are the best ones until now, with costs `best`."""
+        ...
+
+
+class _LevenbergMarquardt:
+    """Steps by Levenberg-Marquardt, whose damping follows how far promised decreases are kept."""
+
+    def begin(self, damping: np.ndarray, z: np.ndarray, which: np.ndarray | None = None) -> None:
+        self.damping = damping if which is None else np.where(which, damping, self.damping)
+        self.promised = np.zeros(len(z)) if which is None else np.where(which, 0.0, self.promised)
+
+    def next(self, trial: _Trial, at: np.ndarray, best: np.ndarray, linear: _Linear) -> np.ndarray:
+        with np.errstate(invalid="ignore"):
+            kept = np.where(self.promised > 0.0, (trial.before - trial.cost) / np.maximum(self.promised, TINY), 0.5)
+        factor = np.where(kept >= GOOD_DECREASE, LESS_DAMPING, np.where(kept > 0.0, 1.0, MORE_DAMPING))
+        self.damping = self.damping * factor
+        step, self.promised = linear.damped(self.damping)
+        return at + step
+
+
+class _OptimistixSteps:
+    """Steps by a least-squares method of optimistix."""
+
+    def __init__(self, method: "optimistix.AbstractLeastSquaresSolver", K: int, sets: int):
+        self.start, self.step = _compiled_step(method, K, sets)
+        self.state = self.start
+
+    def begin(self, damping: np.ndarray, z: np.ndarray, which: np.ndarray | None = None) -> None:
+        every = np.ones(len(z), bool) if which is None else which
+        self.unit = 1.0 / np.sqrt(damping) if which is None else np.where(which, 1.0 / np.sqrt(damping), self.unit)
+        self.y = jnp.asarray(z) if which is None else jnp.where(which[:, None], z, self.y)
+        self.state = jax.tree.map(
+            lambda old, new: np.where(every.reshape(-1, *[1] * (new.ndim - 1)), new, old), self.state, self.start
+        )
+
+    def next(self, trial: _Trial, at: np.ndarray, best: np.ndarray, linear: _Linear) -> np.ndarray:
+        # What cannot be computed is a step to be refused: it costs a hundred times more than where we are.
+        bad = ~np.isfinite(trial.cost)
+        seen = np.where(bad[:, None, None], 0.0, trial.triangles * self.unit[:, None, None])
+        seen[bad, -1, -1] = 10.0 * self.unit[bad] * np.sqrt(2.0 * best[bad] + 1.0)
+        self.y, self.state, following = self.step(self.state, self.y, trial.z, seen)
+        return np.array(following)
 
 
 def _triangular_factor(r: np.ndarray, J: np.ndarray) -> np.ndarray:
@@ -136,20 +225,6 @@ def _triangular_factor(r: np.ndarray, J: np.ndarray) -> np.ndarray:
     return np.where(np.diag(R) < 0, -1.0, 1.0)[:, None] * R
 
 
-def _gauss_newton(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest entry of each Gauss-Newton step in directions that show, and the part of r that it removes."""
-    sizes, cosines = np.full(len(triangles), np.inf), np.full(len(triangles), np.inf)
-    for k, T in enumerate(triangles):
-        u, s, vt = np.linalg.svd(T[:-1, :-1])
-        if not s.size or s[0] == 0.0:
-            continue
-        part = u.T @ T[:-1, -1]
-        shows = s > INVISIBLE * s[0]
-        sizes[k] = np.abs(vt[shows].T @ (part[shows] / s[shows])).max(initial=0.0)
-        cosines[k] = np.linalg.norm(part) / max(np.linalg.norm(T[:, -1]), TINY)
-    return sizes, cosines
-
-
 def _linear(y: Array, known: tuple[Array, Array]) -> tuple[Array, None]:
     """Return residuals around a point, from the triangle there."""
     point, T = known
@@ -157,19 +232,13 @@ def _linear(y: Array, known: tuple[Array, Array]) -> tuple[Array, None]:
 
 
 @lru_cache(maxsize=32)
-def _compiled_step(method: "optimistix.AbstractLeastSquaresSolver | None", K: int, sets: int) -> tuple[PyTree, Callable]:
+def _compiled_step(method: "optimistix.AbstractLeastSquaresSolver", K: int, sets: int) -> tuple[PyTree, Callable]:
     """Return the first state of a method, of arrays alone, and its compiled step, of `sets` fits at once."""
-    import optimistix
-
-    solver = method
-    if solver is None:
-        search = optimistix.ClassicalTrustRegion(high_cutoff=GOOD_DECREASE, high_constant=DAMPING_FACTOR)
-        solver = eqx.tree_at(lambda s: s.search, optimistix.LevenbergMarquardt(rtol=0.0, atol=0.0), search)
     given = jnp.zeros((sets, K)), (jnp.zeros((sets, K)), jnp.zeros((sets, K + 1, K + 1)))
     residual = jax.ShapeDtypeStruct((K + 1,), given[0].dtype)
 
     def begin(y: Array, known: tuple[Array, Array]) -> PyTree:
-        return solver.init(_linear, y, known, {}, residual, None, frozenset())
+        return method.init(_linear, y, known, {}, residual, None, frozenset())
 
     first, fixed = eqx.partition(eqx.filter_vmap(begin)(*given), eqx.is_array)
 
@@ -177,7 +246,7 @@ def _compiled_step(method: "optimistix.AbstractLeastSquaresSolver | None", K: in
     def step(state: PyTree, y: Array, trial: Array, triangles: Array) -> tuple[Array, PyTree, Array]:
         def one(state: PyTree, y: Array, trial: Array, T: Array) -> tuple[Array, PyTree]:
             state = eqx.tree_at(lambda s: s.y_eval, state, trial)
-            y, state, _ = solver.step(_linear, y, (trial, T), {}, state, frozenset())
+            y, state, _ = method.step(_linear, y, (trial, T), {}, state, frozenset())
             return y, state
 
         y, state = eqx.filter_vmap(one)(eqx.combine(state, fixed), y, trial, triangles)

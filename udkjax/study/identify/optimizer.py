@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias, Union, cast
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias, Union, cast
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from udkjax.study.identify.least_squares import (
     minimize_squares,
 )
 from udkjax.study.identify.prediction import Tolerances
-from udkjax.study.identify.problem import INVISIBLE, Problem, Residuals
+from udkjax.study.identify.problem import INVISIBLE, Residuals
 from udkjax.study.identify.records import IdentificationError
 
 if TYPE_CHECKING:  # imported where a fit begins: it takes a second
@@ -102,8 +102,16 @@ def huber(found: Residuals, residuals: int, c: float = HUBER) -> Residuals:
 # --- fits
 
 
-def weighted_residuals(problem: Problem, tol: Tolerances, loss: Loss, horizon: float | None = None) -> Objective:
-    """Return the residuals whose squares are minimized, of the part `horizon` of each record (None: all of it)."""
+class Evaluated(Protocol):
+    """What has residuals and a Jacobian: a `Problem`, or what is made of one."""
+
+    def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
+        """Compute residuals and their Jacobian: see `Problem.evaluate`."""
+        ...
+
+
+def weighted_residuals(problem: Evaluated, tol: Tolerances, loss: Loss, horizon: float | None = None) -> Objective:
+    """Return the residuals whose squares are minimized, of the first `horizon` seconds of each record (None: all of it)."""
     return lambda z: loss(problem.evaluate(z, tol, horizon))
 
 
@@ -117,7 +125,7 @@ class Minimizer:
 
     def minimize(
         self,
-        problem: Problem,
+        problem: Evaluated,
         z: Float[np.ndarray, "B K"],
         tol: Tolerances,
         horizon: float | None = None,
@@ -125,7 +133,7 @@ class Minimizer:
         settled: float = EXACT_STEP,
         undamped: bool = False,
     ) -> Fit:
-        """Fit the part `horizon` of each record (None: all of it) from several first guesses: see `minimize_squares`."""
+        """Fit the first `horizon` seconds of each record (None: all of it) from several first guesses: see `minimize_squares`."""
         evaluate = weighted_residuals(problem, tol, self.loss, horizon)
         if isinstance(self.method, GradientMethod):
             return minimize_by_gradient(self.method, evaluate, z, settled=settled, report=self.report)

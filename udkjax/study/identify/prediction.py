@@ -20,7 +20,6 @@ from jaxtyping import Array, Float, Int, PyTree
 from udkjax.integrate.assembly import State, close
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Solution
-from udkjax.integrate.solvers import forward_mode
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure
 from udkjax.study.channels import Channel, Quantity
@@ -108,7 +107,8 @@ class Predictor:
 
     def guess(self, members: Members, which: int) -> State:
         """Return the state from which the initial state of a member is closed."""
-        return _place(self.mechanism, jax.tree.map(lambda leaf: leaf[which], members), self.targets)[1]
+        member = jax.tree.map(lambda leaf: leaf[which], members)
+        return jax.tree.map(np.asarray, _guess(self._static, self._arrays, member))
 
     def _compute(self, members: Members, tol: Tolerances) -> tuple:
         return jax.tree.map(np.asarray, _predict(self._static, self._arrays, members, tol))
@@ -138,6 +138,12 @@ class _Static:
 def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
     """Return some members, filled up with copies of the last."""
     return x[np.minimum(np.arange(first, first + count), len(x) - 1)]
+
+
+@partial(jax.jit, static_argnums=0)
+def _guess(static, arrays, member):
+    mechanism, _ = eqx.combine(arrays, static.static_part)
+    return _place(mechanism, member, static.rest[0])[1]
 
 
 @partial(jax.jit, static_argnums=0)
@@ -193,7 +199,7 @@ def _with_state(mechanism: Mechanism, q: Numbers, v: Numbers) -> Mechanism:
 
 
 def _run(mechanism, ts, closure, tol, settings, channels, ends):
-    solution: Solution = simulate(mechanism, ts, closure, *tol, adjoint=forward_mode(), throw=False, **settings)
+    solution: Solution = simulate(mechanism, ts, closure, *tol, throw=False, **settings)
     y = measure(mechanism, solution, channels)
     if not ends:
         return (y,), solution.code

@@ -98,6 +98,11 @@ class Problem:
         self.settings = {"analysis": analyse(mechanism), **(settings or {})}
         self.predictor = Predictor(mechanism, unknowns.targets, self.channels, self.settings)
 
+    @property
+    def duration(self) -> float:
+        """The duration of the longest record, s."""
+        return float((self.ts[:, -1] - self.ts[:, 0]).max())
+
     def series(self) -> list[np.ndarray]:
         """Return which residuals belong to one channel of one record, in the order of time: for each that has some."""
         record, _, channel = self.index.T
@@ -142,7 +147,7 @@ class Problem:
         Args:
             z: B sets of unknowns.
             tol: tolerances of the integration.
-            horizon: the part of each record (0 to 1) that counts; residuals beyond it are zero. None: all of it.
+            horizon: how much of each record counts, s since it began; residuals beyond are zero. None: all of it.
         """
         found = self.predictor(self.members(z, horizon), tol)
         found = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), found)
@@ -151,7 +156,7 @@ class Problem:
         J = self.by_unknowns(found.dy[:, *at] / self.sigma[:, None], self.run, z)
         if horizon is not None:
             record, time, _ = self.index.T
-            beyond = self.ts[record, time] > _end(self.ts[record], horizon)
+            beyond = self.ts[record, time] - self.ts[record, 0] > horizon
             r[:, beyond], J[:, beyond] = 0.0, 0.0
         for more_r, more_J in self.further_rows(found, z):
             r, J = np.concatenate([r, more_r], axis=1), np.concatenate([J, more_J], axis=1)
@@ -193,13 +198,9 @@ def _size_of(values: np.ndarray) -> float:
     return float(deviation if deviation > STILL * size else size or 1.0)
 
 
-def _end(ts: np.ndarray, horizon: float) -> np.ndarray:
-    return ts[..., 0] + horizon * (ts[..., -1] - ts[..., 0])
-
-
 def _times_until(ts: np.ndarray, horizon: float) -> np.ndarray:
-    """Return the times up to a part of a record, padded to the same length."""
-    last = max(1, int(np.searchsorted(ts, _end(ts, horizon), side="right")) - 1)
+    """Return the times of a record until so long after it began, padded to the same length."""
+    last = max(1, int(np.searchsorted(ts - ts[0], horizon, side="right")) - 1)
     return pad_times(ts[: last + 1], len(ts))
 
 

@@ -1,17 +1,18 @@
 """Which first guesses a fit sets out from, and along which parts of the records: no more than a fit needs.
 
-A long record has many minima: one for each number of swings by which a guess can be wrong. So a fit that does not explain the
-whole record from its first guess begins with the first few samples, which have one minimum, and takes more and more of the
-record, each time from where it was; and where that fails too, from other guesses beside the first. What is left are records
-of chaotic motion: see `shooting`.
+A fit that does not explain the whole records from its first guess, since phases were wrong by too much, begins with their first
+parts and follows them as they grow: see `growing_records`. Where that fails too, it does so from other guesses beside the first,
+one after another until one explains the records. What is left are records of chaotic motion: see `shooting`.
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, SOME_STEPS, STEPS, Fit, History
+from udkjax.study.identify.growing_records import Known, fit_growing_records
+from udkjax.study.identify.least_squares import LOOSE_STEP, SOME_STEPS, Fit, History
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import LOOSE, MEDIUM, Tolerances
 from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Strategy
@@ -20,8 +21,11 @@ from udkjax.study.identify.unknowns import sample_guesses
 
 N_STARTS = 15  # guesses besides the first, where it does not lead to a fit
 MOST_PIECEWISE = 4  # guesses from which the records are fitted in pieces
-PART_GROWTH = 2.0  # from one part of the records that is fitted to the next
-SHORTEST_PART = 1e-6  # of the records: the first that is fitted, where all was measured when they began
+SAMPLED = 8  # times as many guesses are looked at: one evaluation each, where a fit takes some fifty; many begin alike
+AGREED = 4  # guesses that lead to the best fit: where it shows most of the motion, others will hardly lead to a better one
+MOST_SHOWN = 0.3  # of what the channels show: residuals below it are of a fit that shows most of the motion
+PART_GROWTH = 2.0  # from one part of the records by which guesses are ranked to the next
+SHORTEST_PART = 1e-6  # of the records: the first of these, where all was measured when they began
 CHAOTIC_GROWTH = 100.0  # of derivatives, from the first halves of records to the second: t^2 makes 4 of it
 EXPLAINED_PART = 1e-3  # of what the channels show: smaller residuals are taken for a fit, where their noise is not known
 LIKELY_SQUARE = 2.0  # mean square of residuals whose noise is known, up to which they are taken for a fit
@@ -57,45 +61,69 @@ def search(
     """
     loose = max(tol[0], LOOSE), max(tol[1], LOOSE)
     if strategy == "pieces":
-        along = fit_growing_parts(problem, z, loose, minimizer)
+        along = fit_growing_records(problem, z[0], loose, minimizer)
         if found := fit_in_pieces(problem, np.concatenate([along.z, z]), tol, minimizer):
             return found._replace(history=along.history + found.history)
     ways, tried = ["whole records"], [z]
+    known: Known = []
     fit = minimizer.with_label("whole records").minimize(problem, z, loose, None, SOME_STEPS, LOOSE_STEP)
     history = list(fit.history)
     if not explains(problem, fit, loose):
         ways.append("growing records")
-        other = fit_growing_parts(problem, z, loose, minimizer)
-        history += other.history
-        tried = [other.z, z]
-        fit = fit.join(other).take(np.arange(len(z)) + np.where(other.cost < fit.cost, len(z), 0))
+        grown = [fit_growing_records(problem, guess, loose, minimizer, known) for guess in z]
+        tried.append(np.concatenate([one.z for one in grown]))
+        history += [row for one in grown for row in one.history]
+        others = reduce(Fit.join, grown)
+        fit = fit.join(others).take(np.arange(len(z)) + np.where(others.cost < fit.cost, len(z), 0))
+    count = len(z)
     if more and not explains(problem, fit, loose):
-        ways.append(f"{more} more first guesses")
-        guesses = sample_guesses(problem.unknowns, z[0], more, seed)
-        other = fit_growing_parts(problem, guesses, loose, minimizer)
-        history += other.history
-        z = np.concatenate([z, guesses])
-        tried.append(other.z)
-        fit = fit.join(other)
+        ways.append("more first guesses")
+        sampled = sample_guesses(problem.unknowns, z[0], SAMPLED * more, seed)
+        for guess in rank_guesses(problem, sampled, loose):
+            one = fit_growing_records(problem, guess, loose, minimizer, known)
+            history += one.history
+            tried.append(one.z)
+            fit, count = fit.join(one), count + 1
+            if (
+                explains(problem, fit, loose)
+                or len(known) >= len(z) + more
+                or (_agreeing(fit) >= AGREED and _shows_most(problem, fit))
+            ):
+                break
+    best, agreeing = int(np.argmin(fit.cost)), _agreeing(fit)
+    only = fit.take(np.array([best]))
+    if more and not explains(problem, only, loose):
+        # Where half of the guesses agree, the mechanism does not move like that.
+        chaotic = is_chaotic(problem, only.z, loose)
+        pieces = MOST_PIECEWISE if chaotic else 2 * agreeing < count
+        found = fit_in_pieces(problem, np.concatenate(tried), tol, minimizer, pieces)
+        if found:
+            return found._replace(guesses=count, ways=(*ways, *found.ways), history=history + found.history)
+    return SearchResult(only, agreeing, count, tuple(ways), history, problem)
+
+
+def _agreeing(fit: Fit) -> int:
+    """Return how many fits are at the best minimum."""
     best = int(np.argmin(fit.cost))
     there = np.abs(fit.z - fit.z[best]).max(1) <= SAME_MINIMUM * (1.0 + np.abs(fit.z[best]).max())
-    agreeing = int((there & np.isfinite(fit.cost)).sum())
-    only = fit.take(np.array([best]))
-    lost = 2 * agreeing < len(z) or is_chaotic(problem, only.z, loose)  # else the mechanism does not move like that
-    if more and lost and not explains(problem, only, loose):
-        found = fit_in_pieces(problem, np.concatenate(tried), tol, minimizer)
-        if found:
-            return found._replace(guesses=len(z), ways=(*ways, *found.ways), history=history + found.history)
-    return SearchResult(only, agreeing, len(z), tuple(ways), history, problem)
+    return int((there & np.isfinite(fit.cost)).sum())
 
 
-def fit_in_pieces(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, minimizer: Minimizer) -> SearchResult | None:
-    """Fit the records in pieces, from the most promising guesses until one explains them; None: none does.
+def _shows_most(problem: Problem, fit: Fit) -> bool:
+    """Return whether the best fit shows most of the motion."""
+    scale = problem.channel_scale[problem.index[:, 2]] / problem.sigma
+    return bool(2.0 * fit.cost.min() < MOST_SHOWN**2 * np.sum(scale**2))
+
+
+def fit_in_pieces(
+    problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, minimizer: Minimizer, most: int = MOST_PIECEWISE
+) -> SearchResult | None:
+    """Fit the records in pieces, from the `most` promising guesses until one explains them; None: none does.
 
     Where the motion is not so chaotic that whole records are beyond the errors of their integration, the fit is of these.
     """
     loose = max(tol[0], MEDIUM), max(tol[1], MEDIUM)
-    for k, guess in enumerate(rank_guesses(problem, z, loose)[:MOST_PIECEWISE]):
+    for k, guess in enumerate(rank_guesses(problem, z, loose)[:most] if most else ()):
         try:
             pieces, fit = fit_pieces(problem, guess, loose, minimizer)
         except PieceFailed:
@@ -121,32 +149,24 @@ def is_chaotic(problem: Problem, z: Float[np.ndarray, "1 K"], tol: Tolerances) -
 
 def rank_guesses(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> Float[np.ndarray, "B K"]:
     """Return guesses, the best first: those that leave least of the records and of their first parts, which all count alike."""
+    record, time, _ = problem.index.T
+    r, since = problem.evaluate(z, tol).r[:, : len(record)], problem.ts[record, time] - problem.ts[record, 0]
     with np.errstate(divide="ignore"):
-        logs = [np.log(np.sum(np.square(problem.evaluate(z, tol, part).r), axis=1)) for part in horizons(problem)]
-    return z[np.argsort(np.nan_to_num(np.sum(logs, axis=0), nan=np.inf), kind="stable")]
-
-
-def fit_growing_parts(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, minimizer: Minimizer) -> Fit:
-    """Fit more and more of the records, each time from where the fits of the part before have ended."""
-    history: History = []
-    for part in horizons(problem)[:-1]:
-        one = minimizer.with_label(f"{part:.0%} of the records")
-        fit = one.minimize(problem, z, tol, part, FEW_STEPS, COARSE_STEP)
-        z = np.where(np.isfinite(fit.cost)[:, None], fit.z, z)
-        history += fit.history
-    fit = minimizer.with_label("whole records").minimize(problem, z, tol, None, STEPS, LOOSE_STEP)
-    return fit._replace(history=history + fit.history)
+        logs = [np.log(np.sum(np.square(r[:, since <= part]), axis=1)) for part in horizons(problem)]
+    # A run that fails on its way counts as one that shows nothing from there on.
+    worst = np.log(np.sum((problem.channel_scale[problem.index[:, 2]] / problem.sigma) ** 2))
+    return z[np.argsort(np.sum(np.nan_to_num(logs, nan=worst), axis=0), kind="stable")]
 
 
 def horizons(problem: Problem) -> list[float]:
-    """Return parts of the records to fit, one after another: the last is all of them."""
+    """Return parts of the records, s since their beginnings, one longer than the other: the last is all of them."""
     record, time, _ = problem.index.T
-    ts = problem.ts
-    passed = np.sort((ts[record, time] - ts[record, 0]) / (ts[record, -1] - ts[record, 0]))
+    passed = np.sort(problem.ts[record, time] - problem.ts[record, 0])
     enough = min(int(RESIDUALS_PER_UNKNOWN * problem.K), len(passed) - 1)
-    first = max(float(passed[enough]), SHORTEST_PART)
-    count = max(0, int(np.ceil(np.log(1.0 / first) / np.log(PART_GROWTH))))
-    return [PART_GROWTH ** (k - count) for k in range(count)] + [1.0]
+    begin, length = passed[0], max(passed[-1] - passed[0], SHORTEST_PART * problem.duration)
+    first = max(float(passed[enough] - begin), SHORTEST_PART * length)
+    count = max(0, int(np.ceil(np.log(length / first) / np.log(PART_GROWTH))))
+    return [*(begin + length * PART_GROWTH ** (k - count) for k in range(count)), problem.duration]
 
 
 def explains(problem: Problem, fit: Fit, tol: Tolerances) -> bool:

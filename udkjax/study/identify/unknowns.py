@@ -26,7 +26,8 @@ from udkjax.study.quantities import Setter, parameter_value
 Transform = Literal["positive", "bounded", "free"]
 AT_BOUND = 1e-3  # of the distance between the bounds: a value as near to one of them is said to be at it
 FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
-GUESS_RADIUS = 0.5  # of a value: how far other guesses are from the first
+# How far other guesses are from the first: positive parameters by a factor, others by a part of their scale.
+GUESS_FACTOR, GUESS_RADIUS = 2.5, 0.5
 BOUND_MARGIN = 0.02  # of the distance between the bounds: no guess is nearer, since bounds themselves are infinitely far
 READABLE = 1e-3  # of the largest: how much of a free motion the coordinates that are taken as its unknowns must show at least
 STATE_RADIUS = 0.05  # of the scene's length, time and one radian: how far guesses of initial states are from the first
@@ -132,21 +133,27 @@ def apply_values(mechanism: Mechanism, targets: Sequence[Target], x: Float[Array
 
 
 def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int) -> Float[np.ndarray, "B K"]:
-    """Sample guesses beside a first one: each parameter within a half of its value, or anywhere between its bounds.
+    """Sample guesses beside a first one: each parameter within a factor or a half of its scale, or anywhere between its bounds.
 
     Unknowns of initial states, which come after the parameters, are moved by a little.
     """
-    from scipy.stats import qmc  # here: it takes a second
-
     P = len(u.names)
-    unit = qmc.Sobol(len(z), rng=seed).random(1 << max(0, int(np.ceil(np.log2(count)))))[:count]
-    x0 = u.values(z[None, :P])[0]
-    bounded = np.array([kind == "bounded" for kind in u.kinds])
-    size = np.where([kind == "positive" for kind in u.kinds], x0, u.scale)
-    low, high = np.where(bounded, u.low, x0 - GUESS_RADIUS * size), np.where(bounded, u.high, x0 + GUESS_RADIUS * size)
-    inside = BOUND_MARGIN + (1.0 - 2.0 * BOUND_MARGIN) * unit[:, :P]
+    unit = _latin_hypercube(count, len(z), seed)
+    low, high = np.full(P, -np.log(GUESS_FACTOR)), np.full(P, np.log(GUESS_FACTOR))  # of z, from that of the first on
+    free, bounded = (np.array([kind == which for kind in u.kinds], bool) for which in ("free", "bounded"))
+    low[free], high[free] = -GUESS_RADIUS, GUESS_RADIUS
+    guesses = z[:P] + low + (high - low) * unit[:, :P]
+    inside = u.low + (u.high - u.low) * (BOUND_MARGIN + (1.0 - 2.0 * BOUND_MARGIN) * unit[:, :P])
+    guesses[:, bounded] = u.z_of(np.where(bounded, inside, u.values(guesses)))[:, bounded]
     states = z[P:] + STATE_RADIUS * (2.0 * unit[:, P:] - 1.0)
-    return np.concatenate([u.z_of(low + (high - low) * inside), states], axis=1)
+    return np.concatenate([guesses, states], axis=1)
+
+
+def _latin_hypercube(count: int, dimensions: int, seed: int) -> Float[np.ndarray, "B K"]:
+    """Sample points of the unit cube, one in each of `count` parts of every coordinate. SciPy's takes a second to import."""
+    random = np.random.default_rng(seed)
+    parts = random.permuted(np.tile(np.arange(count), (dimensions, 1)), axis=1).T
+    return (parts + random.random((count, dimensions))) / count
 
 
 # --- initial states

@@ -20,7 +20,7 @@ from jaxtyping import Array, Int, PyTree
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.assembly import Closure, State, close
 from udkjax.integrate.simulate import simulate
-from udkjax.integrate.solvers import forward_mode, is_explicit
+from udkjax.integrate.solvers import is_explicit
 from udkjax.pinv import Auto, Elimination
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -160,8 +160,7 @@ class Recipe:
         closure, settings = self._closure(shared, own, mechanism), self.settings(shared, own, shift)
         method, state = settings.get("method"), settings.pop("state", None)
         start: State | Closure | None = closure if state is None else state
-        adjoint = forward_mode() if self.names else None
-        solution = simulate(mechanism, settings.pop("ts"), start, adjoint=adjoint, throw=False, **settings)
+        solution = simulate(mechanism, settings.pop("ts"), start, throw=False, **settings)
         stored = {RESULT: solution.code.astype(jnp.int8), END: solution.time, STEPS: solution.stats["steps"].astype(jnp.int32)}
         for measure in self.plan.measures:
             stored |= measure.of(mechanism, solution, method)
