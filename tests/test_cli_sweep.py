@@ -97,7 +97,7 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys, grid):
 
 @pytest.mark.slow
 def test_the_example_on_workers_of_dask(tmp_path, capsys):
-    pytest.importorskip("distributed", reason="dask is not installed: pip install 'udkjax[dask]'")
+    pytest.importorskip("distributed", reason="dask is not installed: pip install '.[dask]'")
     arguments = ("sweep", EXAMPLES / "parallelogram.toml", EXAMPLE)
     assert udkjax(*arguments, "--dry-run") == 0
     shown = " ".join(capsys.readouterr().out.split())

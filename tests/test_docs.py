@@ -1,18 +1,101 @@
-"""Every block of Python in the documentation runs, those of a page one after another; every link leads somewhere."""
+"""What the documentation says is true: blocks run and print what they say, names, files and commands exist, links lead somewhere.
 
+A block of Python says what it prints by a comment on the line, `print(x)  # -> 3.14 (m)`, or by a block of `text` behind it, in
+which `...` stands for anything. Numbers agree to the digits that are shown; what is in brackets behind two spaces is a comment.
+"""
+
+import ast
+import builtins
+import importlib
+import inspect
 import re
+import shlex
+import sys
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 
+import udkjax
+from udkjax.cli import COMMANDS
+
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "CONTRIBUTING.md"]
-BLOCK = re.compile(r"^```python\n(.*?)^```", re.S | re.M)
+OTHERS = [ROOT / name for name in ("CONTRIBUTING.md", "experiments/README.md", "benchmarks/README.md")]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *OTHERS]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.S | re.M)
 LINK = re.compile(r"\]\(([^)#\s]+)")
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
+CODE = re.compile(r"`([^`\n]+)`")
 
 
 def name_of(page: Path) -> str:
     return str(page.relative_to(ROOT))
+
+
+every_page = pytest.mark.parametrize("page", PAGES, ids=name_of)
+
+
+# --- blocks
+
+
+def agrees(printed: str, said: str) -> bool:
+    """Whether a text is what was said of it: numbers to the digits that are shown, all else to the letter but for spaces."""
+    pattern = "".join(".*" if part == "..." else re.escape(part) for part in re.split(r"(\.\.\.)", NUMBER.sub("0", said)))
+    if not re.fullmatch(re.sub(r"(\\[ \n])+", r"\\s+", pattern), NUMBER.sub("0", printed).strip(), re.S):
+        return False
+    numbers = zip(NUMBER.findall(printed), NUMBER.findall(said))  # with `...`, those before it
+    return "..." in said or all(abs(float(a) - float(b)) <= 0.501 * digit(b) for a, b in numbers)
+
+
+def digit(number: str) -> float:
+    """The size of one in the last digit of a number as written."""
+    mantissa, _, exponent = number.partition("e")
+    return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+
+
+def untrue(text: str, names: dict) -> list[str]:
+    """Run a page's blocks, one after another; return what they print otherwise than it says, by line."""
+    wrong, printed, lines = [], [], text.splitlines()
+
+    def show(*values, sep=" ", **_):
+        line = sys._getframe(1).f_lineno
+        printed.append(sep.join(map(str, values)))
+        said = lines[line - 1].partition("# -> ")[2].split("  (")[0].strip()
+        if said and not agrees(printed[-1], said):
+            wrong.append(f"line {line}: prints {printed[-1]}")
+
+    names["print"], end = show, 0
+    for found in BLOCK.finditer(text):
+        start = text[: found.start(2)].count("\n")
+        if found[1] == "python":
+            printed.clear()
+            exec(compile("\n" * start + found[2], "page", "exec"), names)  # so that an error names the line of the page
+            end = found.end()
+        elif (
+            found[1] == "text"
+            and end
+            and not text[end : found.start()].strip()
+            and not agrees("\n".join(printed), found[2].strip())
+        ):
+            wrong.append(f"line {start}: prints\n" + "\n".join(printed))
+    return wrong
+
+
+@pytest.mark.parametrize(
+    ("page", "wrong"),
+    [
+        ("print(3.14159)  # -> 3.14", 0),
+        ("print(3.14159)  # -> 3.15", 1),
+        ("print('a', 2e-9)  # -> a 2e-09  (m)", 0),
+        ("print('a', 2e-9)  # -> b 2e-09  (m)", 1),
+        ("print(1)\nprint(2)\n```\n\n```text\n1\n2\n", 0),
+        ("print(1)\nprint(2)\n```\n\n```text\n1\n3\n", 1),
+        ("print(1, 'and much more')\n```\n\n```text\n1 and...\n", 0),
+    ],
+)
+def test_a_false_claim_is_noticed(page, wrong):
+    assert len(untrue(f"```python\n{page}\n```\n", {})) == wrong
 
 
 # With the slow tests, and where all checks run: the other pages, each of which compiles programs of its own.
@@ -24,21 +107,196 @@ FIRST = ("README.md",)
     [
         pytest.param(p, id=name_of(p), marks=[] if name_of(p) in FIRST else pytest.mark.slow)
         for p in PAGES
-        if BLOCK.search(p.read_text())
+        if "```python" in p.read_text()
     ],
 )
-def test_its_blocks_run(page, tmp_path, monkeypatch):
+def test_its_blocks_run_and_print_what_it_says(page, tmp_path, monkeypatch):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
-    names = {"__name__": "__page__"}
-    text = page.read_text()
-    for found in BLOCK.finditer(text):
-        line = text[: found.start(1)].count("\n")
-        exec(compile("\n" * line + found[1], str(page), "exec"), names)  # so that an error names the line of the page
+    assert untrue(page.read_text(), {"__name__": "__page__"}) == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@every_page
 def test_its_links_lead_somewhere(page):
     for target in LINK.findall(page.read_text()):
         if not target.startswith(("http:", "https:", "mailto:")):
             assert (page.parent / target).exists(), target
+
+
+# --- names
+
+
+SOURCES = {
+    path: ast.parse(path.read_text())
+    for folder in ("udkjax", "experiments", "benchmarks")
+    for path in (ROOT / folder).rglob("*.py")
+}
+ELSEWHERE = (
+    "jax",
+    "jnp",
+    "numpy",
+    "np",
+    "scipy",
+    "diffrax",
+    "equinox",
+    "eqx",
+    "optax",
+    "lineax",
+    "optimistix",
+    "equinox.internal",
+)
+LONG = {"jnp": "jax.numpy", "np": "numpy", "eqx": "equinox", "eqxi": "equinox.internal"}
+
+
+@cache
+def identifiers() -> set[str]:
+    """All names that the package and its studies know: of modules, of Python, keys of dictionaries and of scenes."""
+    found = {*dir(builtins), "udk", "udkjax", "pytest", "Args", "Returns", "Raises", "Source"}
+    found |= set(re.findall(r"\w+", (ROOT / "udkjax/show/player/player.js").read_text()))
+    tests = {
+        path: ast.parse(path.read_text()) for path in [ROOT / "tests" / "elements.py", *(ROOT / "tests").glob("*/methods.py")]
+    }
+    for path, tree in (SOURCES | tests).items():
+        found |= {path.stem, path.parent.name}
+        for node in ast.walk(tree):
+            for field in ("id", "attr", "arg", "name", "asname"):
+                if isinstance(value := getattr(node, field, None), str):
+                    found |= set(value.split("."))
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and re.fullmatch(r"[\w.\s]+", node.value):
+                found |= set(re.findall(r"\w+", node.value))
+    for page in PAGES:
+        found |= {word for kind, block in BLOCK.findall(page.read_text()) for word in re.findall(r"\w+", block)}
+    return found | {re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower() for name in found}  # types of scene files
+
+
+def has(owner: object, name: str) -> bool:
+    """Whether an object has an attribute, also one that only its instances have: a field."""
+    return hasattr(owner, name) or any(name in vars(cls).get("__annotations__", {}) for cls in getattr(owner, "__mro__", ()))
+
+
+def exists(name: str) -> bool:
+    """Whether a dotted name exists: of the public face and of other libraries exactly, else every part of it somewhere."""
+    head, *rest = name.replace("udkjax.paper", "experiments.paper").split(".")  # so it is called where it is installed
+    if head in ("udk", "udkjax") or (head in udkjax.__all__ and head[0].isupper()):
+        owner: object = udkjax if head in ("udk", "udkjax") else getattr(udkjax, head)
+        for part in rest:
+            if inspect.ismodule(owner) and not hasattr(owner, part):
+                try:
+                    owner = importlib.import_module(f"{owner.__name__}.{part}")
+                    continue
+                except ImportError:
+                    return False
+            if not has(owner, part):
+                return False
+            owner = getattr(owner, part, None)
+            if owner is None:  # a field
+                return True
+        return True
+    if rest and (LONG.get(head, head) in sys.modules or head in ELSEWHERE):
+        owner = importlib.import_module(LONG.get(head, head))
+        for part in rest:
+            if not has(owner, part):
+                return False
+            owner = getattr(owner, part, None)
+        return True
+    if name.startswith("JAX_"):  # of the environment
+        return hasattr(importlib.import_module("jax").config, name.lower())
+    return all(part in identifiers() for part in (head, *rest))
+
+
+NAME = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*)(?:\(.*\)|=.*|\[.*)?")
+PATH = re.compile(r"[\w.-]+(?:/[\w.-]+)+/?|[\w-]+\.(?:py|md|toml|sh|txt|cff)")
+SCENE_NAMES = re.compile(
+    r"(?:[A-Z]{4,}\.|body|joint|driver|force|pin|link|length|angle|point|gravity)\b[\w.(), -]*(?:\[.*\])*(?: \[.*\])?"
+)
+
+
+def missing(text: str) -> Iterator[str]:
+    """What is in backticks, looks like a name or a file, and does not exist."""
+    for code in CODE.findall(text):
+        if PATH.fullmatch(code):
+            if not any(
+                (base / code).exists() for base in (ROOT, ROOT / "udkjax", ROOT / "docs", *{p.parent for p in SOURCES})
+            ) and not (exists(code.replace("/", ".")) or re.match(r"[A-Za-z]\w*\.(toml|py|md)$|[\w/]*[A-Z]+[/.]", code)):
+                yield code
+        elif (found := NAME.fullmatch(code)) and not SCENE_NAMES.fullmatch(code) and not exists(found[1]):
+            yield code
+
+
+@every_page
+def test_its_names_and_files_exist(page):
+    assert list(missing(BLOCK.sub("", page.read_text()))) == []
+
+
+def docstrings() -> Iterator[tuple[str, str]]:
+    """Each docstring of the package, and where it is."""
+    for path, tree in SOURCES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
+                yield f"{name_of(path)}: {getattr(node, 'name', 'module')}", text
+
+
+def test_names_in_docstrings_exist():
+    assert [(where, name) for where, text in docstrings() for name in missing(text)] == []
+    files = {path.name for path in [*SOURCES, *(ROOT / "tests").rglob("*.py")]}
+    assert [(where, file) for where, text in docstrings() for file in re.findall(r"\w+\.py\b", text) if file not in files] == []
+
+
+def test_a_name_that_does_not_exist_is_noticed():
+    said = (
+        "`udk.simulate` `udk.simulat` `Motion.position` `Spline.times` `jnp.linalg.svd` `jnp.linalg.sdv` `tests/no.py` `quooks`"
+    )
+    assert list(missing(said)) == ["udk.simulat", "Motion.position", "jnp.linalg.sdv", "tests/no.py", "quooks"]
+
+
+# --- commands
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """The command lines of a page, without what surrounds them."""
+    shell = "\n".join(block for kind, block in BLOCK.findall(text) if kind == "sh").replace("\\\n", " ")
+    for line in [*shell.splitlines(), *CODE.findall(BLOCK.sub("", text))]:
+        for part in re.split(r"&&|#|;", line):
+            if re.match(r"\s*(\S*/)?(udkjax|python|pytest|sh|pip)\s", part):
+                words = shlex.split(part)
+                yield [Path(words[0]).name, *words[1:]]
+
+
+def wrong(words: list[str]) -> str:
+    """What is wrong with a command line; an empty text if nothing is."""
+    program, *rest = words
+    options = [word.partition("=")[0] for word in rest if word.startswith("--")]
+    if program == "udkjax":
+        named = [word for word in rest if word in COMMANDS]
+        if not named:
+            return "" if not rest or rest[0] in ("COMMAND", "--version", "--help") else f"no command {rest[0]}"
+        function = getattr(importlib.import_module(f"udkjax.cli.{named[0]}"), named[0])
+        known = {f"--{name.strip('_').replace('_', '-')}" for name in inspect.signature(function).parameters}
+        known |= {f"--no-{option[2:]}" for option in known} | {"--help"}
+        return " ".join(option for option in options if option not in known)
+    if program == "python" and rest[:1] == ["-m"] and rest[1].split(".")[0] in ("experiments", "benchmarks", "examples"):
+        folder = ROOT / rest[1].replace(".", "/")
+        names = [word for word in rest[2:] if re.fullmatch(r"[a-z_]+", word) and word not in ("all", "figures")]
+        return " ".join(name for name in names if not (folder / f"{name}.py").exists())
+    if program == "sh" and rest:
+        script = ROOT / rest[0]
+        return rest[0] if not script.exists() else " ".join(o for o in options if o not in script.read_text())
+    if program == "pip" and re.search(r"udkjax(\[|$)", " ".join(rest)):
+        return "udkjax is not in any package index: install it from its folder"
+    return ""
+
+
+@every_page
+def test_its_commands_exist(page):
+    assert [(" ".join(words), wrong(words)) for words in commands(page.read_text()) if wrong(words)] == []
+
+
+def test_a_command_that_does_not_exist_is_noticed():
+    said = [
+        "udkjax simulat a.toml",
+        "udkjax simulate a.toml --t1 5 --outt x",
+        "python -m experiments wire_lore",
+        "pip install 'udkjax[io]'",  # which is in no index
+    ]
+    assert [bool(wrong(shlex.split(line))) for line in said] == [True] * 4
+    assert not wrong(shlex.split("udkjax simulate a.toml --t1 5 --out x.nc"))

@@ -51,4 +51,4 @@ def cure(error: ModuleNotFoundError) -> str:
     missing = (error.name or "").partition(".")[0]
     if missing not in EXTRAS:
         return ""
-    return f"{missing} is not installed: pip install 'udkjax[{EXTRAS[missing]}]'"
+    return f"{missing} is not installed: pip install '.[{EXTRAS[missing]}]' in the folder of udkjax"

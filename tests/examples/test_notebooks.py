@@ -11,7 +11,7 @@ FOLDER = Path(__file__).parents[2] / "examples" / "notebooks"
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: path.stem)
 def test_a_notebook_runs(path):
-    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed: pip install 'udkjax[browser]'")
+    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed: pip install '.[browser]'")
     nbformat = pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
     notebook = nbformat.read(path, as_version=4)

@@ -1,7 +1,7 @@
 """Derivatives of programs of loops, forward and reverse: kernel by kernel.
 
-Every array x has another one for its changes, `d_x`, or for its cotangents, `bar_x`. What a program has computed on the way must
-still be there: no number is written again once it has been read.
+Every array x has another one, for its changes (named d_x) or for its cotangents (bar_x). What a program has computed on the way
+must still be there: no number is written again once it has been read.
 """
 
 from collections.abc import Callable, Collection, Sequence

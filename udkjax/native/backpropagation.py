@@ -7,7 +7,7 @@ lies on; those of a point through its accelerations and its projection to the en
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
 
 of its stages, the last first, to the point before. The stages are evaluated again on the way, with what the derivatives need to
-know of them; the transposed programs are those of equations/derivative.py.
+know of them; the transposed programs are those of expressions/differential.py.
 
 Members walk back side by side, in lanes; the next ones follow when all are back.
 """

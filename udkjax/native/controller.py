@@ -117,7 +117,7 @@ def write_decide(t: Module):
 
 
 def first_step(t: Module, f: Function, s: Lane) -> Value:
-    """As given, or one over which the state changes by a small part of itself (first_step.py)."""
+    """As given, or one over which the state changes by a small part of itself (`first_step` of integrate/diffrax_engine.py)."""
     rtol = t.broadcast(f, s.rtol)
 
     def relative(of_q: str, of_v: str) -> Any:

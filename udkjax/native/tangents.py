@@ -1,12 +1,12 @@
 """Derivatives of a trajectory in forward mode: along P directions, in the same code, step by step.
 
 Where a run goes is a function of the constants of a scene and of the initial state. Steps are taken as they are: no derivative is
-taken of their sizes. ForwardMode a direction the states of the stages change by the same sums as they are made of,
+taken of their sizes. Along a direction, the states of the stages change by the same sums that they are made of,
 
     dq_i = dq + h c_i dv + h^2 sum_j (A A)_ij da_j,        dv_i = dv + h sum_j A_ij da_j,
 
 and the accelerations, the end of a step and the outputs, which are projected, by the programs of their own derivatives
-(equations/derivative.py), with what those know of the state from its own evaluation. Interpolation is linear.
+(expressions/differential.py), with what those know of the state from its own evaluation. Interpolation is linear.
 """
 
 from collections.abc import Iterator, Sequence

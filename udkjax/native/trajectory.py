@@ -12,7 +12,7 @@ W members run side by side in the lanes of vectors, each with a time, a step and
 takes the next one. Where elimination meets a pivot that it must not trust, a step is taken a little shorter; where that does not
 help it is taken again by a fallback: a rank-revealing method on all rows (least_norm.py), lane by lane.
 
-The functions of one module, all of them on one piece of memory (`Places`): `run` takes members and calls `attempt` (one step),
+The functions of one module, all of them on one piece of memory (`Layout`): `run` takes members and calls `attempt` (one step),
 `decide` (whether it counts, and the next), `outputs` (states between steps).
 """
 

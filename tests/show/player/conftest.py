@@ -78,7 +78,7 @@ def hostile():
 @pytest.fixture(scope="session")
 def browser():
     """Headless Chromium."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install 'udkjax[browser]'")
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install '.[browser]'")
     from pathlib import Path
 
     path = next((path for path in CHROMIUM if Path(path).exists()), None)

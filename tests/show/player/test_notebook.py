@@ -28,8 +28,8 @@ CELLS = (
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
     """JupyterLab with a notebook, and its address."""
-    pytest.importorskip("jupyterlab", reason="jupyterlab is not installed: pip install 'udkjax[browser]'")
-    pytest.importorskip("anywidget", reason="anywidget is not installed: pip install 'udkjax[notebook]'")
+    pytest.importorskip("jupyterlab", reason="jupyterlab is not installed: pip install '.[browser]'")
+    pytest.importorskip("anywidget", reason="anywidget is not installed: pip install '.[notebook]'")
     folder = tmp_path_factory.mktemp("lab")
     root = str(Path(__file__).parents[3])
     cells = [

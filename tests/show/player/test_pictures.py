@@ -65,13 +65,13 @@ def test_a_gif_moves_as_long_as_the_run(animation, tmp_path):
 
 
 def test_an_mp4_is_a_film(animation, tmp_path):
-    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: pip install 'udkjax[video]'")
+    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: pip install '.[video]'")
     path = animation.save(tmp_path / "motion.mp4", fps=5, width=160)
     assert path.read_bytes()[4:8] == b"ftyp" and path.stat().st_size > 1000
 
 
 def test_a_dxf_is_in_metres_in_layers(animation, closed_form, tmp_path):
-    ezdxf = pytest.importorskip("ezdxf", reason="ezdxf is not installed: pip install 'udkjax[dxf]'")
+    ezdxf = pytest.importorskip("ezdxf", reason="ezdxf is not installed: pip install '.[dxf]'")
     drawing = ezdxf.readfile(animation.save(tmp_path / "pose.dxf", t=0.3))
     space = drawing.modelspace()
     places = sorted((c.dxf.center.x, c.dxf.center.y) for c in space.query('CIRCLE[layer=="joints"]'))

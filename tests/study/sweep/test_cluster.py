@@ -16,8 +16,8 @@ from udkjax.study.sweep import executors as cluster
 from udkjax.study.sweep.executors import ClusterError, dask_engine
 from udkjax.study.sweep.plan import Chunk
 
-dask_config = pytest.importorskip("dask.config", reason="dask is not installed: pip install 'udkjax[dask]'")
-distributed = pytest.importorskip("distributed", reason="dask is not installed: pip install 'udkjax[dask]'")
+dask_config = pytest.importorskip("dask.config", reason="dask is not installed: pip install '.[dask]'")
+distributed = pytest.importorskip("distributed", reason="dask is not installed: pip install '.[dask]'")
 
 CHUNKS = [Chunk(k, 0, np.arange(3 * k, 3 * k + 3), 1.0) for k in range(40)]
 PLAN: Any = SimpleNamespace(factor=2.0)
@@ -136,5 +136,5 @@ def test_without_dask_or_a_client_the_cure_is_told(monkeypatch):
         with pytest.raises(ClusterError, match=r"client=distributed\.Client"):
             dask_engine()
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'udkjax\[dask\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install '\.\[dask\]'"):
         dask_engine()

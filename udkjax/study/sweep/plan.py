@@ -57,7 +57,7 @@ class Chunk:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a sweep is. Immutable; it pickles, so that other processes can compute parts of it. Made by `planned`."""
+    """What a sweep is. Immutable; it pickles, so that other processes can compute parts of it. Made by `make_plan`."""
 
     mechanism: Mechanism
     dimensions: tuple[Dimension, ...]

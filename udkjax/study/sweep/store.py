@@ -196,7 +196,7 @@ def pack(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def unpack(content: bytes) -> dict[str, np.ndarray] | None:
-    """Return the arrays of an archive that `packed` made, or None where a bit of it is not as it was."""
+    """Return the arrays of an archive that `pack` made, or None where a bit of it is not as it was."""
     body, length, digest = content[: -DIGEST - 2], content[-DIGEST - 2 : -DIGEST], content[-DIGEST:]
     if length != struct.pack("<H", DIGEST) or digest != hashlib.sha256(body).hexdigest().encode():
         return None
