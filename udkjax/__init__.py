@@ -98,6 +98,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.show.player import animate as animate
     from udkjax.show.player import animate_modes as animate_modes
     from udkjax.study.branches import branches as branches
+    from udkjax.study.channel_values import path as path
     from udkjax.study.continuation import Reached as Reached
     from udkjax.study.diagnosis import Diagnosis as Diagnosis
     from udkjax.study.diagnosis import diagnose as diagnose
@@ -173,6 +174,7 @@ _NAMES = {
     "udkjax.show.player": "animate animate_modes Animation",
     "udkjax.study.sweep": "sweep Axis Zipped Sobol LatinHypercube Random SweepError",
     "udkjax.study.branches": "branches",
+    "udkjax.study.channel_values": "path",
     "udkjax.study.continuation": "Reached",
     "udkjax.study.drive": "Coordinate",
     "udkjax.study.equilibrium": "equilibria equilibrium Equilibrium",

@@ -108,7 +108,7 @@ def test_names_may_hold_what_separates_them():
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("rod.x", 'begins with none of body., joint., driver., distance.; did you mean "body.rod.x"?'),
+        ("rod.x", 'begins with none of body., joint., pin., driver., distance.; did you mean "body.rod.x"?'),
         ("body.rot.x", 'no body named "rot"; did you mean "rod"?'),
         ("body.ground.x", '"ground" does not move; name a body'),
         ("body.rod.vz", 'body "rod" has no "vz"; it has x, y, vx, vy, ax, ay, angle, omega, alpha'),

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
@@ -13,8 +14,9 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from udkjax.extras import OptionalImport
 from udkjax.integrate.events.event import Events
 from udkjax.printing import PrintedTable, PrintsTable, PrintsWords, units
-from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.bodies import COORDINATES, Frame, frame_over_time
 from udkjax.scene.description import format_pose, size_of
+from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -137,6 +139,14 @@ class Solution(PrintsTable):
         for k, body in enumerate(self.bodies):
             rows[body] = f"from {format_pose(q[0, k], size_of(q))} to {format_pose(q[-1, k], size_of(q))}"
         return PrintedTable("simulation", list(rows.items()))
+
+    def frame(self, body: str) -> Frame:
+        """Return the frame of a body, each of its numbers (T,)."""
+        return frame_over_time(self.bodies, self.q, self.v, body)
+
+    def path(self, body: str, point: Numbers = (0.0, 0.0)) -> Float[Array, "T 2"]:
+        """Return the path (m) of a point given in the body's own frame (m). `udkjax.path` knows pins, too, and velocities."""
+        return jnp.stack(self.frame(body).point(number(point)), -1)
 
     def to_xarray(self, mechanism: Mechanism | None = None) -> Any:
         """Return an xarray Dataset: q and v over time, body, coordinate, with units, versions, settings, result and statistics.

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.printing import PrintsLine, one_line
@@ -97,6 +98,32 @@ class Frame(NamedTuple):
 
 GROUND_FRAME = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # as joints see the ground
 GROUND_FRAME_AT_REST = Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # as force elements see it, with its velocities
+
+
+def frame_over_time(names: Sequence[str], q: Float[Array, "T bodies 3"], v: Float[Array, "T bodies 3"], body: str) -> Frame:
+    """Return the frame of a body along a motion, each of its numbers (T,).
+
+    Args:
+        names: The bodies, in the order of q and v.
+        q: Coordinates (m, m, rad).
+        v: Velocities (m/s, m/s, rad/s).
+        body: One of them, or "ground".
+
+    Returns:
+        The frame, with its velocities.
+
+    Raises:
+        ValueError: No such body.
+    """
+    if body == GROUND:
+        zero = jnp.zeros_like(q[..., 0, 0])
+        return Frame(zero, zero, zero, zero + 1.0, zero, zero, zero, zero)
+    if body not in names:
+        cure = "a pin is found by udk.path(mechanism, solution, pin)"
+        raise ValueError(f'no body named "{body}"; there are {", ".join(names)}; {cure}')
+    k = names.index(body)
+    (x, y, angle), (vx, vy, omega) = (jnp.moveaxis(jnp.asarray(s)[..., k, :], -1, 0) for s in (q, v))
+    return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
 
 
 def between(points: Float[Array, "2 2"] | Sequence[Vector], one: Frame, two: Frame) -> Point:

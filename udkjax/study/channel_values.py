@@ -1,21 +1,26 @@
-"""What channels show of a motion: positions, rates, accelerations, reactions, and functions of the user's own."""
+"""What channels show of a motion, and the paths of points: positions, rates, accelerations, reactions, functions of one's own."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.abstract_system import MechanismSystem
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.textbook import prepare
 from udkjax.pinv import SVD
-from udkjax.scene.bodies import GROUND, Frame, between
+from udkjax.scene.arguments import checked
+from udkjax.scene.bodies import GROUND, Frame, Point, between
+from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import LOADS, Channel, Quantity, Trajectory
+from udkjax.study.channels import LOADS, POINT_UNITS, Channel, Quantity, Trajectory, locate, point_of_joint
+from udkjax.study.channels import Point as Place
 
 
 def measure(mechanism: Mechanism, solution: Trajectory, channels: Sequence[Channel | Quantity]) -> Float[Array, "T C"]:
@@ -37,14 +42,59 @@ def measure(mechanism: Mechanism, solution: Trajectory, channels: Sequence[Chann
         Values (T, C) in SI units, one channel a column. Where a state is not a number, after a run has failed, nor are its
         values; derivatives are zero there, and unharmed elsewhere.
     """
+    motion, reached = _fill(mechanism, solution)
+    filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (motion.q, motion.v))
+    columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
+    return jnp.where(reached[:, None], jnp.stack(columns, -1), jnp.nan) if columns else jnp.zeros((len(motion.q), 0))
+
+
+@checked
+def path(
+    mechanism: Mechanism, solution: Trajectory, of: str, point: Numbers | None = None, derivative: Literal[0, 1, 2] = 0
+) -> Float[Array, "T 2"]:
+    """Return the path of a point of a body, or of a pin, over a motion; or the point's velocities, or accelerations.
+
+    Pure, jittable, batched by `vmap`, and differentiable by every number of the mechanism, the point and the motion.
+
+    Args:
+        mechanism: the mechanism that moved.
+        solution: a `Solution`, a `Kinematics`, or another motion with ts (T,), q and v (T, bodies, 3).
+        of: a body, or a joint for its point: that of its second body, where it has two.
+        point: in the body's own frame (m); by default its centre of mass.
+        derivative: 0 for positions (m), 1 for velocities (m/s), 2 for accelerations (m/s^2): those that the motion has, as a
+            `Kinematics` does, or those of the equations of motion, a = a_F + M^(-1/2) D^+ b.
+
+    Returns:
+        x and y (T, 2) in ground axes; not a number where the motion is not.
+
+    Raises:
+        ValueError: no such body or joint.
+    """
+    body, local = locate(mechanism, of, point)
+    given = getattr(solution, "a", None)
+    analysis = analyse(mechanism) if derivative == 2 and given is None else None
+    motion = jnp.asarray(solution.ts), jnp.asarray(solution.q), jnp.asarray(solution.v)
+    return _path(mechanism.without_origin, analysis, *motion, given if derivative == 2 else None, local, body, derivative)
+
+
+@eqx.filter_jit
+def _path(mechanism, analysis, ts, q, v, a, local, body, derivative):
+    motion, reached = _fill(mechanism, SimpleNamespace(ts=ts, q=q, v=v, a=a), analysis)
+    return jnp.where(reached[:, None], jnp.stack(motion.point(body, local, derivative), -1), jnp.nan)
+
+
+def _fill(
+    mechanism: Mechanism, solution: Trajectory | SimpleNamespace, analysis: Analysis | None = None
+) -> tuple["_Motion", Bool[Array, "T"]]:
+    """Return a motion with the scene's guess where it is not a number, so that all derivatives are, and where it is one."""
     reached = jnp.all(jnp.isfinite(solution.q) & jnp.isfinite(solution.v), axis=(1, 2))
     finite = reached[:, None, None]
-    # The scene's guess stands in: any state at which all derivatives are numbers.
     q, v = (jnp.where(finite, x, jax.lax.stop_gradient(x0)) for x, x0 in ((solution.q, mechanism.q0), (solution.v, mechanism.v0)))
-    filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (q, v))
-    motion = _Motion(mechanism, solution.ts, q, v)
-    columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
-    return jnp.where(reached[:, None], jnp.stack(columns, -1), jnp.nan) if columns else jnp.zeros((len(q), 0))
+    a = getattr(solution, "a", None)
+    return _Motion(mechanism, solution.ts, q, v, None if a is None else jnp.where(finite, a, 0.0), analysis), reached
+
+
+DERIVATIVE = {"": 0, "v": 1, "a": 2}  # of a position, by the letter before x or y
 
 
 class _Dynamics(NamedTuple):
@@ -64,11 +114,13 @@ class _Motion:
     ts: Float[Array, "T"]
     q: Float[Array, "T bodies 3"]
     v: Float[Array, "T bodies 3"]
+    a: Float[Array, "T bodies 3"] | None  # where the motion has accelerations of its own
+    analysis: Analysis | None
 
     @cached_property
     def dynamics(self) -> _Dynamics:
         """Solve the equations of motion: only where a channel asks for it."""
-        equations: MechanismSystem = prepare(self.mechanism, SVD())
+        equations: MechanismSystem = prepare(self.mechanism, SVD(), None, self.analysis)
         mass = jnp.stack([jnp.stack([body.mass, body.mass, body.inertia]) for body in self.mechanism.bodies.values()])
 
         def at(t, q, v):
@@ -98,7 +150,18 @@ class _Motion:
 
     def acceleration(self, body: str) -> list[Array]:
         """Return ax, ay and alpha of a body, each (T,)."""
-        return self._entries(self.dynamics.a, body)
+        return self._entries(self.q if body == GROUND else self.dynamics.a if self.a is None else self.a, body)
+
+    def point(self, body: str, local: Float[Array, "2"] | Place, derivative: int) -> Point:
+        """Return the position, velocity or acceleration of a point of a body, x and y each (T,)."""
+        frame = self.frames[body]
+        if derivative == 0:
+            return frame.point(local)
+        if derivative == 1:
+            return frame.velocity(local)
+        ax, ay, alpha = self.acceleration(body)  # a + alpha x r - omega^2 r
+        arm, square = frame.vector(local), frame.omega**2
+        return Point(ax - alpha * arm.y - square * arm.x, ay + alpha * arm.x - square * arm.y)
 
     def load(self, owner: str, body: str) -> tuple[Array, Array, Array]:
         """Return force and torque of a constraint on a body; on the ground: minus those on the others."""
@@ -122,17 +185,24 @@ def _measure_body(channel: Channel, motion: _Motion) -> Array:
         return getattr(frame, quantity)
     if quantity == "alpha":
         return motion.acceleration(name)[2]
-    axis = quantity[-1]
-    if channel.needs == "accelerations":  # a + alpha x r - omega^2 r
-        ax, ay, alpha = motion.acceleration(name)
-        arm, square = frame.vector(point), frame.omega**2
-        return ax - alpha * arm.y - square * arm.x if axis == "x" else ay + alpha * arm.x - square * arm.y
-    return getattr(frame.velocity(point) if quantity[0] == "v" else frame.point(point), axis)
+    return _component(motion, name, point, quantity)
+
+
+def _component(motion: _Motion, body: str, point: Float[Array, "2"] | Place, quantity: str) -> Array:
+    """Return x or y of the position, velocity (vx, vy) or acceleration (ax, ay) of a point."""
+    found = motion.point(body, point, DERIVATIVE[quantity[:-1]])
+    return jnp.broadcast_to(getattr(found, quantity[-1]), motion.ts.shape)
+
+
+def _measure_pin(channel: Channel, motion: _Motion) -> Array:
+    return _component(motion, *point_of_joint(motion.mechanism, channel.owner), channel.quantity)
 
 
 def _measure_joint(channel: Channel, motion: _Motion) -> Array:
     if channel.needs == "reactions":
         return motion.load(channel.owner, channel.bodies[0])[list(LOADS).index(channel.quantity)]
+    if channel.quantity in POINT_UNITS:
+        return _measure_pin(channel, motion)
     if channel.quantity == "alpha":
         one, two = (motion.acceleration(body)[2] for body in channel.bodies)
     else:
@@ -152,6 +222,7 @@ def _measure_distance(channel: Channel, motion: _Motion) -> Array:
 _MEASURES: dict[str, Callable[[Channel, _Motion], Array]] = {
     "body": _measure_body,
     "joint": _measure_joint,
+    "pin": _measure_pin,
     "driver": _measure_driver,
     "distance": _measure_distance,
 }

@@ -2,6 +2,7 @@
 
     body.NAME.x  y  angle  vx  vy  omega  ax  ay  alpha       centre of mass and angle, their rates and accelerations
     body.NAME(px, py).x  y  vx  vy  ax  ay                    a point given in the body's own frame (m)
+    pin.NAME.x  y  vx  vy  ax  ay                             the point of a joint; joint.NAME.x is the same
     joint.NAME.angle  omega  alpha                            theta_2 - theta_1 of the joint's two bodies: an encoder at the pin
     joint.NAME.fx  fy  torque                                 what the joint does to its second body, as in `reactions`
     joint.NAME.BODY.fx  fy  torque                            what it does to one that is named
@@ -20,15 +21,17 @@ from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote, suggestion
+from udkjax.scene.fields import Numbers, number
+from udkjax.scene.joints import Joint
 from udkjax.scene.mechanism import Mechanism
 
 Needs = Literal["states", "accelerations", "reactions"]
 Point = tuple[float, float]  # in a body's own frame (m)
 _CENTRE: Point = (0.0, 0.0)
-_POINT_UNITS = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "ax": "m/s2", "ay": "m/s2"}
+POINT_UNITS = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "ax": "m/s2", "ay": "m/s2"}
 _ANGLE_UNITS = {"angle": "rad", "omega": "rad/s", "alpha": "rad/s2"}
 LOADS = {"fx": "N", "fy": "N", "torque": "N m"}
-UNITS = {**_POINT_UNITS, **_ANGLE_UNITS, **LOADS}
+UNITS = {**POINT_UNITS, **_ANGLE_UNITS, **LOADS}
 RATES = ("vx", "vy", "omega")  # of the coordinates of a body
 _ACCELERATIONS = ("ax", "ay", "alpha")
 
@@ -53,7 +56,7 @@ class Channel:
     name: str
     units: str
     needs: Needs
-    section: str  # body, joint, driver or distance
+    section: str  # body, joint, pin, driver or distance
     owner: str  # the joint or driver; else empty
     bodies: tuple[str, ...]  # whose it is; of an angle at a joint, and of a distance, both
     points: tuple[Point, ...] = ()  # of each body
@@ -78,6 +81,59 @@ class Quantity:
         return self.name
 
 
+# --- points
+
+
+def has_point(joint: Joint) -> bool:
+    """Return whether a joint is at a point."""
+    return getattr(joint, "points", None) is not None
+
+
+def point_of_joint(mechanism: Mechanism, name: str) -> tuple[str, Float[Array, "2"]]:
+    """Return a body, or "ground", and the point (m) in its frame where a joint is.
+
+    Where a joint holds two points, such as a slot, a distance or a cam, it is the one of its second body.
+    """
+    joint = mechanism.joints[name]
+    last = len(joint.points) - 1
+    return joint.bodies[last], joint.points[last]
+
+
+def locate(mechanism: Mechanism, of: str, point: Numbers | None = None) -> tuple[str, Float[Array, "2"]]:
+    """Return the body, or "ground", and the point (m) in its frame that are meant by a name and, of a body, a point.
+
+    Raises:
+        ValueError: no body or joint of this name, or a joint without a point; the message says what was probably meant.
+    """
+    section, _, name = of.partition(".")
+    known = {"body": (*mechanism.body_names, GROUND), "pin": [n for n, joint in mechanism.joints.items() if has_point(joint)]}
+    known["joint"] = known["pin"]
+    if section in known and name in known[section] and of not in (*known["body"], *known["pin"]):
+        kinds = [section]
+    else:
+        kinds, name = [kind for kind in ("body", "pin") if of in known[kind]], of
+    if len(kinds) == 2 and point is None:
+        raise ValueError(f"{quote(of)} is a body and a joint: write {quote(f'body.{of}')} or {quote(f'joint.{of}')}")
+    if not kinds:
+        everything = (*mechanism.body_names, *mechanism.joint_names)
+        if of in mechanism.joints:
+            raise ValueError(f"joint {quote(of)}, a {type(mechanism.joints[of]).__name__}, is not at a point: name a body")
+        raise ValueError(f"{quote(of)} is neither a body nor a joint{suggestion(of, everything) or _listed(everything)}")
+    if "body" in kinds:
+        local = number(_CENTRE if point is None else point)
+        if local.shape != (2,):
+            meant = f"(px, py), two numbers (m) in the frame of {quote(name)}"
+            raise ValueError(f"point must be {meant}; its shape is {local.shape}")
+        return name, local
+    if point is not None:
+        raise ValueError(f"{quote(of)} is a joint, whose point is known; a point is given in the frame of a body")
+    return point_of_joint(mechanism, name)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"; there are {', '.join(map(quote, names))}"
+
+
 # --- names
 
 
@@ -96,9 +152,10 @@ def channel_of(mechanism: Mechanism, text: str) -> Channel:
 
 def channels_of(mechanism: Mechanism) -> list[str]:
     """Return the names of all channels that need no point, in the order of the scene."""
-    found = [f"body.{name}.{q}" for name in mechanism.body_names for q in (*_POINT_UNITS, *_ANGLE_UNITS)]
+    found = [f"body.{name}.{q}" for name in mechanism.body_names for q in (*POINT_UNITS, *_ANGLE_UNITS)]
     for name, joint in mechanism.joints.items():
         found += [f"joint.{name}.{q}" for q in (*(_ANGLE_UNITS if len(joint.bodies) == 2 else ()), *LOADS)]
+        found += [f"pin.{name}.{q}" for q in (POINT_UNITS if has_point(joint) else ())]
     return [*found, *(f"driver.{name}.load" for name in mechanism.driver_names)]
 
 
@@ -106,7 +163,7 @@ def _parse_body(mechanism: Mechanism, text: str) -> Channel:
     name, rest = _split_owner("body", mechanism.body_names, text)
     point, rest = _split_point(rest, _CENTRE)
     shown = _with_point(name, point) if point is not _CENTRE else name
-    known = _POINT_UNITS if point is not _CENTRE else {**_POINT_UNITS, **_ANGLE_UNITS}
+    known = POINT_UNITS if point is not _CENTRE else {**POINT_UNITS, **_ANGLE_UNITS}
     quantity = _check_quantity(f"body {quote(shown)}", rest, known)
     needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
     return Channel(f"body.{shown}.{quantity}", UNITS[quantity], needs, "body", "", (name,), (point,), quantity)
@@ -120,13 +177,22 @@ def _parse_joint(mechanism: Mechanism, text: str) -> Channel:
             quantity = _check_quantity(f"joint {quote(name)} on body {quote(body)}", rest.removeprefix(f".{body}"), LOADS)
             return Channel(f"joint.{name}.{body}.{quantity}", UNITS[quantity], "reactions", "joint", name, (body,), (), quantity)
     pair = bodies[:2]
-    known = {**(_ANGLE_UNITS if len(pair) == 2 else {}), **LOADS}
+    places = POINT_UNITS if has_point(mechanism.joints[name]) else {}
+    known = {**places, **(_ANGLE_UNITS if len(pair) == 2 else {}), **LOADS}
     quantity = _check_quantity(f"joint {quote(name)}", rest, known, [f"{b}.{q}" for b in bodies for q in LOADS])
     units, label = UNITS[quantity], f"joint.{name}.{quantity}"
     if quantity in LOADS:
         return Channel(label, units, "reactions", "joint", name, pair[-1:], (), quantity)
     needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
     return Channel(label, units, needs, "joint", name, pair, (), quantity)
+
+
+def _parse_pin(mechanism: Mechanism, text: str) -> Channel:
+    name, rest = _split_owner("pin", [name for name, joint in mechanism.joints.items() if has_point(joint)], text)
+    quantity = _check_quantity(f"pin {quote(name)}", rest, POINT_UNITS)
+    needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
+    body, _ = point_of_joint(mechanism, name)
+    return Channel(f"pin.{name}.{quantity}", UNITS[quantity], needs, "pin", name, (body,), (), quantity)
 
 
 def _parse_driver(mechanism: Mechanism, text: str) -> Channel:
@@ -153,6 +219,7 @@ def _parse_distance(mechanism: Mechanism, text: str) -> Channel:
 _PARSERS: dict[str, Callable[[Mechanism, str], Channel]] = {
     "body": _parse_body,
     "joint": _parse_joint,
+    "pin": _parse_pin,
     "driver": _parse_driver,
     "distance": _parse_distance,
 }
@@ -167,7 +234,7 @@ def _split_owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
     given = re.split(r"\(|\.[^.]*$", text)[0]
     if given == GROUND:
         raise ValueError(f'"{GROUND}" does not move; name a body')
-    known = f"; there are {', '.join(map(quote, names))}" if names else "; the mechanism has none"
+    known = _listed(names) if names else "; the mechanism has none"
     raise ValueError(f"no {kind} named {quote(given)}{suggestion(given, names) or known}")
 
 

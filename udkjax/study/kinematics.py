@@ -17,7 +17,7 @@ from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.march import can_march, march, march_at_once, psi_at_once
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
-from udkjax.scene.bodies import GROUND, Frame
+from udkjax.scene.bodies import Frame, frame_over_time
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
@@ -77,15 +77,10 @@ class Kinematics(PrintsTable):
 
     def frame(self, body: str) -> Frame:
         """Return the frame of a body, each of its numbers (T,)."""
-        if body == GROUND:
-            zero = jnp.zeros_like(self.values)
-            return Frame(zero, zero, zero, zero + 1.0, zero, zero, zero, zero)
-        k = self.bodies.index(body)
-        (x, y, angle), (vx, vy, omega) = (jnp.moveaxis(s[..., k, :], -1, 0) for s in (self.q, self.v))
-        return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
+        return frame_over_time(self.bodies, self.q, self.v, body)
 
     def path(self, body: str, point: Numbers = (0.0, 0.0)) -> Float[Array, "T 2"]:
-        """Return the path (m) of a point given in the body's own frame (m): a coupler curve."""
+        """Return the path (m) of a point given in the body's own frame (m): a coupler curve. `udkjax.path` knows pins, too."""
         return jnp.stack(self.frame(body).point(number(point)), -1)
 
 

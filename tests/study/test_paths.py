@@ -1,0 +1,123 @@
+"""Paths, velocities and accelerations of points and pins, by any name and in every transformation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+
+TIP = (0.3, -0.1)
+TS = np.linspace(0.0, 0.2, 41)
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    mech = udk.library.four_bar()
+    return mech, udk.simulate(mech, TS, rtol=1e-11, atol=1e-11)
+
+
+def slope(x, step=TS[1]):
+    """The rate of a path, by central differences of fourth order."""
+    return (8 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12 * step)
+
+
+def test_a_path_is_where_the_point_is_and_its_derivatives_are_its_rates(linkage):
+    mech, sol = linkage
+    q = np.asarray(sol.q[:, 1])
+    turned = np.stack(
+        [np.cos(q[:, 2]) * TIP[0] - np.sin(q[:, 2]) * TIP[1], np.sin(q[:, 2]) * TIP[0] + np.cos(q[:, 2]) * TIP[1]], 1
+    )
+    x, v, a = (np.asarray(udk.path(mech, sol, "coupler", TIP, derivative=k)) for k in range(3))
+    assert_allclose(x, q[:, :2] + turned, rtol=0, atol=1e-14)
+    assert_allclose(sol.path("coupler", TIP), x, rtol=0, atol=1e-14)
+    assert_allclose(v[2:-2], slope(x), rtol=0, atol=1e-6 * np.abs(v).max())
+    assert_allclose(a[2:-2], slope(v), rtol=0, atol=1e-5 * np.abs(a).max())
+
+
+def test_a_pin_is_where_both_of_its_bodies_have_it(linkage):
+    mech, sol = linkage
+    for name, joint in mech.joints.items():
+        for k in range(3):
+            one, other = (
+                np.asarray(udk.path(mech, sol, f"body.{body}", point, derivative=k))
+                for body, point in zip(joint.bodies, joint.points, strict=True)
+            )
+            assert_allclose(one, other, rtol=0, atol=1e-9 * max(1.0, np.abs(one).max()))
+            for given in (name, f"joint.{name}", f"pin.{name}"):
+                assert_allclose(udk.path(mech, sol, given, derivative=k), other, rtol=0, atol=1e-14)
+
+
+def test_the_accelerations_of_a_kinematic_motion_are_its_own():
+    mech = udk.library.slider_crank(angular_velocity=3.0)
+    motion = udk.kinematics(mech, None, TS)
+    x, v, a = (np.asarray(udk.path(mech, motion, "P", derivative=k)) for k in range(3))
+    assert_allclose(v[2:-2], slope(x), rtol=0, atol=1e-6 * np.abs(v).max())
+    assert_allclose(a[2:-2], slope(v), rtol=0, atol=1e-5 * np.abs(a).max())
+    assert_allclose(motion.path("crank", TIP), udk.path(mech, motion, "crank", TIP), rtol=0, atol=1e-14)
+
+
+def test_a_path_is_differentiated_and_batched(linkage):
+    mech, sol = linkage
+    point = jnp.asarray(TIP)
+
+    @jax.jit
+    def lowest(points, x):
+        other = mech.with_parameters({"joint.B.points": points})
+        runs = udk.simulate(other, TS[:3], throw=False)
+        return udk.path(other, runs, "B")[-1, 1] + udk.path(other, runs, "coupler", x, derivative=1)[-1, 0]
+
+    points = mech.joints["B"].points
+    by_points, by_x = jax.jit(jax.grad(lowest, (0, 1)))(points, point)
+    step = 1e-5
+    for k in np.ndindex(2, 2):
+        ends = [lowest(points.at[k].add(s * step), point) for s in (1, -1)]
+        assert_allclose(by_points[k], (ends[0] - ends[1]) / (2 * step), rtol=1e-5, atol=1e-7)
+    ends = [lowest(points, point.at[0].add(s * step)) for s in (1, -1)]
+    assert_allclose(by_x[0], (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-9)
+    several = jax.vmap(lambda x: udk.path(mech, sol, "coupler", x))(jnp.stack([point, 2 * point]))
+    assert several.shape == (2, len(TS), 2)
+    assert_allclose(several[1], udk.path(mech, sol, "coupler", 2 * point), rtol=0, atol=1e-14)
+
+
+def test_after_a_failure_a_path_is_not_a_number_and_its_gradient_is(linkage):
+    mech, sol = linkage
+    q = sol.q.at[20:].set(jnp.nan)
+
+    def total(q, x):
+        motion = udk.Solution(sol.ts, q, sol.v, sol.code, sol.time, {}, sol.rtol, sol.atol, sol.bodies, ())
+        found = udk.path(mech, motion, "coupler", x, derivative=2)
+        return jnp.sum(found[:20]), found
+
+    gradients, found = jax.jit(jax.grad(total, (0, 1), has_aux=True))(q, jnp.asarray(TIP))
+    assert np.isnan(found[20:]).all() and np.isfinite(found[:20]).all()
+    assert np.isfinite(gradients[1]).all() and np.isfinite(gradients[0]).all() and np.any(gradients[0])
+
+
+@pytest.mark.parametrize(
+    ("of", "point", "problem"),
+    [
+        ("copler", None, '"copler" is neither a body nor a joint; did you mean "coupler"?'),
+        ("x y z", None, "there are "),
+        ("B", (0.0, 0.0), '"B" is a joint, whose point is known'),
+        ("coupler", (0.0, 0.0, 0.0), "its shape is (3,)"),
+        ("coupler", 0.1, "its shape is ()"),
+        ("turn", None, 'joint "turn", a Angle, is not at a point'),
+        ("both", None, '"both" is a body and a joint: write "body.both" or "joint.both"'),
+    ],
+)
+def test_what_cannot_be_found_is_named(linkage, of, point, problem):
+    mech, sol = linkage
+    bodies, joints = dict(mech.bodies), dict(mech.joints)
+    if of == "both":
+        bodies, joints = {"both": udk.Body(1, 1)}, {"both": udk.Revolute(["ground", "both"], [[0, 0], [0, 0]])}
+    elif of == "turn":
+        joints["turn"] = udk.Angle(["crank", "rocker"])
+    other = udk.Mechanism(bodies, joints)
+    motion = sol if of != "both" else udk.simulate(other, TS[:2])
+    with pytest.raises(ValueError) as caught:
+        udk.path(other, motion, of, point)
+    assert problem in str(caught.value)
+    with pytest.raises(ValueError, match=r'no body named "B".*udk\.path'):
+        sol.path("B")
