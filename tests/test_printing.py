@@ -46,6 +46,7 @@ def objects() -> dict[str, object]:
     linkage = udk.library.four_bar()
     motion = udk.kinematics(free, coordinate, [0.1, 0.2])
     rest = udk.equilibrium(free)
+    drawing = udk.Drawing({"A": [0, 0], "B": [1, 0]}, {"bar": udk.Link(["A", "B"], mass=1.0)}, ["A"])
     driven = udk.inverse_dynamics(mech, ts)
     found = [
         *(driver.motion for driver in DRIVERS.values()),
@@ -63,6 +64,7 @@ def objects() -> dict[str, object]:
         *(udk.Stop(), udk.Log(), udk.Verner65(), udk.Adams(), udk.BDF(), run.result, udk.Reached.lost),
         udk.ConstrainedSystem(mass=jnp.diag, force=len),
         *(part for joint in JOINTS.values() for part in vars(joint).values() if isinstance(part, udk.Profile)),
+        *(drawing, drawing.links["bar"]),
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),
     ]
     return {type(one).__name__: one for one in found}

@@ -7,6 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.study.channel_values import measure
+from udkjax.study.channels import channel_of
 
 TIP = (0.3, -0.1)
 TS = np.linspace(0.0, 0.2, 41)
@@ -98,9 +100,9 @@ def test_after_a_failure_a_path_is_not_a_number_and_its_gradient_is(linkage):
 @pytest.mark.parametrize(
     ("of", "point", "problem"),
     [
-        ("copler", None, '"copler" is neither a body nor a joint; did you mean "coupler"?'),
+        ("copler", None, '"copler" is neither a body nor a pin; did you mean "coupler"?'),
         ("x y z", None, "there are "),
-        ("B", (0.0, 0.0), '"B" is a joint, whose point is known'),
+        ("B", (0.0, 0.0), '"B" is a pin, whose point is known'),
         ("coupler", (0.0, 0.0, 0.0), "its shape is (3,)"),
         ("coupler", 0.1, "its shape is ()"),
         ("turn", None, 'joint "turn", a Angle, is not at a point'),
@@ -121,3 +123,27 @@ def test_what_cannot_be_found_is_named(linkage, of, point, problem):
     assert problem in str(caught.value)
     with pytest.raises(ValueError, match=r'no body named "B".*udk\.path'):
         sol.path("B")
+
+
+def test_pins_of_a_drawing_are_found_also_where_no_links_meet():
+    pins = {"O": [0.0, 0.0], "A": [0.3, 0.0], "P": [0.5, 0.2]}
+    drawing = udk.Drawing(pins, {"arm": udk.Link(["O", "A"], mass=1.0), "plate": udk.Link(["A", "P"], mass=1.0)}, ["O"])
+    mech = drawing.mechanism()
+    sol = udk.simulate(mech, TS[:3])
+    for name, place in pins.items():
+        assert_allclose(udk.path(mech, sol, name)[0], place, rtol=0, atol=1e-14)
+    tip = channel_of(mech, "pin.P.y")
+    assert_allclose(
+        jax.jit(lambda m, s: measure(m, s, (tip,)))(mech, sol)[:, 0], udk.path(mech, sol, "P")[:, 1], rtol=0, atol=1e-14
+    )
+    moved = jax.jit(jax.jacfwd(lambda place: udk.path(mech.with_parameters({"pin.P": place}), sol, "P")[0]))(
+        jnp.array([0.5, 0.2])
+    )
+    assert np.abs(moved).max() > 0.1
+
+
+def test_a_pin_is_driven_along_a_coordinate(linkage):
+    mech, sol = linkage
+    values = float(udk.path(mech, sol, "C")[0, 0]) - np.array([0.01, 0.05])
+    motion = udk.kinematics(mech, "pin.C.x", values)
+    assert_allclose(udk.path(mech, motion, "C")[:, 0], values, rtol=0, atol=1e-12)

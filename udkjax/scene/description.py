@@ -1,6 +1,6 @@
 """A mechanism and poses of its bodies as tables of numbers with their units."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -28,13 +28,32 @@ def mechanism_table(mechanism: Sections, frame_names: Callable[..., Sequence[str
         for section, elements in groups.items()
         for name, element in elements.items()
     ]
-    counts = ", ".join(
-        f"{len(elements)} {section if len(elements) == 1 else 'bodies' if section == 'body' else f'{section}s'}"
-        for section, elements in groups.items()
-        if elements
-    )
-    title = f"{mechanism.name or 'mechanism'} ({counts}; gravity {format_numbers(mechanism.gravity, 'm/s²')})"
+    title = f"{mechanism.name or 'mechanism'} ({_counts(groups)}; gravity {format_numbers(mechanism.gravity, 'm/s²')})"
     return PrintedTable(title, rows, ("section", "name", "type", "bodies", "numbers"))
+
+
+def drawing_table(name: str, groups: Mapping[str, Mapping[str, eqx.Module]], ground: Sequence[str]) -> PrintedTable:
+    """Return the table of the elements of a drawing by section and name, and of the pins on the ground."""
+    rows = [
+        (section, key, "ground" if section == "pin" and key in ground else _names_in(element), _format_element(element))
+        for section, elements in groups.items()
+        for key, element in elements.items()
+    ]
+    return PrintedTable(f"{name or 'drawing'} ({_counts(groups)})", rows, ("section", "name", "between", "numbers"))
+
+
+def _counts(groups: Mapping[str, Mapping[str, object]]) -> str:
+    return ", ".join(f"{len(group)} {_plural(section, len(group))}" for section, group in groups.items() if group)
+
+
+def _plural(section: str, count: int) -> str:
+    return section if count == 1 else "bodies" if section == "body" else f"{section}s"
+
+
+def _names_in(element: eqx.Module) -> str:
+    """Return the pins and links that an element of a drawing names."""
+    static = [value for value in vars(element).values() if isinstance(value, str | tuple)]
+    return ", ".join(name for value in static for name in ([value] if isinstance(value, str) else value) if name)
 
 
 def _format_element(element: eqx.Module) -> str:

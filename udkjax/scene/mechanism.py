@@ -44,7 +44,7 @@ class Origin:
         return self is other or (isinstance(other, Origin) and self._key == other._key)
 
 
-class AbstractDrawing(eqx.Module):
+class AbstractDrawing(PrintsTable):
     """What a mechanism was made from, with numbers of its own that decide on those of the bodies: pins, widths, densities."""
 
     @property
@@ -55,6 +55,10 @@ class AbstractDrawing(eqx.Module):
     @abstractmethod
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "AbstractDrawing":
         """Return the drawing with other numbers in its elements; raise `SceneError` where they make no mechanism."""
+
+    @abstractmethod
+    def locate_pin(self, name: str) -> tuple[str, Array] | None:
+        """Return a body, or the ground, and the point in its frame (m) where a pin is; None where there is no such pin."""
 
     @abstractmethod
     def mechanism(self) -> "Mechanism":

@@ -19,7 +19,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import LOADS, POINT_UNITS, Channel, Quantity, Trajectory, locate, point_of_joint
+from udkjax.study.channels import LOADS, POINT_UNITS, Channel, Quantity, Trajectory, locate, point_of_pin
 from udkjax.study.channels import Point as Place
 
 
@@ -59,7 +59,7 @@ def path(
     Args:
         mechanism: the mechanism that moved.
         solution: a `Solution`, a `Kinematics`, or another motion with ts (T,), q and v (T, bodies, 3).
-        of: a body, or a joint for its point: that of its second body, where it has two.
+        of: a body; or a pin, by the name of its joint or as it is drawn. Of a joint of two points it is that of its second body.
         point: in the body's own frame (m); by default its centre of mass.
         derivative: 0 for positions (m), 1 for velocities (m/s), 2 for accelerations (m/s^2): those that the motion has, as a
             `Kinematics` does, or those of the equations of motion, a = a_F + M^(-1/2) D^+ b.
@@ -68,7 +68,7 @@ def path(
         x and y (T, 2) in ground axes; not a number where the motion is not.
 
     Raises:
-        ValueError: no such body or joint.
+        ValueError: no such body or pin.
     """
     body, local = locate(mechanism, of, point)
     given = getattr(solution, "a", None)
@@ -195,7 +195,7 @@ def _component(motion: _Motion, body: str, point: Float[Array, "2"] | Place, qua
 
 
 def _measure_pin(channel: Channel, motion: _Motion) -> Array:
-    return _component(motion, *point_of_joint(motion.mechanism, channel.owner), channel.quantity)
+    return _component(motion, *point_of_pin(motion.mechanism, channel.owner), channel.quantity)
 
 
 def _measure_joint(channel: Channel, motion: _Motion) -> Array:

@@ -89,14 +89,26 @@ def has_point(joint: Joint) -> bool:
     return getattr(joint, "points", None) is not None
 
 
-def point_of_joint(mechanism: Mechanism, name: str) -> tuple[str, Float[Array, "2"]]:
-    """Return a body, or "ground", and the point (m) in its frame where a joint is.
+def pins_of(mechanism: Mechanism) -> list[str]:
+    """Return the names of all points that a mechanism names: joints, and pins of its drawing where no two links meet."""
+    drawn = () if mechanism.drawing is None else mechanism.drawing.groups["pin"]
+    joints = [name for name, joint in mechanism.joints.items() if has_point(joint)]
+    return [*joints, *(name for name in drawn if name not in mechanism.joints)]
+
+
+def point_of_pin(mechanism: Mechanism, name: str) -> tuple[str, Float[Array, "2"]]:
+    """Return a body, or "ground", and the point (m) in its frame where a joint is, or a pin of the drawing.
 
     Where a joint holds two points, such as a slot, a distance or a cam, it is the one of its second body.
     """
-    joint = mechanism.joints[name]
-    last = len(joint.points) - 1
-    return joint.bodies[last], joint.points[last]
+    if name in mechanism.joints:
+        joint = mechanism.joints[name]
+        last = len(joint.points) - 1
+        return joint.bodies[last], joint.points[last]
+    found = None if mechanism.drawing is None else mechanism.drawing.locate_pin(name)
+    if found is None:
+        raise ValueError(f"there is no pin {quote(name)}{suggestion(name, pins_of(mechanism))}")
+    return found
 
 
 def locate(mechanism: Mechanism, of: str, point: Numbers | None = None) -> tuple[str, Float[Array, "2"]]:
@@ -106,7 +118,7 @@ def locate(mechanism: Mechanism, of: str, point: Numbers | None = None) -> tuple
         ValueError: no body or joint of this name, or a joint without a point; the message says what was probably meant.
     """
     section, _, name = of.partition(".")
-    known = {"body": (*mechanism.body_names, GROUND), "pin": [n for n, joint in mechanism.joints.items() if has_point(joint)]}
+    known = {"body": (*mechanism.body_names, GROUND), "pin": pins_of(mechanism)}
     known["joint"] = known["pin"]
     if section in known and name in known[section] and of not in (*known["body"], *known["pin"]):
         kinds = [section]
@@ -115,10 +127,10 @@ def locate(mechanism: Mechanism, of: str, point: Numbers | None = None) -> tuple
     if len(kinds) == 2 and point is None:
         raise ValueError(f"{quote(of)} is a body and a joint: write {quote(f'body.{of}')} or {quote(f'joint.{of}')}")
     if not kinds:
-        everything = (*mechanism.body_names, *mechanism.joint_names)
+        everything = (*mechanism.body_names, *pins_of(mechanism))
         if of in mechanism.joints:
             raise ValueError(f"joint {quote(of)}, a {type(mechanism.joints[of]).__name__}, is not at a point: name a body")
-        raise ValueError(f"{quote(of)} is neither a body nor a joint{suggestion(of, everything) or _listed(everything)}")
+        raise ValueError(f"{quote(of)} is neither a body nor a pin{suggestion(of, everything) or _listed(everything)}")
     if "body" in kinds:
         local = number(_CENTRE if point is None else point)
         if local.shape != (2,):
@@ -126,8 +138,8 @@ def locate(mechanism: Mechanism, of: str, point: Numbers | None = None) -> tuple
             raise ValueError(f"point must be {meant}; its shape is {local.shape}")
         return name, local
     if point is not None:
-        raise ValueError(f"{quote(of)} is a joint, whose point is known; a point is given in the frame of a body")
-    return point_of_joint(mechanism, name)
+        raise ValueError(f"{quote(of)} is a pin, whose point is known; a point is given in the frame of a body")
+    return point_of_pin(mechanism, name)
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -155,7 +167,7 @@ def channels_of(mechanism: Mechanism) -> list[str]:
     found = [f"body.{name}.{q}" for name in mechanism.body_names for q in (*POINT_UNITS, *_ANGLE_UNITS)]
     for name, joint in mechanism.joints.items():
         found += [f"joint.{name}.{q}" for q in (*(_ANGLE_UNITS if len(joint.bodies) == 2 else ()), *LOADS)]
-        found += [f"pin.{name}.{q}" for q in (POINT_UNITS if has_point(joint) else ())]
+    found += [f"pin.{name}.{q}" for name in pins_of(mechanism) for q in POINT_UNITS]
     return [*found, *(f"driver.{name}.load" for name in mechanism.driver_names)]
 
 
@@ -188,10 +200,10 @@ def _parse_joint(mechanism: Mechanism, text: str) -> Channel:
 
 
 def _parse_pin(mechanism: Mechanism, text: str) -> Channel:
-    name, rest = _split_owner("pin", [name for name, joint in mechanism.joints.items() if has_point(joint)], text)
+    name, rest = _split_owner("pin", pins_of(mechanism), text)
     quantity = _check_quantity(f"pin {quote(name)}", rest, POINT_UNITS)
     needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
-    body, _ = point_of_joint(mechanism, name)
+    body, _ = point_of_pin(mechanism, name)
     return Channel(f"pin.{name}.{quantity}", UNITS[quantity], needs, "pin", name, (body,), (), quantity)
 
 

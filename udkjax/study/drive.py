@@ -24,7 +24,7 @@ from udkjax.scene.drivers import Driver, Motion, Polynomial
 from udkjax.scene.fields import Numbers, names, number, optional_number
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
-from udkjax.study.channels import channel_of, point_of_joint
+from udkjax.study.channels import channel_of, point_of_pin
 from udkjax.study.holding import require_free
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
@@ -165,7 +165,7 @@ def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
         if len(channel.bodies) == 2 and (kind == "angle" or channel.points):
             return Coordinate(channel.bodies, kind, channel.points or None)
         if channel.owner:
-            body, point = point_of_joint(mechanism, channel.owner)
+            body, point = point_of_pin(mechanism, channel.owner)
             return Coordinate((GROUND, body), kind, [(0.0, 0.0), point])
         return Coordinate((GROUND, *channel.bodies), kind, [(0.0, 0.0), *channel.points])
 

@@ -6,8 +6,10 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from udkjax.printing import PrintedTable
 from udkjax.scene.bodies import Body
 from udkjax.scene.checks import SceneEntry, SceneError, quote, suggestion
+from udkjax.scene.description import drawing_table
 from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, SECTIONS, known_elements, placement_of, read_drawing
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
@@ -117,6 +119,19 @@ class Drawing(AbstractDrawing):
     def links(self) -> dict[str, Link]:
         """The links by name."""
         return self.groups["link"]
+
+    def locate_pin(self, name: str) -> tuple[str, Array] | None:
+        """Return the last of the links through a pin, or the ground, and the point in its frame (m); None where it is no pin."""
+        placement = placement_of(known_elements(self.groups), self.ground)
+        if name not in placement.places:
+            return None
+        body = placement.members(name)[-1]
+        return body, number(placement.local(body, placement.places[name]))
+
+    def _table(self) -> PrintedTable:
+        return drawing_table(self.name, self.groups, self.ground)
+
+    _shapes = _table  # traced numbers are named as such, element by element
 
     def mechanism(self) -> Mechanism:
         """Return the mechanism that is drawn; its numbers follow from those of the drawing, and may be traced."""

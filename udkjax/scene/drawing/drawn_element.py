@@ -8,8 +8,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import equinox as eqx
-
+from udkjax.printing import PrintsLine
 from udkjax.scene.checks import quote
 from udkjax.scene.drawing.placement import PinLayout, Placement
 from udkjax.scene.drivers import Driver
@@ -28,7 +27,7 @@ class Parts(NamedTuple):
     force: ForceElement | None = None
 
 
-class DrawnElement(eqx.Module):
+class DrawnElement(PrintsLine):
     """An element of a drawing besides pins and links."""
 
     @abstractmethod

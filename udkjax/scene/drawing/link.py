@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Body, Frame
 from udkjax.scene.drawing.shapes import Points, Shape, bar, disc, polygon
 from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, array_namespace, names, number, optional_number
@@ -17,14 +18,14 @@ from udkjax.scene.fields import Number as Scalar
 Places = Mapping[str, Points]  # world coordinates of pins (m)
 
 
-class Pin(eqx.Module):
+class Pin(PrintsLine):
     """A point of a drawing, in world coordinates, where links meet, and its initial velocity."""
 
     position: Float[Array, "2"] = eqx.field(converter=number)  # m
     velocity: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None)  # m/s; None: at rest
 
 
-class Link(eqx.Module):
+class Link(PrintsLine):
     """A rigid body through pins: a disc about one, a bar along two, a plate of more, or of an `outline`.
 
     A bar goes from the first pin to the last, with half-round ends of diameter `width` about them; more pins may lie on it.
