@@ -105,6 +105,36 @@ print(udk.analyse(mechanism).redundant_rows, udk.accelerations(mechanism, 0.0, m
     assert_allclose(float(found[1]), -3.5 * 9.81 * np.cos(-np.pi / 4) / 3.05, rtol=1e-12)
 
 
+def row_of_cranks(count, speed, contradicted=False):
+    """Cranks side by side, one of them held twice, and a rod that lengthens from 3.16 m and reaches the first as far as 4 m."""
+    bodies = {f"crank{k}": udk.Body(1.0, 0.1, position=[1.0 + 3 * k, 0.0]) for k in range(count)}
+    joints = {f"pin{k}": udk.Revolute(["ground", f"crank{k}"], [[3 * k, 0.0], [-1.0, 0.0]]) for k in range(count)}
+    joints["copy"] = joints["pin1"]
+    rod = udk.Driver(["ground", "crank0"], "distance", udk.Polynomial([np.sqrt(10.0), speed]), [[0.0, 3.0], [0.0, 0.0]])
+    held = {"held": udk.Driver(["ground", "crank0"], "angle", udk.Polynomial([0.0]))} if contradicted else {}
+    return udk.Mechanism(bodies, joints, {"rod": rod} | held)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_what_drivers_cannot_reach_is_given_up_soon(monkeypatch, large):
+    """As many rows are redundant as where the driver can go on; where it never can, too, but not where drivers contradict."""
+    choose, solved = redundancy.kinematic_rows, []
+
+    def counted(mechanism):
+        rows = choose(mechanism, large)
+        correction = rows.correction
+        rows.correction = lambda t, q: solved.append(t) or correction(t, q)
+        return rows
+
+    monkeypatch.setattr(redundancy, "kinematic_rows", counted)
+    for speed, steps in ((1.0, 80), (100.0, 120), (-0.01, 120)):
+        found = redundancy.redundant_rows(row_of_cranks(4, speed))
+        assert found == (8, 9) and len(solved) < steps, len(solved)
+        solved.clear()
+    assert redundancy.redundant_rows(row_of_cranks(4, 1.0, contradicted=True)) is None
+    assert len(solved) < 400
+
+
 MODULES = position_closure, dense_rows, redundancy, scales, sparse_rows
 DENSE = [
     "CLOSED_TOL",

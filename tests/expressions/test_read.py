@@ -98,6 +98,17 @@ def test_read(function, emit):
     found, expected = jax.jit(lambda x, y: tuple(everything(g)(x, y) for g in (program, f)))(XS, YS)
     close(jax.tree.leaves(found), expected)
     close(program.on_floats(X, Y), [x[0] for x in jax.tree.leaves(expected[0])])  # the first of the batch
+    by_numpy = program.program.by_numpy([*XS.T, *YS.T])
+    close([np.stack(by_numpy, 1)], [np.concatenate([np.reshape(x, (3, -1)) for x in jax.tree.leaves(expected[0])], 1)])
+
+
+def test_branches_and_steps_of_values_that_are_not_finite(emit):
+    """By NumPy, and by floats where Python's operations raise, as by JAX."""
+    program = emit(lambda x: jnp.stack([jnp.where((x[0] > 0) & (x[1] < 2), 1 / x[0], jnp.floor(x[1])), jnp.abs(x[0])]), X[:2])
+    rows = np.array([[0.0, 1.5], [0.5, -0.5], [np.nan, -np.inf], [0.5, 2.5], [1e-320, np.nan], [np.inf, 0.0]])
+    expected = [[1.0, 0.0], [2.0, 0.5], [-np.inf, np.nan], [2.0, 0.5], [np.nan, 1e-320], [0.0, np.inf]]
+    np.testing.assert_array_equal(np.stack(program.program.by_numpy([*rows.T]), 1), expected)
+    np.testing.assert_array_equal([np.ravel(program.on_floats(row)) for row in rows], expected)
 
 
 @pytest.mark.parametrize("name", WRITTEN_OUT)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from udkjax.equations.abstract_system import Time
-from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed
+from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scales import Scales, known_scales, rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_scalars
@@ -144,9 +144,9 @@ class KinematicRows(DenseRows):
         """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""
         return [(np.arange(self.count), positions)]
 
-    def close(self, t: Time, q: np.ndarray) -> DensePosition | None:
-        """Return a closed position near q, or None."""
-        q = close_position(self, t, q, np)
+    def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> DensePosition | None:
+        """Return a closed position near q, or None; `give_up` early where it seems not to exist."""
+        q = try_to_close(self, t, q) if give_up else close_position(self, t, q, np)
         psi, _, D = self.at(t, q)
         still = np.zeros_like(q)
         if not np.all(np.isfinite(D)) or not is_closed(self.scales, q, still, psi, 0 * psi, np):

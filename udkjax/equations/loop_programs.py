@@ -5,8 +5,8 @@ Terms come from loops over elements of the same structure (loop_terms.py), linea
 """
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
-from functools import cached_property, lru_cache
-from typing import NamedTuple, TypeVar
+from functools import cached_property, lru_cache, partial
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ from udkjax.equations.loop_prologue import write_prologue
 from udkjax.equations.loop_terms import LoopTerms, Parts
 from udkjax.equations.structure import AnyArray, ArrayLibrary, Shapes, Time, TreeDef, structure
 from udkjax.expressions.loop_derivative import LoopDerivative
-from udkjax.expressions.loop_program import Kernel, KernelLoop, KernelWriter, LoopProgram, Reset, evaluate_loops
+from udkjax.expressions.loop_program import Kernel, KernelLoop, KernelWriter, LoopProgram, NumpyLoops, Reset, evaluate_loops
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
@@ -259,7 +259,7 @@ class LoopPrograms:
     def constants_of(self, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
         """Return the constants as a function of the numbers of the scene and the gains."""
         arrays = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(self.constants))}
-        return evaluate_loops(self.prologue, arrays, xp)["constants"]
+        return _by_arrays(self.prologue, xp)(arrays)["constants"]
 
     def geometry(self, numbers: AnyArray, xp: ArrayLibrary) -> StateFunction[AnyArray, tuple[AnyArray, AnyArray, AnyArray]]:
         """Return a function of t, q and v, of the numbers of the scene: Psi, Psi_dot and the entries of D at `d_entries`."""
@@ -271,6 +271,11 @@ class LoopPrograms:
             return found["psi"], found["psi_dot"], xp.append(found["D"], 1.0)[places] * factors
 
         return evaluate
+
+    def psi_by_numpy(self, numbers: np.ndarray) -> Callable[[Time, np.ndarray], np.ndarray]:
+        """Return a function of t and q, of the numbers of the scene: Psi."""
+        run = self._run_by_arrays(self.psi, numbers, np)
+        return lambda t, q: run(t, q, q)["psi"]
 
     def loads(self, numbers: AnyArray, xp: ArrayLibrary) -> StateFunction[AnyArray, tuple[AnyArray, AnyArray]]:
         """Return a function of t, q and v, of the numbers of the scene: a_F, and b of all rows."""
@@ -295,14 +300,19 @@ class LoopPrograms:
         """Run a program in which no round of a loop takes anything from another, by NumPy or JAX."""
         constants = self.constants_of(numbers, xp)
         sizes = self.scratch | {"psi": self.row_count, "psi_dot": self.row_count, "terms": self.term_count}
-        results = {"psi", "psi_dot", "terms", "D"}
+        results, evaluate = {"psi", "psi_dot", "terms", "D"}, _by_arrays(program, xp)
         blank = {x: xp.zeros(size) for x, size in sizes.items() if x in program.arrays | results}
 
         def run(t: Time, q: AnyArray, v: AnyArray) -> dict[str, AnyArray]:
             given = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v}
-            return evaluate_loops(program, blank | given, xp)
+            return evaluate(blank | given)
 
         return run
+
+
+def _by_arrays(program: LoopProgram, xp: ArrayLibrary) -> Callable[[dict[str, AnyArray]], dict[str, AnyArray]]:
+    run: Any = NumpyLoops(program) if xp is np else partial(evaluate_loops, program)
+    return run
 
 
 def _program(*parts: Iterable[KernelLoop | Reset]) -> LoopProgram:

@@ -25,6 +25,7 @@ CLOSED_TOL = 1e-9
 ROUNDING_UNITS = 32.0  # of eps and of the largest coordinate: a residual below is rounding, and takes no step
 LONGEST_STEP = 0.3  # rad, and characteristic lengths: the longest change of a coordinate in one step, so that the branch stays
 CLOSURE_ITERATIONS = 40  # of Gauss-Newton: near a solution it doubles the digits, and five or six are usual
+PACE_STEPS = 4  # steps by which the pace of a closure is measured: see `try_to_close`
 STEP_HALVINGS = 12  # of one step: 2^-12 of it has to lower the residual, or the position cannot be closed
 
 State = TypeVar("State")
@@ -102,6 +103,22 @@ def close_position(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary 
         return improves & (k < CLOSURE_ITERATIONS)
 
     return loop(goes_on, lambda state: (*damped_step(rows, t, state[0], xp), state[2] + 1), (q, xp.asarray(True), 0))[0]
+
+
+def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:
+    """Close a position that may not exist, by NumPy: give up where at the present pace the steps that are left do not suffice.
+
+    The last steps of a closure that succeeds are its fastest. Where drivers ask for the impossible, the residual falls by ever
+    less, but does fall, up to the last step.
+    """
+    sizes, improves = [float(np.linalg.norm(rows.residual(t, q)))], True
+    while improves and len(sizes) <= CLOSURE_ITERATIONS:
+        q, improves = damped_step(rows, t, q, np)
+        sizes.append(float(np.linalg.norm(rows.residual(t, q))))
+        if len(sizes) > PACE_STEPS:
+            fall = (sizes[-1 - PACE_STEPS] - sizes[-1]) / PACE_STEPS
+            improves &= sizes[-1] <= fall * (CLOSURE_ITERATIONS + 1 - len(sizes))
+    return q
 
 
 def driver_time_step(scales: Scales) -> float:

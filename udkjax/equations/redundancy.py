@@ -22,6 +22,8 @@ from udkjax.scene.mechanism import Mechanism
 
 POSITION_SAMPLES = 24  # positions of the random motion, where the first one shows rows that depend on each other
 FEWER_SAMPLES_FROM = 300  # rows of Psi: a scene of more takes a third of the positions, each of which takes long
+FAILURES = 3  # positions in a row that cannot be closed: drivers ask for the impossible, and will go on to do so
+CREEP = 1e-3  # of the drivers' step in time, where they ask for it from the first on: what drivers contradict stays impossible
 HEADING_NOISE = 0.3  # share of the direction of the random motion that is new at each position
 ORDINARY_TOL = 0.05  # of the largest singular value: a position whose smallest one is above decides on the rows
 
@@ -66,8 +68,8 @@ class PositionRows(Protocol[Position]):
         """Psi, the lengths of the rows of D, and D with rows of length one."""
         ...
 
-    def close(self, t: Time, q: np.ndarray) -> Position | None:
-        """Return a closed position near q, or None."""
+    def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> Position | None:
+        """Return a closed position near q, or None; `give_up` early where it seems not to exist."""
         ...
 
     def split_rows(self, positions: list[Position]) -> Sequence[tuple[np.ndarray, Sequence[Any]]]:
@@ -94,22 +96,27 @@ def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Positi
     first = rows.close(0.0, q)
     if first is None:
         return []
-    found = [first]
+    found, failures, time_step = [first], 0, rows.driver_time_step
     random = np.random.default_rng(0)
     heading = random.standard_normal(rows.size)
     for k in range(POSITION_SAMPLES if rows.count <= FEWER_SAMPLES_FROM else POSITION_SAMPLES // 3):
         full = [p for p in found if p.is_clear and p.rank == rows.count]
         if full:
             return full[:1]
+        if failures == FAILURES:
+            if any(p.is_clear for p in found[1:]):
+                break
+            time_step = CREEP * rows.driver_time_step
         last = found[-1]
         heading = heading / np.linalg.norm(heading) + HEADING_NOISE * random.standard_normal(rows.size) / np.sqrt(rows.size)
         heading = last.tangent_part(heading)  # onward, so that the motion gets around
         step = rows.metric * heading
         moved = last.q + LONGEST_STEP * step / max(rows.scales.size(step, np), 1e-300)
-        position = rows.close(rows.driver_time_step * (k + 1), moved)
+        position = rows.close(time_step * (k + 1), moved, give_up=True)
         if position is None or not position.is_clear or not np.any(heading):  # stuck: jump
             heading, jump = random.standard_normal(rows.size), random.uniform(-1.0, 1.0, rows.size)
-            position = rows.close(rows.driver_time_step * (k + 1), first.q + LONGEST_STEP * rows.metric * jump)
+            position = rows.close(time_step * (k + 1), first.q + LONGEST_STEP * rows.metric * jump, give_up=True)
+        failures = 0 if position is not None else failures + 1
         found.extend([] if position is None else [position])
     found = [p for p in found if p.is_clear]
     if not found or (len(found) == 1 and found[0] is first and first.rank < rows.size):

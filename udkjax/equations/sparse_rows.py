@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE
 from udkjax.equations.loop_programs import loop_programs
-from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed
+from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.pinv.elimination import default_rank_tol
@@ -115,7 +115,8 @@ class SparseRows:
         self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
         self._stretch = self.metric / root
         self.driver_time_step = driver_time_step(self.scales)
-        self._evaluate = programs.geometry(np.asarray(numbers_as_vector(mechanism.numbers)), np)
+        numbers = np.asarray(numbers_as_vector(mechanism.numbers))
+        self._evaluate, self._psi = programs.geometry(numbers, np), programs.psi_by_numpy(numbers)
 
     @cached_property
     def _order(self) -> list[int]:
@@ -138,7 +139,7 @@ class SparseRows:
         return csr_array(D.multiply(1 / length[:, None])), length
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
-        return self._evaluate(t, q, q)[0] / self.scales.rows
+        return self._psi(t, q) / self.scales.rows
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
         psi, length, D = self.at(t, q)
@@ -151,9 +152,9 @@ class SparseRows:
         system = csc_array(D @ D.T + DAMPING * eye_array(self.count))
         return -self.metric * (D.T @ splu(system, **_SYMMETRIC).solve(residual))
 
-    def close(self, t: Time, q: np.ndarray) -> SparsePosition | None:
-        """Return a closed position near q, or None."""
-        q = close_position(self, t, q, np)
+    def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> SparsePosition | None:
+        """Return a closed position near q, or None; `give_up` early where it seems not to exist."""
+        q = try_to_close(self, t, q) if give_up else close_position(self, t, q, np)
         psi, _, D = self.at(t, q)
         if not np.all(np.isfinite(D.data)) or not is_closed(self.scales, q, 0 * q, psi, 0 * psi, np):
             return None

@@ -5,8 +5,7 @@ row of a table of bases, in order. The code grows with the number of kinds of el
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from types import ModuleType
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -14,7 +13,6 @@ import numpy as np
 from udkjax.expressions.graph import Graph, Scalar
 from udkjax.expressions.scalar_program import ScalarProgram
 
-AnyArray = TypeVar("AnyArray", jax.Array, np.ndarray)
 SET, ADD, MINIMUM = "set", "add", "least"  # an output replaces what is there, is added to it, or the smaller of both stays
 
 
@@ -97,33 +95,65 @@ class LoopProgram(NamedTuple):
         return found.union(*({part.array(x) for x in part.kernel.arrays} for part in self.parts if isinstance(part, KernelLoop)))
 
 
-def evaluate_loops(program: LoopProgram, arrays: dict[str, AnyArray], xp: ModuleType) -> dict[str, AnyArray]:
-    """Return the arrays as a program leaves them, by NumPy or JAX; no row of a loop may read what another writes."""
+def evaluate_loops(program: LoopProgram, arrays: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+    """Return the arrays as a program leaves them, by JAX; no row of a loop may read what another writes."""
     found = dict(arrays)
     for part in program.parts:
         if isinstance(part, Reset):
-            inside = np.arange(part.start, part.start + part.count)
-            found[part.array] = _update(found[part.array], inside, xp.full(part.count, part.value), SET, xp)
+            found[part.array] = found[part.array].at[part.start : part.start + part.count].set(part.value)
             continue
         kernel, table = part.kernel, part.table
         if not kernel.outputs or not len(table):
             continue
-
-        def places(address: Address, table: np.ndarray = table) -> np.ndarray:
-            return address.offset + (np.zeros(len(table), int) if address.base is None else table[:, address.base])
-
-        pairs = list(zip(kernel.program.inputs, kernel.inputs, strict=True))
-        values = [found[part.array(x.array)][places(x)] if kernel.program.uses(s) else np.zeros(len(table)) for s, x in pairs]
-        run: Callable = kernel.program.by_numpy if xp is np or not values else jax.vmap(kernel.program)
+        pairs = zip(kernel.program.inputs, kernel.inputs, strict=True)
+        values = [
+            found[part.array(x.array)][_places(x, table)] if kernel.program.uses(s) else np.zeros(len(table)) for s, x in pairs
+        ]
+        run: Callable = jax.vmap(kernel.program) if values else kernel.program.by_numpy
         for x, address in zip(run(values), kernel.outputs, strict=True):
             name = part.array(address.array)
-            found[name] = _update(found[name], places(address), x, address.update, xp)
+            place = found[name].at[_places(address, table)]
+            found[name] = place.add(x) if address.update == ADD else place.set(x)
     return found
 
 
-def _update(array: AnyArray, places: np.ndarray, x: AnyArray, update: str, xp: ModuleType) -> AnyArray:
-    if not isinstance(array, np.ndarray):
-        return array.at[places].add(x) if update == ADD else array.at[places].set(x)
-    array = array.copy()
-    (np.add.at if update == ADD else np.ndarray.__setitem__)(array, places, x)
-    return array
+class NumpyLoops:
+    """A program of loops as a function of its arrays, by NumPy: what `evaluate_loops` does, without compiling anything.
+
+    The indices of all numbers are made once, for as many calls as there are.
+    """
+
+    def __init__(self, program: LoopProgram):
+        self._parts: list[tuple[ScalarProgram | float, list, list]] = []
+        for part in program.parts:
+            if isinstance(part, Reset):
+                self._parts.append((part.value, [], [(part.array, slice(part.start, part.start + part.count), SET)]))
+            elif part.kernel.outputs and len(part.table):
+                kernel, unused = part.kernel, ("", np.zeros(len(part.table)))
+                inputs = [
+                    (part.array(x.array), _places(x, part.table)) if kernel.program.uses(s) else unused
+                    for s, x in zip(kernel.program.inputs, kernel.inputs, strict=True)
+                ]
+                outputs = [(part.array(x.array), _places(x, part.table), x.update) for x in kernel.outputs]
+                self._parts.append((kernel.program, inputs, outputs))
+        self._written = {name for *_, outputs in self._parts for name, *_ in outputs}
+
+    def __call__(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the arrays as the program leaves them; what is given stays as it is."""
+        found = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
+        for program, inputs, outputs in self._parts:
+            if isinstance(program, ScalarProgram):
+                results = program.by_numpy([found[name][places] if name else places for name, places in inputs])
+            else:
+                results = [program]
+            for x, (name, places, update) in zip(results, outputs, strict=True):
+                if update == ADD:
+                    np.add.at(found[name], places, x)
+                else:
+                    found[name][places] = x
+        return found
+
+
+def _places(address: Address, table: np.ndarray) -> np.ndarray:
+    """Return the indices of a number in its array, one for each row of a table."""
+    return address.offset + (np.zeros(len(table), int) if address.base is None else table[:, address.base])

@@ -23,15 +23,30 @@ _SINE_AND_COSINE = ("sin", "cos")
 _LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # of these names math and NumPy have functions, too
 # Of Python's numbers: what other primitives compute, without a call of JAX, which takes some hundred times as long.
 _NUMBER_FUNCTIONS: dict[str, Callable] = {
-    **{name: getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge")},
+    **{name.strip("_"): getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and_", "or_")},
     "abs": abs,
     "atan2": math.atan2,
+    "floor": lambda x: float(math.floor(x)),
     "integer_pow": lambda x, y: x**y,
     "max": lambda a, b: a if a > b or a != a else b,  # not a number where one of both is not
     "min": lambda a, b: a if a < b or a != a else b,
     "neg": operator.neg,
     "select_n": lambda which, *cases: cases[int(which)],
     "square": lambda x: x * x,
+}
+# The same of NumPy's arrays, element by element.
+_ARRAY_FUNCTIONS: dict[str, Callable] = {
+    **{name.strip("_"): getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and_", "or_", "neg")},
+    "abs": np.abs,
+    "atan2": np.arctan2,
+    "floor": np.floor,
+    "max": np.maximum,
+    "min": np.minimum,
+    "select_n": lambda which, *cases: (
+        np.where(which, cases[1], cases[0]) if len(cases) == 2 else np.choose(np.asarray(which, int), cases)
+    ),
+    "sign": np.sign,
+    "square": np.square,
 }
 # On floats, and traced: by what jax.lax has, since each operator on a JAX array is a function call, ten times as long to trace.
 _OPERATORS: dict[str, tuple[Callable, Callable]] = {
@@ -40,6 +55,9 @@ _OPERATORS: dict[str, tuple[Callable, Callable]] = {
     "mul": (operator.mul, jax.lax.mul),
     "div": (operator.truediv, jax.lax.div),
 }
+
+
+Steps: TypeAlias = tuple[list[tuple[Callable, list[int]]], list[int]]
 
 
 class ScalarProgram:
@@ -68,17 +86,17 @@ class ScalarProgram:
                 return self._run_on_floats(values)
             except (ArithmeticError, ValueError):  # 1/0, an overflow, sin(inf): in JAX no errors, but values that are not finite
                 with np.errstate(all="ignore"):
-                    return self._run([np.float64(v) for v in values])
+                    return _run_steps(self._steps_on_arrays, [np.float64(v) for v in values])
         return self._traced(self._typed(values))
 
     def by_numpy(self, values: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Evaluate the program on arrays (rows,), element by element, without compiling anything."""
         rows = len(values[0]) if values else 1
-        with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
+        with np.errstate(all="ignore"):
             if any(self.graph.nodes[i].kind == "call" for i in self.order):  # of an array primitive: one row after the other
                 found = [self([float(v[k]) for v in values]) for k in range(rows)]
                 return [np.array(x, float) for x in zip(*found, strict=True)]
-            return [np.broadcast_to(np.asarray(x), (rows,)) for x in self._run(values)]
+            return [np.broadcast_to(np.asarray(x), (rows,)) for x in _run_steps(self._steps_on_arrays, values)]
 
     def depends_on(self, flags: Sequence[bool]) -> tuple[bool, ...]:
         """Return for each output whether it depends on any of the inputs that are flagged."""
@@ -100,14 +118,17 @@ class ScalarProgram:
         return [_signed(known, s) for s in self.outputs]
 
     def _run_on_floats(self, values: Sequence[float]) -> list[Value]:
-        steps, outputs = self._steps_on_floats
-        known: list[Value] = [*values]
-        for function, places in steps:
-            known.append(function(*[known[k] for k in places]))
-        return [known[k] for k in outputs]
+        return _run_steps(self._steps_on_floats, values)
 
     @cached_property
-    def _steps_on_floats(self) -> tuple[list[tuple[Callable, list[int]]], list[int]]:
+    def _steps_on_floats(self) -> Steps:
+        return self._steps(_function_of_floats)
+
+    @cached_property
+    def _steps_on_arrays(self) -> Steps:
+        return self._steps(_function_of_arrays)
+
+    def _steps(self, function_of: Callable[[Node], Callable]) -> Steps:
         """Each step's function and where its arguments are among the inputs and the steps' results; where the outputs are."""
         places, steps = {(s.index, 1): k for k, s in enumerate(self.inputs)}, []
 
@@ -122,7 +143,7 @@ class ScalarProgram:
 
         for index in self.order:
             node = self.graph.nodes[index]
-            append((index, 1), _function_of_floats(node), [find(a) for a in node.arguments])
+            append((index, 1), function_of(node), [find(a) for a in node.arguments])
         return steps, [find(s) for s in self.outputs]
 
     def count(self) -> dict[str, int]:
@@ -223,6 +244,37 @@ def _function_of_floats(node: Node) -> Callable:
     if name in _LIBRARY_FUNCTIONS:
         return getattr(math, name)
     return _NUMBER_FUNCTIONS.get(name) or (lambda *values: _evaluate(node, list(values)))
+
+
+def _function_of_arrays(node: Node) -> Callable:
+    """Return what computes a node of NumPy's arrays, or of floats, as constants are."""
+    if node.kind in _OPERATORS:
+        return _OPERATORS[node.kind][0]
+    if node.kind == "sqrt":
+        return np.sqrt
+    name = node.detail.primitive.name if node.kind == "apply" else ""
+    if name == "integer_pow":
+        exponent = node.detail.parameters["y"]
+        return lambda x: np.power(x, exponent)
+    if name in _LIBRARY_FUNCTIONS:
+        return getattr(np, name)
+    if node.kind == "constant":
+        return lambda: np.float64(node.detail) if isinstance(node.detail, float) else node.detail
+    return _ARRAY_FUNCTIONS.get(name) or (lambda *values: _evaluate_by_jax(node, values))
+
+
+def _evaluate_by_jax(node: Node, values: Sequence[np.ndarray]) -> np.ndarray | list[np.ndarray]:
+    with jax.ensure_compile_time_eval():
+        found = _evaluate(node, list(values))
+        return found if isinstance(found, list) else np.asarray(found)[()]
+
+
+def _run_steps(program: Steps, values: Sequence[Value]) -> list[Value]:
+    steps, outputs = program
+    known: list[Value] = [*values]
+    for function, places in steps:
+        known.append(function(*[known[k] for k in places]))
+    return [known[k] for k in outputs]
 
 
 def _library(x: Value) -> ModuleType:
