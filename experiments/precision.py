@@ -8,9 +8,9 @@ and a smaller tolerance takes more steps, which makes it no better; from about 1
 From +60 degrees the linkage crosses singular configurations. A direction whose singular value s is kept brings an error of eps
 / s into the accelerations, elimination with a pivot p one of eps / p; where that is more than the tolerance, the controller
 sees jumps that no step is small enough for. So the threshold of the rank, and the pivot at which `Auto` turns to singular
-values, have to be above eps / tol. The defaults, 1e-4 and 1e-6, leave room for 2e-10 in float64, where smaller tolerances take
-several times as many steps as with wider thresholds, and for no tolerance at all in float32. There 1e-2 and 1e-3 let runs
-cross.
+values, have to be above eps / tol. The defaults, 1e-4 and 1e-6, leave room for 2e-10 in float64; at smaller tolerances steps are
+placed around the configuration, and cost no more than with wider thresholds. In float32 they leave room for no tolerance at all:
+runs are lost, or, where the tolerance is loose, come out radians off. There 1e-2 and 1e-3 let runs cross.
 """
 
 import os
@@ -85,8 +85,8 @@ def holds(data: xarray.Dataset) -> dict[str, bool]:
         "float32 follows the tolerance down to 1e-5": bool(
             (single.run.sel(start=swings).where(single.tol > 0.9e-5, drop=True) < 10 * single.tol).all()
         ),
-        "with the default thresholds float32 crosses nothing": bool(
-            np.isinf(best(single).sel(start=crosses, thresholds="default"))
+        "with the default thresholds float32 is lost or radians off": bool(
+            best(single).sel(start=crosses, thresholds="default") > 1.0
         ),
         "with 1e-2 and 1e-3 it does": bool(best(single).sel(start=crosses, thresholds="wide") < 3e-3),
     }
@@ -94,8 +94,8 @@ def holds(data: xarray.Dataset) -> dict[str, bool]:
         least = best(data).sel(start=swings, thresholds="default")
         ratio = float(least.sel(precision="float32") / least.sel(precision="float64")) / float(data.eps[1] / data.eps[0])
         cost = data.right_hand_sides.sel(precision="float64", start=crosses).isel(tol=-1)
-        parts["at 1e-12 the default thresholds cost float64 three times the right-hand sides"] = bool(
-            cost.sel(thresholds="default") > 3 * cost.sel(thresholds="wide")
+        parts["at 1e-12 the default thresholds cost float64 no more than wide ones"] = bool(
+            cost.sel(thresholds="default") < 1.2 * cost.sel(thresholds="wide")
         )
         parts["float64 reaches 1e-10 across singularities"] = bool(
             best(data).sel(precision="float64", start=crosses).max() < 1e-10
@@ -110,7 +110,8 @@ def headline(data: xarray.Dataset) -> str:
     f32, f64 = (least.sel(precision=p) for p in ("float32", "float64"))
     return (
         f"best error of q after 20 s in float32 and float64: {float(f32.sel(start=swings, thresholds='default')):.0e} and "
-        f"{float(f64.sel(start=swings, thresholds='default')):.0e} without singularities; across them lost and "
+        f"{float(f64.sel(start=swings, thresholds='default')):.0e} without singularities; across them "
+        f"{float(f32.sel(start=crosses, thresholds='default')):.0e} and "
         f"{float(f64.sel(start=crosses, thresholds='default')):.0e} with the default thresholds, "
         f"{float(f32.sel(start=crosses, thresholds='wide')):.0e} and {float(f64.sel(start=crosses, thresholds='wide')):.0e} "
         f"with wide ones; "

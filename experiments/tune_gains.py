@@ -15,11 +15,11 @@ hundredth of the tolerance, which is about what controlled steps leave.
 At outputs between the steps interpolation errs by more than the drift; so that of runs at a tolerance is read off at the ends of
 four runs of different length.
 
-Claim, for two linkages and tolerances of 1e-6 to 1e-10: four guesses come to the same gains, between 1 and 8 /s, in some ten
+Claim, for two linkages and tolerances of 1e-6 to 1e-10: four guesses come to the same gains, between 0.5 and 10 /s, in some ten
 gradients each, of which one takes as long as three runs. By equal steps they drift less than any equal gains of a grid of nine,
 but not by a factor of two; at the steps of another tolerance, 1.3 times as much as what is tuned there, at most. At a tolerance
-they take fewer right-hand sides than gains of 5, and drift between a third and three times as much as the best (which is also the
-luckiest) of the grid that takes no more, not always less. Equal steps are not what controlled ones are: the four-bar, whose steps
+they take no more right-hand sides than gains of 5, and drift up to five times as much as the best (which is also the luckiest) of
+the grid that takes no more, seldom less: which it is changes with every change of where the steps end. Equal steps are not what controlled ones are: the four-bar, whose steps
 differ in size, drifts a hundred times less with these.
 """
 
@@ -180,12 +180,12 @@ def holds(data: xarray.Dataset) -> dict[str, bool]:
     redundant = np.isfinite(data.exponent_from_closed)
     return {
         "all guesses come to the same gains": bool((spread < 1.02).all()),
-        "these are of a few per second": bool((data.tuned > 1).all() and (data.tuned < 8).all()),
+        "these are between 0.5 and 10 per second": bool((data.tuned > 0.5).all() and (data.tuned < 10).all()),
         "by equal steps no equal gains drift less": bool((advantage(data) >= 1).all()),
         "but less than twice as much": bool((advantage(data) < 2).all()),
         "gains of another tolerance drift 1.3 times as much at most": bool(elsewhere(data).max() < 1.3),
-        "at a tolerance they take less than gains of 5": bool((price(data) < 1).all()),
-        "where they drift a third to three times as much as the grid": bool((np.abs(np.log(controlled(data))) < np.log(3)).all()),
+        "at a tolerance they take no more than gains of 5": bool((price(data) < MORE).all()),
+        "where they drift a fifth to five times as much as the grid": bool((np.abs(np.log(controlled(data))) < np.log(5)).all()),
         "and not always less": bool((controlled(data) > 1).any()),
         "by equal steps derivatives tell the next gain's drift": bool((misfit(data, "equal") < 0.05).all()),
         "at a tolerance they do not": bool((misfit(data, "controlled") > 0.5).all()),

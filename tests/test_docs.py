@@ -243,10 +243,8 @@ def test_names_in_docstrings_exist():
 
 
 def test_a_name_that_does_not_exist_is_noticed():
-    said = (
-        "`udk.simulate` `udk.simulat` `Motion.position` `Spline.times` `jnp.linalg.svd` `jnp.linalg.sdv` `tests/no.py` `quooks`"
-    )
-    assert list(missing(said)) == ["udk.simulat", "Motion.position", "jnp.linalg.sdv", "tests/no.py", "quooks"]
+    said = "`udk.load` `udk.laod` `Motion.position` `Spline.times` `jnp.linalg.svd` `jnp.linalg.sdv` `tests/no.py` `quooks`"
+    assert list(missing(said)) == ["udk.laod", "Motion.position", "jnp.linalg.sdv", "tests/no.py", "quooks"]
 
 
 # --- commands
