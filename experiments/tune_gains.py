@@ -19,8 +19,8 @@ Claim, for two linkages and tolerances of 1e-6 to 1e-10: four guesses come to th
 gradients each, of which one takes as long as three runs. By equal steps they drift less than any equal gains of a grid of nine,
 but not by a factor of two; at the steps of another tolerance, 1.3 times as much as what is tuned there, at most. At a tolerance
 they take no more right-hand sides than gains of 5, and drift up to five times as much as the best (which is also the luckiest) of
-the grid that takes no more, seldom less: which it is changes with every change of where the steps end. Equal steps are not what controlled ones are: the four-bar, whose steps
-differ in size, drifts a hundred times less with these.
+the grid that takes no more, seldom less: which it is changes with every change of where the steps end. Equal steps are not what
+controlled ones are: the four-bar, whose steps differ in size, drifts a hundred times less with these.
 """
 
 from typing import Any

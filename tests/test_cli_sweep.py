@@ -1,5 +1,6 @@
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -101,8 +102,10 @@ def test_the_example_on_workers_of_dask(tmp_path, capsys):
     arguments = ("sweep", EXAMPLES / "parallelogram.toml", EXAMPLE)
     assert udkjax(*arguments, "--dry-run") == 0
     shown = " ".join(capsys.readouterr().out.split())
-    for part in ("members 288: 9 body.coupler.mass x 8 tolerance x 2 start x 2 stabilization", "2 programs", "chunks 4", "q_end"):
+    for part in ("members 288: 9 body.coupler.mass x 8 tolerance x 2 start x 2 stabilization", "2 programs", "q_end"):
         assert part in shown
+    (chunks,) = re.findall(r"chunks (\d+)", shown)
+    assert 2 <= int(chunks) <= 32  # one of each program at least; more where more compute at a time
     assert list(tmp_path.iterdir()) == []
     assert udkjax(*arguments, "--out", tmp_path / "sweep", "--engine", "dask") == 0
     assert "288 successful" in capsys.readouterr().out

@@ -19,8 +19,6 @@ def test_a_notebook_runs(path):
     shown = [output.data for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs if "data" in output]
     players = [data for data in shown if "text/html" in data and data["text/html"].startswith("<iframe")]
     assert len(players) >= 1 and any("image/png" in data for data in shown)
-    pytest.importorskip("anywidget")
-    assert all("application/vnd.jupyter.widget-view+json" in data for data in players)
 
 
 def test_notebooks_are_kept_without_what_they_showed():

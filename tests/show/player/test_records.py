@@ -2,6 +2,7 @@
 
 import json
 import re
+from html import unescape
 
 import numpy as np
 import pytest
@@ -247,6 +248,16 @@ def test_what_is_not_finite_is_no_json(animation):
 
 def test_it_shows_itself(animation):
     assert "2 s" in repr(animation)
-    bundle = animation._repr_mimebundle_()
-    data = bundle[0] if isinstance(bundle, tuple) else bundle
-    assert data["text/html"].startswith("<iframe")
+    assert animation._repr_html_().startswith("<iframe")
+
+
+def test_a_notebook_keeps_the_player(animation):
+    """A cell shows nothing that needs Python again: nbconvert would take that, such as a widget, and leave it empty."""
+    formatters = pytest.importorskip("IPython.core.formatters")
+    data, metadata = formatters.DisplayFormatter().format(animation)
+    assert set(data) == {"text/plain", "text/html"}
+    nbformat, nbconvert = pytest.importorskip("nbformat"), pytest.importorskip("nbconvert")
+    output = nbformat.v4.new_output("display_data", data, metadata=metadata)
+    cell = nbformat.v4.new_code_cell("animation", outputs=[output])
+    text, _ = nbconvert.HTMLExporter().from_notebook_node(nbformat.v4.new_notebook(cells=[cell]))
+    assert embedded(unescape(text)) == embedded(unescape(data["text/html"]))

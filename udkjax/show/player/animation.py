@@ -29,7 +29,11 @@ class FailedRunWarning(UserWarning):
 
 
 class Animation:
-    """What `animate` returns. In a notebook it shows itself: as a widget where anywidget is installed, else in a frame."""
+    """What `animate` returns. In a notebook it shows itself, as a page in a frame.
+
+    So it is still there when the notebook is opened without Python, and in what nbconvert exports. `widget` returns one that
+    Python can steer.
+    """
 
     def __init__(self, data: Json, failures: Mapping[str, str] | None = None):
         self.data, self.failures = data, dict(failures or {})  # how runs failed, by their labels
@@ -89,14 +93,6 @@ class Animation:
 
     def _repr_html_(self) -> str:
         return frame(self.data, FRAME_HEIGHT)
-
-    def _repr_mimebundle_(self, **options: Any) -> dict[str, Any] | tuple[dict[str, Any], dict[str, Any]]:
-        try:
-            bundle = self.widget()._repr_mimebundle_(**options)
-        except ImportError:
-            return {"text/html": self._repr_html_(), "text/plain": repr(self)}
-        shown, metadata = bundle if isinstance(bundle, tuple) else (bundle, {})
-        return {**(shown or {}), "text/html": self._repr_html_(), "text/plain": repr(self)}, metadata
 
     def __repr__(self) -> str:
         runs, data = self.data["runs"], self.data
