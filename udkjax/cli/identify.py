@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from udkjax.study.identify.profile_likelihood import ProfileLikelihood
 
 # The names of udkjax.study.identify, which cannot be imported before a command is known: it imports JAX.
-Loss = Literal["least_squares", "huber"]
+Loss = Literal["least_squares", "huber", "soft_l1"]
 Estimated = Literal["nothing", "position", "velocity", "both"]
 
 Several = tuple[tuple[str, ...], ...]  # of an option that may be given again
@@ -71,7 +71,7 @@ def identify(
         prior: what was known of a parameter before.
         estimate_initial_state: what of the state in which each run begins is to be found too.
         ignore: columns of the data that are not to be read.
-        loss: huber lets single wrong numbers count less.
+        loss: huber and soft_l1 let single wrong numbers count less.
         n_starts: how many more first guesses may be tried.
         tol: tolerance of the integration.
         seed: of the first guesses.

@@ -86,12 +86,39 @@ def test_noise_that_is_given_and_noise_that_is_estimated(measured):
     assert estimated.uncertainty.standard_errors == pytest.approx(ratio * given.uncertainty.standard_errors, rel=1e-6)
 
 
-def test_wrong_numbers_count_less_by_huber(measured):
+@pytest.mark.parametrize("loss", ["huber", "soft_l1"])
+@pytest.mark.parametrize("noise", [0.003, None])
+def test_wrong_numbers_count_less(measured, loss, noise):
     angle = measured[1] + 0.003 * np.random.default_rng(6).standard_normal(len(TS))
     angle[5::9] += 0.5
     data = {"time": TS, ANGLE: angle}
-    squares, robust = found(measured[0], data, noise=0.003), found(measured[0], data, noise=0.003, loss="huber")
+    squares, robust = found(measured[0], data, noise=noise), found(measured[0], data, noise=noise, loss=loss)
     assert off(robust) < 0.2 * off(squares) and off(robust) < 0.03
+    assert [one.row for one in robust.outliers] == list(range(5, len(TS), 9))
+    assert robust.noise[0][ANGLE][0] == pytest.approx(0.003, rel=0.3) and "count little" in robust.message
+
+
+def test_one_wrong_number_is_named_and_is_no_noise(measured):
+    """Of two records, one begins before its first sample; squares count the wrong number, and say so."""
+    sigma, rng = 0.003, np.random.default_rng(7)
+    angles = {first: measured[1][first:] + sigma * rng.standard_normal(len(TS) - first) for first in (0, 3)}
+
+    def records():
+        return [udk.Record(TS[first:], {ANGLE: angle}, t0=0.0) for first, angle in angles.items()]
+
+    without = found(measured[0], records())
+    angles[3][20] -= 0.3
+    estimate, robust = found(measured[0], records()), found(measured[0], records(), loss="huber")
+    (one,) = estimate.outliers
+    assert (one.record, one.channel, one.row, one.time, one.units) == (1, ANGLE, 20, TS[23], "rad")
+    assert one.residual == pytest.approx(-0.3, abs=0.02) and one.deviations == pytest.approx(100.0, rel=0.3)
+    assert estimate.noise[1][ANGLE][0] == pytest.approx(sigma, rel=0.2)
+    assert f"row 20 ({TS[23]:.6g} s) by -0." in str(estimate) and "put nan in their places" in estimate.message
+    assert not without.outliers and "row" not in without.message
+    errors = without.uncertainty.standard_errors
+    assert (np.abs(robust.values - without.values) < 0.5 * errors).all()
+    assert robust.uncertainty.standard_errors == pytest.approx(errors, rel=0.1)
+    assert (np.abs(estimate.values - without.values) < 3.0 * estimate.uncertainty.standard_errors).all()
 
 
 def test_what_the_mechanism_lacks_is_told(measured):

@@ -11,7 +11,7 @@ from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import Record
-from udkjax.study.noise import noise_of_differences
+from udkjax.study.noise import noise_of_differences, outlier_rows
 
 LOOSE = 1e-7, 1e-7
 
@@ -46,6 +46,18 @@ def test_a_record_that_begins_late():
     estimate = identify(pendulum(0.2, 0.04), Record(ts, {ANGLE: angle}, t0=0.0), NAMES, progress=False)
     assert estimate.success and "better minimum" not in estimate.message
     assert np.all(np.abs(estimate.values - [0.375, 0.02]) < 4.0 * estimate.uncertainty.standard_errors)
+
+
+def test_outliers_are_single_numbers():
+    rng = np.random.default_rng(3)
+    noise = rng.standard_normal((2000, 300))
+    assert sum(outlier_rows(row).any() for row in noise) <= 12  # two are expected; noise of a sample's median makes a few more
+    r = noise[0].copy()
+    r[[7, 8, 250]] = 30.0, -8.0, 9.0
+    assert np.flatnonzero(outlier_rows(r)).tolist() == [7, 8, 250]
+    r[100:110] = 30.0  # another signal
+    assert np.flatnonzero(outlier_rows(r)).tolist() == [7, 8, 250]
+    assert not outlier_rows(np.zeros(9)).any() and not outlier_rows(np.zeros(0)).any()
 
 
 def test_noise_that_is_given_is_taken():

@@ -20,7 +20,8 @@ from udkjax.printing import PrintedTable, align_columns, html_table
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
-from udkjax.study.identify.optimizer import Loss, weighted_residuals
+from udkjax.study.identify.optimizer import Loss, squares, weighted_residuals
+from udkjax.study.identify.outliers import Outlier, outlier_sentences
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikelihood, profile_likelihood, profiles_dataset
@@ -59,6 +60,7 @@ class Estimate:
         initial_state_values: of each unknown of an initial state by how much it was moved, and its standard error.
         predicted, residuals, noise: for each record, by channel, at its times (T,): what the mechanism shows; measured minus
             predicted; and standard deviations, given or estimated.
+        outliers: measured values too far from what the mechanism shows to be noise; `noise` is that of the others.
         whiteness: of the residuals of each record's channels, where they are more than rounding.
         converged: whether the fit has settled.
         agreeing: how many first guesses led here, out of `guesses`.
@@ -79,6 +81,7 @@ class Estimate:
     predicted: tuple[Mapping[str, np.ndarray], ...]
     residuals: tuple[Mapping[str, np.ndarray], ...]
     noise: tuple[Mapping[str, np.ndarray], ...]
+    outliers: tuple[Outlier, ...]
     whiteness: Mapping[tuple[int, str], Whiteness]
     converged: bool
     agreeing: int
@@ -128,6 +131,7 @@ class Estimate:
         lines = [] if self.converged else ["the fit has not settled: these are the best values that were found"]
         lines += self.uncertainty.messages
         lines += [f"{name} is at one of its bounds" for name in self.at_bounds]
+        lines += outlier_sentences(self.problem, self.outliers, self.loss is not squares)
         lines += [found.text(prefixes[k] + channel) for (k, channel), found in self.whiteness.items() if not found.white]
         if self.guesses > 1 and self.agreeing == 1 and not all(found.white for found in self.whiteness.values()):
             lines.append(f"only one of {self.guesses} first guesses led here: there may be a better minimum")
@@ -176,15 +180,15 @@ class Estimate:
         return cells
 
     def _head(self) -> str:
-        problem, title = self.problem, self.mechanism.name or "mechanism"
-        numbers, records = plural(len(problem.index), "number"), plural(len(problem.records), "record")
-        return f"{title}: {plural(len(self.names), 'parameter')} from {numbers} in {records}"
+        title, problem = self.mechanism.name or "mechanism", self.problem
+        numbers = f"{plural(len(problem.index), 'number')} in {plural(len(problem.records), 'record')}"
+        return f"{title}: {plural(len(self.names), 'parameter')} from {numbers}"
 
     def _facts(self) -> dict[str, str]:
         problem, known = self.problem, self.uncertainty
-        ended = "settled" if self.converged else "not settled"
+        ended = f"{'' if self.converged else 'not '}settled after {plural(self.evaluations, 'evaluation')}"
         agreed = f", {self.agreeing} of {self.guesses} first guesses led here" if self.guesses > 1 else ""
-        facts = {"fit": f"{ended} after {plural(self.evaluations, 'evaluation')} in {self.seconds:.1f} s{agreed}"}
+        facts = {"fit": f"{ended} in {self.seconds:.1f} s{agreed}"}
         if problem.noise_given.any():
             facts["chi^2"] = f"{known.chi2:.4g} with {known.degrees_of_freedom} degrees of freedom"
         estimated = problem.index[~problem.noise_given]
@@ -197,15 +201,14 @@ class Estimate:
         return facts
 
     def __str__(self) -> str:
-        facts = self._facts()
-        width = max(map(len, facts))
+        width = max(map(len, facts := self._facts()))
         lines = [self._head(), *align_columns(self._cells()), *(f"  {name:<{width}}  {text}" for name, text in facts.items())]
         return "\n".join([*lines, self.message])
 
     def _repr_html_(self) -> str:
         heads, *cells = self._cells()
-        facts = [f"{name}: {text}" for name, text in self._facts().items()]
-        remarks = "".join(f"<br>{html.escape(text)}" for text in [*facts, *self.message.splitlines()])
+        lines = *(f"{name}: {text}" for name, text in self._facts().items()), *self.message.splitlines()
+        remarks = "".join(f"<br>{html.escape(text)}" for text in lines)
         return html_table(PrintedTable(self._head(), cells, heads)) + f"<p>{remarks.removeprefix('<br>')}</p>"
 
     def __repr__(self) -> str:
@@ -278,6 +281,7 @@ class Estimate:
             "chi2": known.chi2,
             "degrees_of_freedom": known.degrees_of_freedom,
             "noise": [{channel: _finite(np.nanmedian(sigma)) for channel, sigma in table.items()} for table in self.noise],
+            "outliers": [one._asdict() for one in self.outliers],
             "whiteness": [{"record": k, "channel": c, "p": _finite(w.p)} for (k, c), w in self.whiteness.items()],
             "guesses": self.guesses,
             "agreeing": self.agreeing,
@@ -293,6 +297,5 @@ class Estimate:
         return json.dumps(self.to_dict(), indent=1)
 
 
-def _finite(x: float) -> float | None:
-    """Return a number as JSON knows it: what is not finite is null."""
+def _finite(x: float) -> float | None:  # as JSON knows it
     return float(x) if np.isfinite(x) else None

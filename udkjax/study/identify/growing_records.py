@@ -13,13 +13,14 @@ the noise that is seen in the record,
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
 from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, Fit, History
-from udkjax.study.identify.optimizer import Minimizer
+from udkjax.study.identify.optimizer import Minimizer, huber, robust
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals
 from udkjax.study.noise import noise_of_differences
@@ -30,6 +31,7 @@ SPREAD = 1.0  # of an unknown: how far it is taken to be from its guess; a posit
 LINEAR = 0.3
 LEAST_GROWTH, MOST_GROWTH = 1.3, 30.0  # from one part to the next: what has no end is not waited for
 MOST_PARTS = 30
+WRONG = 4.0  # standard deviations: on the way larger residuals count as by Huber's loss
 LOST = 3.0  # times the root mean square of residuals of the part before: the larger part has led to another minimum
 SAME_BEGINNING = 0.02  # of an unknown: fits of first parts this near lead to the same fit of the whole
 LEAST_NOISE = 1e-4  # of what a channel shows: less is not used of what is known, so that a model that lacks something still fits
@@ -52,7 +54,11 @@ class HeldProblem:
     noise: Float[np.ndarray, "R"]
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
-        """Compute residuals and their Jacobian: see `Problem.evaluate`."""
+        """Compute residuals and their Jacobian: see `Problem.evaluate`. Single wrong numbers count less."""
+        return robust(self.plain(z, tol, horizon), partial(huber, c=WRONG), len(self.noise))
+
+    def plain(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
+        """Compute the same with all numbers counted alike."""
         found = self.problem.evaluate(z, tol, horizon)
         scale = np.concatenate([1.0 / self.noise, np.ones(found.r.shape[1] - len(self.noise))])
         hold = np.broadcast_to(np.eye(len(self.guess)) / SPREAD, (len(z), len(self.guess), len(self.guess)))
@@ -122,7 +128,7 @@ def _predictable(held: HeldProblem, z: np.ndarray, tol: Tolerances, fitted: floa
     `size` is the root mean square of its residuals.
     """
     problem, times = held.problem, _times(held.problem)
-    along = held.evaluate(z[None], tol)
+    along = held.plain(z[None], tol)
     J, R = along.J[0], len(times)
     data, usable = J[:R], np.isfinite(along.r[0]) & np.isfinite(J).all(1)  # a run may fail on its way
     own = (times <= fitted) & usable[:R]

@@ -15,9 +15,10 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History
 from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
+from udkjax.study.identify.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
 from udkjax.study.identify.parameters import Asked
 from udkjax.study.identify.prediction import LOOSE, TIGHT, Tolerances
-from udkjax.study.identify.problem import Problem, Strategy, build_problem
+from udkjax.study.identify.problem import INVISIBLE, Problem, Residuals, Strategy, build_problem
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
 from udkjax.study.identify.search import N_STARTS, SearchResult, search
@@ -26,7 +27,6 @@ from udkjax.study.progress import ProgressOption, report_progress
 from udkjax.study.whiteness import Whiteness, whiteness_of
 
 REWEIGHTED = 2  # fits, each with the noise that the one before left
-NOISE_FLOOR = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike
 SAME_WEIGHTS = 1.05  # ratio of weights, compared with each other, that moves no estimate by what counts beside its error
 ROUNDING = 1e-8  # of what a channel shows: smaller residuals are errors of the integration, which need not be noise
 
@@ -71,8 +71,8 @@ def identify(
             the records' own, and for those of tables the scene's.
         n_starts: how many more first guesses may be followed, the best of eight times as many; 0: none.
         guesses: first guesses (B, P) to try besides the first, in place of `n_starts`.
-        loss: "least_squares"; "huber", for which single wrong numbers count less; or a function of the weighted residuals (R,) by
-            JAX (standard errors stay those of squares).
+        loss: "least_squares"; "huber" or "soft_l1", for which single wrong numbers count less; or a function of the weighted
+            residuals (R,) by JAX (standard errors stay those of squares).
         optimizer: another least-squares solver of optimistix, or any optimizer of optax.
         strategy: "pieces" cuts the records into pieces at once; "auto": only where nothing else leads to a fit.
         tol: tolerance of the integration at the end, relative and absolute.
@@ -137,7 +137,8 @@ def _refit(found: SearchResult, tol: Tolerances, minimizer: Minimizer) -> tuple[
     fit = _polish(problem, found.fit.z, tol, minimizer)
     history = [*found.history, *fit.history]
     unknown = np.unique(problem.index[~problem.noise_given, 2])
-    for _ in range(REWEIGHTED if len(unknown) + problem.noise_given.any() > 1 else 0):
+    robust = minimizer.loss is not squares  # what is an outlier depends on the noise
+    for _ in range(REWEIGHTED if len(unknown) + problem.noise_given.any() > 1 or (robust and len(unknown)) else 0):
         if not reweigh(problem, fit.z, tol, minimizer.loss, NOISE_FLOOR):
             break
         fit = _polish(problem, fit.z, tol, minimizer)
@@ -161,16 +162,17 @@ def reweigh(problem: Problem, z: Float[np.ndarray, "1 K"], tol: Tolerances, loss
         Whether residuals weigh otherwise now, compared with each other.
     """
     before = problem.sigma.copy()
-    found = loss(problem.evaluate(z, tol))
     rows = len(problem.index)
-    left = found.r[0, :rows] * problem.sigma
+    r = problem.evaluate(z, tol).r[0, :rows]
+    left, kept = r * problem.sigma, ~find_outlier_rows(problem, r)
     for c in range(len(problem.channels)):
-        own = (problem.index[:, 2] == c) & ~problem.noise_given
+        own = (problem.index[:, 2] == c) & ~problem.noise_given & kept
         if own.any():
             # Unknowns take their part of each channel's freedom.
             freedom = own.sum() * (1.0 - (problem.K - problem.constrained) / rows)
             size = np.sqrt(left[own] @ left[own] / max(freedom, 1.0))
-            problem.sigma[own] = max(size, max(least, np.finfo(float).tiny ** 0.25) * problem.channel_scale[c])
+            every = (problem.index[:, 2] == c) & ~problem.noise_given
+            problem.sigma[every] = max(size, max(least, np.finfo(float).tiny ** 0.25) * problem.channel_scale[c])
     ratio = problem.sigma / before
     return bool(ratio.max() > SAME_WEIGHTS * ratio.min()) or loss is not squares or bool(len(problem.priors))
 
@@ -180,8 +182,11 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
     problem = found.problem
     unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z[0]
     x, states = unknowns.values(z[:P]), problem.state_sizes * z[P:]
-    plain = problem.evaluate(fit.z, tol)
+    plain, rows = problem.evaluate(fit.z, tol), len(problem.index)
     weighted = loss(plain)
+    outlying, robust = find_outlier_rows(problem, plain.r[0, :rows]), loss is not squares
+    # By a robust loss outliers hardly count, and are left out here; squares count them, and so do standard errors.
+    kept = np.concatenate([~outlying | (not robust), np.ones(problem.extra_rows, bool)])
     groups = problem.noise_groups()
     values = UnknownValues(
         problem.all_names,
@@ -190,18 +195,22 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
         np.concatenate([unknowns.dx_dz(z[:P]), problem.state_sizes]),
         (*unknowns.kinds, *["free"] * (problem.K - P)),
     )
-    uncertainty = estimate_uncertainty(weighted.J[0], weighted.r[0], values, groups, P, len(problem.priors))
+    J, r = weighted.J[0][kept], weighted.r[0][kept]
+    uncertainty = estimate_uncertainty(J, r, values, groups[kept], P, len(problem.priors))
     scale = np.append(uncertainty.noise, 1.0)[groups]
-    rows = len(problem.index)
-    sigma = problem.sigma * scale[:rows]
+    projection = np.zeros((len(kept), uncertainty.projection.shape[1]))
+    projection[kept] = uncertainty.projection
     left = -plain.r[0, :rows] * problem.sigma
+    sigma = problem.sigma * scale[:rows]
+    if outlying.any():
+        sigma = _noise_of_others(problem, plain, groups[:rows], outlying, sigma)
     white: dict[tuple[int, str], Whiteness] = {}
     for places in problem.series():
         record, _, channel = problem.index[places[0]]
         if np.abs(left[places]).max() > ROUNDING * problem.channel_scale[channel]:
             times = problem.ts[record, problem.index[places, 1]]
             seen = (weighted.r[0, :rows] / scale[:rows])[places]
-            white[int(record), problem.channel_names[channel]] = whiteness_of(times, seen, uncertainty.projection[places])
+            white[int(record), problem.channel_names[channel]] = whiteness_of(times, seen, projection[places])
     names = [name for state in problem.initial_states for name in state.names]
     return Estimate(
         names=unknowns.names,
@@ -213,6 +222,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
         predicted=problem.by_record(problem.y[problem.present] - left),
         residuals=problem.by_record(left),
         noise=problem.by_record(sigma),
+        outliers=list_outliers(problem, outlying, left, sigma),
         whiteness=white,
         converged=bool(fit.settled[0]),
         agreeing=found.agreeing,
@@ -226,3 +236,17 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
         problem=problem,
         loss=loss,
     )
+
+
+def _noise_of_others(
+    problem: Problem, found: Residuals, groups: np.ndarray, outlying: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """Return the noise (R,), where it was estimated with outliers: what a fit without them would leave, to first order."""
+    sigma, kept = sigma.copy(), np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
+    r, J = found.r[0], found.J[0]
+    left = (r - J @ np.linalg.lstsq(J[kept], r[kept], rcond=INVISIBLE)[0])[: len(outlying)]
+    freedom = 1.0 - problem.K / kept.sum()
+    for g in np.unique(groups[outlying & (groups >= 0)]):
+        own = groups == g
+        sigma[own] = problem.sigma[own] * np.sqrt(np.mean(left[own & ~outlying] ** 2) / freedom)
+    return sigma

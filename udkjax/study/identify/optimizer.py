@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # imported where a fit begins: it takes a second
 
 GRADIENT_STEPS = 2000  # at most, of an optimizer that knows no curvature
 FAILED_COST = 100.0  # times the first cost: what is taken for the cost where nothing can be computed
-HUBER = 1.345  # standard deviations: of noise that is Gaussian after all, estimates lose a twentieth of their precision
+TUNING = 1.345  # standard deviations: of noise that is Gaussian after all, estimates lose a twentieth of their precision
 
 Loss: TypeAlias = Callable[[Residuals], Residuals]  # residuals whose squares are minimized, of plain ones
 UserLoss: TypeAlias = Callable[[Array], Array]
@@ -76,27 +76,44 @@ def named_loss(name: str, residuals: int) -> Loss:
     """Return the loss of a name, for the first `residuals` of a problem: priors are not outliers."""
     if name == "least_squares":
         return squares
-    if name == "huber":
-        return partial(huber, residuals=residuals)
-    raise IdentificationError([f"loss must be 'least_squares' or 'huber', is {name!r}"])
+    if name in ROBUST:
+        return partial(robust, rho=ROBUST[name], residuals=residuals)
+    raise IdentificationError([f"loss must be 'least_squares', {' or '.join(map(repr, ROBUST))}, is {name!r}"])
 
 
-def huber(found: Residuals, residuals: int, c: float = HUBER) -> Residuals:
-    """Return s = sign(r) sqrt(rho(r)) and its Jacobian ds/dr J, whose sum of squares is that of Huber's rho.
+def robust(found: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], residuals: int) -> Residuals:
+    """Return s = sign(r) sqrt(rho(r)) and its Jacobian ds/dr J: the sum of its squares, and their gradient, are those of rho.
 
-    rho(r) = r^2 up to |r| = c, and 2 c |r| - c^2 beyond; the gradient of its sum is exact.
-
-    Source: P. J. Huber, Robust estimation of a location parameter, 1964.
+    `rho` returns rho and half of its derivative, of |r|.
     """
     r = found.r[:, :residuals]
     size = np.abs(r)
-    outside = size > c
-    root = np.sqrt(np.where(outside, 2.0 * c * size - c**2, 1.0))
-    s, slope = np.where(outside, np.sign(r) * root, r), np.where(outside, c / root, 1.0)
+    value, half_slope = rho(size)
+    s = np.sqrt(value)
+    slope = np.where(s > 0.0, half_slope / np.where(s > 0.0, s, 1.0), 1.0)
     rest = found.r[:, residuals:], found.J[:, residuals:]
     return Residuals(
-        np.concatenate([s, rest[0]], 1), np.concatenate([slope[..., None] * found.J[:, :residuals], rest[1]], 1), found.code
+        np.concatenate([np.sign(r) * s, rest[0]], 1),
+        np.concatenate([slope[..., None] * found.J[:, :residuals], rest[1]], 1),
+        found.code,
     )
+
+
+def huber(size: np.ndarray, c: float = TUNING) -> tuple[np.ndarray, np.ndarray]:
+    """Return rho(r) = r^2 up to |r| = c, and 2 c |r| - c^2 beyond; and half of its derivative.
+
+    Source: P. J. Huber, Robust estimation of a location parameter, 1964.
+    """
+    return np.where(size > c, 2.0 * c * size - c**2, size**2), np.minimum(size, c)
+
+
+def soft_l1(size: np.ndarray, c: float = TUNING) -> tuple[np.ndarray, np.ndarray]:
+    """Return rho(r) = 2 c^2 ((1 + (r / c)^2)^(1/2) - 1), and half of its derivative."""
+    root = np.sqrt(1.0 + (size / c) ** 2)
+    return 2.0 * size**2 / (root + 1.0), size / root
+
+
+ROBUST = {"huber": huber, "soft_l1": soft_l1}
 
 
 # --- fits

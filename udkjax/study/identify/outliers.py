@@ -1,0 +1,73 @@
+"""Single wrong numbers in records: residuals that are too large for the noise of the others."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.records import label_prefixes, output_times
+from udkjax.study.noise import outlier_rows
+from udkjax.study.wording import plural
+
+NOISE_FLOOR = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike
+MOST_NAMED = 5  # of a channel, the largest; the others are counted
+
+
+class Outlier(NamedTuple):
+    """A measured value that is not noise: which one, and how far from what the mechanism shows.
+
+    `row` is its place in the record, from 0 on; `deviations` is the residual over the noise of the channel's other values.
+    """
+
+    record: int
+    channel: str
+    row: int
+    time: float
+    residual: float
+    units: str
+    deviations: float
+
+
+def find_outlier_rows(problem: Problem, r: Float[np.ndarray, "R"]) -> Bool[np.ndarray, "R"]:
+    """Return which measured numbers are outliers, by weighted residuals: each channel by its own, of all records together."""
+    found, channel = np.zeros(len(problem.index), bool), problem.index[:, 2]
+    shows = np.abs(r * problem.sigma) > NOISE_FLOOR * problem.channel_scale[channel]
+    for c in range(len(problem.channels)):
+        own = np.flatnonzero(channel == c)
+        found[own] = outlier_rows(r[own]) & shows[own]
+    return found
+
+
+def list_outliers(
+    problem: Problem, rows: Bool[np.ndarray, "R"], residuals: Float[np.ndarray, "R"], sigma: Float[np.ndarray, "R"]
+) -> tuple[Outlier, ...]:
+    """List the outliers among measured numbers, with residuals in the units of their channels and the noise of the others."""
+    found = []
+    for k in np.flatnonzero(rows).tolist():
+        record, time, c = problem.index[k].tolist()
+        channel, before = problem.channels[c], output_times(problem.records[record])[1]
+        place = record, channel.name, time - before, float(problem.ts[record, time])
+        found.append(Outlier(*place, float(residuals[k]), channel.units, float(abs(residuals[k]) / sigma[k])))
+    return tuple(found)
+
+
+def outlier_sentences(problem: Problem, outliers: Sequence[Outlier], robust: bool) -> Iterator[str]:
+    """Iterate over sentences that name the outliers of each channel of each record, with the cure."""
+    prefixes = label_prefixes(problem.records)
+    for k, name in dict.fromkeys((one.record, one.channel) for one in outliers):
+        own = sorted((one for one in outliers if (one.record, one.channel) == (k, name)), key=lambda one: -one.deviations)
+        named = [
+            f"row {one.row} ({one.time:.6g} s) by {f'{one.residual:.3g} {one.units}'.rstrip()}, "
+            f"{one.deviations:.3g} standard deviations"
+            for one in own[:MOST_NAMED]
+        ]
+        more = f" and {len(own) - MOST_NAMED} more" if len(own) > MOST_NAMED else ""
+        cure = (
+            "the loss lets them count little"
+            if robust
+            else "they move the estimate, and standard errors take them for noise: put nan in their places, or give loss='huber'"
+        )
+        where = f"{prefixes[k]}{name}: {plural(len(own), 'value')} far from what the mechanism shows"
+        yield f"{where}, {'; '.join(named)}{more}: {cure}"
