@@ -125,3 +125,56 @@ def test_under_jit_a_call_computes_the_same(given):
         found = jax.jit(lambda mech: udk.simulate(mech, TS, analysis=analysis))(mechanism)
     assert_allclose(found.q, eager.q, rtol=0, atol=1e-10)
     assert int(found.code) == int(eager.code)
+
+
+# Coordinates that are zero, zero but for rounding, or small: no step, scale or tolerance is relative to them alone.
+SMALL = [0.0, 5e-324, 1e-300, 1e-100, 1e-30, 1e-17, 3e-16, 1e-12, 1e-8, -1e-17, -1e-9]
+
+
+@pytest.mark.parametrize("engine", ["native", "diffrax"])
+@pytest.mark.parametrize("tol", [(1e-8, 1e-8), (1e-10, 0.0), (0.0, 1e-8)], ids=["both", "relative", "absolute"])
+def test_a_body_at_rest_at_the_origin_but_for_rounding_falls(engine, tol):
+    y0 = np.array([(y, v) for y in SMALL for v in SMALL])
+    body = udk.Mechanism({"b": udk.Body(2.0, 0.1)})
+
+    def fall(y, v):
+        state = udk.State([[y, y, v]], [[v, v, y]])
+        return (s := udk.simulate(body, [0.0, 1.0], state, *tol, engine=engine)).code, s.q[-1, 0]
+
+    code, q = jax.jit(jax.vmap(fall))(*y0.T)
+    assert (code == udk.Result.successful).all()
+    np.testing.assert_allclose(q[:, 1], y0.sum(1) - 9.81 / 2, rtol=1e-7)
+    np.testing.assert_allclose(q[:, ::2], y0 @ np.array([[1, 1], [1, 1]]), atol=2e-8)
+
+
+@pytest.mark.parametrize("engine", ["native", "diffrax"])
+def test_a_slider_at_the_origin_follows_its_driver(engine):
+    """sin(pi/2) - 1 and cos(pi/2) are zero but for rounding."""
+
+    motion = udk.Sine(amplitude=1.0, frequency=4.0, phase=np.pi / 2, offset=-1.0)
+    guide = udk.Prismatic(["ground", "p"], [[0, 0], [0, 0]], np.pi / 2)
+    slide = udk.Mechanism({"p": udk.Body(1.0, 1.0)}, {"s": guide}, {"d": udk.Driver(["ground", "p"], "y", motion)})
+
+    def driven(x):
+        s = udk.simulate(slide, [0.0, 1.0, 2.0], udk.State([[x, x, x]], [[x, 0.0, x]]), engine=engine)
+        return s.code, s.q[-1, 0, 1]
+
+    code, y = jax.jit(jax.vmap(driven))(np.array([x for x in SMALL if abs(x) < 1e-15]))
+    assert (code == udk.Result.successful).all()
+    np.testing.assert_allclose(y, np.cos(8.0) - 1, rtol=1e-9)
+
+
+@pytest.mark.parametrize("x", [0.0, 5e-324, 1e-17, -3e-16])
+def test_arms_and_rows_of_rounding_are_none(x):
+    """Pins in the centres of mass, and a row that nothing moves at the guess, have the scales of exact zeros."""
+
+    class Parabola(udk.Joint):
+        def residual(self, t, *frames):
+            return [frames[1].y ** 2]
+
+    bodies = {"a": udk.Body(1.0, 0.1, position=[x, x]), "b": udk.Body(1.0, 0.1, position=[x, x])}
+    pins = {"p": udk.Revolute(["ground", "a"], [[0, 0], [x, 0]]), "r": udk.Revolute(["a", "b"], [[0, x], [0, 0]])}
+    found = udk.analyse(udk.Mechanism(bodies, {**pins, "own": Parabola(["ground", "b"])})).scales
+    length = np.sqrt(0.1)  # the radius of gyration: there is no arm
+    assert_allclose([found.length, found.arm], length, rtol=1e-12)
+    assert_allclose(found.rows, length, rtol=1e-12)

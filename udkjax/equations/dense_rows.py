@@ -10,7 +10,7 @@ import numpy as np
 
 from udkjax.equations.abstract_system import Time
 from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed, try_to_close
-from udkjax.equations.scales import Scales, known_scales, rank_tolerance
+from udkjax.equations.scales import ROUNDING, Scales, known_scales, rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_scalars
 from udkjax.expressions import ScalarProgram
@@ -137,7 +137,7 @@ class KinematicRows(DenseRows):
         """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
-        length[length == 0.0] = 1.0
+        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # a row of rounding errors has no direction
         return self._run(self._programs.psi, t, q, q), length, D / length[:, None]
 
     def split_rows(self, positions: list[DensePosition]) -> list[tuple[np.ndarray, list[DensePosition]]]:

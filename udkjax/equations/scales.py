@@ -25,6 +25,9 @@ from udkjax.scene.mechanism import Mechanism
 RANK_TOL = 1e-4
 ORDINARY_MASS_RATIO = 100.0  # up to which that holds: see `rank_tolerance`
 
+# Of the largest of its kind: what a number that is zero in theory may be as it is computed, some hundred units of rounding.
+ROUNDING = 256 * float(np.finfo(float).eps)
+
 
 class GuessTerms(NamedTuple):
     """The terms of the equations at the initial guess that the scales are made of; Psi_q by its entries."""
@@ -148,10 +151,10 @@ def _scales(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> Scales
     moved = xp.sqrt(sum_by_pair(xp.where(turns, 0.0, psi_q**2)))
     turned = sum_by_pair(xp.where(turns, xp.abs(psi_q), 0.0))
     if len(pair):
-        by_place = moved > jnp.finfo(float).eps * xp.max(moved)
+        by_place = moved > ROUNDING * xp.max(moved)
         arm = xp.where(by_place, turned / xp.where(by_place, moved, 1.0), 0.0)
         arm = xp.max(xp.where(xp.isfinite(arm), arm, 0.0))
-        arm = xp.where(arm > 0.0, arm, length)
+        arm = xp.where(arm > ROUNDING * length, arm, length)
         length = xp.maximum(length, arm)
     change = xp.maximum(moved * length, turned)
     row, count = pair // len(mass), len(psi_t)
@@ -160,7 +163,9 @@ def _scales(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> Scales
         np.maximum.at(scale, row, change)
     else:
         scale = jnp.zeros(count).at[row].max(change)
-    scale = xp.where(xp.isfinite(scale) & (scale > 0.0), scale, length)  # a row that nothing moves here: as if in metres
+    scale = xp.where(xp.isfinite(scale), scale, 0.0)
+    moves = scale > ROUNDING * xp.max(scale, initial=0.0)
+    scale = xp.where(moves, scale, length)  # a row that nothing moves here: as if in metres
 
     def largest(x: NumericArray) -> NumericArray:
         return xp.max(xp.where(xp.isfinite(x), xp.abs(x), 0.0), initial=0.0)

@@ -21,7 +21,7 @@ from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed, try_to_close
-from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
+from udkjax.equations.scales import RANK_TOL, ROUNDING, known_scales, mass_of
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
@@ -135,7 +135,7 @@ class SparseRows:
         row, column, *_ = self._programs.d_entries
         D = csr_array((values * self._stretch[column], (row, column)), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
-        length[length == 0.0] = 1.0
+        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # a row of rounding errors has no direction
         return csr_array(D.multiply(1 / length[:, None])), length
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:

@@ -71,14 +71,16 @@ def _first_step(problem: Problem, y0: Array) -> Array:
 
 
 def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, unit: Array) -> Array:
-    """Return a step over which the state y (n,), with this slope, changes by a small part of itself. `unit` is that of `atol`.
+    """Return a step over which the state y (n,), with this slope, changes by a hundredth of itself or, if more, of its unit.
 
-    As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off.
+    As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off. The unit is that of
+    `atol`: a state that is zero, or zero but for rounding, changes by none of itself.
     """
     y, slope, span, rtol, atol, unit = stop_gradients((y, slope, span, rtol, atol, unit))
     scale = atol * unit + rtol * jnp.abs(y)
-    size, rate = jnp.max(jnp.abs(y) / scale, initial=0.0), jnp.max(jnp.abs(slope) / scale, initial=0.0)
-    ordinary = jnp.isfinite(rate) & (rate > 0) & (size > 0)
+    size = jnp.max(jnp.maximum(jnp.abs(y), unit) / scale, initial=0.0)
+    rate = jnp.max(jnp.abs(slope) / scale, initial=0.0)
+    ordinary = jnp.isfinite(rate) & (rate > 0)
     return jnp.where(ordinary, jnp.minimum(0.01 * size / jnp.where(ordinary, rate, 1.0), span), 1e-4 * span)
 
 

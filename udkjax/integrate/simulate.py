@@ -27,7 +27,7 @@ from udkjax.integrate.outcome import Run, counts, increases, outcome, usable
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SimulationError, Solution
-from udkjax.native.steps import SMALLEST_STEP
+from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.arguments import checked, describe, require_output_times
 from udkjax.scene.fields import number, optional_number
@@ -248,7 +248,7 @@ def _simulate(
         in_order = increases(stop_gradients(ts))
         good, ts = good & in_order, jnp.where(in_order, ts, jnp.arange(len(ts)))
     # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
-    loose_rtol, loose_atol = (xp.where(good & closed, tol, 1e3) for tol in (rtol, atol))
+    loose_rtol, loose_atol = (xp.where(good & closed, tol, 1e3) for tol in (rtol, xp.maximum(atol, LEAST_ATOL)))
     ulp = np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1]))
     numbers: Any = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v, xp))
     problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, breakpoints=mechanism.breakpoints)

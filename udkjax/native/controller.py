@@ -62,7 +62,8 @@ def write_decide(t: Module):
     stepped, begun = ~begin, stepping & begin
     # --- the next step
     order, step = t.method.order, s.t1 - s.T3
-    size = where(f.is_finite(error), f.max(error, 1e-30), 1e30)
+    # An error that lets a step grow as far as it may is not told from a smaller one, which may be rounding and say nothing.
+    size = where(f.is_finite(error), f.max(error, GROW ** -float(order)), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
     foreseen = size * (rate / s.rate)  # the error of a step as long, where errors grow as they did (Gustafsson 1994)
     steep = accept & (foreseen > 1.0)
@@ -117,20 +118,21 @@ def write_decide(t: Module):
 
 
 def first_step(t: Module, f: Function, s: Lane) -> Value:
-    """As given, or one over which the state changes by a small part of itself (`first_step` of integrate/diffrax_engine.py)."""
-    rtol = t.broadcast(f, s.rtol)
+    """As given, or one over which the state changes by a hundredth of itself, or of its unit (`first_step` of integrate/diffrax_engine.py)."""
+    rtol, atol, omega = (t.broadcast(f, x) for x in (s.rtol, s.atol, s.omega))
 
-    def relative(of_q: str, of_v: str) -> Any:
+    def relative(of_q: str, of_v: str, least: float) -> Any:
         def both(r: Value) -> list[Value]:
-            return [
-                f.abs(t.vector(f, name, r)) / f.fma(rtol, f.abs(t.vector(f, y, r)), t.vector(f, scale, r))
-                for name, y, scale in ((of_q, "X q", "scale q"), (of_v, "O v", "scale v"))
-            ]
+            per_unit, found = t.vector(f, "inverse unit", r), []
+            for name, y, per in ((of_q, "X q", per_unit), (of_v, "O v", per_unit / omega)):
+                x = f.max(f.abs(t.vector(f, name, r)) * per, f.const(least, DOUBLE, t.plan.vector))
+                found.append(x / f.fma(rtol, f.abs(t.vector(f, y, r)) * per, atol))
+            return found
 
         return both
 
-    size, rate = t.largest(f, relative("X q", "O v")), t.largest(f, relative("O v", "O a"))
+    size, rate = t.largest(f, relative("X q", "O v", 1.0)), t.largest(f, relative("O v", "O a", 0.0))
     span = s.end - s.start
-    ordinary = f.is_finite(rate) & (rate > 0.0) & (size > 0.0)
+    ordinary = f.is_finite(rate) & (rate > 0.0)
     chosen = f.select(ordinary, f.min(size / f.select(ordinary, rate, 1.0) * 0.01, span), span * 1e-4)
     return f.select(s.first > 0.0, f.min(s.first, span), chosen)

@@ -1,5 +1,7 @@
 """The numbers that steps are chosen by, for machine code and whatever steps as it does."""
 
+import numpy as np
+
 # The step controller: a step is SAFETY times as long as one whose error would be the tolerance, and between SHRINK and GROW times
 # as long as the one before (the usual bounds). With 0.9 every tenth step of an ordinary run is rejected, and most runs take 4 to
 # 15 % more at equal error. A step that is tried again for the sake of a pivot is as much shorter.
@@ -7,6 +9,10 @@ SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
 # Of the step before a breakpoint: the first behind it. Its outputs have states on one side alone, and so larger errors: with
 # SAFETY in its place rates across the knots of a cam are off by 34 times the tolerance instead of ten.
 RESTART_FACTOR = 0.5
+
+# Of the scene's units: what `atol` is at least. Nothing is known to less than rounding, and a coordinate that is zero has no
+# other tolerance.
+LEAST_ATOL = np.finfo(float).eps
 
 # Steps near singular configurations. Distances are the smallest pivot of D D^T relative to its diagonal, as a root.
 RETRIES = 3  # of a step that meets a pivot which elimination must not trust, before the fallback takes it

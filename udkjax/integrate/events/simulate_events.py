@@ -24,6 +24,7 @@ from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.outcome import increases, usable
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solution import Result, Solution
+from udkjax.native.steps import LEAST_ATOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
 
@@ -139,7 +140,7 @@ def _run(arrays: Given, static: Given) -> tuple[EventRun, tuple[str, ...]]:
         phases,
         events,
         choices.rtol,
-        choices.atol,
+        jnp.maximum(choices.atol, LEAST_ATOL),
         choices.smallest_step * ulp,
         choices.dt0,
         length,
