@@ -113,6 +113,11 @@ def test_numbers_of_a_wrong_shape_sign_or_type_are_refused(name):
             assert name in message(udk.simulate, **({"mechanism": MECH, "ts": TS} | {name: wrong}))
 
 
+def test_tolerances_below_rounding_are_refused():
+    assert "are below rounding" in message(udk.simulate, MECH, TS, rtol=1e-30, atol=0.0)
+    assert udk.simulate(OTHER, TS, rtol=0.0, atol=1e-10).result.is_success
+
+
 CHOICES = [
     ("stabilization", udk.Projection, "stabilization=udk.Projection()"),
     ("stabilization", "projection", "stabilization=udk.Projection()"),

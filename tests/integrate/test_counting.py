@@ -203,7 +203,7 @@ def test_the_first_step_may_be_given(pendulum):
     assert stats[1e-9]["steps"] >= stats[0.01]["steps"] + 6  # steps grow by 10 at most
 
 
-@pytest.mark.parametrize(("dt0", "problem"), [(0.0, "positive"), (-0.1, "positive"), (jnp.nan, "positive"), ([0.1], "one time")])
+@pytest.mark.parametrize(("dt0", "problem"), [(0.0, "positive"), (-0.1, "positive"), (jnp.nan, "positive"), ([0.1], "one")])
 def test_a_first_step_is_checked(pendulum, dt0, problem):
     with pytest.raises(ValueError, match=problem):
         udk.simulate(pendulum, TS, dt0=dt0)

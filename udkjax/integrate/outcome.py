@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
-from udkjax.native.steps import DONE, LOOK_AHEAD, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.native.steps import DONE, LEAST_ATOL, LOOK_AHEAD, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
 
 
 class Run(eqx.Module):
@@ -32,7 +32,7 @@ def increases(ts: Float[Array, "T"]) -> Bool[Array, ""]:
 def usable(q: Array, v: Array, rtol: Array, atol: Array, drift_tol: Array, dt0: Array | None) -> Bool[Array, ""]:
     """Tell whether numbers are what `simulate` lets in: of those that are traced when it is called it sees the shapes alone."""
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
-    tolerant = (rtol >= 0) & (atol >= 0) & (rtol + atol > 0) & (rtol + atol < jnp.inf) & (drift_tol > 0)
+    tolerant = (rtol >= 0) & (atol >= 0) & (rtol + atol >= LEAST_ATOL) & (rtol + atol < jnp.inf) & (drift_tol > 0)
     return finite & tolerant & (True if dt0 is None else (dt0 > 0) & (dt0 < jnp.inf))
 
 

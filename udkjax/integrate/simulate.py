@@ -123,14 +123,14 @@ def simulate(
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.
     """
     require_output_times("ts", ts)
-    if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and not float(number(rtol)) and not float(number(atol)):
-        raise ValueError("rtol and atol must not both be 0: no step has no error")
-    ts = number(ts)
+    rtol, atol, ts = number(rtol), number(atol), number(ts)
+    if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and float(rtol) + float(atol) < LEAST_ATOL:
+        raise ValueError(f"rtol = {rtol:g} and atol = {atol:g} are below rounding, which no step can meet: raise one of them")
     if state is None and isinstance(mechanism, ConstrainedSystem):
         raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
     drift = number((DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE) if drift_tol is None else drift_tol)
     method = Auto() if method is None else method
-    settings = (number(rtol), number(atol), method, stabilization, drift, optional_number(dt0), formulation)
+    settings = (rtol, atol, method, stabilization, drift, optional_number(dt0), formulation)
     choices = (solver, _adjoint(adjoint), max_steps, _meter(progress))
 
     start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
@@ -162,7 +162,7 @@ def simulate(
         assert analysis is not None  # a mechanism has one
         more = (SMALLEST_STEP, isinstance(stabilization, Projection), solver, max_steps, max_events, engine)
         baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
-        given: Any = (number(rtol), number(atol), method, baumgarte, formulation, drift, optional_number(dt0), *more)
+        given: Any = (rtol, atol, method, baumgarte, formulation, drift, optional_number(dt0), *more)
         solution = simulate_events(mechanism, events, analysis, ts, state, closure, Choices(*given))
         if not _has_failed(solution) or not mechanism.is_concrete or int(solution.stats["events"]):
             return _required(solution, throw)  # events may have changed what moved

@@ -37,7 +37,7 @@ def write_decide(t: Module):
     begin = s.begin > 0.5
     bad = stepping & ~(error < np.inf)
     # --- pivots too small to be trusted, and steps a little shorter instead
-    if t.checks_pivots:
+    if t.falls_back:
         fallback_due = bad & ~fallback
         far_from_here = is_clear(t, f, s, s.distance2)
         beside = stepping & ~fallback & (error < 1.0) & ~is_clear(t, f, s, s.distance) & (s.last < 0.5)
@@ -74,7 +74,7 @@ def write_decide(t: Module):
     h = where(stepping, step * where(dodge, f.const(SAFETY, DOUBLE, f.width), factor), s.h)
     h = where(again, s.h, h)
     failed = stepping & ~accept & stepped & ~again
-    if t.checks_pivots:
+    if t.falls_back:
         h = where(failed, step_around(t, f, s, left, step, h), h)
     s.behind = h
     with f.if_(f.any_of(begun)):

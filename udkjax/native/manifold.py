@@ -91,7 +91,7 @@ def project_output(t: Module, f: Function, s: Lane, which: str):
                 s.where(s.open > 0.5, violated=largest_violation(t, f))
 
     if t.plan.projected:
-        with_threshold(t, f, s, f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width), project) if t.checks_pivots else project()
+        with_threshold(t, f, s, f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width), project) if t.falls_back else project()
         return
     t.invoke(f, "psi")
     with f.each(t.rowcount) as r:

@@ -76,14 +76,10 @@ class Module(Memory):
         return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
 
     @property
-    def checks_pivots(self) -> bool:
-        """Whether pivots may be too small to be trusted."""
-        return isinstance(self.code, EliminationPrograms | LoopPrograms) and self.code.policy.reports
-
-    @property
     def falls_back(self) -> bool:
-        """Whether steps may be taken again by a rank-revealing method."""
-        return self.checks_pivots and self.m > 0
+        """Whether pivots may be too small to be trusted, and steps are taken again by a rank-revealing method."""
+        reports = isinstance(self.code, EliminationPrograms | LoopPrograms) and self.code.policy.reports
+        return reports and self.m > 0
 
     def write_programs(self):
         code, n = self.code, self.n

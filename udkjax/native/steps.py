@@ -46,7 +46,7 @@ POINTS = 4  # states that an interpolating polynomial goes through: with three, 
 STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 
 # What a run may be. `NOT_FINITE`: its step became too small because of a number that is not finite.
-RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, UNSAFE_PIVOT, NOT_FINITE = range(6)
+RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE = range(5)
 
 LOOK_AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one looks for what is not finite
 

@@ -30,7 +30,7 @@ from udkjax.native.members import write_begin, write_finish, write_run
 from udkjax.native.module import Module
 from udkjax.native.pieces import write_leave
 from udkjax.native.runge_kutta import write_attempt
-from udkjax.native.steps import RUNNING, UNSAFE_PIVOT
+from udkjax.native.steps import RUNNING
 
 
 class Trajectory(Module):
@@ -73,8 +73,6 @@ class Trajectory(Module):
         aim(self, f, s)
         f.call("attempt", work)
         f.call("decide", work)
-        if not self.falls_back and self.checks_pivots:
-            s.where(s.fallback_due > 0.5, code=UNSAFE_PIVOT)
         f.call("outputs", work, call)
         ended = (s.active > 0.5) & s.code.is_not(float(RUNNING))
         with f.if_(f.any_of(ended)):

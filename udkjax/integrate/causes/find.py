@@ -18,7 +18,6 @@ GROWN = 1e6  # times as large as before: a load that grows without bound
 NEAR_REACH = 1e-2  # of the span: how far from its end a run may be by a dead point
 STIFF = 0.1  # rate times step: explicit methods of any order lose stability between 1 and 10
 SINGULAR = 1e-4  # of the largest singular value of D with rows of length one
-ROUNDING = 1e-15  # tolerances below it are not to be met
 RATES = ("vx", "vy", "omega")
 
 
@@ -119,8 +118,6 @@ def _explain_not_finite(run: FailedRun) -> str | None:
 
 
 def _explain_small_step(run: FailedRun) -> str | None:
-    if run.rtol < ROUNDING and run.atol < ROUNDING:
-        return f"rtol={run.rtol:g} and atol={run.atol:g} are below rounding, which no step can meet: raise one of them"
     return _not_finite_ahead(run) or _reach_at_end(run) or _violent_load(run) or _near_singular(run) or _stiff(run)
 
 
