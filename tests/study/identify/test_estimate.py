@@ -79,6 +79,7 @@ def estimate() -> Estimate:
         predicted=(),
         residuals=(),
         noise=({channel.name: np.array([np.nan, 0.02, 0.02]) for channel in channels},),
+        outliers=(),
         whiteness={},
         converged=False,
         agreeing=3,
