@@ -118,7 +118,10 @@ def write_decide(t: Module):
 
 
 def first_step(t: Module, f: Function, s: Lane) -> Value:
-    """As given, or one over which the state changes by a hundredth of itself, or of its unit (`first_step` of integrate/diffrax_engine.py)."""
+    """As given, or one over which the state changes by a hundredth of itself, or of its unit.
+
+    It is that of `first_step` of integrate/diffrax_engine.py.
+    """
     rtol, atol, omega = (t.broadcast(f, x) for x in (s.rtol, s.atol, s.omega))
 
     def relative(of_q: str, of_v: str, least: float) -> Any:
