@@ -78,7 +78,7 @@ def units(**by_field: str) -> Mapping[str, str]:
 
 def has_numbers(value: object) -> bool:
     """Return whether every number is there to be read: none is traced, or stands for a shape alone."""
-    return all(isinstance(leaf, Plain) or _is_stored(leaf) for leaf in _leaves(value))
+    return all(isinstance(leaf, Plain | str) or _is_stored(leaf) for leaf in _leaves(value))
 
 
 def _leaves(value: object) -> list[Any]:

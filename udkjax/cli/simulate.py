@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -79,6 +80,7 @@ def simulate(
     import numpy as np
 
     import udkjax as udk
+    from udkjax.integrate.assembly_moves import AssemblyWarning, moves_of_assembly
     from udkjax.show.plots import trajectory
     from udkjax.show.summary import run_summary
     from udkjax.study.accuracy import accuracy
@@ -98,7 +100,8 @@ def simulate(
     if max_steps is not None:
         choices["max_steps"] = max_steps
     ts = t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # t1 itself too, where it is a multiple of dt up to rounding
-    with _stopwatch() as seconds:
+    with _stopwatch() as seconds, warnings.catch_warnings():
+        warnings.simplefilter("ignore", AssemblyWarning)  # which the summary says
         sol = udk.simulate(mech, ts, **choices)
         np.asarray(sol.q)  # JAX runs ahead: wait for it
 
@@ -107,16 +110,18 @@ def simulate(
     save(data, out)
     trajectory(mech, sol).savefig(plot, dpi=150)
     found = accuracy(mech, sol)
+    moved = () if t0 and mech.drivers else moves_of_assembly(mech, udk.assemble(mech, t0, throw=False).q)
     results = {
         "result": sol.result,
         "end_time": sol.time,
+        "moved": moved,
         **sol.stats,
         **found._asdict(),
         "seconds": seconds["all"],
         "seconds_compiling": seconds["compiling"],
         "files": [out, plot],
     }
-    text = run_summary(mech, sol, found, seconds["all"], seconds["compiling"])
+    text = run_summary(mech, sol, found, seconds["all"], seconds["compiling"], moved)
     show(results, f"{text}\nwrote {out} and {plot}", json)
     if sol.result:
         fail(sol.cause)

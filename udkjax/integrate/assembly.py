@@ -11,6 +11,7 @@ one that all pseudoinverses share: gradients of the assembled state are right wh
 """
 
 import weakref
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -29,6 +30,7 @@ from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.structure import is_large
 from udkjax.integrate import native_closing
+from udkjax.integrate.assembly_moves import moves_of_assembly
 from udkjax.integrate.causes.open_rows import explain_open
 from udkjax.integrate.closure import close_by_jax, close_by_machine_code
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
@@ -36,6 +38,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.description import poses_table
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.suspicions import suspicions
 
 
 class State(PrintsTable):
@@ -198,6 +201,8 @@ class Check(NamedTuple):
     length: float  # m; characteristic, as in `analyse`
     time: float  # s
     mass: float  # kg
+    moved: tuple[str, ...] = ()  # by assembly, far beside their sizes
+    suspicious: tuple[str, ...] = ()  # what is likely a mistake
 
     def _table(self) -> PrintedTable:
         return PrintedTable("mechanism, checked", list(check_lines(self).items()))
@@ -205,7 +210,11 @@ class Check(NamedTuple):
 
 @checked
 def check(mechanism: Mechanism) -> Check:
-    """Count rows, rank and degrees of freedom, name redundant rows, and say how well the initial guess closes."""
+    """Count rows, rank and degrees of freedom, name redundant rows, and say how well the initial guess closes.
+
+    Bodies that assembly moves by more than a hundredth of their size are named, and what is likely a mistake: points far outside
+    of all bodies, angles that look like degrees, bodies without a joint.
+    """
     closure = close(mechanism)
     before = psi(mechanism, 0.0, mechanism.q0)
     rows = len(before)
@@ -226,6 +235,8 @@ def check(mechanism: Mechanism) -> Check:
         length=float(found.length),
         time=float(found.time),
         mass=float(found.mass),
+        moved=moves_of_assembly(mechanism, closure.state.q) if closed else (),
+        suspicious=tuple(suspicions(mechanism)),
     )
 
 
@@ -243,4 +254,11 @@ def check_lines(found: Check) -> dict[str, str]:
         lines["depend on each other"] = ", ".join(found.dependent)
     lines["length, time, mass"] = f"{found.length:.3g} m, {found.time:.3g} s, {found.mass:.3g} kg"
     before, after = (format_number(x, "m or rad", found.length) for x in (found.residual_before, found.residual_after))
-    return {**lines, "closure, as given": before, "closure, assembled": after + ("" if found.closed else ": it does not close")}
+    lines |= {"closure, as given": before, "closure, assembled": after + ("" if found.closed else ": it does not close")}
+    more = [text.removeprefix("assembly ") for text in found.moved]
+    return lines | numbered("assembly", more) | numbered("likely a mistake", list(found.suspicious))
+
+
+def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
+    """Return texts by one title, counted where there are more than one."""
+    return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}

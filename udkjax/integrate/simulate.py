@@ -19,6 +19,7 @@ from udkjax.equations.partitioning import PartitionedSystem
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
+from udkjax.integrate.assembly_moves import warn_of_moves
 from udkjax.integrate.causes.explained import explained
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.gradients import stop_gradients
@@ -144,6 +145,8 @@ def simulate(
         bare = mechanism.without_origin
         if state is None and closure is None:
             closure = close(mechanism, start, analysis=analysis)
+            if mechanism.is_concrete:
+                warn_of_moves(mechanism, start, closure, stacklevel=3)
         if throw and closure is not None:
             require_closed(mechanism, closure, start)  # before anything runs
 

@@ -1,7 +1,9 @@
 """What the command line says about a mechanism and about a run."""
 
+from collections.abc import Sequence
+
 from udkjax.integrate import Solution
-from udkjax.integrate.assembly import Check, check_lines
+from udkjax.integrate.assembly import Check, check_lines, numbered
 from udkjax.integrate.solution import format_work
 from udkjax.printing import align_columns
 from udkjax.scene import Mechanism
@@ -18,10 +20,13 @@ def check_summary(mech: Mechanism, found: Check) -> str:
     return table(mech.name or "mechanism", lines)
 
 
-def run_summary(mech: Mechanism, sol: Solution, accuracy: Accuracy, seconds: float, compiling: float) -> str:
-    """Describe how a run ended, what it took and how far it can be trusted."""
+def run_summary(
+    mech: Mechanism, sol: Solution, accuracy: Accuracy, seconds: float, compiling: float, moved: Sequence[str] = ()
+) -> str:
+    """Describe how a run ended, how far assembly `moved` bodies before it, what it took and how far it can be trusted."""
     lines = {
         "result": sol.cause if sol.result else sol.result.name,
+        **numbered("assembly", [text.removeprefix("assembly ") for text in moved]),
         "work": format_work(sol.stats),
         **trust(accuracy),
         "time": f"{seconds:.2f} s, {compiling:.2f} s of it to compile",

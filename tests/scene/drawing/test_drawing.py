@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.core import Tracer
 from numpy.testing import assert_allclose
 
 import udkjax as udk
@@ -55,6 +56,7 @@ def by_hand(pins, links, ground, motor):
 def test_the_six_bar_moves_as_by_hand():
     drawn = udk.load(SIX_BAR)
     assert len(SIX_BAR.read_text().splitlines()) <= 30
+    assert isinstance(drawn.drawing, udk.Drawing)
     pins = {name: np.asarray(place) for name, place in drawn.drawing.pins.items()}
     plate = 7850 * 0.005
     bars = {n: (p, plate, 0.015) for n, p in {"crank": "O2 A", "rocker": "O4 B", "floating": "C D", "output": "O6 D"}.items()}
@@ -203,8 +205,7 @@ def test_a_traced_pin_keeps_machine_code_and_known_numbers():
     @jax.jit
     def crank(place):
         moved = mech.with_parameters({"pin.P": place})
-        assert moved.bodies["crank"].mass.aval is not None and not isinstance(moved.bodies["crank"].mass, jax.core.Tracer)
-        assert isinstance(moved.bodies["coupler"].mass, jax.core.Tracer)
+        assert isinstance(moved.bodies["coupler"].mass, Tracer) and not isinstance(moved.bodies["crank"].mass, Tracer)
         sol = udk.simulate(moved, [0.0, 0.1])
         assert sol.settings["engine"] == "native"  # and no warning that geometry is traced
         return sol.q[-1, 0]

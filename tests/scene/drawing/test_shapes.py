@@ -31,15 +31,15 @@ def test_a_bar_with_round_ends(length, width):
     area, moment = integrate_slices(length, width)
     start, way = np.array([0.7, -0.2]), length * np.array([0.6, 0.8])
     found = bar(start, start + way, width)
-    assert_allclose([found.area, found.square_radius], [area, moment / area], rtol=1e-10)
+    assert_allclose(np.array([found.area, found.square_radius]), [area, moment / area], rtol=1e-10)
     assert_allclose(found.centre, start + way / 2, rtol=1e-15)
 
 
 def test_a_bar_is_between_a_rod_and_a_disc():
     start, end = np.array([1.0, 2.0]), np.array([4.0, 6.0])
     assert_allclose(bar(start, end, 0.0).square_radius, 25 / 12, rtol=1e-15)
-    assert_allclose(bar(start, start, 0.4)[::2], disc(start, 0.4)[::2], rtol=1e-15)
-    assert_allclose(disc(start, 0.4)[::2], [np.pi * 0.2**2, 0.2**2 / 2], rtol=1e-15)
+    assert_allclose(np.array(bar(start, start, 0.4)[::2]), np.array(disc(start, 0.4)[::2]), rtol=1e-15)
+    assert_allclose(np.array(disc(start, 0.4)[::2]), [np.pi * 0.2**2, 0.2**2 / 2], rtol=1e-15)
 
 
 @pytest.mark.parametrize("backwards", [False, True])
@@ -52,7 +52,7 @@ def test_a_polygon_that_is_not_convex(backwards):
     square = np.sum(own + areas * np.sum((centres - centre) ** 2, axis=1)) / 6
     turn, place = np.array([[0.6, -0.8], [0.8, 0.6]]), np.array([1e3, -2e3])
     found = polygon((corners @ turn.T + place)[:: -1 if backwards else 1])
-    assert_allclose([found.area, found.square_radius], [6, square], rtol=1e-11)
+    assert_allclose(np.array([found.area, found.square_radius]), [6, square], rtol=1e-11)
     assert_allclose(found.centre, turn @ centre + place, rtol=1e-14)
 
 
