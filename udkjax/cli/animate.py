@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from udkjax.cli.common import Json, fail, load, refuse, show
+from udkjax.cli.common import Json, fail, load, output_times, refuse, show
 from udkjax.cli.datasets import check_target
 
 if TYPE_CHECKING:
@@ -106,11 +106,9 @@ def _run(file: Path, t1: float, dt: float) -> "ShownRun":
     if file.suffix.lower() == ".toml":
         mechanism, _ = load(file)
 
-        import numpy as np
-
         import udkjax as udk
 
-        run = udk.simulate(mechanism, dt * np.arange(int(t1 / dt + 1e-6) + 1), throw=False)
+        run = udk.simulate(mechanism, output_times(0.0, t1, dt), throw=False)
         return mechanism, run, {}
 
     from udkjax.show.player.files import read_run

@@ -36,13 +36,17 @@ with OptionalImport():
     import tyro
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from udkjax import Mechanism
 
-__all__ = ["BAD_INPUT", "BAD_RUN", "INTERRUPTED", "Json", "Quiet", "Scene", "fail", "load", "refuse", "say", "show"]
+__all__ = ["BAD_INPUT", "BAD_RUN", "INTERRUPTED", "Json", "Quiet", "Scene"]
+__all__ += ["fail", "load", "output_times", "refuse", "say", "show"]
 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml")]
 JsonValue = dict[str, "JsonValue"] | list["JsonValue"] | str | float | bool | None
 Json = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+MOST_TIMES = 10**7  # that a command writes: some gigabytes for a few bodies
 Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
@@ -63,6 +67,17 @@ def load(scene: Path) -> tuple["Mechanism", str]:
         refuse(f"cannot read {scene}: {problem}")
     except udk.SceneError as problem:
         refuse(problem)
+
+
+def output_times(t0: float, t1: float, dt: float) -> "np.ndarray":
+    """Return the times from t0 in steps of dt, t1 too, where it is one of them up to rounding; or refuse the options and exit."""
+    if not 0 < dt <= t1 - t0 < math.inf:
+        refuse(f"from --t0 {t0:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
+    if (t1 - t0) / dt > MOST_TIMES:
+        refuse(f"--dt {dt:g} makes {(t1 - t0) / dt:.3g} output times; at most {MOST_TIMES:.0e} are written: make it longer")
+    import numpy as np
+
+    return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)
 
 
 def show(results: Mapping[str, object], text: str, json: bool) -> None:

@@ -1,8 +1,6 @@
 """`udkjax diagnose`."""
 
-import math
-
-from udkjax.cli.common import Json, Scene, fail, load, refuse, show
+from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
 
 
 def diagnose(
@@ -18,17 +16,14 @@ def diagnose(
         fixes: look for changes of joints that take redundancy away, and verify them.
         json: write the results as JSON.
     """
-    if t1 is not None and not 0 < dt <= t1 - t < math.inf:
-        refuse(f"from --t {t:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
+    ts = None if t1 is None else output_times(t, t1, dt)
     mech, _ = load(scene)
-    import numpy as np
 
     import udkjax as udk
 
     run = None
     try:
-        if t1 is not None:
-            ts = t + dt * np.arange(int((t1 - t) / dt + 1e-6) + 1)
+        if ts is not None:
             run = udk.simulate(mech, ts, rtol=1e-10, atol=1e-10, throw=False)
         found = udk.diagnose(mech, solution=run, t=t, fixes=fixes)
     except udk.AssemblyError as problem:

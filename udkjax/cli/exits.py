@@ -45,6 +45,8 @@ def exit_codes() -> Iterator[None]:
         sys.exit(BAD_RUN)
     except OSError as error:  # no such folder, no permission, no space
         fail(error)
+    except MemoryError:
+        fail("there is not enough memory for what was asked")
     except (ValueError, RuntimeError) as error:
         if not type(error).__module__.startswith("udkjax."):
             raise

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from udkjax.cli.common import Json, Scene, fail, load, refuse, show
+from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
 from udkjax.cli.datasets import check_target, write
 
 
@@ -29,8 +29,7 @@ def inverse(
         out: file to write (.nc, .h5, .csv or .npz): effort and power (time, driver).
         json: write the results as JSON.
     """
-    if not 0 < dt <= t1 - t0 < math.inf:
-        refuse(f"from --t0 {t0:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
+    ts = output_times(t0, t1, dt)
     check_target(out)
     mech, text = load(scene)
     if not mech.drivers:
@@ -40,7 +39,6 @@ def inverse(
     import udkjax as udk
     from udkjax.show.summary import table
 
-    ts = t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)
     try:
         found = udk.inverse_dynamics(mech, ts, drivers=list(drivers) or None)
     except udk.SceneError as problem:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from udkjax.cli.common import Json, Scene, fail, load, refuse, show
+from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
 from udkjax.cli.datasets import PICTURES, check_target, save
 from udkjax.extras import require
 
@@ -63,8 +63,7 @@ def simulate(
         plot: picture to write (.png, .svg, .pdf or .jpg); by default a .png beside the file.
         json: write the results as JSON.
     """
-    if not 0 < dt <= t1 - t0 < math.inf:
-        refuse(f"from --t0 {t0:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
+    ts = output_times(t0, t1, dt)
     plot = plot or out.with_suffix(".png")
     if dt0 is not None and not 0 < dt0 < math.inf:
         refuse(f"the first step --dt0 {dt0:g} must be positive")
@@ -99,7 +98,6 @@ def simulate(
     }
     if max_steps is not None:
         choices["max_steps"] = max_steps
-    ts = t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # t1 itself too, where it is a multiple of dt up to rounding
     with _stopwatch() as seconds, warnings.catch_warnings():
         warnings.simplefilter("ignore", AssemblyWarning)  # which the summary says
         sol = udk.simulate(mech, ts, **choices)

@@ -41,6 +41,14 @@ EXAMPLES = {
 }
 
 
+class ArgumentError(ValueError):
+    """An argument of a public function is of no use; the message names it, what was given and what is meant."""
+
+
+class ArgumentTypeError(ArgumentError, TypeError):
+    """It is of a wrong type."""
+
+
 def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return a function that checks its arguments.
 
@@ -106,7 +114,7 @@ def _instance(classes: tuple[type, ...]) -> Check:
 
     def check(name: str, value: Any, given: Given):
         if not isinstance(value, kinds):
-            raise TypeError(f"{name} must be {meant}, {describe(value)}{_remedy(name, value, classes)}")
+            raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}{_remedy(name, value, classes)}")
 
     return check
 
@@ -158,7 +166,7 @@ def _choice(known: tuple[Any, ...]) -> Check:
     def check(name: str, value: Any, given: Given):
         if not isinstance(value, str | bool | int | None) or value not in known:
             listed = ", ".join(quote(x) if isinstance(x, str) else str(x) for x in known)
-            raise ValueError(f"{name} must be one of {listed}, {describe(value)}{suggestion(value, texts)}")
+            raise ArgumentError(f"{name} must be one of {listed}, {describe(value)}{suggestion(value, texts)}")
 
     return check
 
@@ -179,12 +187,12 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
         try:
             found = np.asarray(value)
         except ValueError:
-            raise TypeError(f"{name} must be an array of numbers; its rows have different lengths") from None
+            raise ArgumentTypeError(f"{name} must be an array of numbers; its rows have different lengths") from None
         except TypeError:
-            raise TypeError(f"{name} must be an array of numbers, {describe(value)}") from None
+            raise ArgumentTypeError(f"{name} must be an array of numbers, {describe(value)}") from None
     if not (jnp.issubdtype(found.dtype, jnp.floating) or jnp.issubdtype(found.dtype, jnp.integer)):
         kind = "complex numbers" if jnp.issubdtype(found.dtype, jnp.complexfloating) else None
-        raise TypeError(f"{name} must be real numbers, {f'not {kind}' if kind else describe(value)}")
+        raise ArgumentTypeError(f"{name} must be real numbers, {f'not {kind}' if kind else describe(value)}")
     return found
 
 
@@ -193,23 +201,23 @@ def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = F
     found = array(name, value)
     if found.shape != ():
         cure = "a batch is for jax.vmap, or for udk.sweep"
-        raise ValueError(f"{name} must be one number, not an array of the shape {found.shape}; {cure}")
+        raise ArgumentError(f"{name} must be one number, not an array of the shape {found.shape}; {cure}")
     if isinstance(found, Tracer):
         return
     x = float(found)
     bad = np.isnan(x) or (np.isinf(x) and not infinite)
     if bad or (sign == "positive" and not x > 0) or (sign == "not negative" and not x >= 0):
         meant = {"any": "a finite number", "positive": "positive", "not negative": "zero or positive"}[sign]
-        raise ValueError(f"{name} must be {meant}{' and finite' if sign != 'any' and not infinite else ''}, not {x:g}")
+        raise ArgumentError(f"{name} must be {meant}{' and finite' if sign != 'any' and not infinite else ''}, not {x:g}")
 
 
 def require_count(name: str, value: Any, least: int = 1) -> None:
     """Require a whole number that is not below `least`; of a traced one, the shape and the dtype alone."""
     found = None if isinstance(value, bool | np.bool_) else array(name, value)
     if found is None or found.shape != () or not jnp.issubdtype(found.dtype, jnp.integer):
-        raise TypeError(f"{name} must be a whole number, {describe(value)}")
+        raise ArgumentTypeError(f"{name} must be a whole number, {describe(value)}")
     if not isinstance(found, Tracer) and int(found) < least:
-        raise ValueError(f"{name} must be at least {least}, not {int(found)}")
+        raise ArgumentError(f"{name} must be at least {least}, not {int(found)}")
 
 
 def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "") -> None:
@@ -219,7 +227,7 @@ def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *in
         return
     index = tuple(int(k) for k in np.argwhere(~finite)[0])
     where = f"[{', '.join(map(str, index))}]" if index else ""
-    raise ValueError(f"{name}{where} is {found[index]:g}{place(*index)}: it must be finite")
+    raise ArgumentError(f"{name}{where} is {found[index]:g}{place(*index)}: it must be finite")
 
 
 def require_coordinates(name: str, value: Any, given: Given, flat: bool = True) -> None:
@@ -227,7 +235,7 @@ def require_coordinates(name: str, value: Any, given: Given, flat: bool = True) 
     mechanism, found = given["mechanism"], array(name, value)
     if not isinstance(mechanism, Mechanism):  # a system of the user's own has coordinates as many as he gives
         if found.ndim != 1:
-            raise ValueError(f"{name} must be a vector (n,), not an array of the shape {found.shape}")
+            raise ArgumentError(f"{name} must be a vector (n,), not an array of the shape {found.shape}")
         require_finite(name, value)
         return
     names = mechanism.body_names
@@ -235,7 +243,7 @@ def require_coordinates(name: str, value: Any, given: Given, flat: bool = True) 
     if found.shape != right and not (flat and found.shape == (3 * len(names),)):
         rest = f": x, y and angle of {', '.join(map(quote, names[:4]))}{', ...' if len(names) > 4 else ''}"
         cure = "; a batch of states is for jax.vmap" if found.ndim > 2 and found.shape[-2:] == right else ""
-        raise ValueError(f"{name} must have the shape {right}{rest}; it has the shape {found.shape}{cure}")
+        raise ArgumentError(f"{name} must have the shape {right}{rest}; it has the shape {found.shape}{cure}")
     require_finite(name, found, lambda *k: _place(names, k))
 
 
@@ -248,7 +256,7 @@ def require_times(name: str, value: Any) -> None:
     """Require a vector of finite times; of a traced one, the shape alone."""
     found = array(name, value)
     if found.ndim != 1 or not len(found):
-        raise ValueError(f"{name} must be a vector of times in s; its shape is {found.shape}")
+        raise ArgumentError(f"{name} must be a vector of times in s; its shape is {found.shape}")
     require_finite(name, found)
 
 
@@ -257,12 +265,12 @@ def require_output_times(name: str, value: Any) -> None:
     found = array(name, value)
     if found.ndim != 1 or len(found) < 2:
         what = "a vector of at least two output times, from the start on"
-        raise ValueError(f"{name} must be {what}; its shape is {found.shape}")
+        raise ArgumentError(f"{name} must be {what}; its shape is {found.shape}")
     require_finite(name, found)
     if not isinstance(found, Tracer) and not np.all(steps := np.diff(found) > 0):
         k = int(np.argmin(steps))
         after = f"{name}[{k + 1}] = {found[k + 1]:g} s follows {found[k]:g} s"
-        raise ValueError(f"{name} must increase from each output time to the next: {after}")
+        raise ArgumentError(f"{name} must increase from each output time to the next: {after}")
 
 
 def _check_state(name: str, value: Any, given: Given) -> None:
@@ -272,13 +280,13 @@ def _check_state(name: str, value: Any, given: Given) -> None:
             require_coordinates(f"{name}.{part}", getattr(value, part), given, flat=False)
         shapes = np.shape(value.q), np.shape(value.v)
         if shapes[0] != shapes[1]:
-            raise ValueError(f"{name}.v must have the shape of {name}.q, {shapes[0]}; it has the shape {shapes[1]}")
+            raise ArgumentError(f"{name}.v must have the shape of {name}.q, {shapes[0]}; it has the shape {shapes[1]}")
 
 
 def _check_mechanism(name: str, value: Any, given: Given) -> None:
     if isinstance(value, Mechanism) and (shape := np.shape(value.gravity)) != (2,):
         cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
-        raise ValueError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
+        raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
 
 
 def _check_thresholds(name: str, value: Any, given: Given) -> None:
@@ -294,20 +302,20 @@ def require_history(name: str, value: Any, given: Given) -> None:
     mechanism = given["mechanism"]
     missing = [part for part in ("ts", "q", "v") if not hasattr(value, part)]
     if missing or isclass(value):
-        raise TypeError(f"{name} must have times and states, ts, q and v, as a Solution: {describe(value)}")
+        raise ArgumentTypeError(f"{name} must have times and states, ts, q and v, as a Solution: {describe(value)}")
     bodies = getattr(value, "bodies", None)
     if isinstance(mechanism, Mechanism) and isinstance(bodies, tuple) and bodies and bodies != mechanism.body_names:
         listed = [", ".join(map(quote, x[:6])) + (", ..." if len(x) > 6 else "") for x in (bodies, mechanism.body_names)]
-        raise ValueError(f"{name} is of another mechanism: its bodies are {listed[0]}, those of the mechanism {listed[1]}")
+        raise ArgumentError(f"{name} is of another mechanism: its bodies are {listed[0]}, those of the mechanism {listed[1]}")
     ts, q, v = (array(f"{name}.{part}", getattr(value, part)) for part in ("ts", "q", "v"))
     right = (*ts.shape, len(mechanism.body_names), 3) if isinstance(mechanism, Mechanism) else q.shape
     if q.ndim == 4:
         one, all_of_them = "jax.tree.map(lambda x: x[0], batch)", "jax.vmap(lambda one: function(mechanism, one))(batch)"
-        raise ValueError(f"{name} is a batch of {len(q)} solutions: take one of them, {one}, or map over them, {all_of_them}")
+        raise ArgumentError(f"{name} is a batch of {len(q)} solutions: take one of them, {one}, or map over them, {all_of_them}")
     if ts.ndim != 1 or q.shape[:1] != ts.shape or q.shape != right or v.shape != q.shape:
         meant = "ts (T,), q and v (T, bodies, 3)" if isinstance(mechanism, Mechanism) else "ts (T,), q and v (T, n)"
         is_of = f" of {len(mechanism.body_names)} bodies" if isinstance(mechanism, Mechanism) else ""
-        raise ValueError(f"{name} must have {meant}{is_of}; the shapes are {ts.shape}, {q.shape} and {v.shape}")
+        raise ArgumentError(f"{name} must have {meant}{is_of}; the shapes are {ts.shape}, {q.shape} and {v.shape}")
 
 
 def _optional_history(name: str, value: Any, given: Given) -> None:
@@ -321,14 +329,15 @@ def _check_analysis(name: str, value: Any, given: Given) -> None:
         return
     owners = list(dict.fromkeys(owner for owner, _ in value.row_names))
     if value.coordinates != 3 * len(mechanism.body_names) or owners != list(mechanism.constraints):
-        raise ValueError(f"{name} is that of another mechanism: give udk.analyse(mechanism), or leave it out")
+        raise ArgumentError(f"{name} is that of another mechanism: give udk.analyse(mechanism), or leave it out")
 
 
 def _of_diffrax(kind: str, example: str) -> Check:
     def check(name: str, value: Any, given: Given):
         diffrax = sys.modules.get("diffrax")  # who has an instance of its classes has imported it
         if value is not None and not (diffrax and isinstance(value, getattr(diffrax, kind))):
-            raise TypeError(f"{name} must be an instance of diffrax's, such as {name}={example}, or None, {describe(value)}")
+            meant = f"an instance of diffrax's, such as {name}={example}, or None"
+            raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}")
 
     return check
 
