@@ -19,6 +19,7 @@ import pytest
 
 import udkjax
 from udkjax.cli import COMMANDS
+from udkjax.cli import main as udkjax_cli
 
 ROOT = Path(__file__).parents[1]
 OTHERS = [ROOT / name for name in ("CONTRIBUTING.md", "experiments/README.md", "benchmarks/README.md")]
@@ -245,6 +246,46 @@ def test_names_in_docstrings_exist():
 def test_a_name_that_does_not_exist_is_noticed():
     said = "`udk.load` `udk.laod` `Motion.position` `Spline.times` `jnp.linalg.svd` `jnp.linalg.sdv` `tests/no.py` `quooks`"
     assert list(missing(said)) == ["udk.laod", "Motion.position", "jnp.linalg.sdv", "tests/no.py", "quooks"]
+
+
+# --- the reference
+
+sys.path.insert(0, str(ROOT / "docs"))
+reference = importlib.import_module("reference_tables")
+CLASSES = sorted(
+    {name for page in (ROOT / "docs/reference").glob("*.md") for name, _ in reference.DIRECTIVE.findall(page.read_text())}
+)
+
+
+def test_the_reference_names_all_that_is_public():
+    named = {
+        name
+        for page in (ROOT / "docs/reference").glob("*.md")
+        for name in re.findall(r"^::: udkjax\.(?:pinv\.)?(\w+)$", page.read_text(), re.M)
+    }
+    assert named >= set(udkjax.__all__) - {"pinv", "equations", "library", "GROUND"}
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_every_argument_is_described(name):
+    cls = reference.resolve(name)
+    assert [row[0] for row in reference.described(cls) if not row[3] or not row[1]] == []
+
+
+def test_tables_say_types_units_and_defaults():
+    table = reference.table(udkjax.Body)
+    assert "| `position` | `array (2,)` | `(0.0, 0.0)` | of the centre of mass (m). |" in table
+    assert "| `mass` | `number` | required |" in table
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_is_described_as_the_help_does(name, capsys):
+    with pytest.raises(SystemExit):
+        udkjax_cli([name, "--help"])
+    shown, page = capsys.readouterr().out, reference.command(name)
+    for option in re.findall(r"^\| `(--[\w-]+)`", page, re.M):
+        assert option in shown
+    assert " |  |\n" not in page
 
 
 # --- commands

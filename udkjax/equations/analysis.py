@@ -34,7 +34,14 @@ ANALYSIS_CACHE_SIZE = 256  # analyses that are stored; the one that was asked fo
 
 
 class Analysis(PrintsTable):
-    """The result of `analyse`. A pytree: its scales are arrays, everything else is static."""
+    """The result of `analyse`. A pytree: its scales are arrays, everything else is static.
+
+    Attributes:
+        scales: lengths, times and masses that thresholds are relative to.
+        coordinates: names of the coordinates.
+        row_names: joint and number of each row of Psi.
+        redundant_rows: indices of the rows that depend on others; None: not known.
+    """
 
     scales: Scales
     coordinates: int = eqx.field(static=True)

@@ -63,6 +63,9 @@ class Augmented(PointwiseFormulation):
     `Augmented(udk.SVD())`, a and lambda are the solution of minimum norm: what is redundant is shared, and the accelerations are
     right, also in singular configurations where the right-hand side is consistent. Its default `rank_tol` is the square of the
     others': a singular value sigma of D = A M^(-1/2) is one of about sigma^2 here.
+
+    Args:
+        method: a pseudoinverse, such as `SVD()`; None: LU with partial pivoting.
     """
 
     method: Pseudoinverse | None = None
@@ -87,6 +90,9 @@ class NullSpaceQR(PointwiseFormulation):
     nothing. So their drift does not grow by itself: the paper's linkage is right to 5e-9 after 20 s at 1e-9 without any
     stabilization. In a singular configuration the rank falls and N gains a column: with `Projection` the run crosses, but where
     the choice of rows jumps near it, in up to nine times the steps of `NullSpaceSVD`.
+
+    Args:
+        rank_tol: what counts as dependent, relative to the longest row or the largest singular value.
     """
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
@@ -113,6 +119,9 @@ class NullSpaceSVD(PointwiseFormulation):
     least squares, and so, not stabilized, their drift grows as it does with a truncated pseudoinverse: the paper's linkage is
     lost after 18 s. In a singular configuration N gains a column, and with `Projection` the run crosses. It differs from the
     Udwadia-Kalaba equation by singular values in the metric of rank and least squares: A is not weighted by the masses.
+
+    Args:
+        rank_tol: what counts as dependent, relative to the longest row or the largest singular value.
     """
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)

@@ -22,6 +22,13 @@ class ConstrainedSystem(PrintsLine):
     or is None; `velocity_constraint(t, q, v)` returns phi (k,), nonholonomic or not, or is None. All of them are differentiated:
     write them in jax.numpy. Numbers to be traced or differentiated belong into an equinox module whose methods these are.
     `breakpoints` are the times (s) where force or constraints are not smooth. Simulate it from a `State` with q and v (n,).
+
+    Args:
+        mass: q -> M (n, n).
+        force: (t, q, v) -> F (n,).
+        constraint: (t, q) -> Psi (m,), or None.
+        velocity_constraint: (t, q, v) -> phi (k,), or None.
+        breakpoints: times (s) where force or constraints are not smooth.
     """
 
     mass: Callable[[Vector], Float[ArrayLike, "n n"]]

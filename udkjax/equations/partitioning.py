@@ -39,6 +39,9 @@ class CoordinatePartitioning(Formulation):
     longest column of D is left, there are more independent coordinates for a step, which the next ones constrain again: the
     paper's linkage crosses (20 s at 1e-9 from each of the starts in tests/integrate/test_accuracy.py: errors up to 9e-7).
     Mechanisms only, since the rows of a `ConstrainedSystem` may be nonholonomic.
+
+    Args:
+        rank_tol: what counts as dependent, relative to the longest row or the largest singular value.
     """
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)

@@ -36,6 +36,10 @@ class Baumgarte(PrintsLine):
     """Feed the violation back: Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0, alpha and beta in 1/s.
 
     Gains of 2 to 5 hold the drift that redundancy and rounding excite; the hundreds of the literature make the problem stiff.
+
+    Args:
+        alpha: the gain on Psi_dot (1/s).
+        beta: the gain on Psi (1/s).
     """
 
     alpha: Float[Array, ""]

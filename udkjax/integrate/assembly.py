@@ -45,6 +45,10 @@ class State(PrintsTable):
     """Coordinates and velocities of all bodies: x, y (m) and angle (rad), and their rates, each (bodies, 3).
 
     Of a `ConstrainedSystem`: (n,) each.
+
+    Args:
+        q: coordinates (bodies, 3): x, y (m) and angle (rad).
+        v: their rates (bodies, 3): m/s and rad/s.
     """
 
     q: Float[Array, "bodies 3"] | Float[Array, "n"]
@@ -62,7 +66,12 @@ class State(PrintsTable):
 
 
 class AssemblyError(ValueError):
-    """A mechanism cannot be closed, or not moved as its drivers ask. `state` is the best that was found."""
+    """A mechanism cannot be closed, or not moved as its drivers ask. `state` is the best that was found.
+
+    Attributes:
+        message: the joints that stay open.
+        state: the best `State` that was found.
+    """
 
     def __init__(self, message: str, state: State):
         super().__init__(message)

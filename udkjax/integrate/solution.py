@@ -74,7 +74,12 @@ _ORDER = "steps rejected right_hand_sides projections events"  # of counts in te
 
 
 class SimulationError(RuntimeError):
-    """A simulation did not reach its end. `solution` is what it got."""
+    """A simulation did not reach its end. `solution` is what it got.
+
+    Attributes:
+        message: what happened, and the cure.
+        solution: the `Solution` as far as it came.
+    """
 
     def __init__(self, message: str, solution: "Solution"):
         super().__init__(message)
@@ -86,6 +91,16 @@ class Solution(PrintsTable):
 
     `q` and `v` are (T, bodies, 3): x, y (m) and angle (rad) and their rates; not a number after the time of a failure. `code` is
     a `Result`, `time` the time (s) that was reached, or at which the drift was first seen.
+
+    Attributes:
+        ts: output times (s).
+        q: x, y (m) and angle (rad) of each body.
+        v: their rates (m/s, rad/s).
+        code: the number of a `Result`; `result` is the member.
+        time: that was reached (s).
+        rtol: that was asked for.
+        atol: that was asked for.
+        bodies: the names of the bodies, in the order of q and v.
     """
 
     ts: Float[Array, "T"]

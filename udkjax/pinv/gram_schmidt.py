@@ -15,6 +15,9 @@ class GramSchmidt(Orthogonal):
     With `twice` each column is made orthogonal to the previous ones a second time when its turn comes: the error then is of the
     order of eps cond(D), as with Householder. Without it Q is orthogonal to eps cond(D) only, and the error can be of the order
     of eps cond(D)^2. The threshold is on the diagonal of R, its scale the largest column norm.
+
+    Args:
+        twice: whether each column is made orthogonal a second time.
     """
 
     twice: bool = eqx.field(static=True, default=True)

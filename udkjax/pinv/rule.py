@@ -60,6 +60,10 @@ class Pseudoinverse(PrintsLine):
 
     Methods for any operator: the matrix as a pytree, everything else as the seven functions below. Derivatives assume that the
     rank stays constant nearby; where it jumps no derivative exists.
+
+    Args:
+        rank_tol: what counts as zero, of the method's scale of D; None: rounding.
+        relative: whether it is relative to that scale, or in the units of D.
     """
 
     rank_tol: Float[Array, ""] | None = eqx.field(converter=number, default=None)

@@ -19,6 +19,14 @@ class Body(PrintsLine):
     """A rigid body in the plane; its frame has its origin at the centre of mass.
 
     `position`, `angle`, `velocity` and `angular_velocity` are the initial guess that `assemble` closes.
+
+    Args:
+        mass: in kg, greater than zero.
+        inertia: about the centre of mass, in kg m^2, greater than zero.
+        position: of the centre of mass (m).
+        angle: of the frame, anticlockwise from the x axis (rad).
+        velocity: of the centre of mass (m/s).
+        angular_velocity: in rad/s.
     """
 
     mass: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)  # kg, > 0
@@ -34,7 +42,12 @@ class Body(PrintsLine):
 
 
 class Point(NamedTuple):
-    """A point, a vector or a velocity in ground coordinates."""
+    """A point, a vector or a velocity in ground coordinates.
+
+    Attributes:
+        x: in m, or in m/s.
+        y: likewise.
+    """
 
     x: Number
     y: Number
@@ -57,6 +70,16 @@ class Frame(NamedTuple):
     """Position and velocity of a body, as scalars: the arguments with which joints and force elements are written.
 
     Joints see `vx`, `vy` and `omega` as None: ideal joints hold positions. The ground is `GROUND_FRAME`.
+
+    Attributes:
+        x: of the centre of mass (m).
+        y: likewise (m).
+        angle: in rad; the relative angle of two bodies is a difference of these.
+        cos: of the angle.
+        sin: of the angle.
+        vx: of the centre of mass (m/s).
+        vy: likewise (m/s).
+        omega: the rate of the angle (rad/s).
     """
 
     x: Number  # m

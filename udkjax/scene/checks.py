@@ -34,7 +34,12 @@ class Mistakes(ValueError):
 
 
 class SceneError(Mistakes):
-    """A scene is wrong. `problems` lists every mistake, each with the path of the offending entry."""
+    """A scene is wrong. `problems` lists every mistake, each with the path of the offending entry.
+
+    Attributes:
+        problems: every mistake, each with its place.
+        source: the name of the mechanism or the file.
+    """
 
     subject = "scene"
 

@@ -32,7 +32,11 @@ class Motion(PrintsLine):
 
 
 class Polynomial(Motion):
-    """c0 + c1 t + c2 t^2 + ..."""
+    """c0 + c1 t + c2 t^2 + ...
+
+    Args:
+        coefficients: c0, c1, c2, ..., in the unit of the coordinate (rad or m) per power of seconds.
+    """
 
     coefficients: Float[Array, "n"] = eqx.field(converter=number, metadata=NOT_EMPTY)
 
@@ -44,7 +48,14 @@ class Polynomial(Motion):
 
 
 class Sine(Motion):
-    """offset + amplitude sin(frequency t + phase), frequency in rad/s."""
+    """offset + amplitude sin(frequency t + phase), frequency in rad/s.
+
+    Args:
+        amplitude: in the unit of the coordinate (rad or m).
+        frequency: in rad/s: 2 pi times the cycles in a second.
+        phase: in rad.
+        offset: in the unit of the coordinate.
+    """
 
     amplitude: Float[Array, ""] = eqx.field(converter=number)
     frequency: Float[Array, ""] = eqx.field(converter=number)
@@ -56,7 +67,12 @@ class Sine(Motion):
 
 
 class Spline(Motion):
-    """A natural cubic spline through (times, values), at least two; outside its times it goes on as a straight line."""
+    """A natural cubic spline through (times, values), at least two; outside its times it goes on as a straight line.
+
+    Args:
+        times: in s, increasing; two at least.
+        values: at these times, in the unit of the coordinate (rad or m).
+    """
 
     times: Float[Array, "n"] = eqx.field(converter=number, metadata=KNOTS)
     values: Float[Array, "n"] = eqx.field(converter=number)
@@ -75,6 +91,13 @@ class Driver(Constraint):
     `angle`: theta2 - theta1 (rad). `x`, `y`: point 2 from point 1, along the axes of body 1's frame (m): with point 1 at the
     origin, the default, the coordinates of point 2 in that frame; `axis` turns these axes in it, by an angle (rad) or as a
     vector. `distance`: between the points (m), which must not meet.
+
+    Args:
+        bodies: the names of the two bodies; "ground" is the fixed frame.
+        coordinate: "angle", "x", "y" or "distance".
+        motion: the prescribed value as a function of time: `Polynomial`, `Sine`, `Spline`, or a `Motion` of your own.
+        points: for x, y and distance, each in its own body's frame (m); by default the origins.
+        axis: for x and y: the direction of x in body 1's frame, as an angle (rad) or as a vector; by default its own.
     """
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)

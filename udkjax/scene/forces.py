@@ -18,6 +18,9 @@ class ForceElement(PrintsLine):
     """A force element. Subclass it and write `potential` or `loads`; the other one stays None, and costs nothing.
 
     One that is smooth in pieces of time names the times where they meet in `breakpoints`; its loads may jump there.
+
+    Args:
+        bodies: the names of the bodies whose frames `potential` and `loads` get.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
@@ -48,6 +51,13 @@ class Spring(ForceElement):
     """V = 1/2 stiffness (|d| - length)^2 between two points, d from point 1 to point 2, and a damper beside it.
 
     The damper's force on point 2 is -damping d|d|/dt along the line. Units: N/m, N s/m, m.
+
+    Args:
+        bodies: the names of the two bodies; "ground" is the fixed frame.
+        points: the ends, each in its own body's frame (m).
+        stiffness: in N/m, not negative.
+        length: without load (m), not negative.
+        damping: in N s/m, not negative; None: no damper.
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
@@ -73,6 +83,12 @@ class TorsionSpring(ForceElement):
     """V = 1/2 stiffness (theta2 - theta1 - angle)^2, and a damper: the torque -damping (omega2 - omega1) on body 2.
 
     Units: N m/rad, N m s/rad, rad.
+
+    Args:
+        bodies: the names of the two bodies; "ground" is the fixed frame.
+        stiffness: in N m/rad, not negative.
+        damping: in N m s/rad, not negative; None: no damper.
+        angle: theta2 - theta1 without load (rad).
     """
 
     stiffness: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
@@ -91,7 +107,14 @@ class TorsionSpring(ForceElement):
 
 
 class Force(ForceElement):
-    """A constant force `vector` (N) at a `point` of a body, in the axes of the ground, or of the body: it then turns with it."""
+    """A constant force `vector` (N) at a `point` of a body, in the axes of the ground, or of the body: it then turns with it.
+
+    Args:
+        body: the name of the body.
+        vector: the force (N).
+        point: where it acts, in the body's frame (m).
+        frame: the axes of the vector: "ground", or "body", with which it turns.
+    """
 
     bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)
     body: str = eqx.field(static=True, metadata=BODY)
@@ -109,7 +132,12 @@ class Force(ForceElement):
 
 
 class Torque(ForceElement):
-    """A constant torque `value` (N m) on body 2, and its reaction on body 1."""
+    """A constant torque `value` (N m) on body 2, and its reaction on body 1.
+
+    Args:
+        bodies: the names of two bodies: it acts on the second, its reaction on the first.
+        value: in N m, anticlockwise.
+    """
 
     value: Float[Array, ""] = eqx.field(converter=number)
 
@@ -122,6 +150,11 @@ class Friction(ForceElement):
 
     Dry friction of `torque` (N m), smoothed over `velocity` (rad/s). Its bodies are those of its `joint`, which the mechanism
     looks up (`Mechanism.frames_of`).
+
+    Args:
+        joint: the name of a revolute joint.
+        torque: of dry friction (N m), not negative.
+        velocity: over which it is smoothed (rad/s), greater than zero.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)

@@ -33,7 +33,11 @@ from udkjax.scene.splines import count_knots, periodic_spline, wrap
 
 
 class Constraint(PrintsLine):
-    """Anything that holds Psi(t, q) = 0: a joint or a driver. A subclass writes `residual`, nothing more."""
+    """Anything that holds Psi(t, q) = 0: a joint or a driver. A subclass writes `residual`, nothing more.
+
+    Args:
+        bodies: the names of the bodies whose frames `residual` gets.
+    """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
     n_bodies: ClassVar[int] = 2  # how many `bodies` a type of the scene format names
@@ -71,11 +75,20 @@ AnyConstraint = TypeVar("AnyConstraint", bound=Constraint)
 
 
 class Joint(Constraint):
-    """A constraint that does not depend on time. Subclass it to write a joint of your own."""
+    """A constraint that does not depend on time. Subclass it to write a joint of your own.
+
+    Args:
+        bodies: the names of the bodies whose frames `residual` gets; "ground" is the fixed frame.
+    """
 
 
 class Revolute(Joint):
-    """Two points coincide. 2 rows: the x and y components of point 2 minus point 1 (m)."""
+    """Two points coincide. 2 rows: the x and y components of point 2 minus point 1 (m).
+
+    Args:
+        bodies: the names of the two bodies; "ground" is the fixed frame.
+        points: the pin in both bodies, in each body's own frame (m).
+    """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
 
@@ -90,6 +103,12 @@ class Prismatic(Joint):
 
     2 rows: the distance of point 2 from the line through point 1 along `axis` (m, positive on its left), and
     theta2 - theta1 - `angle` (rad; default: as in the initial guess).
+
+    Args:
+        bodies: the names of the two bodies; "ground" is the fixed frame.
+        points: a point of the line in body 1, and the point of body 2 that slides on it (m).
+        axis: the direction of the line in body 1's frame, as an angle (rad) or as a vector.
+        angle: theta2 - theta1 (rad); by default as in the initial guess.
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
@@ -105,7 +124,13 @@ class Prismatic(Joint):
 
 
 class Slot(Joint):
-    """A pin of body 2 slides along a line of body 1, free to turn. 1 row: its distance from the line, as in `Prismatic`."""
+    """A pin of body 2 slides along a line of body 1, free to turn. 1 row: its distance from the line, as in `Prismatic`.
+
+    Args:
+        bodies: the names of the two bodies; "ground" is the fixed frame.
+        points: a point of the line in body 1, and the pin in body 2 (m).
+        axis: the direction of the line in body 1's frame, as an angle (rad) or as a vector.
+    """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
     axis: Float[Array, ""] = eqx.field(converter=direction)
@@ -115,7 +140,13 @@ class Slot(Joint):
 
 
 class Weld(Joint):
-    """No relative motion. 3 rows: those of `Revolute`, and theta2 - theta1 - `angle` (rad; default: as in the initial guess)."""
+    """No relative motion. 3 rows: those of `Revolute`, and theta2 - theta1 - `angle` (rad; default: as in the initial guess).
+
+    Args:
+        bodies: the names of the two bodies; "ground" is the fixed frame.
+        points: the point where they meet, in each body's own frame (m).
+        angle: theta2 - theta1 (rad); by default as in the initial guess.
+    """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
     angle: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None)
@@ -133,6 +164,11 @@ class Distance(Joint):
     """A massless rod of `length` L joins two points. 1 row: (d.d - L^2) / (2 L) (m), d the vector from point 1 to point 2.
 
     Its gradient at d.d = L^2 is the unit vector along the rod, so its multiplier is the rod's force (N), positive in compression.
+
+    Args:
+        bodies: the names of the two bodies; "ground" is the fixed frame.
+        points: the two points that it connects, each in its own body's frame (m).
+        length: of the rod (m), greater than zero; by default as in the initial guess.
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
@@ -148,7 +184,12 @@ class Distance(Joint):
 
 
 class Angle(Joint):
-    """The relative angle is fixed. 1 row: theta2 - theta1 - `angle` (rad; default: as in the initial guess)."""
+    """The relative angle is fixed. 1 row: theta2 - theta1 - `angle` (rad; default: as in the initial guess).
+
+    Args:
+        bodies: the names of the two bodies; "ground" is the fixed frame.
+        angle: theta2 - theta1 (rad); by default as in the initial guess.
+    """
 
     angle: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None)
 
@@ -165,6 +206,12 @@ class Gear(Joint):
 
     1 row (m): r1 (theta1 - theta_c) + r2 (theta2 - theta_c) - constant, with r2 negated where wheel 1 is an `internal` gear
     (or wheel 2 is: the sign does not tell). The constant is the initial guess's.
+
+    Args:
+        bodies: the names of the two wheels.
+        radii: of wheel 1 and of wheel 2 (m), greater than zero.
+        internal: whether one of them is an internal gear.
+        carrier: the body that holds both centres.
     """
 
     radii: Float[Array, "2"] = eqx.field(converter=number, metadata=POSITIVE)
@@ -193,6 +240,11 @@ class Rack(Joint):
 
     1 row (m): s + r (theta2 - theta1) - constant, s the displacement of body 2's origin from body 1's along the axis. The
     constant is the initial guess's. Only the rolling is held: what keeps the pinion at its height is another joint, a `Slot`.
+
+    Args:
+        bodies: the names of the rack and of the pinion.
+        radius: of the pinion (m), greater than zero.
+        axis: the direction of the rack in body 1's frame, as an angle (rad) or as a vector.
     """
 
     radius: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)
@@ -211,7 +263,12 @@ class Rack(Joint):
 
 
 class Profile(PrintsLine):
-    """A cam's outline: a closed curve, radius over polar angle, by a periodic cubic spline. The first point is not repeated."""
+    """A cam's outline: a closed curve, radius over polar angle, by a periodic cubic spline. The first point is not repeated.
+
+    Args:
+        angle: polar angles (rad), increasing, within less than one turn; three at least.
+        radius: at each of them (m), greater than zero.
+    """
 
     angle: Float[Array, "n"] = eqx.field(converter=number, metadata=PROFILE_ANGLES)  # rad, increasing, less than one turn
     radius: Float[Array, "n"] = eqx.field(converter=number, metadata=PROFILE_RADII)  # m
@@ -234,6 +291,11 @@ class Cam(Joint):
     """A follower, point 2, stays on body 1's closed `profile` around point 1.
 
     1 row (m): |d| - radius(phi), with d the vector from point 1 to point 2 in body 1's frame, and phi its polar angle.
+
+    Args:
+        bodies: the names of the cam and of the follower.
+        points: the centre of the profile in body 1, and the point of body 2 that stays on it (m).
+        profile: a `Profile`, or a table of its angles and radii.
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)

@@ -74,6 +74,17 @@ class Mechanism(PrintsTable):
     place among those of its type. Numbers that a joint leaves to the initial guess are filled in here.
 
     Raises `SceneError`, which lists every mistake. Numbers that are traced are not looked at; their shapes are.
+
+    Args:
+        bodies: a `Body` by name.
+        joints: a joint by name.
+        drivers: a `Driver` by name.
+        forces: a force element by name, or a list of them.
+        gravity: in m/s^2.
+        name: of the mechanism, for titles and files.
+        origin: for internal use: the known mechanism that traced numbers stand for.
+        drawing: the `Drawing` that it is made from, if any.
+        changed: for internal use: names of numbers that do not follow from the drawing any more.
     """
 
     name: str = eqx.field(static=True)

@@ -36,6 +36,11 @@ class Coordinate(PrintsLine):
     """A coordinate of body 2 relative to body 1 that may be driven, as those of a `Driver`.
 
     `angle`: theta2 - theta1 (rad), which counts turns; `x`, `y`: point 2 from point 1 in body 1's frame (m); `distance` (m).
+
+    Args:
+        bodies: the names of two bodies, or "ground".
+        coordinate: "angle", "x", "y" or "distance".
+        points: each in its own body's frame (m); by default the origins.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names)

@@ -35,7 +35,13 @@ Trial: TypeAlias = tuple[Array, Array, Array, Array]  # the part of a step, how 
 
 
 class Equilibrium(PrintsTable):
-    """A position of rest. `balanced` says whether it is one; `omega2` tells whether it is stable."""
+    """A position of rest. `balanced` says whether it is one; `omega2` tells whether it is stable.
+
+    Attributes:
+        q: x, y (m) and angle (rad) of each body.
+        balanced: whether loads and constraint forces cancel.
+        bodies: the names of the bodies, in the order of q.
+    """
 
     q: Float[Array, "bodies 3"]
     multipliers: Float[Array, "m"]  # lambda of F = Psi_q^T lambda (N, N m), of least norm; rows as in `analyse`

@@ -32,7 +32,27 @@ class Gauss(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """Every symbol of section 3 of the paper for one state. Rows are those of Psi, columns x, y, angle of each body."""
+    """Every symbol of section 3 of the paper for one state. Rows are those of Psi, columns x, y, angle of each body.
+
+    Attributes:
+        mechanism: of which it is.
+        t: time (s).
+        q: coordinates.
+        v: velocities.
+        row_names: joint and number of each row.
+        psi: Psi.
+        psi_dot: its rate.
+        psi_q: its Jacobian.
+        gamma: the right-hand side of Psi_q a = gamma.
+        D: Psi_q M^(-1/2), with weighted rows.
+        rank: of D.
+        D_plus: its pseudoinverse.
+        a_F: M^(-1) F.
+        b: gamma - Psi_q a_F, with weighted rows.
+        a: accelerations.
+        multipliers: lambda.
+        gauss: Gauss's principle, checked.
+    """
 
     mechanism: Mechanism
     t: float

@@ -89,6 +89,12 @@ class Effort(ForceElement):
     """An effort (N m, N) along a coordinate of two bodies: it does the work effort times the change of the coordinate.
 
     `law` gives the effort at time t (s), as a `Motion` gives a value.
+
+    Args:
+        bodies: the names of the two bodies.
+        coordinate: of the driver: "angle", "x", "y" or "distance".
+        law: the torque (N m) or force (N) as a function of time.
+        points: each in its own body's frame (m); None: the origins.
     """
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)

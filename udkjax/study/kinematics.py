@@ -35,6 +35,15 @@ class Kinematics(PrintsTable):
 
     `status` is a `Reached` for each value. `limit` is the value at the toggle that ended it (not a number where none did), and
     `limit_q` the position there, which has no derivative.
+
+    Attributes:
+        q: x, y (m) and angle (rad) of each body.
+        v: their rates (m/s, rad/s).
+        a: the rates of these (m/s^2, rad/s^2).
+        status: the number of a `Reached` for each value.
+        limit: the value at the toggle that ended it; not a number where none did.
+        limit_q: the position at that toggle.
+        bodies: the names of the bodies, in the order of q.
     """
 
     values: Float[Array, "T"]  # of the driver (rad, m), or of time (s)
@@ -88,6 +97,13 @@ class Travel(PrintsTable):
     """Between which values (rad, m) a coordinate can be driven; infinite where nothing ends it.
 
     `lower_q` and `upper_q` are the positions at the toggles; not a number where there is none.
+
+    Attributes:
+        lower: the lower end (rad, m); -inf where nothing ends it.
+        upper: the upper end (rad, m); inf where nothing ends it.
+        lower_q: the position at the lower toggle.
+        upper_q: the position at the upper toggle.
+        unit: of the coordinate.
     """
 
     lower: Float[Array, ""]

@@ -20,7 +20,12 @@ from udkjax.study.linearization import linearize
 
 
 class Modes(PrintsTable):
-    """Small motions about a position of rest: q = q0 + shape exp(s t), or without damping q0 + shape cos(omega t)."""
+    """Small motions about a position of rest: q = q0 + shape exp(s t), or without damping q0 + shape cos(omega t).
+
+    Attributes:
+        q: the position about which the mechanism vibrates (bodies, 3).
+        bodies: the names of the bodies, in the order of q.
+    """
 
     omega2: Float[Array, "f"]  # (rad/s)^2 without damping, ascending; negative: it moves away as exp(sqrt(-omega2) t)
     shapes: Float[Array, "f bodies 3"]  # of omega2, with shape^T M shape = 1 kg m^2

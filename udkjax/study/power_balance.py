@@ -33,7 +33,11 @@ from udkjax.study.channels import Trajectory
 
 @prints_table
 class PowerBalance(NamedTuple):
-    """Powers (W) at each output time. What they do not explain of the energies' rates is `residual`."""
+    """Powers (W) at each output time. What they do not explain of the energies' rates is `residual`.
+
+    Attributes:
+        drivers: power of each driver over time (W).
+    """
 
     drivers: dict[str, Float[Array, "T"]]
     forces: dict[str, Float[Array, "T"]]  # what is not stored: of dampers, loads, and potentials that change with time

@@ -23,7 +23,12 @@ from udkjax.study.kinematics import Kinematics, kinematics
 
 @prints_table
 class Workspace(NamedTuple):
-    """Where a point gets, (S, T, 2) in m, over the values of a first driver (S,) and a second one (T,)."""
+    """Where a point gets, (S, T, 2) in m, over the values of a first driver (S,) and a second one (T,).
+
+    Attributes:
+        points: where the point gets (m).
+        reached: the number of a `Reached` for each.
+    """
 
     points: Float[Array, "S T 2"]
     reached: Bool[Array, "S T"]

@@ -28,6 +28,10 @@ class Impact(Action):
     The jump of the velocities is the smallest in the metric of M that keeps all constraints (`jumps`): no friction. Rebounds
     that have become too small to follow end in rest: with `at_rest="hold"` the condition is held at zero, as a constraint, until
     the contact would have to pull; with "stop" the run ends there (`Result.at_rest`).
+
+    Args:
+        restitution: the part of the approaching speed that comes back, 0 to 1.
+        at_rest: "hold": rest in contact; "stop": end the run.
     """
 
     restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
@@ -35,7 +39,11 @@ class Impact(Action):
 
 
 class Release(Action):
-    """Take a joint or driver away, from then on: one of the scene's, or what `Attach` or `Lock` has added, by its name."""
+    """Take a joint or driver away, from then on: one of the scene's, or what `Attach` or `Lock` has added, by its name.
+
+    Args:
+        name: of the joint or driver.
+    """
 
     name: str = eqx.field(static=True)
 
@@ -44,6 +52,10 @@ class Attach(Action):
     """Add a joint, under a `name`, from then on. Numbers that it leaves to the guess are those of the state at the event.
 
     Velocities jump as in an inelastic impact: the smallest change in the metric of M that the new constraints allow.
+
+    Args:
+        joint: such as `Revolute(...)`.
+        name: under which it is added.
     """
 
     joint: Joint
@@ -54,6 +66,9 @@ class Lock(Action):
     """Stop all motion in a revolute or prismatic joint or a slot's sliding, where it is, as `Attach` does.
 
     What it adds is called as the joint with ".lock" behind it: `Release("elbow.lock")` takes it away again.
+
+    Args:
+        joint: the name of a joint of the scene.
     """
 
     joint: str = eqx.field(static=True)

@@ -36,6 +36,12 @@ class Event(PrintsLine):
     `direction` is 1 for rising, -1 for falling, 0 for either; of an `Impact`, before whose zero the condition is positive, always
     -1. Only crossings count: a run that starts at a zero, or that touches one and turns back, does not cross it. But an `Impact`
     whose condition is zero at the start, and falling, happens at once.
+
+    Args:
+        condition: (t, frames) -> a number.
+        action: what happens: `Stop`, `Log`, `Impact`, `Release`, `Attach` or `Lock`.
+        direction: 1: where it rises; -1: where it falls; 0: both.
+        name: by which it is listed.
     """
 
     condition: Callable[[Number, Frames], Scalar]
@@ -53,6 +59,14 @@ class JointLimit(PrintsLine):
 
     Of a revolute joint the coordinate is theta2 - theta1 (rad), of a prismatic joint or a slot how far point 2 is from point 1
     along the axis (m). The events are called as the joint (or `name`), with ".lower" or ".upper" behind it.
+
+    Args:
+        joint: the name of a revolute or prismatic joint, or of a slot.
+        lower: end of travel (rad, m), or None.
+        upper: likewise.
+        restitution: the part of the approaching speed that comes back, 0 to 1.
+        at_rest: "hold": rest in contact; "stop": end the run.
+        name: by which it is listed; by default that of the joint.
     """
 
     joint: str = eqx.field(static=True)
@@ -80,6 +94,16 @@ class Contact(PrintsLine):
 
     The line goes through the point `through` of the body `on`; the `normal`, of any length, is on the side that is allowed. Both
     are in that body's own frame (m).
+
+    Args:
+        body: the name of the body that hits.
+        point: of that body, in its own frame (m).
+        through: a point of the line, in the frame of `on` (m).
+        normal: of the line, towards what is allowed, in the frame of `on`.
+        restitution: the part of the approaching speed that comes back, 0 to 1.
+        on: the body that has the line, or "ground".
+        at_rest: "hold": rest in contact; "stop": end the run.
+        name: by which it is listed.
     """
 
     body: str = eqx.field(static=True)
@@ -108,6 +132,15 @@ class Events(PrintsTable):
     """The events of a run in their order: times (s), states before and after, and which each was.
 
     Where numbers are traced, or in a batch, there are `max_events` of each, padded with NaN, and -1 for `index`.
+
+    Attributes:
+        time: of each event (s).
+        q_before: positions right before it.
+        v_before: velocities right before it.
+        q_after: positions right after it.
+        v_after: velocities right after it.
+        count: how many there were.
+        names: of the conditions.
     """
 
     time: Float[Array, "events"]

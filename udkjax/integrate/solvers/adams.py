@@ -152,6 +152,13 @@ class Adams(Multistep):
 
     Source: L. F. Shampine, M. K. Gordon, Computer Solution of Ordinary Differential Equations, 1975 (the code STEP), with
     formulas for steps that all differ, and a step that follows the error more closely. The iteration is stopped as in VODE.
+
+    Args:
+        corrector: "pece" or "iteration".
+        min_order: the lowest order, from 1 on.
+        max_order: the highest order, up to 12.
+        root_finder: tolerances for steps of given sizes; by default those of the step controller.
+        root_find_max_steps: iterations of a corrector, at most.
     """
 
     corrector: Literal["pece", "iteration"] = eqx.field(default="pece", static=True)

@@ -117,6 +117,12 @@ class BDF(Multistep):
     Source: C. W. Gear, Numerical Initial Value Problems in Ordinary Differential Equations, 1971; formulas and error estimates as
     in K. E. Brenan, S. L. Campbell, L. R. Petzold, Numerical Solution of Initial-Value Problems in Differential-Algebraic
     Equations, 1996, chapter 5; the choice of order and step as in VODE (see `newton`).
+
+    Args:
+        max_order: the highest order, up to 5.
+        min_order: the lowest order, from 1 on.
+        root_finder: tolerances for steps of given sizes; by default those of the step controller.
+        root_find_max_steps: Newton's iterations of a step, at most.
     """
 
     max_order: int = eqx.field(default=HIGHEST, static=True)

@@ -69,6 +69,9 @@ class Verner65(diffrax.AbstractERK):
     The method of IMSL's DIVPRK. J. H. Verner, Explicit Runge-Kutta methods with estimates of the local truncation error,
     SIAM J. Numer. Anal. 15 (1978) 772-790; T. E. Hull, W. H. Enright, K. R. Jackson, User's guide for DVERK, Toronto (1976).
     Between the steps a polynomial of order 4 (the pair has none of its own).
+
+    Args:
+        scan_kind: how diffrax loops over the stages.
     """
 
     tableau: ClassVar[diffrax.ButcherTableau] = TABLEAU

@@ -32,6 +32,16 @@ class Link(PrintsLine):
     Without a width a link of three or more pins is a plate, the polygon of its pins in their order. A link of one pin is a disc
     of diameter `width` about it. Mass, centre and inertia follow from `density` and `thickness`; or from `mass` alone, for the
     same shape, of which a bar without a width is a thin rod. `centre` and `inertia`, about it, may be given beside either.
+
+    Args:
+        pins: the names of its pins, in their order.
+        density: in kg/m^3.
+        width: of a bar, or the diameter of a disc (m).
+        thickness: in m.
+        mass: in kg.
+        inertia: about the centre (kg m^2).
+        centre: of mass, in world coordinates (m).
+        outline: corners of the polygon, in world coordinates (m).
     """
 
     pins: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=PIN)

@@ -33,6 +33,10 @@ class Animation:
 
     So it is still there when the notebook is opened without Python, and in what nbconvert exports. `widget` returns one that
     Python can steer.
+
+    Attributes:
+        data: what the player shows, as JSON.
+        failures: how runs failed, by their labels.
     """
 
     def __init__(self, data: Json, failures: Mapping[str, str] | None = None):

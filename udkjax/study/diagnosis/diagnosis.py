@@ -20,7 +20,19 @@ ROUNDED = 1e-9  # rad, and of the length: smaller numbers of a pose are rounding
 
 
 class Diagnosis(NamedTuple):
-    """The freedoms, redundancies, singularities and determinate forces of a mechanism in one configuration."""
+    """The freedoms, redundancies, singularities and determinate forces of a mechanism in one configuration.
+
+    Attributes:
+        mechanism: of which it is.
+        coordinates: how many.
+        rows: how many, of joints and drivers.
+        joint_rows: how many of them are of joints.
+        redundancies: minimal sets of dependent rows, with their fixes.
+        branches: motions that meet in a singular configuration.
+        forces: for each joint, which components of its forces are unique.
+        clearance: how far away the rank changes.
+        timeline: rank and singular values along a solution; None without one.
+    """
 
     mechanism: Mechanism
     t: float  # s

@@ -33,7 +33,13 @@ Criterion = Literal["D", "A", "E"]
 @renamed_arguments(start="initial_state")
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An experiment that may be made: what of the scene is different in it (`conditions`, by name), and how it begins."""
+    """An experiment that may be made: what of the scene is different in it (`conditions`, by name), and how it begins.
+
+    Args:
+        conditions: numbers of the scene that are different in it, by name.
+        initial_state: how it begins; None: as the scene says.
+        name: of the experiment, for tables.
+    """
 
     conditions: Mapping[str, ArrayLike] = field(default_factory=dict)
     initial_state: Start | State | None = None

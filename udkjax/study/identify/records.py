@@ -29,7 +29,12 @@ Noise = TypeAliasType(
 
 
 class IdentificationError(Mistakes):
-    """Data, parameters or settings do not fit the mechanism, or each other. `problems` lists every mistake, with its place."""
+    """Data, parameters or settings do not fit the mechanism, or each other. `problems` lists every mistake, with its place.
+
+    Attributes:
+        problems: every mistake, each with its place.
+        source: the name of the file, if any.
+    """
 
     subject = "identification"
 

@@ -52,6 +52,12 @@ class Axis:
     or a frozen distribution of scipy.stats. `of` is the name of a parameter or of a setting, several names that all take the
     value (tied), or a pure function (mechanism, value) -> mechanism; by default the axis's own name. Functions and parameters
     are applied in the order of the axes. `units` are those of the value, where its name does not tell.
+
+    Args:
+        values: numbers, one entry a value; instances; with a design a range (low, high) or a distribution of scipy.stats.
+        of: the name of a parameter or a setting, several that take the same value, or (mechanism, value) -> mechanism; by default
+            the axis's own name.
+        units: of the values, where the name does not tell.
     """
 
     def __init__(self, values: Values, of: str | Sequence[str] | Setter | None = None, units: str | None = None):
@@ -63,7 +69,11 @@ class Axis:
 
 
 class Zipped(NamedTuple):
-    """Axes of equal length that advance together, along one dimension."""
+    """Axes of equal length that advance together, along one dimension.
+
+    Args:
+        axes: an `Axis`, or its values, by name.
+    """
 
     axes: Mapping[str, "AxisValues"]
 
@@ -154,7 +164,12 @@ def structure_of(choice: PyTree) -> Hashable:
 
 @dataclass(frozen=True)
 class Design(abc.ABC):
-    """`n` members in the ranges of the axes; the same `seed` gives the same members."""
+    """`n` members in the ranges of the axes; the same `seed` gives the same members.
+
+    Args:
+        n: how many members.
+        seed: of the random numbers.
+    """
 
     n: int
     seed: int = 0

@@ -38,7 +38,12 @@ TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
 
 
 class SweepError(Mistakes):
-    """A sweep cannot be what it says. `problems` lists every mistake."""
+    """A sweep cannot be what it says. `problems` lists every mistake.
+
+    Attributes:
+        problems: every mistake, each with its place.
+        source: the name of the file, if any.
+    """
 
     subject = "sweep"
 

@@ -1,0 +1,142 @@
+"""A hook of MkDocs: behind each public class in the reference a table of its arguments or fields, and the page of commands.
+
+A class says what they are in its docstring (Args, Attributes), or by a comment beside a field; its signature says the rest.
+Commands are functions of their options, with the same sections.
+"""
+
+import dataclasses
+import importlib
+import inspect
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from enum import Enum
+from typing import Annotated, get_args, get_origin
+
+DIRECTIVE = re.compile(r"^::: (udkjax[\w.]*\.([A-Z]\w*))$", re.M)
+ARRAY = re.compile(r"(?:jaxtyping\.)?(?:Float|Int|Bool)\[[\w.]*(?:Array|ArrayLike|ndarray|Union\[.*?\]), *(['\"])(.*?)\1\]")
+MODULE = re.compile(r"\b(?:udkjax|collections|typing|jax|numpy|pathlib|diffrax|optimistix|scipy)(?:\.\w+)*\.(?=\w)")
+COMMANDS = "<!-- commands -->"
+ITEM = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {5,}.*)*)", re.M)
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Put a table behind each class that a page of the reference names, and all commands where they are to be."""
+    if COMMANDS in markdown:
+        from udkjax.cli import COMMANDS as names
+
+        markdown = markdown.replace(COMMANDS, "\n".join(command(name) for name in names))
+    return DIRECTIVE.sub(lambda found: found[0] + OPTIONS + table(resolve(found[1])), markdown)
+
+
+def command(name: str) -> str:
+    """The section of a command, in Markdown: what it does, and its options."""
+    function = getattr(importlib.import_module(f"udkjax.cli.{name}"), name)
+    said, text = sections(function), inspect.getdoc(function) or ""
+    lines = [
+        f"## udkjax {name}\n",
+        text.partition("\nArgs:\n")[0].strip(),
+        "",
+        "| Option | Type | Default | Meaning |",
+        "|---|---|---|---|",
+    ]
+    for option, parameter in inspect.signature(function).parameters.items():
+        spelled = next((n for m in getattr(parameter.annotation, "__metadata__", ()) if (n := getattr(m, "name", None))), option)
+        words = f"`{option}`" if parameter.kind is parameter.POSITIONAL_ONLY else f"`--{spelled.replace('_', '-')}`"
+        kind = type_text(
+            get_args(parameter.annotation)[0] if get_origin(parameter.annotation) is Annotated else parameter.annotation
+        )
+        lines.append(f"| {words} | {kind} | {default_text(type, option, parameter)} | {said.get(option, '')} |")
+    return "\n".join([*lines, ""])
+
+
+OPTIONS = "\n    options: {show_docstring_parameters: false, show_docstring_attributes: false}\n\n"
+
+
+def resolve(name: str) -> type:
+    """The class of a full name."""
+    module, _, attribute = name.rpartition(".")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def table(cls: type) -> str:
+    """The table of a class in Markdown; an empty text where there is nothing to say."""
+    if issubclass(cls, Enum):
+        lines = [f"| `{member.name}` | {comments(cls).get(member.name) or str(member)} |" for member in cls]
+        return "\n".join(["| Member | Meaning |", "|---|---|", *lines, ""])
+    rows = list(described(cls))
+    if not rows:
+        return ""
+    lines = [f"| `{name}` | {kind} | {default} | {meaning} |" for name, kind, default, meaning in rows]
+    return "\n".join(["| Name | Type | Default | Meaning |", "|---|---|---|---|", *lines, ""])
+
+
+def described(cls: type) -> Iterator[tuple[str, str, str, str]]:
+    """Name, type, default and meaning of what a class is made of, or holds: the arguments of its constructor."""
+    if cls.__init__ is object.__init__ and not hasattr(cls, "_fields"):
+        return
+    mentioned = set(re.findall(r"`(\w+)`", inspect.getdoc(cls) or ""))
+    meanings = dict.fromkeys(mentioned, "see above") | comments(cls) | sections(cls)
+    fields = {field.name: field.type for field in dataclasses.fields(cls)} if dataclasses.is_dataclass(cls) else {}
+    for name, parameter in inspect.signature(cls).parameters.items():
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            kind = type_text(fields.get(name, parameter.annotation))  # a field says the shape that its converter makes
+            yield name, kind, default_text(cls, name, parameter), meanings.get(name, "").replace("|", "\\|")
+
+
+def sections(cls: object) -> dict[str, str]:
+    """What docstrings of a class, its constructor and its bases, or of a function, say of arguments and attributes."""
+    found: dict[str, str] = {}
+    for each in reversed(getattr(cls, "__mro__", (cls,))):
+        for doc in (each.__dict__.get("__doc__") or each.__doc__, getattr(each.__dict__.get("__init__"), "__doc__", None)):
+            for section in re.split(r"^(?=\w+:\n)", inspect.cleandoc(doc or ""), flags=re.M):
+                if section.startswith(("Args:", "Attributes:")):
+                    found |= {name: " ".join(text.split()) for names, text in ITEM.findall(section) for name in names.split(", ")}
+    return found
+
+
+def comments(cls: type) -> dict[str, str]:
+    """The comments beside the fields of a class and of its bases."""
+    found: dict[str, str] = {}
+    for each in reversed(cls.__mro__):
+        try:
+            source = inspect.getsource(each)
+        except (OSError, TypeError):
+            continue
+        name, depth = "", 0
+        for token in tokenize.generate_tokens(io.StringIO(inspect.cleandoc("\n" + source)).readline):
+            if token.type == tokenize.INDENT:
+                depth += 1
+            elif token.type == tokenize.DEDENT:
+                depth -= 1
+            elif token.type == tokenize.NAME and depth == 1 and (field := re.match(r"    (\w+)(?::| =) ", token.line)):
+                name = field[1]
+            elif token.type == tokenize.COMMENT and depth == 1 and name and not token.line.lstrip().startswith("#"):
+                text = re.sub(r"#?\s*(pyright: ignore\S*|noqa\S*)\s*#?", "", token.string).lstrip("# ").strip()
+                found |= {name: text} if text else {}
+    return found
+
+
+def type_text(annotation: object) -> str:
+    """A type in words: arrays by their shapes."""
+    text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    text = MODULE.sub("", ARRAY.sub(shape, text)).replace("~", "")
+    return "" if annotation is inspect.Parameter.empty else f"`{text}`".replace("|", "\\|")
+
+
+def shape(found: re.Match[str]) -> str:
+    """An array's shape in words."""
+    sizes = found[2].split()
+    return "number" if not sizes else f"array ({', '.join(sizes)}{',' if len(sizes) == 1 else ''})"
+
+
+def default_text(cls: type, name: str, parameter: inspect.Parameter) -> str:
+    """A default as one would write it."""
+    value = parameter.default
+    if value is inspect.Parameter.empty:
+        return "required"
+    if dataclasses.is_dataclass(cls):  # whose signature shows that there is a factory, not what it makes
+        field = {f.name: f for f in dataclasses.fields(cls)}.get(name)
+        value = field.default if field is not None and field.default is not dataclasses.MISSING else value
+    return f"`{value!r}`".replace("|", "\\|") if len(repr(value)) < 40 and "<" not in repr(value) else ""
