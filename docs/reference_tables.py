@@ -122,7 +122,7 @@ def type_text(annotation: object) -> str:
     """A type in words: arrays by their shapes."""
     text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
     text = MODULE.sub("", ARRAY.sub(shape, text)).replace("~", "")
-    return "" if annotation is inspect.Parameter.empty else f"`{text}`".replace("|", "\\|")
+    return "" if annotation is inspect.Parameter.empty else f"`{text}`".replace(" | ", " or ")
 
 
 def shape(found: re.Match[str]) -> str:
@@ -139,4 +139,4 @@ def default_text(cls: type, name: str, parameter: inspect.Parameter) -> str:
     if dataclasses.is_dataclass(cls):  # whose signature shows that there is a factory, not what it makes
         field = {f.name: f for f in dataclasses.fields(cls)}.get(name)
         value = field.default if field is not None and field.default is not dataclasses.MISSING else value
-    return f"`{value!r}`".replace("|", "\\|") if len(repr(value)) < 40 and "<" not in repr(value) else ""
+    return f"`{value!r}`" if len(repr(value)) < 40 and "<" not in repr(value) else ""
