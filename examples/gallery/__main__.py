@@ -2,7 +2,8 @@
 
     python -m examples.gallery [NAME ...] [--out docs/gallery]
 
-Each example is a script that one can read and run by itself: `python examples/gallery/peaucellier.py`.
+Each example is a script that one can read and run by itself: `python examples/gallery/peaucellier.py`. The others are drawings,
+files of at most 25 lines: `udkjax animate examples/drawings/door_closer.toml`.
 """
 
 import argparse
@@ -23,6 +24,8 @@ NAMES = (
     "double_pendulum_map",
     "neural_friction",
 )
+DRAWINGS = {"toggle_press": 1.0, "quick_return": 2.0, "cam_follower": 0.5, "door_closer": 6.0, "scissor_lift_spring": 2.0}  # s
+FRAMES = 121  # of their players
 WIDTH = 720  # px, of pictures
 DPI = 96  # of plots
 MOMENT = 0.3  # of the motion: when its picture is taken
@@ -30,9 +33,12 @@ MOMENT = 0.3  # of the motion: when its picture is taken
 
 def make(name: str, out: Path) -> dict:
     """Make one example, write its files, and return its title, its words, its facts and the names of its files."""
-    module = import_module(f"examples.gallery.{name}")
     start = time.perf_counter()
-    facts, shown = module.make()
+    if name in DRAWINGS:
+        module, text, (facts, shown) = None, *make_drawing(name)
+    else:
+        module = import_module(f"examples.gallery.{name}")
+        text, (facts, shown) = module.__doc__ or "", module.make()
     files = []
     for what, thing in shown.items():
         if what == "motion":
@@ -45,15 +51,34 @@ def make(name: str, out: Path) -> dict:
             thing.savefig(picture, dpi=DPI)
         _shrink(picture)
         files.append(picture.name)
-    title, _, words = module.__doc__.strip().partition("\n")
+    title, _, words = text.strip().partition("\n")
     return {
         "name": name,
+        "source": f"examples/drawings/{name}.toml" if name in DRAWINGS else f"examples/gallery/{name}.py",
         "title": title,
         "words": words.strip(),
         "facts": facts,
         "files": files,
         "seconds": time.perf_counter() - start,
     }
+
+
+def make_drawing(name: str) -> tuple[str, tuple[dict, dict]]:
+    """Simulate a drawing, and return the comment that it starts with, its facts and its player."""
+    import numpy as np
+
+    import udkjax as udk
+
+    path = Path("examples/drawings") / f"{name}.toml"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    words = [line.lstrip("# ") for line in lines if line.startswith("# ")]
+    mech = udk.load(path)
+    sol = udk.simulate(mech, np.linspace(0.0, DRAWINGS[name], FRAMES))
+    facts = {
+        "lines of the drawing": float(len(lines)),
+        "largest violation of a constraint (m or rad)": float(np.abs(udk.violation(mech, sol)).max()),
+    }
+    return "\n".join(words), (facts, {"motion": udk.animate(mech, sol)})
 
 
 def _shrink(picture: Path) -> None:
@@ -68,7 +93,8 @@ def page(examples: list[dict]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Each picture opens a player. `python -m examples.gallery` makes them all; the scripts are in `examples/gallery`.",
+        "Each picture opens a player. `python -m examples.gallery` makes them all; the scripts are in `examples/gallery`,",
+        "the drawings in `examples/drawings`.",
         "",
     ]
     for example in examples:
@@ -77,22 +103,23 @@ def page(examples: list[dict]) -> str:
         motion, *others = example["files"]
         lines += [f"## {example['title']}", "", example["words"], "", f"[![{name}]({motion})]({name}.html)", ""]
         lines += [f"![{name}: {file}]({file})" for file in others]
-        lines += ["", *facts, "", f"Script: `examples/gallery/{name}.py`", ""]
+        kind = "Drawing" if name in DRAWINGS else "Script"
+        lines += ["", *facts, "", f"{kind}: `{example['source']}`", ""]
     return "\n".join(lines)
 
 
 def main() -> None:
     """Make what is asked for."""
     parser = argparse.ArgumentParser(prog="python -m examples.gallery", description="Make the gallery.")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; by default all")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join((*DRAWINGS, *NAMES))}; by default all")
     parser.add_argument("--out", type=Path, default=Path("docs/gallery"), help="folder to write to")
     given = parser.parse_args()
-    unknown = [name for name in given.names if name not in NAMES]
+    unknown = [name for name in given.names if name not in (*DRAWINGS, *NAMES)]
     if unknown:
         parser.error(f"there is no example {unknown[0]}")
     given.out.mkdir(parents=True, exist_ok=True)
     found = []
-    for name in given.names or NAMES:
+    for name in given.names or (*DRAWINGS, *NAMES):
         found.append(make(name, given.out))
         print(
             f"{name}: {found[-1]['seconds']:.1f} s",

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+import udkjax as udk
 from examples.gallery import __main__ as gallery
 
 ROOT = Path(__file__).parents[2]
@@ -26,6 +27,28 @@ FAST = ("peaucellier",)
 def test_every_script_is_in_the_gallery_and_is_tested():
     scripts = {path.stem for path in (ROOT / "examples" / "gallery").glob("*.py")} - {"__main__"}
     assert scripts == set(gallery.NAMES) == set(FACTS)
+
+
+def test_every_drawing_is_in_the_gallery_and_short():
+    drawings = {path.stem: path for path in (ROOT / "examples" / "drawings").glob("*.toml")}
+    assert drawings.keys() == gallery.DRAWINGS.keys()
+    assert all(len(path.read_text(encoding="utf-8").splitlines()) <= 25 for path in drawings.values())
+
+
+@pytest.mark.parametrize("name", gallery.DRAWINGS)
+def test_a_drawing_moves_as_it_is_drawn(name):
+    """It is closed as drawn, and has at most one freedom, which no motor has."""
+    found = udk.check(udk.load(ROOT / "examples" / "drawings" / f"{name}.toml"))
+    assert found.closed and found.residual_before < 1e-12 and found.degrees_of_freedom <= 1
+    assert found.moved == found.suspicious == found.redundant == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", gallery.DRAWINGS)
+def test_the_picture_of_a_drawing(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    lines, violation = gallery.make(name, tmp_path)["facts"].values()
+    assert lines <= 25 and violation < 1e-9 and (tmp_path / f"{name}.html").stat().st_size < 300_000
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in FAST else pytest.mark.slow) for n in gallery.NAMES])

@@ -61,6 +61,10 @@ class AbstractDrawing(PrintsTable):
         """Return a body, or the ground, and the point in its frame (m) where a pin is; None where there is no such pin."""
 
     @abstractmethod
+    def shapes(self) -> dict[str, Array]:
+        """Return the points (n, 2) through which bodies are drawn, by name, in their own frames (m)."""
+
+    @abstractmethod
     def mechanism(self) -> "Mechanism":
         """Return the mechanism that is drawn."""
 

@@ -45,7 +45,7 @@ def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: Scala
     names = _check_names(mechanism, bodies)
     values: dict[str, Numbers] = {}
     for body in names:
-        points = dict(_attachments(mechanism, body))
+        points = dict(attachments(mechanism, body))
         scale = number(length) / length_of(mechanism, body)
         values |= {name: scale * point for name, point in points.items()}
         if as_rod:
@@ -57,7 +57,7 @@ def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: Scala
 def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
     """Return the largest distance (m) between two points where a body is attached. Raises `SceneError`."""
     _check_names(mechanism, body)
-    points = [point for _, point in _attachments(mechanism, body)]
+    points = [point for _, point in attachments(mechanism, body)]
     if len(points) < 2:
         raise SceneError([f"body {quote(body)} has no length: it is attached at fewer than two points"], mechanism.name)
     stacked = jnp.stack(points)
@@ -102,8 +102,8 @@ def _check_names(mechanism: Mechanism, bodies: Sequence[str] | str) -> tuple[str
     return names
 
 
-def _attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[Array, "2"]]]:
-    """The points of a body, under their names as parameters."""
+def attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[Array, "2"]]]:
+    """Iterate over the points (m) of a body, or of the ground, under their names as parameters, in its own frame."""
     groups = {"joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
     for section, elements in groups.items():
         for name, element in elements.items():

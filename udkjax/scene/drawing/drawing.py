@@ -128,6 +128,14 @@ class Drawing(AbstractDrawing):
         body = placement.members(name)[-1]
         return body, number(placement.local(body, placement.places[name]))
 
+    def shapes(self) -> dict[str, Array]:
+        """Return the points (n, 2) through which links are drawn, their pins or outlines, by name, in their own frames (m)."""
+        placement, found = placement_of(known_elements(self.groups), self.ground), {}
+        for name, link in placement.links.items():
+            places = [placement.places[pin] for pin in link.pins] if link.outline is None else list(link.outline)
+            found[name] = number([placement.local(name, place) for place in places])
+        return found
+
     def _table(self) -> PrintedTable:
         return drawing_table(self.name, self.groups, self.ground)
 

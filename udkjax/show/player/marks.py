@@ -77,7 +77,8 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: Shapes | None = None) 
     unknown = [name for name in shapes or {} if name not in mechanism.bodies]
     if unknown:
         raise ValueError(f"shapes: there is no body {unknown[0]!r}")
-    drawing = _Drawing(mechanism, np.asarray(poses, float), shapes or {})
+    drawn = {} if mechanism.drawing is None else mechanism.drawing.shapes()
+    drawing = _Drawing(mechanism, np.asarray(poses, float), {**drawn, **(shapes or {})})
     links = drawing.links()
     plates = [mark for mark in links if mark.get("closed")]
     bars = [mark for mark in links if not mark.get("closed")]
