@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.equations import NullSpaceSVD as NullSpaceSVD
     from udkjax.equations import accelerations as accelerations
     from udkjax.equations import analyse as analyse
+    from udkjax.equations import efforts as efforts
     from udkjax.equations import energy as energy
     from udkjax.equations import reactions as reactions
     from udkjax.equations import singular_values as singular_values
@@ -160,7 +161,7 @@ _NAMES = {
     "udkjax.integrate.assembly": "AssemblyError State assemble check",
     "udkjax.integrate.events": "Event Events JointLimit Contact Stop Log Impact Release Attach Lock",
     "udkjax.equations": """
-        ConstrainedSystem Baumgarte Analysis analyse accelerations violation energy reactions
+        ConstrainedSystem Baumgarte Analysis analyse accelerations violation energy efforts reactions
         unique_reactions uniqueness singular_values
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
     "udkjax.study.diagnosis": "diagnose Diagnosis",

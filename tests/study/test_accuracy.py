@@ -1,11 +1,15 @@
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.integrate import Result, Solution
+from udkjax.show.summary import trust
 from udkjax.study import exact_coordinates
-from udkjax.study.accuracy import accuracy, largest_violation
+from udkjax.study.accuracy import accuracy, conserves_energy, largest_violation
 
 
 def solution(mech, ts, q, v) -> Solution:
@@ -34,3 +38,43 @@ def test_what_is_put_in_is_found():
     wrong = accuracy(mech, solution(mech, ts, jnp.asarray(q), jnp.asarray(v)))
     assert wrong.error == pytest.approx(1e-3) and wrong.violation == pytest.approx(1e-3)
     assert accuracy(udk.library.four_bar(), solution(udk.library.four_bar(), ts, *2 * [jnp.zeros((11, 3, 3))])).error is None
+
+
+def test_work_is_told_from_errors_of_the_energy():
+    ts = np.linspace(0.0, 0.5, 6)
+    for mech, works in (
+        (udk.library.simple_pendulum(), False),
+        (udk.library.driven_pendulum(), True),
+        (held(udk.Polynomial([0.1])), False),
+        (held(udk.Polynomial([0.1]), udk.Torque(["ground", "a"], 1.0)), True),
+        (held(udk.Polynomial([0.1]), udk.TorsionSpring(["ground", "a"], 2.0)), False),
+        (held(udk.Polynomial([0.1]), udk.TorsionSpring(["ground", "a"], 2.0, 0.1)), True),
+    ):
+        assert conserves_energy(mech, ts) != works
+    mech = udk.library.driven_pendulum()
+    found = accuracy(mech, udk.simulate(mech, ts))
+    total = udk.energy(mech, udk.simulate(mech, ts)).total
+    assert found.work == pytest.approx(float(total[-1] - total[0])) and "J of work" in trust(found)["energy"]
+    rest = accuracy(held(udk.Polynomial([0.1])), udk.simulate(held(udk.Polynomial([0.1])), ts))
+    assert rest.work is None and trust(rest)["energy"].startswith("changes by 0 J") and trust(rest)["violation"].startswith("0 m")
+
+
+def held(motion: udk.Motion, *forces: udk.ForceElement) -> udk.Mechanism:
+    """A body on a pin, held by a driver, with forces."""
+    bodies = {"a": udk.Body(1.0, 0.1, angle=0.1)}
+    pin = udk.Revolute(["ground", "a"], [[0.0, 0.0], [0.0, 0.0]])
+    return udk.Mechanism(bodies, {"A": pin}, {"hold": udk.Driver(["ground", "a"], "angle", motion)}, list(forces))
+
+
+def test_efforts_are_what_inverse_dynamics_finds_by_another_way():
+    mech, ts = udk.library.slider_crank(), np.linspace(0.0, 0.5, 6)
+    sol, needed = udk.simulate(mech, ts, rtol=1e-11, atol=1e-11), udk.inverse_dynamics(mech, ts)
+    (name,) = mech.driver_names
+    wanted = np.asarray(needed.efforts[name])
+    assert_allclose(udk.efforts(mech, sol)[name], wanted, rtol=0, atol=1e-8 * np.abs(wanted).max())
+    data = sol.to_xarray(mech)
+    assert_allclose(data.effort.sel(driver=name), wanted, rtol=0, atol=1e-8 * np.abs(wanted).max())
+    q = sol.q.at[3:].set(jnp.nan)
+    failed = jax.jit(lambda q: udk.efforts(mech, eqx.tree_at(lambda s: s.q, sol, q))[name])
+    assert np.isnan(failed(q)[3:]).all() and np.isfinite(failed(q)[:3]).all()
+    assert np.isfinite(jax.jit(jax.grad(lambda q: jnp.sum(failed(q)[:3])))(q)).all()

@@ -13,6 +13,7 @@ from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
 from udkjax.equations.partitioning import CoordinatePartitioning as CoordinatePartitioning
 from udkjax.equations.quantities import Energy as Energy
 from udkjax.equations.quantities import accelerations as accelerations
+from udkjax.equations.quantities import efforts as efforts
 from udkjax.equations.quantities import energy as energy
 from udkjax.equations.quantities import equations_of as equations_of
 from udkjax.equations.quantities import violation as violation

@@ -155,6 +155,30 @@ def energy(mechanism: Mechanism, solution: StateHistory) -> Energy:
     return _evaluate_along(mechanism, solution, _energy)
 
 
+@checked
+def efforts(
+    mechanism: Mechanism, solution: StateHistory, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+) -> dict[str, Float[Array, "T"]]:
+    """Return what each driver exerts along its coordinate on its second body: -lambda of its row.
+
+    Args:
+        mechanism: The scene.
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
+        method: Decides the rank; by default `SVD`. Where a driver is redundant, the share of least norm is returned.
+        stabilization: The run's `Baumgarte`, to include what it adds.
+
+    Returns:
+        By driver a torque (N m) along an angle, a force (N) along a length (T,); not a number where the states are not.
+    """
+    if not mechanism.driver_names:
+        return {}
+    analysis, method = analyse(mechanism), SVD() if method is None else method
+    ts, q, v = (jnp.asarray(x) for x in (solution.ts, solution.q, solution.v))
+    multipliers = _multipliers(mechanism.without_origin, analysis, ts, q, v, method, stabilization)
+    rows = {owner: k for k, (owner, _) in enumerate(analysis.row_names)}
+    return {name: -multipliers[:, rows[name]] for name in mechanism.driver_names}
+
+
 # Functions of their own: what is compiled for one call serves the next.
 
 
@@ -163,6 +187,15 @@ def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation,
     equations, flat = equations_of(mechanism, method, baumgarte, formulation, analysis), (q.ravel(), v.ravel())
     a = equations.accelerations(t, *flat).reshape(q.shape)
     return (a, equations.multipliers(t, *flat)) if multipliers else a
+
+
+@eqx.filter_jit
+def _multipliers(mechanism, analysis, ts, q, v, method, baumgarte):
+    equations, finite = equations_of(mechanism, method, baumgarte, analysis=analysis), jnp.isfinite(q) & jnp.isfinite(v)
+    reached = jnp.all(finite, axis=(1, 2))
+    # Where a run has failed the guess stands in, for the sake of the derivatives elsewhere.
+    q, v = (jnp.where(reached[:, None, None], x, x0).reshape(len(ts), -1) for x, x0 in ((q, mechanism.q0), (v, mechanism.v0)))
+    return jnp.where(reached[:, None], jax.vmap(equations.multipliers)(ts, q, v), jnp.nan)
 
 
 def _psi(equations: AbstractSystem, t: Array, q: Vector, v: Vector) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from udkjax.equations.quantities import efforts
 from udkjax.extras import OptionalImport
 from udkjax.integrate.events.event import Events
 from udkjax.printing import PrintedTable, PrintsTable, PrintsWords, units
@@ -166,7 +167,8 @@ class Solution(PrintsTable):
     def to_xarray(self, mechanism: Mechanism | None = None) -> Any:
         """Return an xarray Dataset: q and v over time, body, coordinate, with units, versions, settings, result and statistics.
 
-        With the mechanism, its numbers (the attribute `parameters`, as JSON) and its text (`scene`, as TOML) are inside too.
+        With the mechanism, its numbers (the attribute `parameters`, as JSON) and its text (`scene`, as TOML) are inside too, and
+        what its drivers exert (`effort` over time, driver): torques (N m) and forces (N), as `udkjax.efforts` returns them.
         """
         with OptionalImport():
             import xarray
@@ -193,6 +195,10 @@ class Solution(PrintsTable):
         if mechanism is not None:
             data.attrs["parameters"] = json.dumps({k: np.asarray(v).tolist() for k, v in mechanism.parameters().items()})
             data.attrs["scene"] = scene_text(mechanism)
+            if found := efforts(mechanism, self):
+                data = data.assign_coords(driver=list(found))
+                data["effort"] = ("time", "driver"), np.stack([np.asarray(x) for x in found.values()], 1)
+                data["effort"].attrs = {"long_name": "what drivers exert along their coordinates", "units": "N m or N"}
         return data
 
 

@@ -1,11 +1,18 @@
 """What the command line says about a mechanism and about a run."""
 
+<<<<<<< HEAD
 from collections.abc import Sequence
 
+=======
+import numpy as np
+from jaxtyping import ArrayLike
+
+from udkjax.equations import efforts
+>>>>>>> 10f378f (Return what drivers exert along a run; tell work from errors of the energy; measure channels in sweeps)
 from udkjax.integrate import Solution
 from udkjax.integrate.assembly import Check, check_lines, numbered
 from udkjax.integrate.solution import format_work
-from udkjax.printing import align_columns
+from udkjax.printing import align_columns, format_number
 from udkjax.scene import Mechanism
 from udkjax.study.accuracy import Accuracy
 from udkjax.study.row_labels import row_label
@@ -29,20 +36,41 @@ def run_summary(
         **numbered("assembly", [text.removeprefix("assembly ") for text in moved]),
         "work": format_work(sol.stats),
         **trust(accuracy),
+        **{name: format_peak(sol.ts, x, mech.drivers[name].coordinate) for name, x in efforts(mech, sol).items()},
         "time": f"{seconds:.2f} s, {compiling:.2f} s of it to compile",
     }
     return table(f"{mech.name or 'mechanism'}, {float(sol.ts[0]):g} to {float(sol.ts[-1]):g} s, {len(sol.ts)} instants", lines)
 
 
 def trust(accuracy: Accuracy) -> dict[str, str]:
-    """Describe the largest violation, the change of the energy and, where one is known, the error against the exact solution."""
+    """Describe the largest violation, the energy and, where one is known, the error against the exact solution."""
+    kinetic = f"kinetic up to {accuracy.kinetic_energy:.3g} J"
+    if accuracy.work is None:
+        changed = f"changes by {format_error(accuracy.energy_change, accuracy.kinetic_energy)} J at most, where nothing does work"
+    else:
+        changed = f"drivers, dampers and loads do {accuracy.work:.6g} J of work"
     lines = {
-        "violation": f"{accuracy.violation:.2e} m or rad at most",
-        "energy": f"changes by {accuracy.energy_change:.2e} J at most; kinetic up to {accuracy.kinetic_energy:.3g} J",
+        "violation": f"{format_error(accuracy.violation, accuracy.length)} m or rad at most",
+        "energy": f"{changed}; {kinetic}",
     }
     if accuracy.error is not None:
-        lines["exact solution"] = f"missed by {accuracy.error:.2e} m or rad at most"
+        lines["exact solution"] = f"missed by {format_error(accuracy.error, accuracy.length)} m or rad at most"
     return lines
+
+
+def format_peak(ts: ArrayLike, effort: ArrayLike, coordinate: str) -> str:
+    """Describe what a driver exerts over time: its peak and its root mean square, in the unit of its coordinate."""
+    x, unit = np.asarray(effort, float), "N m" if coordinate == "angle" else "N"
+    good = x[np.isfinite(x)]
+    if not good.size:
+        return "exerts nothing that is known"
+    k = int(np.nanargmax(np.abs(x)))
+    return f"peak {format_number(x[k], unit)} at {np.asarray(ts)[k]:g} s, root mean square {np.sqrt(np.mean(good**2)):.6g} {unit}"
+
+
+def format_error(error: float, scale: float) -> str:
+    """Return an error with the digits that matter; 0 where it is rounding beside a scale."""
+    return "0" if format_number(error, scale=scale) == "0" else f"{error:.2e}"
 
 
 def table(title: str, lines: dict[str, str]) -> str:

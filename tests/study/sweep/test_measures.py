@@ -1,5 +1,7 @@
 """What is kept of a member, and its derivatives."""
 
+import pickle
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -12,18 +14,19 @@ from udkjax.study.exact import exact_coordinates
 from udkjax.study.sweep.measures import NOT_REACHED, guess_label, measures_of
 
 TS = np.linspace(0.0, 1.0, 6)
+FOUR_BAR = udk.library.four_bar()
 
 
 def test_a_measure_goes_by_the_name_that_it_is_given():
     def names(measure):
-        return [name for one in measures_of(measure, None, TS) for name in one.variables]
+        return [name for one in measures_of(measure, None, TS, FOUR_BAR) for name in one.variables]
 
     assert names("final") == ["q_end", "v_end"] and names({"final": "final"}) == ["q_end", "v_end"]
     assert names({"last": "final", "open": "violation"}) == ["last_q_end", "last_v_end", "open"]
 
 
 def test_only_what_needs_all_output_times_gets_them():
-    assert [m.along for m in measures_of(["final", "counts", "violation", lambda m, s: s.q], None, TS)] == [
+    assert [m.along for m in measures_of(["final", "counts", "violation", lambda m, s: s.q], None, TS, FOUR_BAR)] == [
         False,
         False,
         True,
@@ -36,6 +39,23 @@ def test_a_users_arrays_are_labelled_by_their_shapes():
     assert guess_label("x", (6, 2), 6, 4).dims == ("time", "x_1")
     assert guess_label("x", (4, 3), 6, 4).dims == ("body", "coordinate")
     assert guess_label("x", (), 6, 4).dims == ()
+
+
+def test_channels_are_measures():
+    ts = TS[:3] / 10
+    axes = {"body.crank.mass": [1.0, 2.0]}
+    data = udk.sweep(
+        FOUR_BAR, axes, ts, {"pin.C.x": "pin.C.x", "rise": "body.coupler(0.1, 0).vy"}, derivatives=["body.crank.mass"]
+    )
+    assert (data["pin.C.x"].units, data.rise.units, data.rise.dims) == ("m", "m/s", ("body.crank.mass", "time"))
+    runs = [FOUR_BAR.with_parameters({"body.crank.mass": mass}) for mass in (1.0, 2.0)]
+    for k, mech in enumerate(runs):
+        sol = udk.simulate(mech, ts)
+        assert_allclose(data["pin.C.x"][k], udk.path(mech, sol, "C")[:, 0], rtol=0, atol=1e-12)
+        assert_allclose(data.rise[k], udk.path(mech, sol, "coupler", [0.1, 0.0], derivative=1)[:, 1], rtol=0, atol=1e-12)
+    pickle.dumps(measures_of("pin.C.x", None, ts, FOUR_BAR))
+    with pytest.raises(udk.SweepError, match=r'measure "pin.Q.x": no pin named "Q"'):
+        udk.sweep(FOUR_BAR, axes, ts, "pin.Q.x")
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from udkjax.equations import Analysis, analyse, energy, reactions, singular_values, unique_reactions, violation
 from udkjax.equations.determinacy import STATIC_RANK_TOL
 from udkjax.scene import GROUND, Mechanism
+from udkjax.study.accuracy import conserves_energy
 
 ROUNDING = 1e-17  # below any violation (m, rad) or singular value but zero; drawn in place of zero, which has no logarithm
 
@@ -100,8 +101,9 @@ def _violation(mechanism: Mechanism, solution: Trajectory) -> list[Measure]:
 def _energy(mechanism: Mechanism, solution: Trajectory) -> list[Measure]:
     parts = energy(mechanism, solution)
     total = np.asarray(parts.total)
+    changed_by = "energy change" if conserves_energy(mechanism, solution.ts) else "work of drivers and loads"
     return [
-        Measure("energy change", "J", total - total[0]),
+        Measure(changed_by, "J", total - total[0]),
         Measure("kinetic energy", "J", np.asarray(parts.kinetic)),
         Measure("potential energy", "J", np.asarray(parts.potential)),
     ]

@@ -18,6 +18,8 @@ from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto, Pseudoinverse
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.channel_values import measure as evaluate_channels
+from udkjax.study.channels import Channel, channel_of
 
 UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, Scalar]])
 OneMeasure = TypeAliasType("OneMeasure", str | UserMeasure)
@@ -87,23 +89,28 @@ def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) ->
     return Label(tuple(dims), "", "")
 
 
-def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray) -> tuple[Measure, ...]:
-    """Read `measure`: a name, a function of (mechanism, solution), a sequence of such, or a dict of them. Raises ValueError."""
+def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mechanism: Mechanism) -> tuple[Measure, ...]:
+    """Read `measure`: a name, a function of (mechanism, solution), a sequence of such, or a dict of them. Raises ValueError.
+
+    Names are those of `MEASURES`, or of channels of the mechanism, such as `pin.C.x` and `driver.motor.load`.
+    """
     if isinstance(given, Mapping):
         items = [(str(key), value) for key, value in given.items()]
     else:
         several = given if isinstance(given, list | tuple) else [cast(OneMeasure, given)]
         items = [("", value) for value in several]
-    found = tuple(_measure(key, value, reference, ts) for key, value in items)
+    found = tuple(_measure(key, value, reference, ts, mechanism) for key, value in items)
     if reference is not None and not any(measure.name == "error" for measure in found):
         raise ValueError('reference: only the measure "error" looks at it, which is not among the measures')
     return found
 
 
-def _measure(key: str, given: OneMeasure, reference: Reference, ts: np.ndarray) -> Measure:
+def _measure(key: str, given: OneMeasure, reference: Reference, ts: np.ndarray, mechanism: Mechanism) -> Measure:
     if isinstance(given, str):
+        if given not in MEASURES and "." in given:
+            return _channel_measure(key, given, mechanism)
         if given not in MEASURES:
-            near = suggestion(given, MEASURES) or f"; known are {', '.join(MEASURES)}"
+            near = suggestion(given, MEASURES) or f"; known are {', '.join(MEASURES)}, and channels such as pin.A.x"
             raise ValueError(f"measure {quote(given)}: there is none of this name{near}")
         along, compute, labels = MEASURES[given]
         if given == "error":
@@ -113,6 +120,25 @@ def _measure(key: str, given: OneMeasure, reference: Reference, ts: np.ndarray) 
         raise ValueError(f"measure {quote(key or str(given))}: must be a name or a function of (mechanism, solution)")
     name = key or getattr(given, "__name__", "measure").strip("<>")
     return Measure(name, True, _UserMeasure(given, name), {})
+
+
+def _channel_measure(key: str, given: str, mechanism: Mechanism) -> Measure:
+    try:
+        channel = channel_of(mechanism, given)
+    except ValueError as problem:
+        raise ValueError(f"measure {quote(given)}: {problem}") from None
+    labels = {channel.name: Label(("time",), channel.units, channel.name)}
+    return Measure(channel.name, True, _ChannelMeasure(channel), labels, None, "" if key == channel.name else key)
+
+
+@dataclass(frozen=True)
+class _ChannelMeasure:
+    """A channel over time."""
+
+    channel: Channel
+
+    def __call__(self, run: Run) -> dict[str, Array]:
+        return {self.channel.name: evaluate_channels(run.mechanism, run.solution, (self.channel,))[:, 0]}
 
 
 @dataclass(frozen=True)
@@ -206,7 +232,11 @@ MEASURES: dict[str, tuple[bool, Callable[[Run], dict[str, Array]], dict[str, Lab
         },
     ),
     "violation": (True, _violation, {"violation": Label((), "m, rad", "largest constraint violation at an output time")}),
-    "energy_drift": (True, _energy_drift, {"energy_drift": Label((), "J", "largest change of the total energy")}),
+    "energy_drift": (
+        True,
+        _energy_drift,
+        {"energy_drift": Label((), "J", "largest change of the total energy, by whatever does work, too")},
+    ),
     "error": (
         True,
         _error,

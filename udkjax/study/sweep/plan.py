@@ -170,7 +170,7 @@ def make_plan(
     problems += check_tangents(mechanism, dimensions, derivatives)
     measures: tuple[Measure, ...] = ()
     try:
-        measures = measures_of(measure, reference, ts)
+        measures = measures_of(measure, reference, ts, mechanism)
     except ValueError as error:
         problems.append(str(error))
     if problems:
