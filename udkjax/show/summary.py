@@ -1,14 +1,11 @@
 """What the command line says about a mechanism and about a run."""
 
-<<<<<<< HEAD
 from collections.abc import Sequence
 
-=======
 import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.equations import efforts
->>>>>>> 10f378f (Return what drivers exert along a run; tell work from errors of the energy; measure channels in sweeps)
 from udkjax.integrate import Solution
 from udkjax.integrate.assembly import Check, check_lines, numbered
 from udkjax.integrate.solution import format_work
