@@ -19,6 +19,33 @@ def findings(data) -> str:
     return "<ul>\n" + "\n".join(f"<li>{text}</li>" for text in _sentences(data)) + "\n</ul>"
 
 
+def summary(data) -> str:
+    """Say in words what became of the runs: which kinds of them stay right."""
+    free = [run for run in runs(data, "paper") if not run.alpha > 0]
+    right = sum(map(_is_right, free))
+    first = (
+        "Without stabilization every run is lost sooner or later, whichever pseudoinverse solves the equations"
+        if not right
+        else "Without stabilization runs stay right with some pseudoinverses and are lost with others"
+        if right < len(free)
+        else "Without stabilization every run stays right for as long as it was followed"
+    )
+    cures = {
+        "small gains": "small gains of Baumgarte's stabilization",
+        "fixed rows": "leaving out one constraint for good",
+        "default": "projecting each step back to the constraints (the default of udkjax)",
+    }
+    kept = [cure for group, cure in cures.items() if (found := list(runs(data, group))) and all(map(_is_right, found))]
+    *most, last = kept or [""]
+    second = f" {', '.join(most)}{' and ' if most else ''}{last} keep{'' if most else 's'} all of them right." if last else ""
+    second = second[:1] + second[1:2].upper() + second[2:]
+    return f"<p>{first}: the linkage has one constraint more than it needs, and errors grow along it.{second}</p>"
+
+
+def _is_right(run) -> bool:
+    return run.kind.item() == "correct"
+
+
 def _sentences(data):
     for stabilized, name in ((False, "without stabilization"), (True, "with the paper's gains")):
         chosen = [run for run in runs(data, "paper") if (run.alpha > 0) == stabilized]

@@ -10,7 +10,7 @@ from typing import Any
 from udkjax.extras import OptionalImport
 
 from . import figures, tables
-from .findings import findings, growth_time, nfunc_note, psi2_note, repeat, second_choice
+from .findings import findings, growth_time, nfunc_note, psi2_note, repeat, second_choice, summary
 
 with OptionalImport():
     from matplotlib import rc_context
@@ -61,6 +61,7 @@ def page(data: Any) -> str:
     pictures = {name: figure(data, name) if _drawable(data, name) else "" for name in FIGURES}
     template = Template(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
     return template.substitute(
+        summary=summary(data),
         findings=findings(data),
         rules=tables.rules(data),
         paper_tables=tables.paper_tables(data),

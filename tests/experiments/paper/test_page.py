@@ -7,7 +7,7 @@ import pytest
 
 from experiments.paper import page as report
 from experiments.paper import tables as report_tables
-from experiments.paper.findings import findings, nfunc_note, psi2_note, repeat
+from experiments.paper.findings import findings, nfunc_note, psi2_note, repeat, summary
 from experiments.paper.record import read, save
 
 VOID = {"meta", "img", "br", "link"}
@@ -131,6 +131,18 @@ def test_findings_count_what_the_tables_show(study_data):
     assert "NFUNC is 534 to 537 times ours" in nfunc_note(study_data)  # 80.1e6 / 10 / 15e3
     assert "times ours" in psi2_note(study_data) and "unexplained" in psi2_note(study_data)
     assert "the paper has 1.1·10<sup>−4</sup> to 9.7·10<sup>−4</sup> m² where it was correct up to" in psi2_note(study_data)
+
+
+def test_the_page_begins_with_a_picture_and_words(page, study_data):
+    found, picture = page.index("What was found"), page.index("<figure")
+    assert picture < found < page.index("<ul>")
+    words = summary(study_data)
+    assert words in page and not re.search(r"\d", words)
+    assert "every run is lost sooner or later" in words and "projecting each step" in words
+    kept = study_data.copy(deep=True)
+    kept["kind"] = kept.kind.copy(data=np.full(kept.kind.shape, "correct", dtype=kept.kind.dtype))
+    assert "every run stays right" in summary(kept)
+    assert "prefers-color-scheme: dark" in page
 
 
 def test_the_page_says_how_to_repeat_it_and_what_was_cut(study_data):
