@@ -1,4 +1,4 @@
-"""`python -m experiments NAME ... [--smoke] [--redraw] [--out DIR]`."""
+"""`python -m experiments NAME ... [--smoke] [--redraw] [--out DIR] [--set CHOICE=NUMBER]`."""
 
 import argparse
 from pathlib import Path
@@ -10,11 +10,15 @@ parser.add_argument("names", nargs="+", metavar="NAME", help=f"of {', '.join(NAM
 parser.add_argument("--smoke", action="store_true", help="the same in small, in seconds; writes to a temporary folder")
 parser.add_argument("--redraw", action="store_true", help="compute nothing: draw the figure anew from the data file")
 parser.add_argument("--out", type=Path, metavar="DIR", help="write DIR/NAME.nc and DIR/NAME.png instead of the committed files")
+parser.add_argument(
+    "--set", action="append", default=[], metavar="CHOICE=NUMBER", help="a choice of the study's own, if it has any"
+)
 arguments = parser.parse_args()
 if unknown := set(arguments.names) - {*NAMES, "all"}:
     parser.error(f"no study {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
+choices = {key: float(value) if "." in value else int(value) for key, _, value in (text.partition("=") for text in arguments.set)}
 for name in NAMES if "all" in arguments.names else arguments.names:
     if arguments.redraw:
         redraw(name, arguments.out)
     else:
-        run(name, arguments.smoke, arguments.out)
+        run(name, arguments.smoke, arguments.out, **choices)

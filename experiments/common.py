@@ -6,6 +6,7 @@ A study is one module that says in its docstring what it claims and why, and has
     holds(data) -> {part: bool}        the claim in parts, each held against the data, of the small run as well
     headline(data) -> str              the claim in figures, in one line; the README quotes it
     figure(data) -> Figure             from the data alone
+    page(data) -> str                  a page of its own, NAME.md, where it has one
 """
 
 import inspect
@@ -34,13 +35,13 @@ COLOURS = 128  # of a figure: enough for lines and a colour map, and a third of 
 Item = TypeVar("Item")
 
 
-def run(name: str, smoke: bool = False, out: Path | None = None) -> xarray.Dataset:
-    """Compute a study, write its data, draw its figure from the file; return what was written."""
+def run(name: str, smoke: bool = False, out: Path | None = None, **choices: Any) -> xarray.Dataset:
+    """Compute a study with some choices of its own, write its data, draw its figure from the file; return what was written."""
     module: Any = import_module(f"experiments.{name}")
     if smoke and out is None:
         out = Path(tempfile.mkdtemp(prefix="experiments-"))
     start = time.perf_counter()
-    data = module.study(smoke)
+    data = module.study(smoke, **choices)
     data.attrs |= {
         "title": name,
         "claim": inspect.cleandoc(module.__doc__),
@@ -63,6 +64,8 @@ def redraw(name: str, out: Path | None = None) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     module.figure(data).savefig(file, dpi=DPI)
     Image.open(file).convert("RGB").quantize(COLOURS).save(file, optimize=True)
+    if hasattr(module, "page"):
+        ((HERE if out is None else out) / f"{name}.md").write_text(module.page(data), encoding="utf-8")
     failed = [part for part, true in module.holds(data).items() if not true]
     print(f"{name} ({data.attrs['seconds']} s): {module.headline(data)}")
     print(f"  {data_file(name, out)}, {file}", *(f"\n  DOES NOT HOLD: {part}" for part in failed))

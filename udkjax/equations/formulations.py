@@ -22,7 +22,7 @@ from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
 from udkjax.pinv.rule import exceeds
 from udkjax.printing import PrintsLine
-from udkjax.scene.fields import number
+from udkjax.scene.fields import number, number_called
 
 
 class Formulation(PrintsLine):
@@ -95,7 +95,7 @@ class NullSpaceQR(PointwiseFormulation):
         rank_tol: what counts as dependent, relative to the longest row or the largest singular value.
     """
 
-    rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
+    rank_tol: Float[Array, ""] = eqx.field(converter=number_called("rank_tol"), default=RANK_TOL)
 
     def solve(self, M, F, A, c):
         if not len(A):
@@ -124,7 +124,7 @@ class NullSpaceSVD(PointwiseFormulation):
         rank_tol: what counts as dependent, relative to the longest row or the largest singular value.
     """
 
-    rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
+    rank_tol: Float[Array, ""] = eqx.field(converter=number_called("rank_tol"), default=RANK_TOL)
 
     def solve(self, M, F, A, c):
         if not len(A):

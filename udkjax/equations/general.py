@@ -12,7 +12,7 @@ from udkjax.equations.scales import RANK_TOL
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
 from udkjax.printing import PrintsLine
-from udkjax.scene.fields import number, optional_number
+from udkjax.scene.fields import number, number_called
 
 
 class ConstrainedSystem(PrintsLine):
@@ -35,7 +35,7 @@ class ConstrainedSystem(PrintsLine):
     force: Callable[[Time, Vector, Vector], Float[ArrayLike, "n"]]
     constraint: Callable[[Time, Vector], Float[ArrayLike, "m"]] | None = None
     velocity_constraint: Callable[[Time, Vector, Vector], Float[ArrayLike, "k"]] | None = None
-    breakpoints: Float[Array, "k"] | None = eqx.field(converter=optional_number, default=None)
+    breakpoints: Float[Array, "k"] | None = eqx.field(converter=number_called("breakpoints", optional=True), default=None)
 
 
 class GeneralEquations(AbstractSystem):

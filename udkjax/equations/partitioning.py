@@ -20,7 +20,7 @@ from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
-from udkjax.scene.fields import number
+from udkjax.scene.fields import number_called
 
 PARTITION_NEWTON_STEPS = 10  # from the prediction of a step; three or four are usual
 
@@ -44,7 +44,7 @@ class CoordinatePartitioning(Formulation):
         rank_tol: what counts as dependent, relative to the longest row or the largest singular value.
     """
 
-    rank_tol: Float[Array, ""] = eqx.field(converter=number, default=RANK_TOL)
+    rank_tol: Float[Array, ""] = eqx.field(converter=number_called("rank_tol"), default=RANK_TOL)
 
     def formulate(self, equations: AbstractSystem) -> "PartitionedSystem":
         if not isinstance(equations, MechanismSystem):

@@ -26,7 +26,7 @@ from udkjax.equations import constraints, loads
 from udkjax.equations.constraints import State, vector
 from udkjax.pinv import Plus, Pseudoinverse
 from udkjax.printing import PrintsLine
-from udkjax.scene.fields import number
+from udkjax.scene.fields import number_called
 from udkjax.scene.mechanism import Mechanism
 
 Weights = Float[ArrayLike, "m"] | None
@@ -46,7 +46,7 @@ class Baumgarte(PrintsLine):
     beta: Float[Array, ""]
 
     def __init__(self, alpha: Scalar = 5.0, beta: Scalar = 5.0):
-        self.alpha, self.beta = number(alpha), number(beta)
+        self.alpha, self.beta = number_called("alpha")(alpha), number_called("beta")(beta)
 
 
 def D(mechanism: Mechanism, t: Scalar, q: State, w: Weights = None) -> Float[Array, "m n"]:

@@ -36,7 +36,7 @@ from udkjax.integrate.closure import close_by_jax, close_by_machine_code
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.description import poses_table
-from udkjax.scene.fields import number
+from udkjax.scene.fields import number, number_called
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.suspicions import suspicions
 
@@ -55,7 +55,7 @@ class State(PrintsTable):
     v: Float[Array, "bodies 3"] | Float[Array, "n"]
 
     def __init__(self, q: Numbers, v: Numbers):
-        self.q, self.v = number(q), number(v)
+        self.q, self.v = number_called("q")(q), number_called("v")(v)
 
     _units = units(q="m, m, rad", v="m/s, m/s, rad/s")
 

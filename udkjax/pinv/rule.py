@@ -47,7 +47,11 @@ def number(value: Scalar | None) -> Float[Array, ""] | None:
     dtype = jnp.result_type(float)
     if isinstance(value, float | int | np.number):
         value = np.asarray(value, dtype)  # JAX would compile a program to convert it
-    return None if value is None else jnp.asarray(value, dtype=dtype)
+    try:
+        return None if value is None else jnp.asarray(value, dtype=dtype)
+    except (TypeError, ValueError):
+        what = "a text" if isinstance(value, str) else f"an object of type {type(value).__name__}"
+        raise TypeError(f"a threshold (rank_tol, or branch_tol of Auto) must be one number or None, not {what}") from None
 
 
 class Pseudoinverse(PrintsLine):
@@ -112,6 +116,8 @@ class Pseudoinverse(PrintsLine):
 
     def plus(self, D: Operator) -> "Plus":
         """D^+ as an operator, factorized once: `plus @ b`, `plus.T @ x`, `plus.rank`."""
+        if np.shape(self.rank_tol):
+            raise ValueError(f"rank_tol must be one number, not of the shape {np.shape(self.rank_tol)}; a batch is for jax.vmap")
         D = self.admit(D)
         method = jax.lax.stop_gradient(self)
         return Plus(method, jax.lax.stop_gradient(method.factor(jax.lax.stop_gradient(D))), D)

@@ -92,7 +92,9 @@ def _checks_of(function: Callable[..., object]) -> list[tuple[str, Check]]:
             found.append((name, _choice(get_args(annotation))))
         elif classes := _classes(annotation):
             found.append((name, _instance(classes)))
-        if name in CHECKS:
+        if name in ("solution", "motion") and parameter.default is parameter.empty:
+            found.append((name, require_history))
+        elif name in CHECKS:
             found.append((name, CHECKS[name]))
     return found
 
@@ -352,6 +354,26 @@ def _optional(check: Callable[..., None], **choices: Any) -> Check:
     return applied
 
 
+def _require_array(name: str, value: Any, given: Given) -> None:
+    require_finite(name, value)
+
+
+def _require_mapping(name: str, value: Any, given: Given) -> None:
+    if value is not None and not isinstance(value, Mapping):
+        raise TypeError(f"{name} must map names to numbers, such as {{name: number}}, {describe(value)}")
+
+
+def _require_point(name: str, value: Any, given: Given) -> None:
+    if array(name, value).shape != (2,):
+        raise ValueError(f"{name} must be two numbers, x and y in m, {describe(value)}")
+    require_finite(name, value)
+
+
+def _require_names(name: str, value: Any, given: Given) -> None:
+    if not isinstance(value, str) and not (isinstance(value, list | tuple) and all(isinstance(x, str) for x in value)):
+        raise TypeError(f"{name} must be the name of a body, or a list of names, {describe(value)}")
+
+
 CHECKS: dict[str, Check] = {
     "mechanism": _check_mechanism,
     "method": _check_thresholds,
@@ -374,6 +396,19 @@ CHECKS: dict[str, Check] = {
     "max_events": _optional(require_count),
     "starts": _optional(require_count),
     "seed": _optional(require_count, least=0),
+    "values": _require_array,
+    "axes": _require_mapping,
+    "rate": _require_array,
+    "acceleration": _require_array,
+    "value": _optional(require_number),
+    "length": _optional(require_number, sign="positive"),
+    "angle": _optional(require_number),
+    "angular_velocity": _optional(require_number),
+    "held": _require_mapping,
+    "weights": _require_mapping,
+    "compliances": _require_mapping,
+    "point": _require_point,
+    "bodies": _require_names,
     "solver": _of_diffrax("AbstractSolver", "diffrax.Tsit5()"),
     "adjoint": _of_diffrax("AbstractAdjoint", "diffrax.ForwardMode()"),
 }

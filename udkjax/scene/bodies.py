@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.printing import PrintsLine, one_line
-from udkjax.scene.fields import POSITIVE, Number, array_namespace, number
+from udkjax.scene.fields import POSITIVE, Number, array_namespace, given_number
 
 GROUND = "ground"
 COORDINATES = ("x", "y", "angle")  # of a body, in the order in which q and v hold them
@@ -29,12 +29,12 @@ class Body(PrintsLine):
         angular_velocity: in rad/s.
     """
 
-    mass: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)  # kg, > 0
-    inertia: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)  # kg m^2 about the centre of mass, > 0
-    position: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))  # m
-    angle: Float[Array, ""] = eqx.field(converter=number, default=0.0)  # rad, anticlockwise from the x axis
-    velocity: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))  # m/s
-    angular_velocity: Float[Array, ""] = eqx.field(converter=number, default=0.0)  # rad/s
+    mass: Float[Array, ""] = eqx.field(converter=given_number, metadata=POSITIVE)  # kg, > 0
+    inertia: Float[Array, ""] = eqx.field(converter=given_number, metadata=POSITIVE)  # kg m^2 about the centre of mass, > 0
+    position: Float[Array, "2"] = eqx.field(converter=given_number, default=(0.0, 0.0))  # m
+    angle: Float[Array, ""] = eqx.field(converter=given_number, default=0.0)  # rad, anticlockwise from the x axis
+    velocity: Float[Array, "2"] = eqx.field(converter=given_number, default=(0.0, 0.0))  # m/s
+    angular_velocity: Float[Array, ""] = eqx.field(converter=given_number, default=0.0)  # rad/s
 
     def frame(self) -> "Frame":
         """Return the body's frame at its initial guess."""

@@ -116,7 +116,7 @@ def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetad
     if hasattr(annotation, "dim_str"):
         yield from _check_number(path, annotation.dim_str.split(), value, metadata, sizes)
     elif get_origin(annotation) is Literal:
-        if value not in get_args(annotation):
+        if not isinstance(value, str) or value not in get_args(annotation):
             choices = ", ".join(quote(choice) for choice in get_args(annotation))
             yield f"{path}: must be one of {choices}, is {abbreviate(value)}{suggestion(value, get_args(annotation))}"
     elif annotation in (str, bool):
@@ -224,7 +224,8 @@ def _check_bodies(where: str, cls: type, table: Table) -> Iterator[str]:
         return
     if is_in_format(cls) and len(bodies) != (n := getattr(cls, "n_bodies", 2)):
         yield f"{where}.bodies: must name {n} {'body' if n == 1 else 'bodies'}, is {abbreviate(bodies)}"
-    carrier = [table["carrier"]] if table.get("carrier", GROUND) != GROUND else []
+    named = table.get("carrier", GROUND)
+    carrier = [named] if isinstance(named, str) and named != GROUND else []
     attached = [*bodies, *carrier]
     twice = {name: None for name in attached if isinstance(name, str) and attached.count(name) > 1}
     yield from (f"{where}.{'carrier' if name in carrier else 'bodies'}: {quote(name)} is connected to itself" for name in twice)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Point, between
-from udkjax.scene.fields import KNOTS, NOT_EMPTY, Number, direction, number, number_or_guess
+from udkjax.scene.fields import KNOTS, NOT_EMPTY, Number, given_direction, given_number, given_or_guess
 from udkjax.scene.joints import Constraint, fill
 from udkjax.scene.splines import natural_spline
 
@@ -38,7 +38,7 @@ class Polynomial(Motion):
         coefficients: c0, c1, c2, ..., in the unit of the coordinate (rad or m) per power of seconds.
     """
 
-    coefficients: Float[Array, "n"] = eqx.field(converter=number, metadata=NOT_EMPTY)
+    coefficients: Float[Array, "n"] = eqx.field(converter=given_number, metadata=NOT_EMPTY)
 
     def __call__(self, t):
         value = self.coefficients[-1]
@@ -57,10 +57,10 @@ class Sine(Motion):
         offset: in the unit of the coordinate.
     """
 
-    amplitude: Float[Array, ""] = eqx.field(converter=number)
-    frequency: Float[Array, ""] = eqx.field(converter=number)
-    phase: Float[Array, ""] = eqx.field(converter=number, default=0.0)
-    offset: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    amplitude: Float[Array, ""] = eqx.field(converter=given_number)
+    frequency: Float[Array, ""] = eqx.field(converter=given_number)
+    phase: Float[Array, ""] = eqx.field(converter=given_number, default=0.0)
+    offset: Float[Array, ""] = eqx.field(converter=given_number, default=0.0)
 
     def __call__(self, t):
         return self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase)
@@ -74,8 +74,8 @@ class Spline(Motion):
         values: at these times, in the unit of the coordinate (rad or m).
     """
 
-    times: Float[Array, "n"] = eqx.field(converter=number, metadata=KNOTS)
-    values: Float[Array, "n"] = eqx.field(converter=number)
+    times: Float[Array, "n"] = eqx.field(converter=given_number, metadata=KNOTS)
+    values: Float[Array, "n"] = eqx.field(converter=given_number)
 
     def __call__(self, t):
         return natural_spline(t, self.times, self.values)
@@ -102,8 +102,8 @@ class Driver(Constraint):
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
     motion: Motion
-    points: Float[Array, "2 2"] = eqx.field(converter=number_or_guess, default=None)
-    axis: Float[Array, ""] | None = eqx.field(converter=direction, default=None)  # of x, for `x` and `y`; None: that of body 1
+    points: Float[Array, "2 2"] = eqx.field(converter=given_or_guess, default=None)
+    axis: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # of x, for `x`, `y`; None: that of body 1
 
     def residual(self, t, *frames):
         one, two = frames

@@ -6,6 +6,7 @@ shape, and the metadata below state what else must hold. Files and Python are ch
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from types import ModuleType
 from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict
 
@@ -61,6 +62,37 @@ def direction(value: Numbers | None) -> Float[Array, ""]:
     return number(xp.arctan2(y, x))
 
 
+def or_as_given(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a converter for fields of a scene's elements: what cannot be converted stays as it is.
+
+    The mechanism that the element is put into refuses it, and names its place.
+    """
+
+    @wraps(convert)
+    def converted(value: Any) -> Any:
+        try:
+            return convert(value)
+        except (TypeError, ValueError, OverflowError):
+            return value
+
+    return converted
+
+
+def number_called(name: str, optional: bool = False) -> Callable[[Any], Any]:
+    """Return `number` as a converter of a field or an argument that errors call by its name; `optional`: None stays None."""
+
+    def converted(value: Any) -> Any:
+        if optional and value is None:
+            return None
+        try:
+            return number(value)
+        except (TypeError, ValueError, OverflowError):
+            kind = "a text" if isinstance(value, str) else f"an object of type {type(value).__name__}"
+            raise TypeError(f"{name} must be a number or an array of numbers, not {kind}") from None
+
+    return converted
+
+
 def vector_as_angle(value: Any) -> Any:
     """Return the angle (rad) of a vector of two numbers in a table; anything else as it is, for others to refuse."""
     is_vector = isinstance(value, list | tuple) and len(value) == 2 and all(type(x) in (int, float) for x in value) and any(value)
@@ -68,8 +100,15 @@ def vector_as_angle(value: Any) -> Any:
 
 
 def names(value: Sequence[str] | str) -> tuple[str, ...]:
-    """Make a hashable tuple of names."""
-    return (value,) if isinstance(value, str) else tuple(value)
+    """Make a hashable tuple of names; raise TypeError where something is no name."""
+    found = (value,) if isinstance(value, str) else tuple(value)
+    if not all(isinstance(name, str) for name in found):
+        raise TypeError("must be a name, or a list of names")
+    return found
+
+
+given_number, given_or_none, given_or_guess = map(or_as_given, (number, optional_number, number_or_guess))
+given_direction, given_names = or_as_given(direction), or_as_given(names)
 
 
 @jax.tree_util.register_static

@@ -9,7 +9,16 @@ from jaxtyping import Array, Float
 
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Frame, Point, between
-from udkjax.scene.fields import BODY, NOT_NEGATIVE, POSITIVE, REVOLUTE, Number, names, number, optional_number
+from udkjax.scene.fields import (
+    BODY,
+    NOT_NEGATIVE,
+    POSITIVE,
+    REVOLUTE,
+    Number,
+    given_names,
+    given_number,
+    given_or_none,
+)
 
 Load = tuple[Number, Number, Number]  # force x, force y (N), torque about the centre of mass (N m), in ground axes
 
@@ -23,7 +32,7 @@ class ForceElement(PrintsLine):
         bodies: the names of the bodies whose frames `potential` and `loads` get.
     """
 
-    bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
+    bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
     n_bodies: ClassVar[int] = 2  # how many `bodies` a type of the scene format names
 
     def potential(self, t: Number, *frames: Frame) -> Number | None:
@@ -60,10 +69,10 @@ class Spring(ForceElement):
         damping: in N s/m, not negative; None: no damper.
     """
 
-    points: Float[Array, "2 2"] = eqx.field(converter=number)
-    stiffness: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
-    length: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
-    damping: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=NOT_NEGATIVE)
+    points: Float[Array, "2 2"] = eqx.field(converter=given_number)
+    stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)
+    length: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)
+    damping: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
 
     def potential(self, t, *frames):
         return 0.5 * self.stiffness * (between(self.points, *frames).norm() - self.length) ** 2
@@ -91,9 +100,9 @@ class TorsionSpring(ForceElement):
         angle: theta2 - theta1 without load (rad).
     """
 
-    stiffness: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
-    damping: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=NOT_NEGATIVE)
-    angle: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)
+    damping: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
+    angle: Float[Array, ""] = eqx.field(converter=given_number, default=0.0)
 
     def potential(self, t, *frames):
         one, two = frames
@@ -118,8 +127,8 @@ class Force(ForceElement):
 
     bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)
     body: str = eqx.field(static=True, metadata=BODY)
-    vector: Float[Array, "2"] = eqx.field(converter=number)
-    point: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))
+    vector: Float[Array, "2"] = eqx.field(converter=given_number)
+    point: Float[Array, "2"] = eqx.field(converter=given_number, default=(0.0, 0.0))
     frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")
 
     def __post_init__(self):
@@ -139,7 +148,7 @@ class Torque(ForceElement):
         value: in N m, anticlockwise.
     """
 
-    value: Float[Array, ""] = eqx.field(converter=number)
+    value: Float[Array, ""] = eqx.field(converter=given_number)
 
     def loads(self, t, *frames):
         return _couple(self.value)
@@ -159,8 +168,8 @@ class Friction(ForceElement):
 
     bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)
     joint: str = eqx.field(static=True, metadata=REVOLUTE)
-    torque: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)
-    velocity: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)
+    torque: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)
+    velocity: Float[Array, ""] = eqx.field(converter=given_number, metadata=POSITIVE)
 
     def loads(self, t, *frames):
         one, two = frames

@@ -8,7 +8,7 @@ them. A number that is None when a joint is made ("as in the initial guess") is 
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,10 +24,11 @@ from udkjax.scene.fields import (
     PROFILE_RADII,
     Number,
     Numbers,
-    direction,
-    names,
+    given_direction,
+    given_names,
+    given_number,
+    given_or_guess,
     number,
-    number_or_guess,
 )
 from udkjax.scene.splines import count_knots, periodic_spline, wrap
 
@@ -39,7 +40,7 @@ class Constraint(PrintsLine):
         bodies: the names of the bodies whose frames `residual` gets.
     """
 
-    bodies: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=BODY)
+    bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
     n_bodies: ClassVar[int] = 2  # how many `bodies` a type of the scene format names
 
     __getattr__ = renamed_attributes("Constraint", attached="frame_names", resolved="complete")
@@ -90,7 +91,7 @@ class Revolute(Joint):
         points: the pin in both bodies, in each body's own frame (m).
     """
 
-    points: Float[Array, "2 2"] = eqx.field(converter=number)
+    points: Float[Array, "2 2"] = eqx.field(converter=given_number)
 
     def residual(self, t, *frames):
         one, two = frames
@@ -111,9 +112,9 @@ class Prismatic(Joint):
         angle: theta2 - theta1 (rad); by default as in the initial guess.
     """
 
-    points: Float[Array, "2 2"] = eqx.field(converter=number)
-    axis: Float[Array, ""] = eqx.field(converter=direction)
-    angle: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None)
+    points: Float[Array, "2 2"] = eqx.field(converter=given_number)
+    axis: Float[Array, ""] = eqx.field(converter=given_direction)
+    angle: Float[Array, ""] = eqx.field(converter=given_or_guess, default=None)
 
     def residual(self, t, *frames):
         one, two = frames
@@ -132,8 +133,8 @@ class Slot(Joint):
         axis: the direction of the line in body 1's frame, as an angle (rad) or as a vector.
     """
 
-    points: Float[Array, "2 2"] = eqx.field(converter=number)
-    axis: Float[Array, ""] = eqx.field(converter=direction)
+    points: Float[Array, "2 2"] = eqx.field(converter=given_number)
+    axis: Float[Array, ""] = eqx.field(converter=given_direction)
 
     def residual(self, t, *frames):
         return [_lateral_distance(self.axis, self.points, *frames)]
@@ -148,8 +149,8 @@ class Weld(Joint):
         angle: theta2 - theta1 (rad); by default as in the initial guess.
     """
 
-    points: Float[Array, "2 2"] = eqx.field(converter=number)
-    angle: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None)
+    points: Float[Array, "2 2"] = eqx.field(converter=given_number)
+    angle: Float[Array, ""] = eqx.field(converter=given_or_guess, default=None)
 
     def residual(self, t, *frames):
         one, two = frames
@@ -171,8 +172,8 @@ class Distance(Joint):
         length: of the rod (m), greater than zero; by default as in the initial guess.
     """
 
-    points: Float[Array, "2 2"] = eqx.field(converter=number)
-    length: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None, metadata=POSITIVE)
+    points: Float[Array, "2 2"] = eqx.field(converter=given_number)
+    length: Float[Array, ""] = eqx.field(converter=given_or_guess, default=None, metadata=POSITIVE)
 
     def residual(self, t, *frames):
         one, two = frames
@@ -191,7 +192,7 @@ class Angle(Joint):
         angle: theta2 - theta1 (rad); by default as in the initial guess.
     """
 
-    angle: Float[Array, ""] = eqx.field(converter=number_or_guess, default=None)
+    angle: Float[Array, ""] = eqx.field(converter=given_or_guess, default=None)
 
     def residual(self, t, *frames):
         one, two = frames
@@ -214,7 +215,7 @@ class Gear(Joint):
         carrier: the body that holds both centres.
     """
 
-    radii: Float[Array, "2"] = eqx.field(converter=number, metadata=POSITIVE)
+    radii: Float[Array, "2"] = eqx.field(converter=given_number, metadata=POSITIVE)
     internal: bool = eqx.field(static=True, default=False)
     carrier: str = eqx.field(static=True, default=GROUND, metadata=BODY)
     constant: Float[Array, ""] = eqx.field(init=False, default_factory=lambda: None)
@@ -247,8 +248,8 @@ class Rack(Joint):
         axis: the direction of the rack in body 1's frame, as an angle (rad) or as a vector.
     """
 
-    radius: Float[Array, ""] = eqx.field(converter=number, metadata=POSITIVE)
-    axis: Float[Array, ""] = eqx.field(converter=direction)
+    radius: Float[Array, ""] = eqx.field(converter=given_number, metadata=POSITIVE)
+    axis: Float[Array, ""] = eqx.field(converter=given_direction)
     constant: Float[Array, ""] = eqx.field(init=False, default_factory=lambda: None)
 
     def residual(self, t, *frames):
@@ -270,8 +271,8 @@ class Profile(PrintsLine):
         radius: at each of them (m), greater than zero.
     """
 
-    angle: Float[Array, "n"] = eqx.field(converter=number, metadata=PROFILE_ANGLES)  # rad, increasing, less than one turn
-    radius: Float[Array, "n"] = eqx.field(converter=number, metadata=PROFILE_RADII)  # m
+    angle: Float[Array, "n"] = eqx.field(converter=given_number, metadata=PROFILE_ANGLES)  # rad, increasing, less than one turn
+    radius: Float[Array, "n"] = eqx.field(converter=given_number, metadata=PROFILE_RADII)  # m
 
     def __call__(self, angle: Number) -> Array:
         """Return the radius (m) at a polar angle (rad)."""
@@ -282,9 +283,9 @@ class Profile(PrintsLine):
         return count_knots(wrap(angle, self.angle[0], 2 * jnp.pi), self.angle)
 
 
-def as_profile(value: Profile | Mapping[str, Numbers]) -> Profile:
-    """Return a profile, which may be given as a table."""
-    return value if isinstance(value, Profile) else Profile(**value)
+def as_profile(value: Any) -> Any:
+    """Return a profile, which may be given as a table; anything else as it is, for the mechanism to refuse."""
+    return Profile(**value) if isinstance(value, Mapping) and value.keys() == {"angle", "radius"} else value
 
 
 class Cam(Joint):
@@ -298,7 +299,7 @@ class Cam(Joint):
         profile: a `Profile`, or a table of its angles and radii.
     """
 
-    points: Float[Array, "2 2"] = eqx.field(converter=number)
+    points: Float[Array, "2 2"] = eqx.field(converter=given_number)
     profile: Profile = eqx.field(converter=as_profile)
 
     def residual(self, t, *frames):

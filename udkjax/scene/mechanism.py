@@ -19,10 +19,18 @@ from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
 from udkjax.scene.checks import SceneEntry, SceneError, check_hashable, problems_of
 from udkjax.scene.description import mechanism_table
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Numbers, StaticValue, number
+from udkjax.scene.fields import Numbers, StaticValue, given_number, number
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.joints import AnyConstraint, Constraint, Joint
-from udkjax.scene.number_fields import groups_of, parameters_in, parameters_of, replace_numbers, split_index, value_of
+from udkjax.scene.number_fields import (
+    groups_of,
+    parameters_in,
+    parameters_of,
+    replace_numbers,
+    require_values,
+    split_index,
+    value_of,
+)
 from udkjax.scene.schema import table_of, type_name
 
 Element = TypeVar("Element", bound=eqx.Module)
@@ -222,6 +230,7 @@ class Mechanism(PrintsTable):
         Numbers of a drawing (`pin.A`, `link.crank.width`) change all that follows from them. A number that follows from the
         drawing (`body.crank.mass`) may be changed as well, and keeps its value when the drawing changes. Raises `SceneError`.
         """
+        require_values(values, self.name)
         traced = any(isinstance(value, Tracer) for value in jax.tree.leaves(dict(values)))
         origin = Origin(self) if traced and self.is_concrete else self.origin
         base, own, changed = self, values, ()
@@ -308,7 +317,7 @@ def _has_load(cls: type) -> bool:
 
 def _as_number(leaf: object) -> object:
     """Convert the plain numbers of user-written elements, which would be static."""
-    return number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
+    return given_number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
 
 
 def _as_static(leaf: object) -> object:

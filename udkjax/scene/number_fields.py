@@ -81,6 +81,12 @@ def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
     return _at(elements[parameter.owner], parameter.path[:-1])
 
 
+def require_values(values: object, name: str) -> None:
+    """Raise `SceneError`, of the scene called `name`, where values do not go by names of parameters."""
+    if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
+        raise SceneError([f"values must map names of parameters to numbers, is {abbreviate(values)}"], name)
+
+
 def replace_numbers(
     groups: Mapping[str, Mapping[str, Any]],
     gravity: Array,
@@ -138,7 +144,7 @@ def _fit(
     """Return the parameter's new value, or None and why the value does not fit."""
     try:
         new = None if isinstance(value, bool) else number(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         new = None
     if new is None:
         return None, f"{given}: must be a number or an array, is {abbreviate(value)}"

@@ -21,7 +21,7 @@ from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.drivers import Driver, Motion, Polynomial
-from udkjax.scene.fields import Numbers, names, number, optional_number
+from udkjax.scene.fields import Numbers, names, number, number_called
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.study.channels import channel_of, point_of_pin
@@ -45,7 +45,7 @@ class Coordinate(PrintsLine):
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
     coordinate: CoordinateName = eqx.field(static=True, default="angle")
-    points: Float[Array, "2 2"] | None = eqx.field(converter=optional_number, default=None)
+    points: Float[Array, "2 2"] | None = eqx.field(converter=number_called("points", optional=True), default=None)
 
 
 Drive = str | Coordinate | None  # a driver's name, the name of a coordinate, a coordinate; or all drivers along time
@@ -54,7 +54,7 @@ Drive = str | Coordinate | None  # a driver's name, the name of a coordinate, a 
 class Value(Motion):
     """The value of a coordinate, in place of time, from an `origin` on (rad, m)."""
 
-    origin: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    origin: Float[Array, ""] = eqx.field(converter=number_called("origin"), default=0.0)
 
     def __call__(self, t: Scalar) -> Float[Array, ""]:
         return self.origin + t

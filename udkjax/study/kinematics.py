@@ -173,6 +173,11 @@ def kinematics(
     values, rate, acceleration = number(values), number(rate), number(acceleration)
     if values.ndim != 1 or not len(values):
         raise ValueError(f"values must be a list of at least one number, not of the shape {values.shape}; batch it by jax.vmap")
+    for name, given in (("rate", rate), ("acceleration", acceleration)):
+        if given.shape not in ((), values.shape):
+            raise ValueError(
+                f"{name} must be one number, or one for each of the {len(values)} values; its shape is {given.shape}"
+            )
     driven, q = _start(mechanism, driver, values[0], state, held)
     if is_known((driven, q, values, rate, acceleration)) and can_march(driven.mechanism, driven.analysis):
         given = np.asarray(q), np.asarray(values), np.asarray(rate), np.asarray(acceleration)

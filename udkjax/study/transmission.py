@@ -11,7 +11,7 @@ from udkjax.integrate.assembly import State
 from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
-from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
@@ -91,6 +91,7 @@ def coupler_curve(
     **choices: Any,
 ) -> Float[Array, "T 2"]:
     """Return the path (m) of a point of a body, given in its own frame (m), over the values of a driver: see `kinematics`."""
+    _require_body(mechanism, body)
     return kinematics(mechanism, driver, values, **choices).path(body, jnp.asarray(point))
 
 
@@ -115,6 +116,7 @@ def workspace(
     Raises:
         SceneError: no such driver or coordinate, or positions do not follow from them.
     """
+    _require_body(mechanism, body)
     if len(drivers) != 2:
         raise SceneError([f"a workspace is over two drivers, not {len(drivers)}"], mechanism.name)
     (first, outer), (second, inner) = ((name, number(values)) for name, values in drivers.items())
@@ -128,3 +130,8 @@ def workspace(
     points, reached = jax.vmap(across)(outer, safe)
     reached = reached & along.reached[:, None]
     return Workspace(jnp.where(reached[..., None], points, jnp.nan), reached)
+
+
+def _require_body(mechanism: Mechanism, body: str) -> None:
+    if body not in mechanism.body_names:
+        raise SceneError([f"body: no body named {quote(body)}{suggestion(body, mechanism.body_names)}"], mechanism.name)

@@ -12,17 +12,7 @@ from udkjax.scene.checks import quote
 from udkjax.scene.drawing.drawn_element import DrawnElement, Parts, pair_mistakes
 from udkjax.scene.drawing.placement import PinLayout, Placement
 from udkjax.scene.drivers import Driver, Motion, Polynomial, Sine, Spline
-from udkjax.scene.fields import (
-    LINK,
-    NOT_NEGATIVE,
-    PIN,
-    SLIDE,
-    Number,
-    array_namespace,
-    names,
-    number,
-    optional_number,
-)
+from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, SLIDE, Number, array_namespace, given_names, given_number, given_or_none
 from udkjax.scene.forces import Force, Spring, Torque, TorsionSpring
 
 
@@ -34,10 +24,12 @@ class Motor(DrawnElement):
 
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
     slide: str | None = eqx.field(static=True, default=None, metadata=SLIDE)
-    of: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=LINK)  # needed where more than two meet
-    speed: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)  # rad/s; of a slide: m/s
+    of: tuple[str, ...] = eqx.field(
+        static=True, converter=given_names, default=(), metadata=LINK
+    )  # needed where more than two meet
+    speed: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad/s; of a slide: m/s
     motion: Motion | None = None  # rad or m, from the drawn position
-    torque: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)  # N m
+    torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m
 
     @property
     def measured_as(self):
@@ -78,13 +70,15 @@ class PinSpring(DrawnElement):
     Both are unloaded as drawn unless told otherwise; an angle counts from there.
     """
 
-    stiffness: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)  # N/m; of torsion: N m/rad
-    between: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=PIN)
+    stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N/m; of torsion: N m/rad
+    between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
-    of: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=LINK)  # needed where more than two meet
-    damping: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=NOT_NEGATIVE)
-    length: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=NOT_NEGATIVE)  # m
-    angle: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)  # rad
+    of: tuple[str, ...] = eqx.field(
+        static=True, converter=given_names, default=(), metadata=LINK
+    )  # needed where more than two meet
+    damping: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
+    length: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)  # m
+    angle: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad
 
     @property
     def measured_as(self):
@@ -113,10 +107,12 @@ class PinSpring(DrawnElement):
 class PinDamper(DrawnElement):
     """A damper `between` two pins, or of the turning at a `pin`."""
 
-    damping: Float[Array, ""] = eqx.field(converter=number, metadata=NOT_NEGATIVE)  # N s/m; of turning: N m s/rad
-    between: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=PIN)
+    damping: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N s/m; of turning: N m s/rad
+    between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
-    of: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=LINK)  # needed where more than two meet
+    of: tuple[str, ...] = eqx.field(
+        static=True, converter=given_names, default=(), metadata=LINK
+    )  # needed where more than two meet
 
     @property
     def measured_as(self):
@@ -140,8 +136,8 @@ class Load(DrawnElement):
 
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
     link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # beside a pin: which of its links
-    force: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None)  # N
-    torque: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)  # N m, from the ground
+    force: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # N
+    torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m, from the ground
     frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")  # whose axes the force has
 
     def mistakes(self, layout):
@@ -191,7 +187,7 @@ class ShiftedMotion(Motion):
     """A motion law of the user's own that begins at another value."""
 
     motion: Motion
-    start: Float[Array, ""] = eqx.field(converter=number)
+    start: Float[Array, ""] = eqx.field(converter=given_number)
 
     def __call__(self, t):
         return self.motion(t) + self.start

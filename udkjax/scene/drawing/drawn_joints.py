@@ -13,9 +13,9 @@ from udkjax.scene.fields import (
     POSITIVE,
     Number,
     array_namespace,
-    direction,
-    names,
-    optional_number,
+    given_direction,
+    given_names,
+    given_or_none,
 )
 from udkjax.scene.joints import Cam, Gear, Prismatic, Profile, Slot, as_profile
 
@@ -24,8 +24,8 @@ class Slide(DrawnElement):
     """A `link` slides along a line of another one, or the ground, and does not turn on it."""
 
     link: str = eqx.field(static=True, metadata=LINK)
-    along: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=PIN)  # two pins
-    direction: Float[Array, ""] | None = eqx.field(converter=direction, default=None)  # rad, or a vector; in place of `along`
+    along: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)  # two pins
+    direction: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # rad or a vector; instead of `along`
     on: str = eqx.field(static=True, default=GROUND, metadata=LINK)
 
     def mistakes(self, layout):
@@ -50,8 +50,8 @@ class PinInSlot(DrawnElement):
     """A `pin` is guided by a line of a link, or of the ground: through two pins, or through itself in a direction."""
 
     pin: str = eqx.field(static=True, metadata=PIN)
-    along: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=PIN)  # two pins
-    direction: Float[Array, ""] | None = eqx.field(converter=direction, default=None)  # rad, or a vector; in place of `along`
+    along: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)  # two pins
+    direction: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # rad or a vector; instead of `along`
     on: str = eqx.field(static=True, default=GROUND, metadata=LINK)
     link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # that is guided; needed where `on` shares the pin
 
@@ -79,9 +79,9 @@ class PinInSlot(DrawnElement):
 class GearPair(DrawnElement):
     """Two wheels mesh. Their centres are the pins by which they turn on the `carrier`; `teeth`, or `radii`, give the ratio."""
 
-    links: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=LINK)
-    teeth: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, metadata=POSITIVE)
-    radii: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None, metadata=POSITIVE)  # m
+    links: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=LINK)
+    teeth: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)
+    radii: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # m
     internal: bool = eqx.field(static=True, default=False)
     carrier: str = eqx.field(static=True, default=GROUND, metadata=LINK)
 
@@ -125,9 +125,9 @@ class CamPair(DrawnElement):
     world's x axis for a cam of one pin.
     """
 
-    pins: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=PIN)
+    pins: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=PIN)
     profile: Profile = eqx.field(converter=as_profile)
-    links: tuple[str, ...] = eqx.field(static=True, converter=names, default=(), metadata=LINK)  # cam and follower
+    links: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # cam and follower
 
     def mistakes(self, layout):
         if len(self.pins) != 2:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Body, Frame
 from udkjax.scene.drawing.shapes import Points, Shape, bar, disc, polygon
-from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, array_namespace, names, number, optional_number
+from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, array_namespace, given_names, given_number, given_or_none
 from udkjax.scene.fields import Number as Scalar
 
 Places = Mapping[str, Points]  # world coordinates of pins (m)
@@ -21,8 +21,8 @@ Places = Mapping[str, Points]  # world coordinates of pins (m)
 class Pin(PrintsLine):
     """A point of a drawing, in world coordinates, where links meet, and its initial velocity."""
 
-    position: Float[Array, "2"] = eqx.field(converter=number)  # m
-    velocity: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None)  # m/s; None: at rest
+    position: Float[Array, "2"] = eqx.field(converter=given_number)  # m
+    velocity: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # m/s; None: at rest
 
 
 class Link(PrintsLine):
@@ -44,14 +44,14 @@ class Link(PrintsLine):
         outline: corners of the polygon, in world coordinates (m).
     """
 
-    pins: tuple[str, ...] = eqx.field(static=True, converter=names, metadata=PIN)
-    density: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=POSITIVE)  # kg/m^3
-    width: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=NOT_NEGATIVE)  # m
-    thickness: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=POSITIVE)  # m
-    mass: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=POSITIVE)  # kg
-    inertia: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None, metadata=POSITIVE)  # kg m^2
-    centre: Float[Array, "2"] | None = eqx.field(converter=optional_number, default=None)  # m, in world coordinates
-    outline: Float[Array, "n 2"] | None = eqx.field(converter=optional_number, default=None, metadata=OUTLINE)  # m, likewise
+    pins: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=PIN)
+    density: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # kg/m^3
+    width: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)  # m
+    thickness: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # m
+    mass: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # kg
+    inertia: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # kg m^2
+    centre: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # m, in world coordinates
+    outline: Float[Array, "n 2"] | None = eqx.field(converter=given_or_none, default=None, metadata=OUTLINE)  # m, likewise
 
     @property
     def kind(self) -> str:

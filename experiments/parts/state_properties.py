@@ -1,0 +1,563 @@
+"""Properties of the equations at a state, by the scalar programs that machine code is made of, run on plain numbers.
+
+Nothing is compiled but the pseudoinverses, once for all mechanisms (`check_methods`), so that thousands take minutes.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import udkjax as udk
+from experiments.parts.random_scenes import RandomScene, Table, build, random_scene, state_of
+from experiments.parts.reference_equations import Terms, evaluate
+from experiments.parts.tally import Property, Tally, relative
+from udkjax.equations.loop_programs import loop_programs
+from udkjax.equations.scene_programs import elimination_programs, scene_programs
+from udkjax.equations.structure import numbers_as_vector
+from udkjax.expressions import ScalarProgram
+from udkjax.pinv.rank_policy import RankPolicy
+
+SAFE = 1e-12  # pivots relative to their rows above which elimination is trusted here: half of the digits
+GAP = 1e-6, 1e-11  # singular values of D relative to the largest: those that count, and those that do not; in between, neither
+ORDINARY = 30.0  # the condition number up to which a state is ordinary; beyond it errors may grow like its square
+ROUNDING = "rounding, of some hundred operations"
+CONDITION = "rounding, times the square of the condition number of the rows that are eliminated"
+PROPERTIES = {
+    "Psi": Property("Psi of the programs is that of an independent implementation", 1e-12, ROUNDING),
+    "Psi_q": Property("Psi_q, by rules for expressions, is that of Taylor series in NumPy", 1e-12, ROUNDING),
+    "Psi_dot": Property("Psi_dot is that of Taylor series", 1e-12, ROUNDING),
+    "gamma": Property(
+        "gamma is that of Taylor series of second order", 1e-12, f"{ROUNDING}, and differences of squares of rates"
+    ),
+    "loads": Property("M^(-1) F is that of loads written by hand", 1e-12, ROUNDING),
+    "energy": Property("Kinetic and potential energy are those written by hand", 1e-12, ROUNDING),
+    "large scenes": Property(
+        "Psi, Psi_q, Psi_dot, gamma and loads of large scenes, by loops, are those of NumPy", 1e-11, ROUNDING
+    ),
+    "elimination": Property("Elimination finds the accelerations that singular values of all rows find", 1e-12, "as asked for"),
+    "constraints": Property("Accelerations satisfy Psi_q a = gamma", 1e-11, CONDITION),
+    "Gauss": Property("a is nearest to a_F in the metric of M: N^T M (a - a_F) = 0 along all free motions N", 1e-11, CONDITION),
+    "power": Property("v^T (M a - F) = lambda^T Psi_t: the power of constraints is that of drivers", 1e-11, CONDITION),
+    "reciprocity": Property("An impulse at i moves j as one at j moves i, through all constraints", 1e-11, CONDITION),
+    "file": Property(
+        "A scene that is written and read has the same numbers, and accelerations to the bit", 0.5, "a count: of bits"
+    ),
+    "rigid motion": Property(
+        "A scene moved and turned as a whole, gravity too, has its accelerations turned",
+        1e-9,
+        "rounding, of positions far from the origin",
+    ),
+    "units": Property("A change of units of length, time and mass changes accelerations by them alone", 1e-11, CONDITION),
+    "names": Property("New names change nothing, to the bit", 0.5, "a count: of bits"),
+    "order": Property("Bodies, joints and forces in another order have the same accelerations", 1e-11, CONDITION),
+    "copies": Property("Constraints that are given k times change no acceleration", 1e-11, CONDITION),
+    **{
+        name: Property(f"{name} finds the accelerations of the reference, whatever is redundant", tol, because)
+        for name, tol, because in (
+            ("SVD", 1e-11, "rounding, times the condition number"),
+            ("Varga", 1e-11, "rounding, times the condition number"),
+            ("Householder", 1e-11, "rounding, times the condition number"),
+            ("GramSchmidt", 1e-11, "rounding, times the condition number"),
+            (
+                "Greville",
+                1e-7,
+                "rounding, times the square of the condition number of all leading rows",
+            ),
+            ("NullSpaceQR", 1e-11, "rounding, times the square of the condition number"),
+            ("NullSpaceSVD", 1e-11, "rounding, times the square of the condition number"),
+            ("Augmented by SVD", 1e-10, "rounding, times the square of the condition number"),
+        )
+    },
+}
+
+
+class Solved(NamedTuple):
+    """A state: the reference's terms, its accelerations by singular values, the free motions, the condition number."""
+
+    terms: Terms
+    a: np.ndarray
+    unit: np.ndarray  # of accelerations
+    weights: np.ndarray  # of the rows, which make them comparable
+    free: np.ndarray  # (n, k) in units of M^(-1/2)
+    condition: float
+    is_clear: bool
+
+
+def solve(scene: RandomScene, terms: Terms | None = None) -> Solved:
+    """Return the accelerations of the reference at the state of a scene."""
+    q, v = state_of(scene.table)
+    terms = evaluate(scene.table, 0.0, q, v) if terms is None else terms
+    unit = np.tile([scene.length, scene.length, 1.0], len(q))
+    root, free = 1 / np.sqrt(terms.mass), terms.force / terms.mass
+    if not len(terms.psi):
+        return Solved(terms, free, unit / scene.time**2, np.ones(0), np.eye(len(root)), 1.0, True)
+    size = np.max(abs(terms.psi_q * unit), axis=1)
+    weights = 1 / size
+    D = weights[:, None] * terms.psi_q * root * math.sqrt(scene.mass) * scene.length
+    u, sigma, vt = np.linalg.svd(D)
+    rank = int(np.sum(sigma > GAP[0] * sigma[0]))
+    b = weights * (terms.gamma - terms.psi_q @ free)
+    x = vt[:rank].T @ (u[:, :rank].T @ b / sigma[:rank])
+    a = free + root * x * math.sqrt(scene.mass) * scene.length
+    clear = bool(np.all(sigma[rank:] <= GAP[1] * sigma[0]))
+    return Solved(terms, a, unit / scene.time**2, weights, vt[rank:].T, float(sigma[0] / sigma[rank - 1]), clear)
+
+
+def growth(solved: Solved, power: int = 2, without: Sequence[int] = ()) -> float:
+    """How much more than at an ordinary state rounding errors may be; `without` the rows that elimination leaves out."""
+    condition = solved.condition
+    if without:
+        rows = (
+            np.delete(solved.terms.psi_q, without, 0) * solved.weights[np.delete(np.arange(len(solved.weights)), without), None]
+        )
+        sigma = np.linalg.svd(rows / np.sqrt(solved.terms.mass), compute_uv=False)
+        condition = max(condition, float(sigma[0] / sigma[-1])) if len(sigma) else condition
+    return max(1.0, condition / ORDINARY) ** power
+
+
+class Programs:
+    """The programs of mechanisms of one structure with their numbers in, run by NumPy on all of them at once."""
+
+    def __init__(self, mechanism: udk.Mechanism, redundant: Sequence[int], tables: Sequence[Table] = ()):
+        """Of one mechanism, or of `tables` of its structure, whose numbers take the places of its own."""
+        self.scene = scene_programs(mechanism)
+        self.elimination = elimination_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE)
+        own = np.concatenate([np.ravel(x) for x in jax.tree.leaves(mechanism)])
+        rows = numbers_of(mechanism, tables) if tables else own[None]
+        numbers = np.hstack([rows, np.tile([0.0, SAFE], (len(rows), 1))])
+        self._constants = {id(p): _run(p.prologue, numbers) for p in (self.scene, self.elimination)}
+
+    def run(self, program: ScalarProgram, q: np.ndarray, v: np.ndarray, more: Any = None, eliminates: bool = False) -> np.ndarray:
+        """Return the outputs (members, outputs) at q and v (members, n), t = 0."""
+        constants = self._constants[id(self.elimination if eliminates else self.scene)]
+        more = np.zeros((len(q), 0)) if more is None else more
+        return _run(program, np.hstack([constants, np.zeros((len(q), 1)), q, v, more]))
+
+    def accelerations(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """a (members, n) by elimination, and whether each is safe."""
+        found = self.run(self.elimination.accelerations, q, v, eliminates=True)
+        return found[:, :-1], found[:, -1] > 0
+
+    def impulse_response(self, q: np.ndarray, v: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """The change of the velocities that constraints leave of one."""
+        found = self.run(self.elimination.tangent_part, q, v, np.hstack([0.0 * change, change]), eliminates=True)
+        return found[:, change.shape[1] : 2 * change.shape[1]]
+
+
+def numbers_of(mechanism: udk.Mechanism, tables: Sequence[Table]) -> np.ndarray:
+    """Return the numbers of tables in the order in which a mechanism of their structure has them: a hundred times sooner than
+    mechanisms are made of them."""
+    name_of = {id(value): name for name, value in mechanism.parameters().items()}
+    name_of |= {id(j.constant): f"joint.{n}.constant" for n, j in mechanism.joints.items() if hasattr(j, "constant")}
+    names = [name_of[id(leaf)] for leaf in jax.tree.leaves(mechanism)]
+    found = []
+    for table in tables:
+        entries = {f"{s}.{e['name']}": e for s in ("body", "joint", "driver", "force") for e in table[s]}
+        frames = {"ground": (0.0, 0.0, 0.0)} | {b["name"]: (*b["position"], b["angle"]) for b in table["body"]}
+        found.append(np.concatenate([np.ravel(_number(table, entries, frames, name)) for name in names]))
+    return np.array(found)
+
+
+def _number(table: Table, entries: dict[str, Table], frames: dict[str, Any], name: str) -> Any:
+    if name == "gravity":
+        return table["gravity"]
+    section, owner, *path = name.split(".")
+    entry: Any = entries[f"{section}.{owner}"]
+    if path[0] in entry:
+        for key in path:
+            entry = entry[key]
+        return entry
+    # What is left to the guess.
+    if section == "driver":
+        return np.zeros((2, 2))
+    (x1, y1, a1), (x2, y2, a2) = one, two = [frames[b] for b in entry["bodies"]]
+    match entry["type"], path[0]:
+        case "distance", _:
+            (px, py), (qx, qy) = (
+                (x + np.cos(a) * p[0] - np.sin(a) * p[1], y + np.sin(a) * p[0] + np.cos(a) * p[1])
+                for (x, y, a), p in zip((one, two), entry["points"], strict=True)
+            )
+            return np.hypot(qx - px, qy - py)
+        case "gear", _:
+            r1, r2 = entry["radii"][0], entry["radii"][1] * (-1.0 if entry["internal"] else 1.0)
+            carrier = frames[entry.get("carrier", "ground")][2]
+            return r1 * (a1 - carrier) + r2 * (a2 - carrier)
+        case "rack", _:
+            along = a1 + entry["axis"]
+            return np.cos(along) * (x2 - x1) + np.sin(along) * (y2 - y1) + entry["radius"] * (a2 - a1)
+        case _, "angle":
+            return a2 - a1
+    raise KeyError(name)
+
+
+def _run(program: ScalarProgram, values: np.ndarray) -> np.ndarray:
+    typed = [column.astype(s.node.dtype) for column, s in zip(values.T, program.inputs, strict=True)]  # some are conditions
+    if len(values) == 1:
+        return np.array([program([column[0].item() for column in typed])], float)
+    return np.array(program.by_numpy(typed), float).reshape(-1, len(values)).T
+
+
+def states_of(scenes: Sequence[RandomScene]) -> tuple[np.ndarray, np.ndarray]:
+    """Return q and v (members, n)."""
+    states = [state_of(scene.table) for scene in scenes]
+    return np.array([q.ravel() for q, _ in states]), np.array([v.ravel() for _, v in states])
+
+
+def accelerate(scene: RandomScene, mechanism: udk.Mechanism, redundant: Sequence[int]) -> tuple[np.ndarray, bool]:
+    """Return a (n,) of one mechanism by elimination, and whether it is safe."""
+    a, safe = Programs(mechanism, redundant).accelerations(*states_of([scene]))
+    return a[0], bool(safe[0])
+
+
+def check_terms(tally: Tally, scene: RandomScene, solved: Solved, found: dict[str, np.ndarray], pattern: Any) -> None:
+    """Hold the terms of the programs against those of the reference."""
+    (q, v), terms, at = state_of(scene.table), solved.terms, scene.label
+    length, rate = np.tile([scene.length, scene.length, 1.0], len(q)), 1 / scene.time
+    n, rows, entries = q.size, len(terms.psi), pattern.value_count
+    values, b, free, root = np.split(found["equation_terms"], [entries, entries + rows, entries + rows + n])
+    speed = max(1.0, np.max(abs(v.ravel() / (length * rate))))
+    if rows:
+        w, psi_q = solved.weights, pattern.dense(values, np) / root
+        reach = max(1.0, np.max(abs(q[:, :2])) / scene.length)
+        tally.add("Psi", np.max(abs(w * (found["psi"] - terms.psi))) / reach, at)
+        tally.add("Psi_q", np.max(abs(w[:, None] * (psi_q - terms.psi_q) * length)) / reach, at)
+        tally.add("Psi_dot", np.max(abs(w * (found["psi_dot"] - terms.psi_dot))) / (rate * speed * reach), at)
+        size = rate**2 * max(speed**2 * reach, np.max(abs(free / (length * rate**2))), np.max(abs(w * terms.gamma)) / rate**2)
+        tally.add("gamma", np.max(abs(w * (b + psi_q @ free - terms.gamma))) / size, at)
+    tally.add("loads", relative(free, terms.force / terms.mass, length * rate**2, 1.0), at)
+    right = np.array([0.5 * terms.mass @ v.ravel() ** 2, terms.potential])
+    tally.add("energy", relative(found["energy"], right, scene.mass * (scene.length * rate) ** 2, 1.0), at)
+
+
+def check_accelerations(tally: Tally, scene: RandomScene, solved: Solved, a: np.ndarray, grown: float) -> None:
+    """Hold accelerations by elimination against singular values, and against the identities of mechanics."""
+    (_, v), terms, at, unit = state_of(scene.table), solved.terms, scene.label, solved.unit
+    free, u = terms.force / terms.mass, solved.unit * scene.time**2
+    size = max(np.max(abs(free / unit)), np.max(abs(solved.a / unit)), 1e-3)
+    tally.add("elimination", np.max(abs(a - solved.a) / unit) / size / grown, at)
+    mass = terms.mass / scene.mass * u**2 / scene.length**2
+    tally.add("Gauss", np.max(abs(solved.free.T @ (np.sqrt(mass) * (a - free) / unit)), initial=0.0) / size / grown, at)
+    if not len(terms.psi):
+        return
+    left, asked = (solved.weights * x * scene.time**2 for x in (terms.psi_q @ a - terms.gamma, terms.gamma))
+    tally.add("constraints", np.max(abs(left)) / max(size, np.max(abs(asked))) / grown, at)
+    force, velocity = terms.mass * a - terms.force, v.ravel()
+    rows = solved.weights[:, None] * terms.psi_q * u
+    multipliers = np.linalg.lstsq(rows.T, -force * u, rcond=1e-8)[0] * solved.weights
+    psi_t = terms.psi_dot - terms.psi_q @ velocity
+    largest = np.sum(abs(velocity * force)) + np.sum(abs(multipliers * psi_t)) + np.sum(abs(velocity * terms.mass * free))
+    largest += scene.mass * scene.length**2 / scene.time**3
+    tally.add("power", abs(velocity @ force - multipliers @ psi_t) / largest / grown, at)
+
+
+def check_reciprocity(
+    tally: Tally, scenes: Sequence[RandomScene], programs: Programs, solved: Sequence[Solved], grown: Sequence[float], rng: Any
+) -> None:
+    """Give two impulses in turn; compare what each does along the other."""
+    q, v = states_of(scenes)
+    u = np.array([s.unit * scene.time**2 for scene, s in zip(scenes, solved, strict=True)])
+    mass = np.array([s.terms.mass for s in solved])
+    unit = np.array([[scene.mass * scene.length**2] for scene in scenes])
+    i, j = rng.standard_normal((2, *q.shape)) / u  # impulses that do as much work in every coordinate
+    moved_i, moved_j = (programs.impulse_response(q, v, unit * impulse / mass) for impulse in (i, j))
+    free = np.sqrt(np.sum(i**2 / mass, 1) * np.sum(j**2 / mass, 1)) * unit[:, 0]
+    for scene, error, by in zip(scenes, abs(np.sum(i * moved_j - j * moved_i, 1)) / free, grown, strict=True):
+        tally.add("reciprocity", error / by, scene.label)
+
+
+def check_file(tally: Tally, scene: RandomScene, mechanism: udk.Mechanism, redundant: Sequence[int]) -> None:
+    """Write a scene and read it; compare all numbers, and the accelerations, bit by bit."""
+    again = udk.loads(udk.dumps(mechanism))
+    old, new = jax.tree.leaves(mechanism), jax.tree.leaves(again)
+    differ = sum(np.asarray(a).tobytes() != np.asarray(b).tobytes() for a, b in zip(old, new, strict=True))
+    one, two = (accelerate(scene, m, redundant)[0] for m in (mechanism, again))
+    tally.add("file", float(differ + (one.tobytes() != two.tobytes())), scene.label)
+
+
+# --- the same scene, seen otherwise
+
+
+def moved(scene: RandomScene, angle: float, shift: np.ndarray) -> RandomScene:
+    """Return a scene that is turned and moved as a whole, with gravity."""
+    table = copy.deepcopy(scene.table)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    table["gravity"] = (turn @ table["gravity"]).tolist()
+    for body in table["body"]:
+        body["position"] = (turn @ body["position"] + shift).tolist()
+        body["velocity"] = (turn @ body["velocity"]).tolist()
+        body["angle"] += angle
+    for entry in (*table["joint"], *table["driver"], *table["force"]):
+        if entry.get("type") == "force":
+            if entry["frame"] == "ground":
+                entry["vector"] = (turn @ entry["vector"]).tolist()
+            continue
+        on = entry.get("bodies", [])
+        for k, name in enumerate(on):
+            if name == "ground" and "points" in entry:
+                entry["points"][k] = (turn @ entry["points"][k] + shift).tolist()
+        grounded = [k for k, name in enumerate(on) if name == "ground"]
+        sign = {(): 0.0, (0,): 1.0, (1,): -1.0}[tuple(grounded)]
+        kind = entry.get("type", "")
+        if "axis" in entry and grounded == [0]:
+            entry["axis"] += angle
+        if kind == "cam" and grounded == [0]:
+            entry["profile"]["angle"] = [x + angle for x in entry["profile"]["angle"]]
+        if kind == "torsion_spring":
+            entry["angle"] = entry.get("angle", 0.0) + sign * angle
+        if entry.get("coordinate") == "angle":
+            motion = entry["motion"]
+            for key in ("coefficients", "values"):
+                if key in motion:
+                    constant = key == "coefficients"  # of which the first alone is one
+                    motion[key] = [x if k and constant else x + sign * angle for k, x in enumerate(motion[key])]
+            if "offset" in motion:
+                motion["offset"] += sign * angle
+    return scene._replace(table=table)
+
+
+def can_be_turned(table: Table) -> bool:
+    """Whether no element is tied to the axes of the ground itself, or to its origin."""
+    axes = [e for e in table["driver"] if e["coordinate"] in ("x", "y") and e["bodies"][0] == "ground"]
+    return not axes and not any(e["type"] == "rack" and e["bodies"][1] == "ground" for e in table["joint"])
+
+
+def in_units(scene: RandomScene, length: float, time: float, mass: float) -> RandomScene:
+    """Return a scene whose numbers are those of other units: lengths `length` times as large, ..."""
+    table, L, T, M = copy.deepcopy(scene.table), length, time, mass
+    scale: Callable[[Any, float], Any] = lambda x, by: [scale(y, by) for y in x] if isinstance(x, list) else x * by  # noqa: E731
+
+    def change(entry: Table, **units: float) -> None:
+        for key, unit in units.items():
+            if key in entry:
+                entry[key] = scale(entry[key], unit)
+
+    change(table, gravity=L / T**2)
+    for body in table["body"]:
+        change(body, mass=M, inertia=M * L**2, position=L, velocity=L / T, angular_velocity=1 / T)
+    for joint in table["joint"]:
+        change(joint, points=L, length=L, radii=L, radius=L)
+        change(joint.get("profile", {}), radius=L)
+    for driver in table["driver"]:
+        unit, motion = (1.0 if driver["coordinate"] == "angle" else L), driver["motion"]
+        change(driver, points=L)
+        change(motion, amplitude=unit, offset=unit, values=unit, frequency=1 / T, times=T)
+        if "coefficients" in motion:
+            motion["coefficients"] = [c * unit / T**k for k, c in enumerate(motion["coefficients"])]
+    F = M * L / T**2
+    for force in table["force"]:
+        match force["type"]:
+            case "spring":
+                change(force, points=L, stiffness=F / L, length=L, damping=F * T / L)
+            case "torsion_spring":
+                change(force, stiffness=F * L, damping=F * L * T)
+            case "friction":
+                change(force, torque=F * L, velocity=1 / T)
+            case "torque":
+                change(force, value=F * L)
+            case _:
+                change(force, vector=F, point=L)
+    return RandomScene(table, scene.seed, scene.length * L, scene.time * T, scene.mass * M)
+
+
+def renamed(table: Table, new: Callable[[str], str]) -> Table:
+    """Return a table with new names of everything but the ground."""
+    table = copy.deepcopy(table)
+    change = lambda name: name if name == "ground" else new(name)  # noqa: E731
+    for section in ("body", "joint", "driver", "force"):
+        for entry in table[section]:
+            entry["name"] = change(entry["name"])
+            for key in ("body", "carrier", "joint"):
+                if key in entry:
+                    entry[key] = change(entry[key])
+            if "bodies" in entry:
+                entry["bodies"] = [change(name) for name in entry["bodies"]]
+    return table
+
+
+def with_copies(table: Table, rng: np.random.Generator) -> Table:
+    """Return a table in which joints and drivers are given once more, up to four times, anywhere among the others."""
+    table = copy.deepcopy(table)
+    for section in ("joint", "driver"):
+        for entry in list(table[section]):
+            for k in range(int(rng.integers(0, 4))):
+                copied = copy.deepcopy(entry) | {"name": f"{entry['name']} copy {k}"}
+                table[section].insert(int(rng.integers(0, len(table[section]) + 1)), copied)
+    return table
+
+
+def check_structures(
+    tally: Tally, scene: RandomScene, redundant: Sequence[int], solved: Solved, a: np.ndarray, rng: np.random.Generator
+) -> None:
+    """Names, orders and copies, which change the structure of a scene: its programs are made anew."""
+    (q, _), grown = state_of(scene.table), growth(solved, without=redundant)
+    names = {e["name"]: f"n {k} ü" for k, e in enumerate(x for s in ("body", "joint", "driver", "force") for x in scene.table[s])}
+    found, _ = accelerate(scene, build(renamed(scene.table, names.__getitem__)), redundant)
+    tally.add("names", float(found.tobytes() != a.tobytes()), scene.label)
+
+    table = copy.deepcopy(scene.table)
+    place = rng.permutation(len(table["body"]))
+    for section in ("body", "joint", "driver", "force"):
+        mixed = place if section == "body" else rng.permutation(len(table[section]))
+        table[section] = [table[section][k] for k in mixed]
+    for name, changed in (("order", table), ("copies", with_copies(scene.table, rng))):
+        mechanism = build(changed)
+        rows = udk.analyse(mechanism).redundant_rows
+        if rows is None:
+            tally.leave_out("analyse finds no redundant rows")
+            continue
+        where = place if name == "order" else np.arange(len(q))
+        found, safe = accelerate(scene._replace(table=changed), mechanism, rows)
+        if safe:
+            right = a.reshape(-1, 3)[where].ravel()
+            other = growth(solve(scene._replace(table=changed)), without=rows)  # which rows are left out may differ
+            tally.add(name, relative(found, right, solved.unit, 1.0) / max(grown, other), scene.label)
+        else:
+            tally.leave_out("elimination says that it is not safe")
+
+
+# --- pseudoinverses and formulations, in batches of one shape
+
+ROWS, COORDINATES = 40, 60  # of the padded systems: rows of zeros, and coordinates that nothing holds, change nothing
+BATCH = 25
+METHODS = ("SVD", "Varga", "Householder", "GramSchmidt", "Greville")
+RANK_TOL = 1e-7  # between the singular values that count here and those that do not
+
+
+@eqx.filter_jit
+def _by_all(D: Any, b: Any, M: Any, F: Any, A: Any, c: Any) -> dict[str, Any]:
+    found = {name: jax.vmap(lambda D, b, m=getattr(udk, name)(RANK_TOL): m.solve(D, b).x)(D, b) for name in METHODS}
+    formulations = {
+        "NullSpaceQR": udk.NullSpaceQR(RANK_TOL),
+        "NullSpaceSVD": udk.NullSpaceSVD(RANK_TOL),
+        "Augmented by SVD": udk.Augmented(udk.SVD(1e-12)),
+    }
+    return found | {name: jax.vmap(f.solve)(M, F, A, c) for name, f in formulations.items()}
+
+
+def check_methods(tally: Tally, cases: Sequence[tuple[RandomScene, Solved]]) -> None:
+    """Solve many states by all pseudoinverses and formulations, and compare with the reference."""
+    cases = [(scene, s) for scene, s in cases if len(s.terms.psi) <= ROWS and s.condition < 1e3]
+    for first in range(0, len(cases), BATCH):
+        part = cases[first : first + BATCH]
+        D, A = np.zeros((2, BATCH, ROWS, COORDINATES))
+        b, c = np.zeros((2, BATCH, ROWS))
+        M, F = np.tile(np.eye(COORDINATES), (BATCH, 1, 1)), np.zeros((BATCH, COORDINATES))
+        for k, (scene, s) in enumerate(part):
+            m, n = s.terms.psi_q.shape
+            u = s.unit * scene.time**2
+            mass = s.terms.mass * u**2 / (scene.mass * scene.length**2)
+            rows = s.weights[:, None] * s.terms.psi_q * u
+            free = s.terms.force / s.terms.mass / s.unit
+            A[k, :m, :n], c[k, :m] = rows, s.weights * s.terms.gamma * scene.time**2
+            D[k, :m, :n], b[k, :m] = rows / np.sqrt(mass), c[k, :m] - rows @ free
+            M[k, range(n), range(n)], F[k, :n] = mass, mass * free
+        for name, x in _by_all(*map(jnp.asarray, (D, b, M, F, A, c))).items():
+            for k, (scene, s) in enumerate(part):
+                right, free = s.a / s.unit, s.terms.force / s.terms.mass / s.unit
+                mass = s.terms.mass * (s.unit * scene.time**2) ** 2 / (scene.mass * scene.length**2)
+                found = np.asarray(x[k])[: len(right)]
+                found = free + found / np.sqrt(mass) if name in METHODS else found
+                power = 1 if name in METHODS[:4] else 2
+                size = max(np.max(abs(free)), np.max(abs(right)), 1e-3)
+                tally.add(name, np.max(abs(found - right)) / size / growth(s, power), scene.label)
+
+
+def check_states(tally: Tally, seed: int, structures: Iterable[int], members: int, other_structures: bool = True) -> int:
+    """Check all properties of states on some mechanisms of each structure.
+
+    Args:
+        tally: What it adds to.
+        seed: Of the series.
+        structures: Their numbers.
+        members: Mechanisms of each structure, at least two.
+        other_structures: Whether to check what needs programs of other structures.
+
+    Returns:
+        How many mechanisms there were.
+    """
+    count, cases = 0, []
+    for structure in structures:
+        rng = np.random.default_rng([seed, structure, 2])
+        drawn = [random_scene(seed, structure, number) for number in range(members)]
+        count += members
+        both = [(scene, s) for scene, s in zip(drawn, map(solve, drawn), strict=True) if s.is_clear]
+        tally.leave_out("singular up to rounding, or nearly", members - len(both))
+        redundant = udk.analyse(build(both[0][0].table)).redundant_rows if both else None
+        if redundant is None:
+            tally.leave_out("closed positions nearby are not found, or all are singular", len(both))
+            continue
+        cases += _check_structure(tally, both, redundant, rng, other_structures)[::4]
+    check_methods(tally, cases)
+    return count
+
+
+def _check_structure(
+    tally: Tally, both: Sequence[tuple[RandomScene, Solved]], redundant: Sequence[int], rng: Any, other_structures: bool
+) -> Sequence[tuple[RandomScene, Solved]]:
+    scenes, solved = [scene for scene, _ in both], [s for _, s in both]
+    grown = [growth(s, without=redundant) for s in solved]
+    mechanism = build(scenes[0].table)
+    programs, (q, v) = Programs(mechanism, redundant, [scene.table for scene in scenes]), states_of(scenes)
+    names = ("equation_terms", "psi", "psi_dot", "energy")
+    terms = {name: programs.run(getattr(programs.scene, name), q, v) for name in names}
+    a, safe = programs.accelerations(q, v)
+    check_reciprocity(tally, scenes, programs, solved, grown, rng)
+    tally.leave_out("elimination says that it is not safe", int(np.sum(~safe)))
+    for k, (scene, s) in enumerate(both):
+        check_terms(tally, scene, s, {name: found[k] for name, found in terms.items()}, programs.scene.pattern)
+        if safe[k]:
+            check_accelerations(tally, scene, s, a[k], grown[k])
+
+    # Half of the mechanisms are turned and moved, the other half, or all that cannot be turned, get other units.
+    can_turn, others, back = can_be_turned(scenes[0].table), [], []
+    tally.leave_out("tied to the axes or the origin of the ground: not turned", 0 if can_turn else len(both))
+    for k, scene in enumerate(scenes):
+        if can_turn and k % 2 == 0:
+            c, d = np.cos(turn := rng.uniform(-3.0, 3.0)), np.sin(turn)
+            others.append(moved(scene, turn, scene.length * rng.uniform(-3.0, 3.0, 2)))
+            back.append(np.kron(np.eye(a.shape[1] // 3), [[c, d, 0.0], [-d, c, 0.0], [0.0, 0.0, 1.0]]))
+        else:
+            L, T, M = 10.0 ** rng.uniform(-3.0, 3.0, 3)
+            others.append(in_units(scene, L, T, M))
+            back.append(np.diag(np.tile([1 / L, 1 / L, 1.0], a.shape[1] // 3)) * T**2)
+    found, is_safe = Programs(mechanism, redundant, [scene.table for scene in others]).accelerations(*states_of(others))
+    for k in np.flatnonzero(safe & is_safe):
+        name = "rigid motion" if can_turn and k % 2 == 0 else "units"
+        tally.add(name, relative(back[k] @ found[k], a[k], solved[k].unit, 1.0) / grown[k], scenes[k].label)
+    if other_structures and safe[0]:
+        check_file(tally, scenes[0], mechanism, redundant)
+        check_structures(tally, scenes[0], redundant, solved[0], accelerate(scenes[0], mechanism, redundant)[0], rng)
+    return both
+
+
+def check_large(tally: Tally, seed: int, structures: Iterable[int]) -> int:
+    """Hold the loops of large scenes, run by NumPy, against the reference; return how many scenes there were."""
+    count = 0
+    for structure in structures:
+        scene = random_scene(seed, structure, 0, bodies=(22, 40))
+        mechanism, solved = build(scene.table), solve(scene)
+        q, v = (x.ravel() for x in state_of(scene.table))
+        programs, terms, at = loop_programs(mechanism), solved.terms, scene.label
+        numbers = np.asarray(numbers_as_vector(jax.tree.leaves(mechanism)))
+        row, column, *_ = programs.d_entries
+        psi, rate, values = programs.geometry(numbers, np)(0.0, q, v)
+        free, b = programs.loads(numbers, np)(0.0, q, v)
+        psi_q = np.zeros_like(terms.psi_q)
+        np.add.at(psi_q, (row, column), values * np.sqrt(terms.mass)[column])
+        found = {"psi": psi, "psi_q": psi_q, "psi_dot": rate, "gamma": b + psi_q @ free, "free": free}
+        w, length = solved.weights, np.tile([scene.length, scene.length, 1.0], len(q) // 3)
+        speed, reach = (max(1.0, np.max(abs(x / length))) for x in (v * scene.time, q))
+        size = max(speed**2 * reach, *(np.max(abs(x)) * scene.time**2 for x in (free / length, w * terms.gamma)))
+        right = {"psi": terms.psi, "psi_q": terms.psi_q, "psi_dot": terms.psi_dot, "gamma": terms.gamma}
+        for name, unit in (("psi", reach), ("psi_dot", reach * speed / scene.time), ("gamma", size / scene.time**2)):
+            tally.add("large scenes", np.max(abs(w * (found[name] - right[name]))) / unit, at)
+        tally.add("large scenes", np.max(abs(w[:, None] * (psi_q - terms.psi_q) * length)) / reach, at)
+        tally.add("large scenes", relative(free, terms.force / terms.mass, length / scene.time**2, 1.0), at)
+        count += 1
+    return count

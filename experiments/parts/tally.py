@@ -1,0 +1,64 @@
+"""What was found of each property: how many cases, the worst error, and where it was."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+
+@dataclass(frozen=True)
+class Property:
+    """A claim that errors stay below a tolerance, each error in its own unit; `tolerance_because` says why that one."""
+
+    claim: str
+    tolerance: float
+    tolerance_because: str
+
+
+@dataclass
+class Found:
+    """The errors of one property so far."""
+
+    cases: int = 0
+    worst: float = 0.0
+    at: str = ""
+
+
+@dataclass
+class Tally:
+    """The errors of all properties, and the cases that a property does not speak of, by the reason."""
+
+    found: dict[str, Found] = field(default_factory=dict)
+    left_out: dict[str, int] = field(default_factory=dict)
+
+    def add(self, name: str, errors: ArrayLike | Sequence[float], at: str) -> None:
+        """Count errors, one or many, of a case; what is not a number is the worst of all."""
+        found = self.found.setdefault(name, Found())
+        for error in np.ravel(np.asarray(errors, float)):
+            error = math.inf if math.isnan(error) else float(error)
+            found.cases += 1
+            if error > found.worst or not found.at:
+                found.worst, found.at = error, at
+
+    def leave_out(self, reason: str, count: int = 1) -> None:
+        """Count cases that are no test of a property."""
+        self.left_out[reason] = self.left_out.get(reason, 0) + count
+
+    def merge(self, other: "Tally") -> None:
+        """Add what another part of a run found."""
+        for name, one in other.found.items():
+            found = self.found.setdefault(name, Found())
+            found.cases += one.cases
+            if one.worst > found.worst or not found.at:
+                found.worst, found.at = one.worst, one.at
+        for reason, count in other.left_out.items():
+            self.leave_out(reason, count)
+
+
+def relative(found: np.ndarray, right: np.ndarray, unit: np.ndarray | float = 1.0, least: float = 0.0) -> float:
+    """Return the largest difference over the largest entry, both in units; `least`, in units, is the smallest that counts."""
+    size = max(np.max(np.abs(right / unit), initial=0.0), least)
+    difference = np.max(np.abs((found - right) / unit), initial=0.0)
+    return float(difference / size) if size else float(difference)

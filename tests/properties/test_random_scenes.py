@@ -1,0 +1,148 @@
+"""A slice of `python -m experiments properties`: another seed, few mechanisms, little input; the same checks."""
+
+import json
+import math
+
+import jax
+import numpy as np
+import pytest
+
+pytest.importorskip("experiments", reason="not in a source tree")
+
+import udkjax as udk
+from experiments.parts import fuzz_arguments, state_properties
+from experiments.parts.fuzz import Case, cases_of, run, verdict
+from experiments.parts.random_scenes import build, random_scene, shrunk, state_of
+from experiments.parts.reference_equations import evaluate
+from experiments.parts.state_properties import PROPERTIES, check_large, check_states
+from experiments.parts.tally import Tally
+
+SEED = 3
+
+
+def check(tally):
+    """Compare all that was found with the tolerances; a failure says how to draw the mechanism again."""
+    assert tally.found
+    wrong = {n: (f.worst, f.at) for n, f in tally.found.items() if not f.worst <= PROPERTIES[n].tolerance}
+    assert not wrong, wrong
+
+
+def test_states_of_random_mechanisms(monkeypatch):
+    monkeypatch.setattr(state_properties, "check_methods", lambda *_: None)  # tests/pinv and test_formulations do that
+    tally = Tally()
+    assert check_states(tally, SEED, range(2), 3) == 6
+    check(tally)
+    assert {"elimination", "order", "copies", "names", "units", "power", "reciprocity"} <= set(tally.found)
+
+
+@pytest.mark.slow
+def test_states_by_all_methods():
+    tally = Tally()
+    check_states(tally, SEED, range(4, 12), 8)
+    check_large(tally, SEED, range(2))
+    check(tally)
+
+
+def test_random_scenes_are_closed_and_drawn_again():
+    for structure in range(40):
+        scene = random_scene(SEED, structure, 0)
+        assert scene.table == random_scene(SEED, structure, 0).table
+        terms = evaluate(scene.table, 0.0, *state_of(scene.table))
+        row = np.max(abs(terms.psi_q * np.tile([scene.length, scene.length, 1.0], len(scene.table["body"]))), axis=1, initial=0.0)
+        assert np.all(abs(terms.psi) <= 1e-12 * row * 10) and np.all(abs(terms.psi_dot) * scene.time <= 1e-9 * row)
+
+
+@pytest.mark.parametrize("mistake", ["psi_q", "gamma", "force"])
+def test_a_mistake_is_found(mistake):
+    """A term that is wrong by a millionth fails a property."""
+
+    def wrong(*arguments):
+        terms = evaluate(*arguments)
+        return terms._replace(**{mistake: getattr(terms, mistake) * (1 + 1e-6)})
+
+    drawn = (random_scene(SEED, k, 0) for k in range(20))
+    scene, tally = next(s for s in drawn if s.table["gravity"][0] and s.table["joint"]), Tally()
+    solved = state_properties.solve(scene, wrong(scene.table, 0.0, *state_of(scene.table)))
+    right = state_properties.solve(scene)
+    mechanism = build(scene.table)
+    redundant = udk.analyse(mechanism).redundant_rows
+    assert redundant is not None
+    a, safe = state_properties.accelerate(scene, mechanism, redundant)
+    assert safe and np.max(abs(a - right.a) / right.unit) < 1e-10
+    state_properties.check_accelerations(tally, scene, solved, a, 1.0)
+    assert any(f.worst > PROPERTIES[name].tolerance for name, f in tally.found.items())
+
+
+def test_numbers_of_tables_are_those_of_mechanisms():
+    for k in range(30):
+        table = random_scene(SEED, k, 0).table
+        mechanism = build(table)
+        right = np.concatenate([np.ravel(x) for x in jax.tree.leaves(mechanism)])
+        found = state_properties.numbers_of(mechanism, [table])[0]
+        np.testing.assert_allclose(found, right, rtol=1e-12, atol=1e-15 * abs(right).max())
+
+
+def test_shrinking_leaves_what_fails():
+    table = random_scene(SEED, 0, 0, bodies=(5, 5)).table
+    body = table["joint"][0]["bodies"][1]
+    small = shrunk(table, lambda t: any(body in j["bodies"] for j in t["joint"]) and build(t) is not None)
+    assert len(small["joint"]) == 1 and not small["driver"] and not small["force"] and len(small["body"]) <= 2
+
+
+def test_what_is_not_a_number_is_the_worst():
+    tally = Tally()
+    tally.add("x", [1.0, math.nan], "here")
+    other = Tally()
+    other.add("x", 0.5, "there")
+    other.merge(tally)
+    assert other.found["x"].worst == math.inf and other.found["x"].cases == 3 and other.found["x"].at == "here"
+
+
+@pytest.mark.parametrize(("kind", "count"), [("files", 120), ("arguments", 60)])
+def test_fuzz(kind, count, tmp_path, monkeypatch):
+    """Whatever is given, the answer is a result or a documented error that names the place."""
+    monkeypatch.chdir(tmp_path)
+    draw = cases_of(kind, SEED)
+    found = {}
+    for k in range(count):
+        case = draw(k)
+        wrong, text = verdict(case)
+        if wrong:
+            found[k, case.about] = wrong, text
+    assert not found, found
+
+
+@pytest.mark.parametrize("name", fuzz_arguments.ELEMENTS)
+def test_every_field_is_named(name):
+    """Whatever is put into a field, the error says which element's, and which field."""
+    given = fuzz_arguments.ELEMENTS[name]
+    for key in given:
+        for wrong in (object(), np.array(["a"]), np.full((2, 5), np.nan), udk.SVD):
+            with pytest.raises(udk.SceneError, match=rf"\b{key}\b"):
+                fuzz_arguments._element(name, **{**given, key: wrong})
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [(udk.SVD, "rank_tol"), (udk.NullSpaceSVD, "rank_tol"), (udk.Baumgarte, "alpha"), (lambda x: udk.State(x, [[0.0] * 3]), "q")]
+    + [(lambda x: udk.Coordinate("b", "x", x), "points"), (lambda x: udk.library.simple_pendulum().with_parameters(x), "values")],
+)
+def test_every_number_is_named(make, name):
+    for wrong in (object(), "text", udk.SVD):
+        with pytest.raises((TypeError, udk.SceneError), match=name):
+            make(wrong)
+
+
+def test_verdicts():
+    """Errors of other kinds, from elsewhere, or without a place, are faults."""
+    assert "no documented error" in verdict(Case("", lambda: {}["x"]))[0]
+    assert "from json/decoder.py" in verdict(Case("", lambda: json.loads("{")))[0]
+    assert "place" in verdict(Case("", lambda: udk.loads("format = 1"), ["nowhere"]))[0]
+    assert verdict(Case("", lambda: udk.loads("format = 1"), ["body"]))[0] == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["files", "commands"])
+def test_fuzz_in_processes(kind):
+    *_, (done, faults) = run(kind, SEED, 0, 40, 300.0)
+    assert done == 40 and not faults, faults
