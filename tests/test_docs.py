@@ -202,7 +202,7 @@ def exists(name: str) -> bool:
         return True
     if name.startswith("JAX_"):  # of the environment
         return hasattr(importlib.import_module("jax").config, name.lower())
-    return all(part in identifiers() for part in (head, *rest))
+    return all(part in identifiers() or part.rstrip("0123456789") in identifiers() for part in (head, *rest))  # spring1, spring2
 
 
 NAME = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*)(?:\(.*\)|=.*|\[.*)?")
@@ -246,6 +246,14 @@ def test_names_in_docstrings_exist():
 def test_a_name_that_does_not_exist_is_noticed():
     said = "`udk.load` `udk.laod` `Motion.position` `Spline.times` `jnp.linalg.svd` `jnp.linalg.sdv` `tests/no.py` `quooks`"
     assert list(missing(said)) == ["udk.laod", "Motion.position", "jnp.linalg.sdv", "tests/no.py", "quooks"]
+
+
+def test_the_readme_counts_and_lists_what_there_is():
+    text = (ROOT / "README.md").read_text()
+    (count,) = re.findall(r"(\d+) mechanisms in `udk\.library`", text)
+    assert int(count) == len(udkjax.library.__all__)
+    (row,) = re.findall(r"\| Command line \|(.*)\|", text)
+    assert set(CODE.findall(row)) == {"--json", "udkjax simulate", *COMMANDS} - {"simulate"}
 
 
 # --- the reference

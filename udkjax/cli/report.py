@@ -38,7 +38,7 @@ def report(
     """Do the paper's study again, with what would have been better, and write a page about it (HTML) with its data (NetCDF).
 
     Five pseudoinverses, three tolerances, with and without Baumgarte's stabilization, on the paper's five-bar parallelogram, each
-    run held against the exact solution.
+    run compared with the exact solution.
 
     Args:
         out: page to write (.html), or folder for report.html; the data goes beside it.

@@ -25,7 +25,7 @@ SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))
 
 
 def differentiable(problem: Problem, native: bool) -> IntegratorOutput:
-    """Integrate a problem by machine code or by diffrax, with derivatives of any order of q, v and y.
+    """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
     None are taken along numbers that do not depend on what is differentiated.
     """

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 MAX_STEPS = 100_000
 MAX_EVENTS = 64
 GEOMETRY_TRACED = (
-    "the geometry of the mechanism is traced: its redundant rows are not known, and the run takes singular values, by diffrax, "
+    "the geometry of the mechanism is traced: its redundant rows are not known, and the run takes singular values, with diffrax, "
     "hundreds of times slower. Make it of plain numbers and change them by with_parameters, or pass analysis=analyse(...)"
 )
 # Of the rows' scales. Projection leaves rounding errors, unless the rows that it does not see drift. Without it drift is what one
@@ -118,7 +118,7 @@ def simulate(
     Raises:
         SimulationError: the run does not reach its end; it carries the solution.
         AssemblyError: the initial guess cannot be closed.
-        ValueError: an argument is of no use, or the engine that is asked for cannot do what is asked.
+        ValueError: an argument cannot be used, or the engine that is asked for cannot run this.
 
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.

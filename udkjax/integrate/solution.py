@@ -54,7 +54,7 @@ CAUSES = {
     Result.step_too_small: "the step fell to the rounding of time: the right-hand side jumps or grows without bound here, a "
     "driver is at the end of its reach, or the tolerance is below what its rounding errors allow",
     Result.not_finite: "a number that is not finite appeared; look at the initial state, and at the loads and motions of the "
-    "scene at this time (and, with `Augmented()`, at its redundant joints: plain LU cannot do with them)",
+    "scene at this time (and, with `Augmented()`, at its redundant joints: plain LU cannot handle them)",
     Result.drift: "the constraints are violated by more than `drift_tol`: drivers ask for what the joints do not allow, or no "
     "`Projection()` stabilizes the run, or rows that its analysis found redundant are independent with the present numbers",
     Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for what stays open",
@@ -66,7 +66,7 @@ CAUSES = {
     Result.beyond_contact: "the run starts beyond a contact or limit, where its condition is negative already",
     Result.event_impossible: "an event asks for what the constraints do not allow: an impact in a direction in which they leave "
     "no motion, or a joint attached where it is open",
-    Result.invalid_argument: "an argument of this run is of no use: output times that do not increase, a state that is not "
+    Result.invalid_argument: "an argument of this run cannot be used: output times that do not increase, a state that is not "
     "finite, or a tolerance or first step that is not positive",
 }
 

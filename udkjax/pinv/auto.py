@@ -17,7 +17,7 @@ class Auto(Dense):
 
     Machine code eliminates the rows of a mechanism that `analyse` found independent, until one of the pivots falls to
     `branch_tol` times its row's diagonal entry of D D^T: steps beside singular configurations are taken with all rows, of which
-    those are dropped that depend on others. Of a matrix of which nothing is known, and by diffrax, it is the `SVD`.
+    those are dropped that depend on others. For a matrix of which nothing is known, and with diffrax, it is the `SVD`.
 
     Args:
         branch_tol: the pivot, relative to its row's diagonal entry of D D^T, at which it turns to singular values.

@@ -42,7 +42,7 @@ EXAMPLES = {
 
 
 class ArgumentError(ValueError):
-    """An argument of a public function is of no use; the message names it, what was given and what is meant."""
+    """An argument of a public function cannot be used; the message names it, what was given and what is meant."""
 
 
 class ArgumentTypeError(ArgumentError, TypeError):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MOST_PANELS = 24  # of the picture of the fit, each a channel of a record; those beyond are only in the dataset
 MOST_COLUMNS = 3  # of panels side by side
 MOST_CHANNELS = 8  # of the picture of residuals, each a channel: those that look least like noise
-MOST_COLOURS = 7  # records that are told apart by colours
+MOST_COLOURS = 7  # records that have a colour each
 MOST_BINS = 40  # at most, of a distribution
 MOST_LAGS = 30  # at most, of an autocorrelation
 NOISE_RANGE = 4.0  # standard deviations of noise that a distribution shows

@@ -5,7 +5,7 @@
 
     plots.draw_energy(pyplot.gca(), sol.ts, udk.energy(mech, sol))
 
-Every axis has its unit. Colours are told apart by everyone, and where curves meet they differ by marks or dashes, too. A figure
+Every axis has its unit. Everyone can distinguish the colours, and where curves meet they differ by marks or dashes, too. A figure
 that is made here (`trajectory`) belongs to nobody else.
 """
 

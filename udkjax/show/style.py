@@ -5,7 +5,7 @@ from udkjax.extras import OptionalImport
 with OptionalImport():
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours, told apart by everyone; the yellow is left out, since thin lines of it vanish on white.
+# Okabe and Ito's colours, which everyone can distinguish; the yellow is left out, since thin lines of it vanish on white.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 MARKERS = "os^Dvph"  # a curve's second sign, where there are several
 DASHES = ("-", "--", "-.", ":")  # likewise

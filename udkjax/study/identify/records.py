@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 PADDING = 1e-9  # of the length of a record: the distance of the times that pad it; so short a step costs nothing
 Estimated = Literal["nothing", "position", "velocity", "both"]
-Key: TypeAlias = str | Quantity  # channels go by their names, a user's own by itself
+Key: TypeAlias = str | Quantity  # the name of a channel, or a quantity of the user's own
 T = TypeVar("T")
 ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[Key, T]
 Noise = TypeAliasType(
@@ -217,7 +217,7 @@ def dataset_of_fit(
 
 
 def key_of(channel: Key | Channel) -> Key:
-    """Return what a channel goes by in a record: its name, or itself if it is the user's own."""
+    """Return the key of a channel in a record: its name, or the user's own quantity."""
     return channel if isinstance(channel, Quantity) else str(getattr(channel, "name", channel))
 
 

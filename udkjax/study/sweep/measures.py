@@ -143,7 +143,7 @@ class _ChannelMeasure:
 
 @dataclass(frozen=True)
 class _UserMeasure:
-    """A user's function, whose single array goes by the measure's name."""
+    """A user's function, whose single array has the measure's name."""
 
     function: UserMeasure
     name: str
