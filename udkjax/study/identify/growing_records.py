@@ -135,10 +135,10 @@ def _predictable(held: HeldProblem, z: np.ndarray, tol: Tolerances, fitted: floa
     enough = own.sum() >= RESIDUALS_PER_UNKNOWN * problem.K
     square = size**2 if enough and np.isfinite(size) else 1.0
     rest = J[R:][usable[R:]]
-    information = data[own].T @ data[own] / max(square, np.finfo(float).eps) + rest.T @ rest
-    cholesky = np.linalg.cholesky(np.linalg.inv(information))
-    with np.errstate(invalid="ignore"):
-        deviation = np.linalg.norm(data @ cholesky, axis=1)
+    known = np.concatenate([data[own] / np.sqrt(max(square, np.finfo(float).eps)), rest])
+    _, s, vt = np.linalg.svd(known, full_matrices=False)  # C = V S^-2 V^T
+    with np.errstate(invalid="ignore", over="ignore"):
+        deviation = np.linalg.norm(data @ (vt.T / s), axis=1)
     scale = problem.channel_scale[problem.index[:, 2]] / (held.noise * problem.sigma)
     beyond = ~(usable[:R] & (deviation <= LINEAR * scale)) & (times > fitted)
     return float(times[beyond].min()) if beyond.any() else np.inf

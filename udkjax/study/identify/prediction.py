@@ -5,10 +5,11 @@ numbers; a mechanism, its targets, its channels and the length of a record are c
 members at once.
 """
 
+import os
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -96,8 +97,7 @@ class Predictor:
         chunks = [jax.tree.map(lambda x, k=k: _rows(x, k, together), members) for k in range(0, size, together)]
         parts = [self._compute(chunks[0], tol)]  # compiled once, before threads ask for it
         if len(chunks) > 1:
-            with ThreadPoolExecutor(cores()) as pool:
-                parts += pool.map(lambda chunk: self._compute(chunk, tol), chunks[1:])
+            parts += _pool(os.getpid()).map(lambda chunk: self._compute(chunk, tol), chunks[1:])
         found = Prediction(*jax.tree.map(lambda *x: np.concatenate(x)[:size], *parts))
         if sum(part.nbytes for part in found if part is not None) <= CACHE_BYTES:
             self._cache[key] = found
@@ -133,6 +133,12 @@ class _Static:
         """What is not an array, in its place."""
         structure, leaves, _ = self._key
         return jax.tree.unflatten(structure, leaves)
+
+
+@lru_cache(maxsize=1)
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Return the threads of this process: to start them anew would take as long as a short run."""
+    return ThreadPoolExecutor(cores(), thread_name_prefix="identify")
 
 
 def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
