@@ -95,7 +95,7 @@ def test_wrong_numbers_count_less(measured, loss, noise):
     squares, robust = found(measured[0], data, noise=noise), found(measured[0], data, noise=noise, loss=loss)
     assert off(robust) < 0.2 * off(squares) and off(robust) < 0.03
     assert [one.row for one in robust.outliers] == list(range(5, len(TS), 9))
-    assert robust.noise[0][ANGLE][0] == pytest.approx(0.003, rel=0.3) and "count little" in robust.message
+    assert robust.noise[0][ANGLE][0] == pytest.approx(0.003, rel=0.3) and "counts little" in robust.message
 
 
 def test_one_wrong_number_is_named_and_is_no_noise(measured):
@@ -113,7 +113,7 @@ def test_one_wrong_number_is_named_and_is_no_noise(measured):
     assert (one.record, one.channel, one.row, one.time, one.units) == (1, ANGLE, 20, TS[23], "rad")
     assert one.residual == pytest.approx(-0.3, abs=0.02) and one.deviations == pytest.approx(100.0, rel=0.3)
     assert estimate.noise[1][ANGLE][0] == pytest.approx(sigma, rel=0.2)
-    assert f"row 20 ({TS[23]:.6g} s) by -0." in str(estimate) and "put nan in their places" in estimate.message
+    assert f"row 20 ({TS[23]:.6g} s) by -0." in str(estimate) and "put nan there" in estimate.message
     assert not without.outliers and "row" not in without.message
     errors = without.uncertainty.standard_errors
     assert (np.abs(robust.values - without.values) < 0.5 * errors).all()
@@ -202,12 +202,12 @@ def test_a_part_of_the_records(two_records):
 
 def test_guesses_beside_the_first():
     u = unknowns_of(pendulum(), [NAMES[0], udk.Parameter(NAMES[1], bounds=(0.1, 0.6)), "body.rod.angle"])
-    x = u.values(sample_guesses(u, np.zeros(3), 16, 0))
+    x = u.values(sample_guesses(u, np.zeros(3), 64, 0))
     low, high = x.min(0), x.max(0)
     assert low[0] < 0.5 * u.guess[0] < 2.0 * u.guess[0] < high[0] < 2.6 * u.guess[0]
     assert (np.abs(x[:, 2] - u.guess[2]) <= 0.5 * np.abs(u.guess[2])).all()
     assert 0.1 < low[1] < 0.15 and 0.5 < high[1] < 0.6
-    assert (x == u.values(sample_guesses(u, np.zeros(3), 16, 0))).all()
+    assert (x == u.values(sample_guesses(u, np.zeros(3), 64, 0))).all()
 
 
 # --- bad input

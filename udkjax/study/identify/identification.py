@@ -201,16 +201,21 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
     projection = np.zeros((len(kept), uncertainty.projection.shape[1]))
     projection[kept] = uncertainty.projection
     left = -plain.r[0, :rows] * problem.sigma
-    sigma = problem.sigma * scale[:rows]
+    sigma, seen = problem.sigma * scale[:rows], weighted.r[0, :rows]
     if outlying.any():
-        sigma = _noise_of_others(problem, plain, groups[:rows], outlying, sigma)
+        others = _residuals_of_others(problem, plain, outlying)
+        for g in np.unique(groups[:rows][outlying & (groups[:rows] >= 0)]):
+            own = groups[:rows] == g
+            sigma[own] = problem.sigma[own] * np.sqrt(np.nanmean(others[own] ** 2) / (1.0 - problem.K / kept.sum()))
+        seen = others
     white: dict[tuple[int, str], Whiteness] = {}
     for places in problem.series():
         record, _, channel = problem.index[places[0]]
         if np.abs(left[places]).max() > ROUNDING * problem.channel_scale[channel]:
             times = problem.ts[record, problem.index[places, 1]]
-            seen = (weighted.r[0, :rows] / scale[:rows])[places]
-            white[int(record), problem.channel_names[channel]] = whiteness_of(times, seen, projection[places])
+            white[int(record), problem.channel_names[channel]] = whiteness_of(
+                times, (seen / scale[:rows])[places], projection[places]
+            )
     names = [name for state in problem.initial_states for name in state.names]
     return Estimate(
         names=unknowns.names,
@@ -238,15 +243,8 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
     )
 
 
-def _noise_of_others(
-    problem: Problem, found: Residuals, groups: np.ndarray, outlying: np.ndarray, sigma: np.ndarray
-) -> np.ndarray:
-    """Return the noise (R,), where it was estimated with outliers: what a fit without them would leave, to first order."""
-    sigma, kept = sigma.copy(), np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
-    r, J = found.r[0], found.J[0]
-    left = (r - J @ np.linalg.lstsq(J[kept], r[kept], rcond=INVISIBLE)[0])[: len(outlying)]
-    freedom = 1.0 - problem.K / kept.sum()
-    for g in np.unique(groups[outlying & (groups >= 0)]):
-        own = groups == g
-        sigma[own] = problem.sigma[own] * np.sqrt(np.mean(left[own & ~outlying] ** 2) / freedom)
-    return sigma
+def _residuals_of_others(problem: Problem, found: Residuals, outlying: np.ndarray) -> Float[np.ndarray, "R"]:
+    """Return what a fit without the outliers would leave of all other residuals, to first order; nan in the place of outliers."""
+    r, J, kept = found.r[0], found.J[0], np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
+    left = r - J @ np.linalg.lstsq(J[kept], r[kept], rcond=INVISIBLE)[0]
+    return np.where(outlying, np.nan, left[: len(outlying)])

@@ -65,9 +65,9 @@ def outlier_sentences(problem: Problem, outliers: Sequence[Outlier], robust: boo
         ]
         more = f" and {len(own) - MOST_NAMED} more" if len(own) > MOST_NAMED else ""
         cure = (
-            "the loss lets them count little"
+            "by the loss this counts little"
             if robust
-            else "they move the estimate, and standard errors take them for noise: put nan in their places, or give loss='huber'"
+            else "this moves the estimate, and standard errors take it for noise: put nan there, or give loss='huber'"
         )
         where = f"{prefixes[k]}{name}: {plural(len(own), 'value')} far from what the mechanism shows"
         yield f"{where}, {'; '.join(named)}{more}: {cure}"

@@ -133,7 +133,7 @@ def apply_values(mechanism: Mechanism, targets: Sequence[Target], x: Float[Array
 
 
 def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int) -> Float[np.ndarray, "B K"]:
-    """Sample guesses beside a first one: each parameter within a factor or a half of its scale, or anywhere between its bounds.
+    """Sample guesses beside a first one: within a factor or a half of the scale, every second anywhere between bounds.
 
     Unknowns of initial states, which come after the parameters, are moved by a little.
     """
@@ -144,7 +144,7 @@ def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int
     low[free], high[free] = -GUESS_RADIUS, GUESS_RADIUS
     guesses = z[:P] + low + (high - low) * unit[:, :P]
     inside = u.low + (u.high - u.low) * (BOUND_MARGIN + (1.0 - 2.0 * BOUND_MARGIN) * unit[:, :P])
-    guesses[:, bounded] = u.z_of(np.where(bounded, inside, u.values(guesses)))[:, bounded]
+    guesses[::2, bounded] = u.z_of(np.where(bounded, inside, u.values(guesses)))[::2, bounded]
     states = z[P:] + STATE_RADIUS * (2.0 * unit[:, P:] - 1.0)
     return np.concatenate([guesses, states], axis=1)
 
