@@ -186,8 +186,8 @@ def test_traces_are_pins_that_move_or_those_that_are_named(slider_crank, run):
     by_default = udk.animate(slider_crank, run, measures=()).data["runs"][0]["traces"]
     assert len(by_default) == 2  # P on its circle and B on its line; O stands, and each is on two bodies
     named = udk.animate(slider_crank, run, measures=(), traces=("rod", "P")).data["runs"][0]["traces"]
-    assert named == [[1, 0.0, 0.0], [0, 0.25, 0.0]]
-    with pytest.raises(ValueError, match="'Q': neither a body nor a joint"):
+    assert named == [[1, 0.0, 0.0], [1, -0.75, 0.0]]  # a pin is a point of the second body
+    with pytest.raises(ValueError, match="trace 'Q': \"Q\" is neither a body nor a pin"):
         udk.animate(slider_crank, run, measures=(), traces=("Q",))
 
 

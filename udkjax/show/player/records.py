@@ -31,6 +31,7 @@ from udkjax.scene import Mechanism
 from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
 from udkjax.show.player.measures import Measures, Trajectory, measures_of, reaction_arrows
 from udkjax.show.player.packing import Json, floats, pack, unpack
+from udkjax.study.channels import locate
 
 Record = Json
 Traces = Sequence[str | tuple[str, ArrayLike]]  # joints, bodies, or points of bodies
@@ -168,7 +169,7 @@ def trace_anchors(
     """Return the anchors whose paths are drawn: those of the joints and bodies that are named, or of the pins that move.
 
     Raises:
-        ValueError: a name of neither a body nor a joint with points.
+        ValueError: a name of neither a body nor a pin.
     """
     bodies = list(mechanism.bodies)
     if wanted is not None:
@@ -189,18 +190,13 @@ def trace_anchors(
 
 def _anchor(mechanism: Mechanism, bodies: list[str], wanted: str | tuple[str, ArrayLike]) -> list[float]:
     name, point = (wanted, None) if isinstance(wanted, str) else wanted
-    if point is not None:
-        if name not in bodies:
-            raise ValueError(f"trace {name!r}: there is no such body")
-        return [bodies.index(name), *np.asarray(point, float).tolist()]
-    if name in bodies:
-        return [bodies.index(name), 0.0, 0.0]
-    points = getattr(mechanism.joints.get(name), "points", None)
-    if points is None:
-        raise ValueError(f"trace {name!r}: neither a body nor a joint with points")
-    joint = mechanism.joints[name]
-    side = next(k for k, body in enumerate(joint.bodies) if body in bodies)
-    return [bodies.index(joint.bodies[side]), *np.asarray(points, float)[side].tolist()]
+    try:
+        body, local = locate(mechanism, name, None if point is None else np.asarray(point, float))
+    except ValueError as error:
+        raise ValueError(f"trace {name!r}: {error}") from None
+    if body not in bodies:
+        raise ValueError(f"trace {name!r}: it does not move")
+    return [bodies.index(body), *np.asarray(local, float).tolist()]
 
 
 def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodies 3"]) -> list[float]:
