@@ -5,7 +5,7 @@ import numpy as np
 from udkjax.native.ir import DOUBLE, INT, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
-from udkjax.native.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS
+from udkjax.native.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS, SHORTEST_LAST
 
 
 def aim(t: Module, f: Function, s: Lane):
@@ -15,7 +15,7 @@ def aim(t: Module, f: Function, s: Lane):
     t1 = s.T3 + s.h
     last = (t1 >= s.end - s.smallest) & ~begin
     if not t.plan.breaks:
-        t1 = where(last, s.end, t1)
+        t1 = where(last, s.end, halve(f, s, t1, begin | last))
         s.lands = f.const(0.0, DOUBLE, f.width)
     else:
         here = s.T3
@@ -30,7 +30,7 @@ def aim(t: Module, f: Function, s: Lane):
         several = (s.steps < float(POINTS - 2)) & (t1 > share) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
         if t.pieces:
             several = several & s.aim.is_not(float(AIM_ACROSS))
-        t1 = where(several, share, t1)
+        t1 = where(several, share, t1 if t.pieces else halve(f, s, t1, begin | last | several))
         reaches = (t1 >= stop - s.smallest * 2.0) & (stop < s.end - s.smallest) & ~begin
         last = last & ~reaches & ~several
         final = s.end - f.max(s.end - end, 0.0)
@@ -42,6 +42,12 @@ def aim(t: Module, f: Function, s: Lane):
     s.step = where((s.stepping > 0.5) & ~begin, t1 - s.T3, 0.0)
     s.begin = where(begin, yes, 0.0)
     s.last = where(last, yes, 0.0)
+
+
+def halve(f: Function, s: Lane, t1: Value, otherwise: Value) -> Value:
+    """The end of a step: in the middle of what is left, where little would be left behind it."""
+    short = (s.end - t1 < s.h * SHORTEST_LAST) & ~otherwise
+    return f.select(short, s.T3 + (s.end - s.T3) * 0.5, t1)
 
 
 def next_breakpoint(t: Module, f: Function, s: Lane, here: Value):

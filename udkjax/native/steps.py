@@ -43,6 +43,9 @@ HALVINGS = 40
 TRIES = 8  # in a row to end a step where a piece does: a mechanism at rest there may be in either, by rounding
 
 POINTS = 4  # states that an interpolating polynomial goes through: with three, velocities between steps are worse than at steps
+# Of a step: a last one that were shorter takes half of it. Outputs of the first step wait for the second, and the polynomial
+# through two points that lie so close beside it takes rounding errors for velocities: by 1e-4 m/s where the last is 1 / 300.
+SHORTEST_LAST = 0.25
 STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 
 # What a run may be. `NOT_FINITE`: its step became too small because of a number that is not finite.
