@@ -37,6 +37,7 @@ class Result(PrintsWords):
     event_impossible = 10
     invalid_argument = 11
     initial_state_open = 12
+    undefined_condition = 13
 
     @property
     def is_success(self) -> bool:
@@ -68,6 +69,7 @@ CAUSES = {
     "no motion, or a joint attached where it is open",
     Result.invalid_argument: "an argument of this run cannot be used: output times that do not increase, a state that is not "
     "finite, or a tolerance or first step that is not positive",
+    Result.undefined_condition: "the condition of an event is not a number: look at what it divides by, or takes the root of",
 }
 
 
@@ -133,6 +135,8 @@ class Solution(PrintsTable):
     def cause(self) -> str:
         """How the run ended, in words; why a single run failed is looked for when this is first read, for up to a second."""
         found = self.found_cause and self.found_cause.text(int(self.code), float(self.time))
+        if self.events is not None and (names := self.events.undefined_names):
+            found = f"the condition of {names} is not a number; look at what it divides by, or takes the root of"
         return f"{self.result.label} at t = {float(self.time):.6g} s: {found or CAUSES[self.result]}"
 
     _units = units(ts="s", q="m, m, rad", v="m/s, m/s, rad/s", time="s")

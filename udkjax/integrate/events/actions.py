@@ -5,8 +5,8 @@ from typing import Literal
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from udkjax.integrate.events.checks import number_if_any
 from udkjax.printing import PrintsLine
-from udkjax.scene.fields import number
 from udkjax.scene.joints import Joint
 
 
@@ -25,7 +25,8 @@ class Log(Action):
 class Impact(Action):
     """Reverse the rate of the condition, g >= 0 being what is allowed: g_dot+ = -restitution g_dot-.
 
-    The jump of the velocities is the smallest in the metric of M that keeps all constraints (`jumps`): no friction. Rebounds
+    All contacts that are closed at the instant are hit together: no impulse pulls, none is penetrated, energy never grows
+    (`impacts`). The jump of the velocities is the smallest in the metric of M that keeps all constraints: no friction. Rebounds
     that have become too small to follow end in rest: with `at_rest="hold"` the condition is held at zero, as a constraint, until
     the contact would have to pull; with "stop" the run ends there (`Result.at_rest`).
 
@@ -34,7 +35,7 @@ class Impact(Action):
         at_rest: "hold": rest in contact; "stop": end the run.
     """
 
-    restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    restitution: Float[Array, ""] = eqx.field(converter=number_if_any, default=0.0)
     at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
 
 

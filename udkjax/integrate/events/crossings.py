@@ -31,18 +31,25 @@ def side_of_zero(values: ConditionValues, rate: Float[Array, ""]) -> Int[Array, 
     return jnp.where(jnp.abs(h) > ZERO * scale, jnp.sign(h), by_rate).astype(int)
 
 
-def first_crossing(hybrid: Hybrid, phase: Int[Array, ""], before: Int[Array, "2E"], after: Int[Array, "2E"]) -> Int[Array, ""]:
-    """Return the first event that happens as conditions change their sides of zero; `NO_EVENT` where none does."""
-    E = hybrid.count
+def first_crossing(
+    hybrid: Hybrid, phase: Int[Array, ""], carried: Bool[Array, "E"], before: Int[Array, "2E"], after: Int[Array, "2E"]
+) -> Int[Array, ""]:
+    """Return the first event that happens as conditions change their sides of zero; `NO_EVENT` where none does.
+
+    Args:
+        hybrid: the system.
+        phase: the phase.
+        carried: the contacts that others hold at zero.
+        before: the sides of zero before.
+        after: the sides of zero now.
+    """
     held = hybrid.is_held(phase)
-    hits = crosses(hybrid, before[:E], after[:E]) & ~held
-    happens = jnp.append(hits, held & (before[E:] > 0) & (after[E:] < 0))
+    happens = crosses(hybrid.directions, before, after) & jnp.append(~held & ~carried, held)
     return jnp.where(jnp.any(happens), jnp.argmax(happens), NO_EVENT)
 
 
-def crosses(hybrid: Hybrid, before: Int[Array, "*G E"], after: Int[Array, "*G E"]) -> Bool[Array, "*G E"]:
-    """Tell which conditions cross zero in the direction that counts."""
-    direction = np.array([e.direction for e in hybrid.events])
+def crosses(direction: Int[np.ndarray, "C"], before: Int[Array, "*G C"], after: Int[Array, "*G C"]) -> Bool[Array, "*G C"]:
+    """Tell which conditions cross zero in the direction that counts, 0 for either."""
     return (before != 0) & (after == -before) & ((direction == 0) | (after == direction))
 
 

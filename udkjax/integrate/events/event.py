@@ -17,15 +17,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.annotations import Scalar
-from udkjax.integrate.events.actions import Action, Attach, Impact, Lock, Stop
+from udkjax.integrate.events.actions import Action, Attach, Impact, Lock, Release, Stop
+from udkjax.integrate.events.checks import (
+    number_if_any,
+    require_joint,
+    require_limits,
+    require_name_text,
+    require_normal,
+    require_restitution,
+    require_vector,
+)
 from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_of, joint_coordinate, require_name
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
+from udkjax.scene.arguments import describe
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import Number, number, optional_number
+from udkjax.scene.fields import Number, number
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -70,18 +80,20 @@ class JointLimit(PrintsLine):
     """
 
     joint: str = eqx.field(static=True)
-    lower: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)
-    upper: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)
-    restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    lower: Float[Array, ""] | None = eqx.field(converter=number_if_any, default=None)
+    upper: Float[Array, ""] | None = eqx.field(converter=number_if_any, default=None)
+    restitution: Float[Array, ""] = eqx.field(converter=number_if_any, default=0.0)
     at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
     name: str = eqx.field(static=True, default="")
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
         """Return one event for each limit."""
+        require_name_text("JointLimit: joint", self.joint)
+        require_name_text("JointLimit: name", self.name, may_be_empty=True)
         name, found = self.name or self.joint, []
-        coordinate = joint_coordinate(mechanism, self.joint, f"limit {quote(name)}")
-        if self.lower is None and self.upper is None:
-            raise ValueError(f"limit {quote(name)}: give `lower` or `upper`, or both")
+        where = f"limit {quote(name)}"
+        coordinate = joint_coordinate(mechanism, self.joint, where)
+        require_limits(where, self.lower, self.upper)
         for side, limit, sign in (("lower", self.lower, 1.0), ("upper", self.upper, -1.0)):
             if limit is not None:
                 action = Impact(self.restitution, self.at_rest)
@@ -107,23 +119,27 @@ class Contact(PrintsLine):
     """
 
     body: str = eqx.field(static=True)
-    point: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))
-    through: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 0.0))
-    normal: Float[Array, "2"] = eqx.field(converter=number, default=(0.0, 1.0))
-    restitution: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    point: Float[Array, "2"] = eqx.field(converter=number_if_any, default=(0.0, 0.0))
+    through: Float[Array, "2"] = eqx.field(converter=number_if_any, default=(0.0, 0.0))
+    normal: Float[Array, "2"] = eqx.field(converter=number_if_any, default=(0.0, 1.0))
+    restitution: Float[Array, ""] = eqx.field(converter=number_if_any, default=0.0)
     on: str = eqx.field(static=True, default=GROUND)
     at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
     name: str = eqx.field(static=True, default="")
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
         """Return the event, as a list."""
+        for argument, text in (("body", self.body), ("on", self.on), ("name", self.name)):
+            require_name_text(f"Contact: {argument}", text, may_be_empty=argument == "name")
         name = self.name or f"{self.body} on {self.on}"
+        where = f"contact {quote(name)}"
         for body in (self.body, self.on):
-            require_name(body, [*mechanism.body_names, GROUND], f"contact {quote(name)}", "body")
+            require_name(body, [*mechanism.body_names, GROUND], where, "body")
         if self.body == self.on:
-            raise ValueError(f"contact {quote(name)}: {quote(self.body)} cannot touch itself")
-        if not isinstance(self.normal, Tracer) and not np.any(np.asarray(self.normal)):
-            raise ValueError(f"contact {quote(name)}: the normal must not be zero")
+            raise ValueError(f"{where}: {quote(self.body)} cannot touch itself")
+        require_vector(f"{where}: point", self.point)
+        require_vector(f"{where}: through", self.through)
+        require_normal(f"{where}: normal", self.normal)
         gap = Gap((self.body, self.on), self.point, self.through, self.normal)
         return [Event(gap, Impact(self.restitution, self.at_rest), -1, name)]
 
@@ -150,9 +166,11 @@ class Events(PrintsTable):
     q_after: Float[Array, "events bodies 3"]
     v_after: Float[Array, "events bodies 3"]
     count: Int[Array, ""]
+    unresolved: Float[Array, "conditions"]  # the time (s) from which on crossings may be missed: a condition varies too quickly
+    undefined: Bool[Array, "conditions"]  # whether a condition is not a number, where the run ends by that
     names: tuple[str, ...] = eqx.field(static=True)
 
-    _units = units(time="s")
+    _units = units(time="s", unresolved="s")
 
     def _table(self) -> PrintedTable:
         if np.ndim(self.count):
@@ -166,6 +184,11 @@ class Events(PrintsTable):
         """Return the times (s) of the events of one name, of a single run."""
         require_name(name, self.names, "events", "event")
         return self.time[np.asarray(self.index) == self.names.index(name)]
+
+    @property
+    def undefined_names(self) -> str:
+        """The names of the events that ended a single run by conditions that are not numbers, as text."""
+        return ", ".join(f"event {quote(self.names[k])}" for k in np.flatnonzero(self.undefined))
 
     @property
     def counts(self) -> dict[str, Int[Array, ""]]:
@@ -188,6 +211,7 @@ def expand_events(events: Sequence[ExpandsToEvents], mechanism: Mechanism) -> tu
         if not hasattr(event, "expand"):
             raise ValueError(f"events[{k}]: must be an Event, a JointLimit or a Contact, is a {type(event).__name__}")
         for one in event.expand(mechanism):
+            require_name_text(f"events[{k}]: name", one.name, may_be_empty=True)
             name = one.name or f"event{k + 1}"
             if any(name == other.name for other in found):
                 raise ValueError(f"event {quote(name)}: two events have this name; give one of them another (`name=`)")
@@ -215,8 +239,8 @@ def _check(event: Event, mechanism: Mechanism) -> None:
     where, action = f"event {quote(event.name)}", event.action
     if not isinstance(action, Action):
         raise ValueError(f"{where}: the action must be Stop(), Log(), Impact(...), ..., is a {type(action).__name__}")
-    if event.direction not in (-1, 0, 1):
-        raise ValueError(f"{where}: the direction must be -1, 0 or 1, is {event.direction}")
+    if not isinstance(event.direction, int) or isinstance(event.direction, bool) or event.direction not in (-1, 0, 1):
+        raise ValueError(f"{where}: the direction must be -1, 0 or 1, {describe(event.direction)}")
     if not callable(event.condition):
         raise ValueError(f"{where}: the condition must be a function (t, frames), is a {type(event.condition).__name__}")
     try:
@@ -236,14 +260,17 @@ def _check(event: Event, mechanism: Mechanism) -> None:
     if isinstance(action, Impact):
         if sees_velocity(event, mechanism):
             raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
-        e = action.restitution
-        if not isinstance(e, Tracer) and not np.all((np.asarray(e) >= 0) & (np.asarray(e) <= 1)):
-            raise ValueError(f"{where}: the restitution must be from 0 to 1, is {float(e):g}")
+        require_restitution(f"{where}: the restitution", action.restitution)
         if action.at_rest not in ("hold", "stop"):
             raise ValueError(f'{where}: at_rest must be "hold" or "stop", is {action.at_rest!r}')
     elif isinstance(action, Lock):
+        require_name_text(f"{where}: the joint of Lock", action.joint)
         joint_coordinate(mechanism, action.joint, where)
+    elif isinstance(action, Release):
+        require_name_text(f"{where}: the name of Release", action.name)
     elif isinstance(action, Attach):
+        require_name_text(f"{where}: the name of Attach", action.name)
+        require_joint(f"{where}: the joint of Attach", action.joint)
         if action.name in mechanism.constraints:
             raise ValueError(f"{where}: {quote(action.name)} is in the scene already; attach the joint under another name")
         for body in action.joint.bodies:

@@ -1,6 +1,6 @@
 """A mechanism with events as a hybrid system: a flow in each phase, and conditions along it. `jumps` leads between phases."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -16,8 +16,8 @@ from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate import native_engine
 from udkjax.integrate.derivatives import differentiable
-from udkjax.integrate.events.actions import Action, Impact
-from udkjax.integrate.events.conditions import frames_of
+from udkjax.integrate.events.actions import Action, Impact, Log, Stop
+from udkjax.integrate.events.conditions import Gap, WithinLimit, frames_of
 from udkjax.integrate.events.event import Event, sees_velocity
 from udkjax.integrate.events.phases import Phases
 from udkjax.integrate.gradients import stop_gradients
@@ -49,9 +49,8 @@ class ConditionValues(NamedTuple):
     h: Float[Array, "2E"]
     rate: Float[Array, "2E"]  # 0 of forces
     rate_2: Float[Array, "2E"]  # 0 of forces, and of conditions that depend on velocities
-    normals: Float[Array, "E n"]  # dh/dq of the conditions
     a: Float[Array, "n"]
-    scale: Float[Array, "2E"]  # the change of a condition by a displacement of L or a turn of one radian
+    scale: Float[Array, "2E"]  # the change of a condition by a displacement of L, a turn of one radian, or in T
 
 
 class Hybrid(eqx.Module):
@@ -90,6 +89,19 @@ class Hybrid(eqx.Module):
         """The characteristic length, time and mass of the scene."""
         return self.phases.analyses[0].scales
 
+    @property
+    def has_usable_numbers(self) -> Bool[Array, ""]:
+        """Whether restitutions are from 0 to 1, and limits and contacts finite, where they were traced when they were checked."""
+        found = jnp.array(True)
+        for e in self.events:
+            if isinstance(e.action, Impact):
+                found &= (e.action.restitution >= 0) & (e.action.restitution <= 1)
+            if isinstance(e.condition, WithinLimit | Gap):
+                found &= jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(e.condition)]))
+            if isinstance(e.condition, Gap):
+                found &= jnp.any(e.condition.normal != 0)
+        return found
+
     def mask(self, *actions: type[Action]) -> Bool[np.ndarray, "E"]:
         """Tell which events have an action of these kinds."""
         return np.array([isinstance(e.action, actions) for e in self.events])
@@ -99,10 +111,23 @@ class Hybrid(eqx.Module):
         """Which events are impacts."""
         return self.mask(Impact)
 
+    def rests(self, at_rest: str) -> Bool[np.ndarray, "E"]:
+        """Tell which events are impacts with this choice of what happens at rest."""
+        return np.array([isinstance(e.action, Impact) and e.action.at_rest == at_rest for e in self.events])
+
     @property
     def by_velocity(self) -> Bool[np.ndarray, "E"]:
         """Which conditions depend on velocities."""
         return np.array([sees_velocity(e, self.phases.mechanisms[0]) for e in self.events])
+
+    @property
+    def directions(self) -> Int[np.ndarray, "2E"]:
+        """The directions in which the zeros of conditions count, and those of contact forces: they fall below it."""
+        return np.array([*(e.direction for e in self.events), *(-1 for _ in self.events)])
+
+    def changes_motion(self, k: Int[Array, ""]) -> Bool[Array, ""]:
+        """Tell whether event k, from E on a contact that lets go, does more than to take note or to stop."""
+        return (k >= self.count) | jnp.array(~self.mask(Log, Stop))[k % self.count]
 
     def table(self, name: str) -> Int[Array, "phases E"]:
         """Return one of the tables of the phases."""
@@ -111,6 +136,20 @@ class Hybrid(eqx.Module):
     def is_held(self, phase: Int[Array, ""]) -> Bool[Array, "E"]:
         """Tell which contacts are at rest in a phase."""
         return self.table("held")[phase] >= 0
+
+    def without_contacts(self, phase: Int[Array, ""]) -> Int[Array, ""]:
+        """Return the phase that follows when all contacts at rest let go."""
+        freed = self.table("freed")
+        for k in np.flatnonzero(self.impacts):
+            phase = freed[phase, k]
+        return phase
+
+    def with_contacts(self, phase: Int[Array, ""], held: Bool[Array, "E"]) -> Int[Array, ""]:
+        """Return the phase that follows when contacts come to rest."""
+        resting = self.table("resting")
+        for k in np.flatnonzero(self.impacts):
+            phase = jnp.where(held[k], resting[phase, k], phase)
+        return phase
 
     # --- the flow
 
@@ -159,22 +198,37 @@ class Hybrid(eqx.Module):
 
         return self.in_phase(state.phase, of_phase, ts, state.q, state.v, state.added)
 
-    def in_phase(self, phase: Int[Array, ""], function: Callable[..., T], *arguments: object) -> T:
-        """Return `function(phase, *arguments)`, with the phase as a Python int for each branch."""
-        count = len(self.phases.mechanisms)
-        if count == 1:
-            return function(0, *arguments)
-        branches = [lambda *x, k=k: function(k, *x) for k in range(count)]
-        return jax.lax.switch(phase, branches, *arguments)
+    @property
+    def contact_free_phases(self) -> tuple[int, ...]:
+        """The phases in which no contact is at rest."""
+        return tuple(k for k, held in enumerate(self.phases.tables.held) if max(held) < 0)
+
+    def in_phase(
+        self, phase: Int[Array, ""], function: Callable[..., T], *arguments: object, among: Sequence[int] | None = None
+    ) -> T:
+        """Return `function(phase, *arguments)`, with the phase as a Python int for each branch.
+
+        Args:
+            phase: the phase.
+            function: what is computed.
+            *arguments: its arrays.
+            among: the phases that there can be; None: all.
+        """
+        among = range(len(self.phases.mechanisms)) if among is None else among
+        if len(among) == 1:
+            return function(among[0], *arguments)
+        branches = [lambda *x, k=k: function(k, *x) for k in among]
+        return jax.lax.switch(jnp.searchsorted(np.array(among), phase), branches, *arguments)
 
     def textbook(self, phase: int, added: Added) -> TextbookEquations:
         """Return the equations of a phase, solved by SVD."""
         return prepare(self.phases.with_added(phase, added), SVD(), self.baumgarte, self.phases.analyses[phase])
 
-    def accelerations(self, state: RunState) -> Float[Array, "n"]:
-        """Return a in one state."""
+    def accelerations(self, state: RunState, among: Sequence[int] | None = None) -> Float[Array, "n"]:
+        """Return a in one state, whose phase is `among` some."""
         t, q, v, phase, added = state
-        return self.in_phase(phase, lambda p, t, q, v, added: self.textbook(p, added).accelerations(t, q, v), t, q, v, added)
+        of_phase = lambda p, t, q, v, added: self.textbook(p, added).accelerations(t, q, v)  # noqa: E731
+        return self.in_phase(phase, of_phase, t, q, v, added, among=among)
 
     # --- conditions
 
@@ -187,22 +241,28 @@ class Hybrid(eqx.Module):
         """Return the conditions, and the rates of those that depend on positions alone."""
         return _with_rate(self.conditions, t, q, v, jnp.zeros_like(v))
 
+    def second_rates(self, t: Array, q: Array, v: Array, a: Array) -> Float[Array, "E"]:
+        """Return the second rates of the conditions that depend on positions alone, with accelerations a; 0 of others."""
+        rates = lambda t, q, v: self.conditions_and_rates(t, q, v)[1]  # noqa: E731
+        return jnp.where(self.by_velocity, 0.0, _with_rate(rates, t, q, v, a)[1])
+
     def values(self, state: RunState) -> ConditionValues:
         """Return conditions, contact forces, and their rates."""
         t, q, v, phase, added = state
         a, pressure = self.in_phase(phase, self._accelerations_and_pressures, t, q, v, added)
         g, g_dot = _with_rate(self.conditions, t, q, v, a)
-        rates = lambda t, q, v: _with_rate(self.conditions, t, q, v, jnp.zeros_like(a))[1]  # noqa: E731
-        g_ddot = jnp.where(self.by_velocity, 0.0, _with_rate(rates, t, q, v, a)[1])
+        g_ddot = self.second_rates(t, q, v, a)
         by_q = jax.jacfwd(self.conditions, 1)(t, q, v)
         unit, zeros = self.scales.coordinates(len(q)), jnp.zeros(self.count)
+        by_t = jax.jacfwd(self.conditions, 0)(jnp.asarray(t, float), q, v)
         size = jnp.max(jnp.abs(by_q) * jnp.maximum(unit, jnp.abs(q)), axis=1)
+        size = jnp.maximum(size, jnp.abs(by_t) * jnp.maximum(1 / self.rate, jnp.abs(t)))
         if self.by_velocity.any():
             by_v = jax.jacfwd(self.conditions, 2)(t, q, v)
             size = jnp.maximum(size, jnp.max(jnp.abs(by_v) * jnp.maximum(unit * self.rate, jnp.abs(v)), axis=1))
         force = self.scales.mass * self.scales.length * self.rate**2
         scale = stop_gradients(jnp.append(size, zeros + force))
-        return ConditionValues(jnp.append(g, pressure), jnp.append(g_dot, zeros), jnp.append(g_ddot, zeros), by_q, a, scale)
+        return ConditionValues(jnp.append(g, pressure), jnp.append(g_dot, zeros), jnp.append(g_ddot, zeros), a, scale)
 
     def rate_of_pressure(self, k: Int[Array, ""], state: RunState, a: Float[Array, "n"]) -> Float[Array, ""]:
         """Return the rate of the contact force of event k, whose contact is at rest."""
@@ -217,11 +277,20 @@ class Hybrid(eqx.Module):
 
     def _accelerations_and_pressures(self, phase: int, t: Array, q: Array, v: Array, added: Added) -> tuple[Array, Array]:
         """Return a, and minus the multipliers of the contacts at rest in a phase, 1 for all other events."""
-        equations, held = self.textbook(phase, added), np.array(self.phases.tables.held[phase])
-        a, ones = equations.accelerations(t, q, v), jnp.ones(self.count)
+        return self.textbook(phase, added).accelerations(t, q, v), self._pressures(phase, t, q, v, added)
+
+    def _pressures(self, phase: int, t: Array, q: Array, v: Array, added: Added) -> Float[Array, "E"]:
+        held, ones = np.array(self.phases.tables.held[phase]), jnp.ones(self.count)
         if not np.any(held >= 0):
-            return a, ones
-        return a, jnp.where(held >= 0, -equations.multipliers(t, q, v)[np.maximum(held, 0)], ones)
+            return ones
+        return jnp.where(held >= 0, -self.textbook(phase, added).multipliers(t, q, v)[np.maximum(held, 0)], ones)
+
+    def pressures(
+        self, t: Float[Array, "G"], q: Float[Array, "G n"], v: Float[Array, "G n"], at: RunState
+    ) -> Float[Array, "G E"]:
+        """Return the contact forces at some states in the phase of another, 1 for events whose contact is not at rest."""
+        of_phase = lambda p, t, q, v, added: jax.vmap(lambda t, q, v: self._pressures(p, t, q, v, added))(t, q, v)  # noqa: E731
+        return self.in_phase(at.phase, of_phase, t, q, v, at.added)
 
 
 def _with_rate(f: Condition, t: Array, q: Array, v: Array, a: Array) -> tuple[Float[Array, "k"], Float[Array, "k"]]:

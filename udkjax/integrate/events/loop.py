@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.integrate.events.actions import Impact, Stop
+from udkjax.integrate.events.actions import Stop
 from udkjax.integrate.events.crossings import NO_EVENT, ZERO, first_crossing, side_of_zero
 from udkjax.integrate.events.hybrid import ConditionValues, Hybrid, RunState
-from udkjax.integrate.events.jumps import apply_event, comes_to_rest
+from udkjax.integrate.events.impacts import CLOSED, OPEN
+from udkjax.integrate.events.jumps import apply_event
 from udkjax.integrate.events.window import (
+    FINER,
     Search,
     WindowResult,
     choose,
@@ -37,6 +39,8 @@ class EventRecord(NamedTuple):
     phase: Int[Array, "K"]  # after it
     q: Float[Array, "K 2 n"]  # before and after
     v: Float[Array, "K 2 n"]
+    together: Bool[Array, "K"]  # whether it happens with the one before it, as one event
+    closed: Int[Array, "K E"]  # the states of all contacts, as in `ContactChanges`
     count: Int[Array, ""]
     last: Float[Array, ""]  # the time of the last one
 
@@ -47,10 +51,13 @@ class LoopState(NamedTuple):
     state: RunState
     values: ConditionValues
     sides: Int[Array, "2E"]  # the last known side of zero of each condition: -1, 1, or 0: not known
+    carried: Bool[Array, "E"]  # the contacts that are held at zero by others that are at rest
     pending: Int[Array, ""]  # the event that happens now; or NO_EVENT, or BEGIN
     search: Search
     reach: Float[Array, ""]  # how far the next window goes (s)
-    quiet: Float[Array, ""]  # the time up to which there is no crossing in pairs
+    quiet: Float[Array, "2E"]  # the time up to which each condition has no crossings in pairs
+    unresolved: Float[Array, "2E"]  # the time from which on a condition varies too quickly to be sure of its crossings, or NaN
+    undefined: Bool[Array, "E"]  # the conditions that are not a number where the run ends by that
     q: Float[Array, "T n"]  # outputs
     v: Float[Array, "T n"]
     written: Int[Array, ""]  # how many of them
@@ -81,9 +88,11 @@ def run_loop(
     first = _first_loop_state(hybrid, ts, state, code, max_events)
 
     def integrate(loop: LoopState) -> WindowResult:
-        window = plan_window(hybrid, ts, loop.state, loop.search, loop.reach, loop.written)
-        sides, scale = loop.sides[: hybrid.count], loop.values.scale[: hybrid.count]
-        return integrate_window(hybrid, window, loop.state, sides, scale, loop.search, loop.quiet, drift_tol)
+        window = plan_window(hybrid, ts, loop.state, loop.search, loop.reach, loop.quiet, loop.written)
+        held, known = hybrid.is_held(loop.state.phase), ~jnp.isnan(loop.unresolved)
+        watched = jnp.append(~held & ~loop.carried, held)
+        looked_at = loop.sides, loop.values.scale, watched, loop.search, loop.quiet, known
+        return integrate_window(hybrid, window, loop.state, *looked_at, drift_tol)
 
     def body(loop: LoopState) -> LoopState:
         happens = loop.pending != NO_EVENT
@@ -91,7 +100,8 @@ def run_loop(
         jumped = jax.lax.cond(loop.pending >= 0, lambda: _apply_pending(hybrid, loop, max_events), lambda: loop)
         result = jax.lax.cond(happens, lambda: nothing, lambda: integrate(loop))
         values = hybrid.values(choose(happens, jumped.state, result.end))
-        values = values._replace(scale=jnp.maximum(values.scale, loop.values.scale))
+        scale = jnp.where(jnp.isfinite(values.scale), values.scale, 0.0)  # beyond where a condition is a number it has no scale
+        values = values._replace(scale=jnp.maximum(scale, loop.values.scale))
         loop = jax.lax.cond(
             happens, lambda: _after_event(hybrid, loop, jumped, values), lambda: _after_window(hybrid, loop, result, values)
         )
@@ -108,18 +118,22 @@ def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, co
     nothing = jnp.full((T, n), jnp.nan, float)
     none, zeros = jnp.full(max_events, -1, int), jnp.zeros(2 * E)
     states, times = jnp.full((max_events, 2, n), jnp.nan, float), jnp.full(max_events, jnp.nan, float)
+    open_ = jnp.full((max_events, E), OPEN, int)
     return LoopState(
         state=state,
-        values=ConditionValues(zeros, zeros, zeros, jnp.zeros((E, n)), jnp.zeros(n), zeros),
+        values=ConditionValues(zeros, zeros, zeros, jnp.zeros(n), zeros),
         sides=jnp.zeros(2 * E, int),
+        carried=jnp.zeros(E, bool),
         pending=jnp.array(BEGIN),
         search=no_search(ts[0]),
         reach=ts[-1] - ts[0],
-        quiet=ts[0],
+        quiet=jnp.full(2 * E, ts[0]),
+        unresolved=jnp.full(2 * E, jnp.nan),
+        undefined=jnp.zeros(E, bool),
         q=nothing,
         v=nothing,
         written=jnp.array(0),
-        record=EventRecord(times, none, none, states, states, jnp.zeros((), int), ts[0]),
+        record=EventRecord(times, none, none, states, states, none > 0, open_, jnp.zeros((), int), ts[0]),
         code=code,
         running=code == Result.successful,
         totals=jnp.zeros(4, int),
@@ -129,7 +143,10 @@ def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, co
 def _after_event(hybrid: Hybrid, loop: LoopState, jumped: LoopState, values: ConditionValues) -> LoopState:
     """Return the loop after an event, or at the start, with the event that happens at once."""
     new = jax.lax.cond(loop.pending == BEGIN, lambda: _begin(hybrid, jumped, values), lambda: jumped)
-    pending = first_crossing(hybrid, new.state.phase, new.sides, side_of_zero(values, hybrid.rate))
+    # The contacts that were closed are settled: what they do next takes time.
+    settled = (loop.pending >= 0) & (new.record.closed[jnp.maximum(new.record.count - 1, 0)] > OPEN)
+    now = jnp.where(jnp.append(settled, jnp.zeros_like(settled)), new.sides, side_of_zero(values, hybrid.rate))
+    pending = first_crossing(hybrid, new.state.phase, new.carried, new.sides, now)
     return new._replace(values=values, pending=jnp.where(new.running, pending, NO_EVENT))
 
 
@@ -140,8 +157,10 @@ def _begin(hybrid: Hybrid, loop: LoopState, values: ConditionValues) -> LoopStat
     impacts = np.append(hybrid.impacts, np.zeros(hybrid.count, bool))
     sides = jnp.where(impacts & is_zero, 1, side_of_zero(values, hybrid.rate))
     beyond = jnp.any(impacts & (values.h < 0) & ~is_zero)
+    undefined = ~jnp.isfinite(values.h[: hybrid.count])
     code = jnp.where(beyond, Result.beyond_contact, loop.code)
-    return loop._replace(sides=sides, code=code, running=loop.running & ~beyond)
+    code = jnp.where(jnp.any(undefined), Result.undefined_condition, code)
+    return loop._replace(sides=sides, undefined=undefined, code=code, running=loop.running & (code == Result.successful))
 
 
 def _after_window(hybrid: Hybrid, loop: LoopState, result: WindowResult, values: ConditionValues) -> LoopState:
@@ -149,36 +168,33 @@ def _after_window(hybrid: Hybrid, loop: LoopState, result: WindowResult, values:
     E, end = hybrid.count, result.end
     step, now = step_search(hybrid, result, values), side_of_zero(values, hybrid.rate)
     k = jnp.maximum(result.search.event, 0)
-    # A contact that would have to pull at the end of the window is released within it.
-    pulls = hybrid.is_held(end.phase) & (loop.sides[E:] > 0) & (now[E:] < 0)
-    is_free = (step.is_found & (k < E)) | (result.search.event < 0)
-    releases = is_free & jnp.any(pulls) & ~result.fails & (end.t > loop.state.t)
-    middle = (loop.state.t + end.t) / 2
-    release = Search(E + jnp.argmax(pulls), middle, loop.state.t, end.t, jnp.array(0), jnp.array(True), jnp.array(1), end.t)
-    is_found, repeats = step.is_found & ~releases, step.continues | releases
-
-    search = choose(releases, release, choose(is_found | step.is_lost, no_search(loop.state.t), step.search))
+    search = choose(step.is_found | step.is_lost, no_search(loop.state.t), step.search)
     h = step.change
     at_event = end._replace(t=end.t + h, q=end.q + h * end.v + h**2 / 2 * values.a, v=end.v + h * values.a)
-    state = choose(is_found, at_event, choose(repeats, loop.state, result.reached))
+    state = choose(step.is_found, at_event, choose(step.continues, loop.state, result.reached))
     # At the end of the run every condition that is not zero tells its side; what is located tells it by happening.
-    others = (np.arange(2 * E) != jnp.where(is_found, k, -1)) & (jnp.abs(values.h) > ZERO * values.scale)
-    sides = jnp.append(choose(repeats, loop.sides[:E], result.sides), loop.sides[E:])
-    is_over = (search.event < 0) & ~step.is_lost & ~result.fails
-    pending = jnp.where(is_over, first_crossing(hybrid, end.phase, sides, now), NO_EVENT)
-    pending = jnp.where(is_found, k, pending)
-    sides = jnp.where(is_found & others, now, sides)
-    sides = sides.at[k].set(jnp.where(is_found, result.search.side, sides[k]))
+    others = (np.arange(2 * E) != jnp.where(step.is_found, k, -1)) & (jnp.abs(values.h) > ZERO * values.scale)
+    sides = jnp.where(step.continues, loop.sides, result.sides)
+    is_over = (search.event < 0) & ~step.is_lost & ~result.fails & ~result.is_coarse
+    pending = jnp.where(is_over, first_crossing(hybrid, end.phase, loop.carried, sides, now), NO_EVENT)
+    pending = jnp.where(step.is_found, k, pending)
+    sides = jnp.where(step.is_found & others, now, sides)
+    sides = sides.at[k].set(jnp.where(step.is_found, result.search.side, sides[k]))
     output, due = result.window.output, result.window.due
     rows = jnp.where((output < len(loop.q)) & (due < state.t), output, len(loop.q))
+    length = result.window.times[-1] - result.window.times[0]
+    reach = jnp.where(result.is_coarse, length / FINER, jnp.where(search.event >= 0, loop.reach, 2 * loop.reach))
     return loop._replace(
         state=state,
         values=values._replace(rate=values.rate + h * values.rate_2),
         sides=sides,
+        carried=loop.carried & (jnp.abs(values.h[:E]) <= CLOSED * values.scale[:E]),
         pending=jnp.where(result.fails, NO_EVENT, pending),
         search=search,
-        reach=jnp.where(search.event >= 0, loop.reach, 2 * loop.reach),
-        quiet=jnp.where(step.is_lost, result.search.until, loop.quiet),
+        reach=reach,
+        quiet=loop.quiet.at[k].set(jnp.where(step.is_lost, result.search.until, loop.quiet[k])),
+        unresolved=jnp.where(result.unresolved & jnp.isnan(loop.unresolved), state.t, loop.unresolved),
+        undefined=result.undefined,
         q=loop.q.at[rows].set(result.q, mode="drop"),
         v=loop.v.at[rows].set(result.v, mode="drop"),
         written=loop.written + jnp.sum(rows < len(loop.q)),
@@ -189,42 +205,52 @@ def _after_window(hybrid: Hybrid, loop: LoopState, result: WindowResult, values:
 
 
 def _apply_pending(hybrid: Hybrid, loop: LoopState, max_events: int) -> LoopState:
-    """Apply the event that is pending, and record it."""
+    """Apply the event that is pending, and record it with the contacts that take part in it."""
     E, k, state, record = hybrid.count, jnp.maximum(loop.pending, 0), loop.state, loop.record
-    rests = comes_to_rest(hybrid, k, loop.values)
-    found = apply_event(hybrid, k, rests, state, loop.values)
-    full, place = record.count >= max_events, jnp.where(record.count < max_events, record.count, max_events)
-    put = lambda x, y: x.at[place].set(y, mode="drop")  # noqa: E731
-    e = k % E
+    held, e = hybrid.is_held(state.phase), k % E
+    found = apply_event(hybrid, k, state, loop.values)
     code = jnp.where(jnp.array(hybrid.mask(Stop))[e] & (k < E), Result.event_stop, loop.code)
-    code = jnp.where(rests & jnp.array(_stops_at_rest(hybrid))[e], Result.at_rest, code)
+    sides = loop.sides.at[e].set(jnp.where(jnp.array(hybrid.impacts)[e] | (k >= E), 1, -loop.sides[e]))
+    carried, happens, closed = loop.carried, np.arange(3 * E) == k, jnp.full(E, OPEN)
+    if found.contacts is not None:
+        contacts = found.contacts
+        closed = contacts.closed
+        rests = (contacts.held & ~held) | contacts.ends
+        happens = jnp.concatenate([contacts.hits, held & ~contacts.held, rests])
+        # The event itself is noted first, be it a contact that only comes to rest.
+        k = jnp.where((k < E) & ~contacts.hits[e] & rests[e], 2 * E + k, k)
+        carried = jnp.where(closed > OPEN, contacts.carried, carried)
+        code = jnp.where(jnp.any(contacts.ends), Result.at_rest, code)
+        sides = jnp.where(jnp.tile(closed > OPEN, 2), 1, sides)
     code = jnp.where(found.blocked, Result.event_impossible, code)
+    others = happens & (np.arange(3 * E) != k)
+    count = 1 + jnp.sum(others)
+    full = record.count + count > max_events
     code = jnp.where(full, Result.event_limit, code)
-    contact = jnp.array(hybrid.impacts)[e] | (k >= E)
-    sides = loop.sides.at[e].set(jnp.where(contact, 1, -loop.sides[e])).at[E + e].set(1)
+    rows = jnp.append(record.count, record.count + jnp.cumsum(others))
+    rows = jnp.where(jnp.append(True, others) & ~full, rows, max_events)
+    put = lambda x, y: x.at[rows].set(y, mode="drop")  # noqa: E731
     interval = state.t - record.last
     return loop._replace(
         state=choose(full | found.blocked, state, found.state),
         sides=sides,
+        carried=carried,
         pending=jnp.array(NO_EVENT),
         reach=jnp.where(interval > 0, jnp.minimum(loop.reach, 2 * interval), loop.reach),
         record=EventRecord(
             put(record.t, state.t),
-            put(record.index, jnp.where(rests, 2 * E + k, k)),
+            put(record.index, jnp.append(k, np.arange(3 * E))),
             put(record.phase, found.state.phase),
             put(record.q, jnp.stack([state.q, found.state.q])),
             put(record.v, jnp.stack([state.v, found.state.v])),
-            record.count + jnp.where(full, 0, 1),
+            put(record.together, jnp.append(False, others)),
+            put(record.closed, closed),
+            record.count + jnp.where(full, 0, count),
             state.t,
         ),
         code=code,
         running=loop.running & (code == Result.successful),
     )
-
-
-def _stops_at_rest(hybrid: Hybrid) -> Bool[np.ndarray, "E"]:
-    """Tell which impacts end the run when they come to rest."""
-    return np.array([isinstance(e.action, Impact) and e.action.at_rest == "stop" for e in hybrid.events])
 
 
 def _fill_end(loop: LoopState, ts: Float[Array, "T"]) -> LoopState:

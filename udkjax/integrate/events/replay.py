@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from udkjax.integrate.events.crossings import ZERO_RATE
 from udkjax.integrate.events.hybrid import Hybrid, RunState
@@ -31,7 +31,11 @@ class EventRun(NamedTuple):
     event_v: Float[Array, "K 2 n"]
     event_index: Int[Array, "K"]
     event_phase: Int[Array, "K"]
+    together: Bool[Array, "K"]
+    closed: Int[Array, "K E"]
     count: Int[Array, ""]
+    unresolved: Float[Array, "E"]
+    undefined: Bool[Array, "E"]
     code: Int[Array, ""]
     totals: Int[Array, "4"]
 
@@ -71,8 +75,10 @@ def _run(fixed: FixedPart, xs: list[Array]) -> EventRun:
     state = RunState(given.ts[0], given.q, given.v, jnp.array(0), hybrid.phases.first_added())
     loop = run_loop(hybrid, given.ts, state, given.code, given.drift_tol, fixed.max_events)
     record, smooth = loop.record, (loop.q, loop.v, loop.state.t)
-    events = record.t, record.q, record.v, record.index, record.phase, record.count
-    return EventRun(*smooth, *events, loop.code, loop.totals)
+    events = record.t, record.q, record.v, record.index, record.phase, record.together, record.closed, record.count
+    # Before it is no number, a condition may vary quickly: that is told by how the run ended.
+    faults = jnp.where(loop.undefined, jnp.nan, loop.unresolved[: hybrid.count]), loop.undefined
+    return EventRun(*smooth, *events, *faults, loop.code, loop.totals)
 
 
 @_run.def_jvp
@@ -159,8 +165,10 @@ def replay(hybrid: Hybrid, given: RunInput, found: EventRun) -> tuple[Array, ...
     q, v = (jnp.full((T, n), jnp.nan).at[rows].set(x.reshape(-1, n), mode="drop") for x in (out.q, out.v))
     last = (ts == found.time)[:, None]
     q, v = jnp.where(last, end.state.q, q), jnp.where(last, end.state.v, v)
-    times = jnp.full(K, jnp.nan).at[out.event].set(out.event_time, mode="drop")
-    qs, vs = (jnp.full((K, 2, n), jnp.nan).at[out.event].set(x, mode="drop") for x in (out.event_q, out.event_v))
+    first = jnp.cumsum(~found.together) - 1  # the number of the event that each happens with, and of itself if it is the first
+    first = jnp.flatnonzero(~found.together, size=K, fill_value=0)[first]
+    times = jnp.full(K, jnp.nan).at[out.event].set(out.event_time, mode="drop")[first]
+    qs, vs = (jnp.full((K, 2, n), jnp.nan).at[out.event].set(x, mode="drop")[first] for x in (out.event_q, out.event_v))
     stopped = (found.code == Result.event_stop) | (found.code == Result.at_rest)
     time = jnp.where(stopped, times[jnp.maximum(found.count - 1, 0)], found.time)
     return q, v, time, times, qs, vs
@@ -190,22 +198,25 @@ def _integrate_piece(
 
     def jump() -> tuple[RunState, Array, tuple[Array, Array, Array, Array]]:
         known = at_end._replace(q=_with_value(at_end.q, found.event_q[j, 0]), v=_with_value(at_end.v, found.event_v[j, 0]))
-        after, d, (t, qs, vs) = _apply_at_fixed_time(hybrid, found.event_index[j], known, shift, short)
+        after, d, (t, qs, vs) = _apply_at_fixed_time(hybrid, found, j, known, shift, short)
         return after, d, (j, t, qs, vs)
 
     after, shift, record = jax.lax.cond(happens, jump, lambda: (at_end, shift, _no_event(len(state.q), K)))
-    following = PieceStart(after, written + jnp.sum(rows < T), event + happens, shift)
+    group = jnp.cumsum(~found.together)
+    event = event + jnp.where(happens, jnp.sum((group == group[j]) & (jnp.arange(K) < found.count)), 0)
+    following = PieceStart(after, written + jnp.sum(rows < T), event, shift)
     return following, PieceOutput(rows, q[1:-1], v[1:-1], *record)
 
 
 def _apply_at_fixed_time(
-    hybrid: Hybrid, index: Int[Array, ""], state: RunState, shift: Float[Array, ""], again: Array
+    hybrid: Hybrid, found: EventRun, j: Int[Array, ""], state: RunState, shift: Float[Array, ""], again: Array
 ) -> tuple[RunState, Float[Array, ""], tuple[Array, Array, Array]]:
     """Apply an event that was found at the time of `state`, and return the state after it at that time.
 
     Args:
         hybrid: the system.
-        index: of the event, as in `EventRecord`.
+        found: the run.
+        j: the number of the event in it.
         state: the state before it.
         shift: the change d of the time of the event before.
         again: whether no time has passed since then.
@@ -214,7 +225,8 @@ def _apply_at_fixed_time(
         The state after the event at the fixed time, the change d of the event's time, and time and states at the event.
     """
     E = hybrid.count
-    rests, k = index >= 2 * E, jnp.where(index >= 2 * E, index - 2 * E, index)
+    index = found.event_index[j]
+    k = jnp.where(index >= 2 * E, index - 2 * E, index)
     values = hybrid.values(state)
     rate = values.rate[k]
     if any(row >= 0 for rows in hybrid.phases.tables.held for row in rows):
@@ -224,7 +236,7 @@ def _apply_at_fixed_time(
     # What happens again at the same instant, where the condition stands still, happens when the first event does.
     d = jnp.where(is_transversal, -h / jnp.where(is_transversal, rate, 1.0), jnp.where(again, shift, 0.0))
     before = state._replace(t=state.t + d, q=state.q + d * state.v, v=state.v + d * values.a)
-    after = apply_event(hybrid, k, rests, before, hybrid.values(before)).state
+    after = apply_event(hybrid, k, before, hybrid.values(before), found.closed[j]).state._replace(phase=found.event_phase[j])
     fixed = after._replace(t=state.t, q=after.q - d * after.v, v=after.v - d * hybrid.accelerations(after))
     return fixed, d, (before.t, jnp.stack([before.q, after.q]), jnp.stack([before.v, after.v]))
 

@@ -1,5 +1,6 @@
 """Simulate with events: prepare a hybrid system of a mechanism, run it, and say how it went."""
 
+import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -26,11 +27,13 @@ from udkjax.integrate.projection import violation
 from udkjax.integrate.solution import Result, Solution
 from udkjax.native.steps import LEAST_ATOL
 from udkjax.pinv import Pseudoinverse
+from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:
     import diffrax
 
+UNRESOLVED = "conditions of events vary too quickly for the shortest window, 1e-9 T; crossings may be missed: {}"
 CACHE_SIZE = 64  # mechanisms with events whose phases are stored
 
 
@@ -86,13 +89,14 @@ def simulate_events(
     Raises:
         ValueError: the events do not fit the mechanism, or machine code was asked for and cannot run it.
     """
-    if not isinstance(choices.max_events, int) or choices.max_events < 1:
-        raise ValueError(f"max_events must be a whole number, at least 1, not {choices.max_events!r}")
     listed, phases = _prepare(mechanism, events, analysis)
     given = Given(phases, listed, ts, state, closure, choices)
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(given))
     found, reasons = _run(*eqx.partition(given, eqx.is_array))
     count = None if traced else int(found.count)
+    if count is not None and not np.isnan(found.unresolved).all():
+        fast = [f"{quote(e.name)} from {t:.6g} s on" for e, t in zip(listed, found.unresolved, strict=True) if not np.isnan(t)]
+        warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
     return _solution(mechanism, tuple(e.name for e in listed), ts, choices, found, reasons, count)
 
 
@@ -165,7 +169,7 @@ def _run(arrays: Given, static: Given) -> tuple[EventRun, tuple[str, ...]]:
         code = jnp.where(
             closed & (closure.rank > native_engine.independent_row_count(hybrid.problem_of_guess(0))), Result.drift, code
         )
-    code = jnp.where(good, code, Result.invalid_argument)
+    code = jnp.where(good & stop_gradients(hybrid.has_usable_numbers), code, Result.invalid_argument)
     return run_events(hybrid, RunInput(ts, q, v, code, choices.drift_tol), choices.max_events), reasons
 
 
@@ -196,6 +200,8 @@ def _solution(
         q_after=event_q[:, 1].reshape(*bodies),
         v_after=event_v[:, 1].reshape(*bodies),
         count=found.count,
+        unresolved=found.unresolved,
+        undefined=found.undefined,
         names=(*names, *(f"{name} lets go" for name in names), *(f"{name} rests" for name in names)),
     )
     stats = {

@@ -1,0 +1,150 @@
+"""No crossing is lost: conditions that vary quickly, late, in pairs, with jumps; and what is said where one may be."""
+
+# pyright: reportOptionalMemberAccess=false
+# All of these runs have events.
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import udkjax as udk
+
+POINT = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, 0])}, gravity=[0, 0])  # x = t
+
+
+def wave(xp, numbers, x):
+    f, power, other, offset = numbers
+    return xp.sin(f * x**power + 0.1) * xp.sin(other * x + 1.0) + offset
+
+
+class Wave(eqx.Module):
+    """A condition of the place of the body, of four numbers."""
+
+    numbers: jax.Array
+
+    def __call__(self, t, at):
+        return wave(jnp, self.numbers, at["b"].x)
+
+
+def crossings(function, end=1.0):
+    t = np.linspace(0, end, 100001)
+    y = np.asarray(function(t))
+    return np.array([brentq(lambda s: float(function(s)), *t[k : k + 2], xtol=1e-15) for k in np.flatnonzero(y[1:] * y[:-1] < 0)])
+
+
+def positions(sol):
+    return np.asarray(sol.events.q_before)[:, 0, 0]
+
+
+def test_no_crossing_is_lost_at_any_frequency():
+    """One compiled run for all: slow and fast ones, one that becomes fast late, products, and dips of a depth of 1e-6."""
+    waves = np.array(
+        [
+            [3, 1, 0, 0],
+            [200, 1, 0, 0],
+            [1000, 1, 0, 0.3],
+            [300, 6, 0, 0],
+            [200, 1, 171, 0],
+            [40, 1, 0, np.sin(1.0) - 1e-6],
+            [0, 1, 0, 1],
+        ]
+    )
+    run = jax.jit(
+        lambda numbers: udk.simulate(POINT, [0.0, 1.0], events=udk.Event(Wave(numbers), udk.Log(), name="wave"), max_events=400)
+    )
+    for numbers in waves:
+        sol, expected = run(numbers), crossings(lambda x, numbers=numbers: wave(np, numbers, x))
+        count = int(sol.events.count)
+        assert sol.code == udk.Result.successful and count == len(expected), numbers
+        assert np.abs(positions(sol)[:count] - expected).max(initial=0) < 1e-9
+        assert np.isnan(sol.events.unresolved).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["native", "diffrax"])
+@pytest.mark.parametrize("f", [200, 500, 1000, 2000])
+@pytest.mark.parametrize("outputs", [2, 50])
+def test_conditions_of_position_velocity_and_time(f, engine, outputs):
+    """Of a body under its weight, v = 1 - g t: all cross where they should."""
+    fall = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, 1.0])})
+    conditions = {
+        "x": (lambda t, at: jnp.sin(f * at["b"].x + 0.1), lambda t: np.sin(f * t + 0.1)),
+        "vy": (lambda t, at: jnp.sin(f / 10 * at["b"].vy + 0.1), lambda t: np.sin(f / 10 * (1 - 9.81 * t) + 0.1)),
+        "t": (lambda t, at: jnp.sin(f * t + 0.2), lambda t: np.sin(f * t + 0.2)),
+    }
+    events = [udk.Event(condition, udk.Log(), name=name) for name, (condition, _) in conditions.items()]
+    sol = udk.simulate(fall, np.linspace(0, 0.5, outputs), events=events, max_events=2000, engine=engine)
+    for name, (_, exact) in conditions.items():
+        found, expected = np.asarray(sol.events.of(name)), crossings(exact, 0.5)
+        assert len(found) == len(expected) and np.abs(found - expected).max() < 1e-8
+
+
+def test_stop_stops_at_the_first_crossing_and_jumps_and_kinks_count_once():
+    end = udk.simulate(POINT, [0, 3.0], events=udk.Event(lambda t, at: jnp.sin(1000 * at["b"].x + 0.1)))
+    assert abs(float(end.time) - (np.pi - 0.1) / 1000) < 1e-12
+    events = [
+        udk.Event(lambda t, at: jnp.where(at["b"].x > 0.4137, -1.0, 1.0), udk.Log(), name="jump"),
+        udk.Event(lambda t, at: jnp.abs(jnp.sin(20 * at["b"].x)) - 0.01, udk.Log(), name="kink"),
+    ]
+    sol = udk.simulate(POINT, [0, 1.0], events=events)
+    kinks = np.arange(0, 7) * np.pi / 20
+    expected = np.sort(np.concatenate([kinks + np.arcsin(0.01) / 20, kinks[1:] - np.arcsin(0.01) / 20]))
+    assert np.abs(sol.events.of("jump") - 0.4137).max() < 1e-12 and len(sol.events.of("jump")) == 1
+    assert len(sol.events.of("kink")) == len(expected) and np.abs(sol.events.of("kink") - expected).max() < 1e-12
+
+
+def test_smooth_conditions_cost_what_they_did():
+    """Right-hand sides of a pendulum that logs where it passes and where it turns: 5,021 before windows were refined."""
+    pendulum = udk.Mechanism(
+        {"link": udk.Body(1.0, 0.1, position=(0.5, 0.0))}, {"A": udk.Revolute(("ground", "link"), [[0, 0], [-0.5, 0]])}
+    )
+    events = [udk.Event(lambda t, at: at["link"].x, udk.Log()), udk.Event(lambda t, at: at["link"].omega, udk.Log())]
+    sol = udk.simulate(pendulum, np.linspace(0, 8, 40), events=events, max_events=60)
+    assert sol.events.count == 16 and int(sol.stats["right_hand_sides"]) < 1.05 * 5021
+
+
+def test_what_is_too_fast_is_said():
+    """A condition that changes its sign from one number to the next."""
+    noise = udk.Event(lambda t, at: jnp.sin(1e13 * at["b"].x + 1.0) + 2 * jnp.sin(3e12 * at["b"].x), udk.Log(), name="noise")
+    with pytest.warns(
+        UserWarning, match='vary too quickly for the shortest window, 1e-9 T; crossings may be missed: "noise" from 0 s'
+    ):
+        sol = udk.simulate(POINT, [0, 1.0], events=noise, max_events=5, throw=False)
+    assert sol.events.unresolved[0] < 1e-6
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+def test_a_condition_that_is_not_a_number_ends_the_run(engine):
+    """Of a batch as data, of one run by a cause that names it and the time."""
+    where = np.array([0.5, 2.0, -0.1])
+
+    def run(x):
+        events = [
+            udk.Event(RootOf(x), udk.Log(), name="root"),
+            udk.Event(lambda t, at: at["b"].x - 0.25, udk.Log(), name="quarter"),
+        ]
+        return udk.simulate(POINT, [0, 0.3, 1.0], events=events, max_events=4, throw=False, engine=engine)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sol = jax.jit(jax.vmap(run))(where)
+    codes = [udk.Result.undefined_condition, udk.Result.successful, udk.Result.undefined_condition]
+    assert (np.asarray(sol.code) == codes).all() and np.abs(sol.time - np.array([0.5, 1.0, 0.0])).max() < 1e-8
+    assert (np.asarray(sol.events.count) == [1, 1, 0]).all() and (
+        np.asarray(sol.events.undefined) == [[1, 0], [0, 0], [1, 0]]
+    ).all()
+    assert np.isfinite(sol.q[0, :2]).all() and np.isnan(sol.q[0, 2]).all()
+    assert run(0.5).cause.startswith('undefined condition at t = 0.5 s: the condition of event "root" is not a number')
+
+
+class RootOf(eqx.Module):
+    """1 + sqrt(end - x)."""
+
+    end: jax.Array
+
+    def __call__(self, t, at):
+        return 1 + jnp.sqrt(self.end - at["b"].x)

@@ -1,0 +1,71 @@
+"""Checks of what events are made of: each error names the event, its argument, what was given and what is meant."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from udkjax.scene.arguments import ArgumentTypeError, array, describe, require_finite, require_number
+from udkjax.scene.fields import number
+from udkjax.scene.joints import Joint
+
+
+def number_if_any(value: Any) -> Any:
+    """Make an array leaf of a number; leave what is none as it is, for the checks to name it."""
+    try:
+        return None if value is None else number(value)
+    except (TypeError, ValueError):
+        return value
+
+
+def require_name_text(name: str, value: object, may_be_empty: bool = False) -> None:
+    """Raise ArgumentTypeError where a name is not a text, ValueError where it is empty."""
+    if not isinstance(value, str):
+        raise ArgumentTypeError(f"{name} must be a text, {describe(value)}")
+    if not value and not may_be_empty:
+        raise ValueError(f"{name} must not be empty")
+
+
+def require_vector(name: str, value: Any) -> None:
+    """Raise where a point or a normal is not two finite numbers; of traced ones, where they are not two."""
+    found = array(name, value)
+    if found.shape != (2,):
+        raise ValueError(f"{name} must be two numbers, x and y, not an array of the shape {found.shape}")
+    require_finite(name, found)
+
+
+def require_normal(name: str, value: Any) -> None:
+    """Raise where a normal has no direction."""
+    require_vector(name, value)
+    if not isinstance(value, Tracer) and not np.any(np.asarray(value)):
+        raise ValueError(f"{name} must not be zero: it points to the side that is allowed")
+
+
+def require_restitution(name: str, value: Any) -> None:
+    """Raise where a restitution is not one number from 0 to 1."""
+    require_number(name, value)
+    if not isinstance(value, Tracer) and not 0 <= float(value) <= 1:
+        raise ValueError(f"{name} must be from 0 to 1, is {float(value):g}")
+
+
+def require_limits(where: str, lower: Any, upper: Any) -> None:
+    """Raise where the limits of a joint's travel are not finite, or leave none."""
+    for name, limit in (("lower", lower), ("upper", upper)):
+        if limit is not None:
+            require_number(f"{where}: {name}", limit)
+    if lower is None and upper is None:
+        raise ValueError(f"{where}: give `lower` or `upper`, or both")
+    if lower is None or upper is None or isinstance(lower, Tracer) or isinstance(upper, Tracer):
+        return
+    if float(lower) > float(upper):
+        raise ValueError(f"{where}: lower must not be above upper, is {float(lower):g}, above {float(upper):g}")
+
+
+def require_joint(name: str, value: object) -> None:
+    """Raise where what is attached is not a joint of finite numbers."""
+    if not isinstance(value, Joint):
+        raise ArgumentTypeError(f"{name} must be a joint, such as udk.Weld(...), {describe(value)}")
+    for leaf in jax.tree.leaves(value):
+        if isinstance(leaf, np.ndarray | jax.Array | float):
+            require_finite(name, leaf)
