@@ -66,6 +66,12 @@ def test_a_scene_that_finds_no_rest_says_so(tmp_path, capsys):
     assert "no position of rest was found" in capsys.readouterr().err
 
 
+def test_statics_and_modes_of_a_scene_without_a_degree_of_freedom(capsys):
+    for command in ("statics", "modes"):
+        assert udkjax(command, EXAMPLES / "slider_crank.toml") == 0
+        assert "no degree of freedom is left" in capsys.readouterr().out
+
+
 def test_statics_and_modes_of_the_papers_linkage(tmp_path, capsys):
     rest = results(capsys, "statics", EXAMPLES / "parallelogram.toml", "--stable", "--out", tmp_path / "s.nc")["equilibria"]
     assert rest[0]["stable"]

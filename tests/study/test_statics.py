@@ -89,6 +89,52 @@ def test_a_four_bar_with_a_diagonal_spring_against_its_reduction():
 
 
 @pytest.mark.slow
+def held_up(length):
+    """A body that two forces hold against its weight: all loads vanish, but for rounding."""
+    weight = 0.1 * length**3 * 9.81
+    forces = {"one": udk.Force("b", [0.0, weight / 3]), "two": udk.Force("b", [0.0, weight * (2 / 3)])}
+    return udk.Mechanism({"b": udk.Body(0.1 * length**3, 0.1 * length**5)}, {}, {}, forces)
+
+
+def see_saw(length):
+    """Two bodies that balance about a pin in any position."""
+    at = length * np.array([np.cos(0.3), np.sin(0.3)])
+    bodies = {"a": udk.Body(1.0, 0.1 * length**2, at, 0.3), "b": udk.Body(3.0, 0.1 * length**2, -at / 3, 0.3)}
+    points = [(length / 3, 0.0), (-length, 0.0)]
+    joints = {
+        "pin": udk.Revolute(["ground", "a"], [(0.0, 0.0), (-length, 0.0)]),
+        "weld": udk.Weld(["b", "a"], [points[0], points[1]]),
+    }
+    return udk.Mechanism(bodies, joints)
+
+
+@pytest.mark.parametrize("stable", [False, True])
+@pytest.mark.parametrize("scene", [held_up, see_saw])
+def test_rest_where_all_loads_vanish_is_indifferent(scene, stable):
+    """What is left is compared with the scale of forces, not with what is left of them; nothing moves by rounding."""
+    for length in (1e-6, 1e3):
+        mech = scene(length)
+        rest = udk.equilibrium(mech, stable=stable)
+        assert bool(rest.balanced) and float(rest.residual) < 1e-14
+        assert rest.kind == "indifferent" and not bool(rest.stable)
+        np.testing.assert_allclose(rest.q, mech.q0, rtol=1e-9, atol=1e-9 * length)
+    pushed = udk.Mechanism(mech.bodies, mech.joints, {}, {"push": udk.Torque(["ground", "b"], 1e-6 * 9.81 * length**4)})
+    assert not bool(udk.equilibrium(pushed).balanced)
+
+
+def test_a_scene_without_a_degree_of_freedom_rests_where_its_drivers_hold_it():
+    mech = udk.library.slider_crank()
+    rest, found = udk.equilibrium(mech, t=0.1), udk.modes(mech, t=0.1)
+    assert bool(rest.stable) and rest.omega2.shape == (0,) and rest.kind == "stable"
+    np.testing.assert_allclose(rest.q, udk.assemble(mech, 0.1).q, atol=1e-12)
+    assert found.omega2.shape == found.s.shape == (0,) and found.shapes.shape == (0, 3, 3)
+    slope = jax.jacfwd(lambda t: udk.equilibrium(mech, t=t).q)(0.1)
+    step = 1e-5
+    np.testing.assert_allclose(
+        slope, (udk.assemble(mech, 0.1 + step).q - udk.assemble(mech, 0.1 - step).q) / (2 * step), atol=1e-7
+    )
+
+
 def test_equilibria_from_many_starts():
     """Both assembly branches of the four-bar, each with its equilibria: the reduction finds those of the first."""
     mech = spring_four_bar()

@@ -41,9 +41,10 @@ def statics(
     found = ([one] if one.balanced else []) if one is not None else udk.equilibria(mech, starts, seed, t)
     lines = {}
     for k, e in enumerate(found):
-        kind = "stable" if bool(e.stable) else "unstable"
+        omega2 = ", ".join(f"{float(x):.6g}" for x in e.omega2)
         angles = ", ".join(f"{name} {float(a):.6g}" for name, a in zip(mech.body_names, e.q[:, 2], strict=True))
-        lines[f"{k + 1}, {kind}"] = f"omega2 {', '.join(f'{float(x):.6g}' for x in e.omega2)} 1/s2; angles {angles}"
+        free = f"omega2 {omega2} 1/s2" if omega2 else "no degree of freedom is left"
+        lines[f"{k + 1}, {e.kind}"] = f"{free}; angles {angles}"
     results = {
         "bodies": mech.body_names,
         "equilibria": [

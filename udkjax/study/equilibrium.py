@@ -12,12 +12,14 @@ from jaxtyping import Array, Bool, Float
 from udkjax.annotations import Scalar
 from udkjax.equations import loads
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.load_scale import LoadScale, load_scale
 from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
 from udkjax.integrate.assembly import State, close
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv import SVD
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, format_numbers, units
 from udkjax.scene.arguments import checked
+from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -28,8 +30,10 @@ from udkjax.study.positions import distinct, random_positions
 from udkjax.study.sequential import sequential
 
 STEPS = 100
-BALANCED = 1e-9  # of the loads: what may be left of them along free directions; rounding leaves 1e-15
+BALANCED = 1e-9  # of the scale of forces: what may be left of the loads along free directions; rounding leaves 1e-15
+SETTLED = 32 * float(np.finfo(float).eps)  # of it: what is left is rounding, which no step makes less
 NEUTRAL = 1e-10  # of the largest stiffness: one below it resists nothing
+ROUNDING = 1e-12  # of the scale of stiffnesses: one below it is rounding; rounding leaves 1e-15
 
 Trial: TypeAlias = tuple[Array, Array, Array, Array]  # the part of a step, how many were tried, whether it is better, q
 
@@ -46,8 +50,9 @@ class Equilibrium(PrintsTable):
     q: Float[Array, "bodies 3"]
     multipliers: Float[Array, "m"]  # lambda of F = Psi_q^T lambda (N, N m), of least norm; rows as in `analyse`
     omega2: Float[Array, "f"]  # (rad/s)^2: stiffness over mass along free directions, ascending; negative: it moves away
-    residual: Float[Array, ""]  # what is left of the loads along free directions, relative to them
+    residual: Float[Array, ""]  # what is left of the loads along free directions, relative to the scale of forces
     balanced: Bool[Array, ""]
+    neutral: Float[Array, ""]  # (rad/s)^2: an omega2 of no more is rounding
     bodies: tuple[str, ...] = eqx.field(static=True, default=())
 
     _units = units(q="m, m, rad", multipliers="N or N m", omega2="(rad/s)²")
@@ -56,7 +61,6 @@ class Equilibrium(PrintsTable):
         if np.ndim(self.balanced):
             title = f"{np.size(self.balanced)} positions, of which {int(np.sum(self.stable))} are stable"
             return fields_table(self, self._units, title)
-        kind = ("unstable", "stable")[int(self.stable)] if self.balanced else "not at rest: loads are left over"
         frequencies = ", ".join(_format_rate(float(x)) for x in np.asarray(self.omega2))
         rows = [
             ("omega²", format_numbers(self.omega2, "(rad/s)²")),
@@ -65,7 +69,7 @@ class Equilibrium(PrintsTable):
         ]
         poses = [format_pose(pose, size_of(self.q)) for pose in np.asarray(self.q)]
         rows += zip(self.bodies or map(str, range(len(poses))), poses, strict=True)
-        return PrintedTable(f"position of rest, {kind}", rows)
+        return PrintedTable(f"position of rest, {self.kind}", rows)
 
     @property
     def state(self) -> State:
@@ -75,7 +79,20 @@ class Equilibrium(PrintsTable):
     @property
     def stable(self) -> Bool[Array, ""]:
         """Whether the potential energy has a minimum there, as all stiffnesses are positive."""
-        return self.balanced & jnp.all(self.omega2 > 0)
+        return self.balanced & jnp.all(self.omega2 > self.neutral[..., None], axis=-1)
+
+    @property
+    def indifferent(self) -> Bool[Array, ""]:
+        """Whether nothing moves it away, though not all stiffnesses are positive: some vanish."""
+        least = jnp.min(self.omega2, axis=-1, initial=jnp.inf)
+        return self.balanced & (jnp.abs(least) <= self.neutral)
+
+    @property
+    def kind(self) -> str:
+        """Of one position: "stable", "indifferent" or "unstable", or that it is none of rest."""
+        if not self.balanced:
+            return "not at rest: loads are left over"
+        return "stable" if self.stable else "indifferent" if self.indifferent else "unstable"
 
 
 def _format_rate(omega2: float) -> str:
@@ -130,11 +147,14 @@ def equilibria(
 
 
 def degrees_of_freedom(analysis: Analysis) -> int:
-    """Return how many degrees of freedom there are; raise ValueError where that is not known."""
+    """Return how many degrees of freedom there are; raise `SceneError` where that is not known."""
     free = analysis.degrees_of_freedom
     if free is None:
-        raise ValueError(
-            "how many degrees of freedom there are is not known of traced numbers: give analysis=udkjax.analyse(mechanism)"
+        raise SceneError(
+            [
+                "how many degrees of freedom there are is not known: the initial guess cannot be closed, or not moved as the "
+                "drivers ask (udkjax check tells); or all numbers are traced: give analysis=udkjax.analyse(mechanism)"
+            ]
         )
     return free
 
@@ -146,6 +166,8 @@ def rest_curve(mechanism: Mechanism, analysis: Analysis) -> Curve:
 
 def omega2(at: Linearization) -> Float[Array, "f"]:
     """Return omega^2 of the undamped linearization, (rad/s)^2, ascending."""
+    if not len(at.mass):
+        return jnp.zeros(0)
     L = jnp.linalg.cholesky(at.mass)
     A = jax.scipy.linalg.solve_triangular(L, at.stiffness, lower=True)
     A = jax.scipy.linalg.solve_triangular(L, A.T, lower=True)
@@ -158,23 +180,20 @@ def _equilibrium(
 ) -> Equilibrium:
     q = sequential(_settle, *stop_gradients((curve, analysis, t, start)), free, stable)
     q = _rest_position(curve, analysis, t, q, free)
-    at = linearize(curve.mechanism, analysis, free, t, q)
-    left = _left(curve.mechanism, at, t, q)
+    at, scale = linearize(curve.mechanism, analysis, free, t, q), load_scale(curve.mechanism, analysis.scales, t, q)
+    left = jnp.linalg.norm(at.force) / jnp.where(scale.force > 0, scale.force, 1.0)
     closed = curve.is_closed(jnp.append(q, t) / curve.units)
     balanced, bodies = closed & (left <= BALANCED), curve.mechanism.body_names
-    return Equilibrium(q.reshape(-1, 3), at.multipliers, omega2(at), left, balanced, bodies)
-
-
-def _left(mechanism: Mechanism, at: Linearization, t: Float[Array, ""], q: Float[Array, "n"]) -> Float[Array, ""]:
-    """Return N^T F relative to F, each coordinate over the root of its mass: N is orthonormal in that metric."""
-    size = jnp.linalg.norm(loads.force(mechanism, t, q, jnp.zeros_like(q)) / jnp.sqrt(loads.mass(mechanism)))
-    return jnp.linalg.norm(at.force) / jnp.where(size > 0, size, 1.0)
+    return Equilibrium(q.reshape(-1, 3), at.multipliers, omega2(at), left, balanced, ROUNDING * scale.stiffness, bodies)
 
 
 def _settle(
     curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int, stable: bool
 ) -> Float[Array, "n"]:
     """Take Newton steps until nothing gets better."""
+    if not free:
+        return q
+    scale = load_scale(curve.mechanism, analysis.scales, t, q)
 
     def at(q: Float[Array, "n"]) -> Linearization:
         return linearize(curve.mechanism, analysis, free, t, q)
@@ -182,7 +201,7 @@ def _settle(
     def body(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         q, k, _ = state
         here = at(q)
-        step = here.directions @ _towards_rest(here, stable)
+        step = here.directions @ _towards_rest(here, scale, stable)
         longest = analysis.scales.size(step)
         step = step * jnp.where(longest > LONGEST_STEP, LONGEST_STEP / jnp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
         size = jnp.linalg.norm(here.force)
@@ -201,18 +220,21 @@ def _settle(
             return (state[1] < STEP_HALVINGS) & ~state[2]
 
         _, _, better, new = jax.lax.while_loop(worse, trial, (jnp.ones(()), jnp.asarray(0), jnp.asarray(False), q))
-        return jnp.where(better, new, q), k + 1, better & (size > 0)
+        better &= size > SETTLED * scale.force
+        return jnp.where(better, new, q), k + 1, better
 
-    return jax.lax.while_loop(lambda s: (s[1] < STEPS) & s[2], body, (q, jnp.asarray(0), jnp.asarray(free > 0)))[0]
+    return jax.lax.while_loop(lambda s: (s[1] < STEPS) & s[2], body, (q, jnp.asarray(0), jnp.asarray(True)))[0]
 
 
-def _towards_rest(here: Linearization, stable: bool) -> Float[Array, "f"]:
+def _towards_rest(here: Linearization, scale: LoadScale, stable: bool) -> Float[Array, "f"]:
     """Return the step eta of the linearization; only downhill, where the equilibrium is to be stable."""
+    rounding = ROUNDING * scale.stiffness
     if not stable:
-        return SVD(NEUTRAL).plus(here.stiffness) @ here.force
+        resists = jnp.max(jnp.abs(here.stiffness)) > rounding
+        return SVD(NEUTRAL).plus(jnp.where(resists, here.stiffness, 0.0)) @ here.force
     values, vectors = jnp.linalg.eigh(0.5 * (here.stiffness + here.stiffness.T))
     values = jnp.abs(values)
-    values = jnp.maximum(values, NEUTRAL * jnp.max(values))
+    values = jnp.maximum(values, jnp.maximum(NEUTRAL * jnp.max(values), rounding))
     return vectors @ (vectors.T @ here.force / jnp.where(values > 0, values, 1.0))
 
 
@@ -231,8 +253,10 @@ def _(primals, tangents):
         X = jnp.append(q, t) / curve.units
         E = curve.slopes(X).at[:, -1].set(0.0)
         closed = ((X - plus(E) @ curve.residual(X)) * curve.units)[:-1]
-        here = linearize(curve.mechanism, analysis, free, t, closed)
-        return closed + here.directions @ _towards_rest(here, False)
+        if not free:
+            return closed
+        here, scale = linearize(curve.mechanism, analysis, free, t, closed), load_scale(curve.mechanism, analysis.scales, t, q)
+        return closed + here.directions @ _towards_rest(here, scale, False)
 
     given = (curve, t)
     none = jax.tree.map(jnp.zeros_like, eqx.filter(given, eqx.is_inexact_array))

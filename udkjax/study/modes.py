@@ -87,6 +87,9 @@ def modes(mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, ana
 @eqx.filter_jit
 def _modes(mechanism: Mechanism, analysis: Analysis, free: int, t: Float[Array, ""], q: Float[Array, "n"]) -> Modes:
     at = linearize(mechanism, analysis, free, t, q)
+    if not free:
+        none = jnp.zeros((0, *q.reshape(-1, 3).shape))
+        return Modes(jnp.zeros(0), none, jnp.zeros(0, complex), none + 0j, q.reshape(-1, 3), jnp.zeros(()), mechanism.body_names)
     L = jnp.linalg.cholesky(at.mass)
     solve = jax.scipy.linalg.solve_triangular
     N = solve(L, at.directions.T, lower=True).T  # of which N^T M N is one

@@ -1,0 +1,59 @@
+"""The scale of forces of a mechanism: what loads are compared with that ought to vanish, also where all of them do.
+
+Loads that balance leave rounding errors of their parts: of gravity, of each force element by itself, and of the change of the
+loads along a characteristic length, which a spring at its natural length has, too.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.equations import loads
+from udkjax.equations.constraints import bodies
+from udkjax.equations.scales import Scales
+from udkjax.equations.structure import Time, evaluate_by_kind
+from udkjax.scene.bodies import Frame
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.mechanism import Mechanism
+
+
+class LoadScale(NamedTuple):
+    """Sizes in the metric of the mass matrix: where they are zero, nothing pulls, and nothing would nearby."""
+
+    force: Float[Array, ""]  # N/sqrt(kg): of M^(-1/2) F
+    stiffness: Float[Array, ""]  # (rad/s)^2: of M^(-1/2) F_q M^(-1/2)
+
+
+def load_scale(mechanism: Mechanism, scales: Scales, t: Time, q: Float[Array, "n"]) -> LoadScale:
+    """Return the scale of forces and of stiffnesses at rest in a position q at time t (s); without derivatives."""
+    mechanism, scales, t, q = jax.lax.stop_gradient((mechanism, scales, t, q))
+    still, root, units = jnp.zeros_like(q), jnp.sqrt(loads.mass(mechanism)), scales.coordinates(len(q))
+    change = jnp.abs(jax.jacfwd(lambda q: loads.force(mechanism, t, q, still))(q)) @ units
+    force = jnp.linalg.norm((load_sizes(mechanism, t, q, still) + change) / root)
+    return LoadScale(force, force / jnp.linalg.norm(root * units))
+
+
+def load_sizes(mechanism: Mechanism, t: Time, q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "n"]:
+    """Return the sum of the sizes of all loads on each coordinate (N, N m): of gravity, and of each force element by itself."""
+    time = jnp.asarray(t, jnp.result_type(float))
+
+    def sizes(element: ForceElement, *frames: Frame) -> Float[Array, "frames 3"]:
+        def potential(places: Float[Array, "frames 3"]) -> Array:
+            moved = [
+                f._replace(x=x, y=y, angle=a, cos=jnp.cos(a), sin=jnp.sin(a)) for f, (x, y, a) in zip(frames, places, strict=True)
+            ]
+            found = element.potential(time, *moved)
+            return jnp.zeros(()) if found is None else jnp.asarray(found)
+
+        total = -jax.grad(potential)(jnp.stack([jnp.stack([jnp.asarray(x, float) for x in f[:3]]) for f in frames]))
+        stated = element.loads(time, *frames)
+        return jnp.abs(total if stated is None else total + jnp.asarray([[jnp.asarray(x) for x in load] for load in stated]))
+
+    total = jnp.abs(loads.mass(mechanism).reshape(-1, 3) * jnp.append(mechanism.gravity, 0.0))
+    elements = [*mechanism.forces.values()]
+    for kind, found in evaluate_by_kind(sizes, mechanism, elements, bodies(q), bodies(v)):
+        total = total.at[kind.bodies.T].add(found[:, ~np.array(kind.structure.ground)])
+    return total.ravel()
