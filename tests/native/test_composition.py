@@ -208,6 +208,21 @@ def test_a_folder_that_cannot_be_written_is_no_obstacle(folder, monkeypatch):
     assert answer() == 42.0
 
 
+def test_a_full_disk_leaves_nothing_behind(folder, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(code_cache.os, "replace", full)
+    assert answer() == 42.0
+    assert list(folder.iterdir()) == []
+
+
+def test_derivatives_pass_where_jax_looks_for_values_that_are_not_numbers():
+    with jax.debug_nans(True):
+        for derivative in (jax.grad, jax.jacfwd):
+            assert abs(float(derivative(lambda inertia: angles(inertia)[-1])(0.3))) > 0.0
+
+
 MANY = """
 from test_composition import TEXT, answer
 for k in range(20):

@@ -190,6 +190,35 @@ def test_all_mistakes_of_a_file_at_once():
     ]
 
 
+ROD = '[[joint]]\nname = "rod"\ntype = "distance"\nbodies = ["ground", "link1"]\npoints = [[0, 0], [0, 0]]\n'
+FROM_THE_GUESS = 'joint "rod" (joint[0]).length: must be '
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (HEAD + "x = " + "[" * 3000 + "]" * 3000, "nest too deeply"),
+        (HEAD + "x = " + "{a=" * 3000 + "1" + "}" * 3000, "nest too deeply"),
+        (HEAD + BODY.replace("1.0", "1" + "0" * 5000), "not valid TOML: Exceeds the limit"),
+        (HEAD + BODY.replace("1.0", "1" + "0" * 400), "must be finite, is inf"),
+        (HEAD + BODY + "x" * 10_000 + " = 1\n", 'xxx...": unknown key'),
+        (HEAD + BODY.replace("link1", r"link\u001b1") + "point = 1\n", r'body "link\U0000001b1" (body[0]).point: unknown key'),
+        (HEAD + BODY + ROD, FROM_THE_GUESS + "> 0, and is 0.0 in the initial guess"),
+        (HEAD + BODY + "position = [1e200, 0]\n" + ROD, FROM_THE_GUESS + "finite, and is inf in the initial guess"),
+    ],
+)
+def test_extreme_texts_and_guesses_are_refused_in_a_short_message(text, expected):
+    with pytest.raises(udk.SceneError) as caught:
+        loads(text)
+    assert expected in str(caught.value) and len(str(caught.value)) < 300
+
+
+def test_a_byte_order_mark_and_windows_lines_do_no_harm(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + (HEAD + BODY).replace("\n", "\r\n").encode())
+    assert udk.load(path).body_names == ("link1",)
+
+
 def test_invalid_toml_says_where(tmp_path):
     path = tmp_path / "bad.toml"
     path.write_text("format = 1\nname = \n")

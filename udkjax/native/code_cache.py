@@ -56,9 +56,13 @@ def write(name: str, code: bytes) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=folder)
-        with os.fdopen(handle, "wb") as file:
-            file.write(_MAGIC + hashlib.sha256(code).digest() + code)
-        os.replace(temporary, folder / name)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(_MAGIC + hashlib.sha256(code).digest() + code)
+            os.replace(temporary, folder / name)
+        except OSError:  # a full disk: nothing half written is left on it
+            Path(temporary).unlink(missing_ok=True)
+            raise
         files = [p for p in folder.iterdir() if p.is_file()]
         if len(files) > MAX_FILES:
             for old in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) - MAX_FILES]:

@@ -1,5 +1,6 @@
 """Checks of a scene, which find all of its mistakes at once, in files and in Python alike."""
 
+import dataclasses
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args, get_origin
@@ -11,10 +12,11 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import FieldMetadata, Table
+from udkjax.scene.fields import FieldMetadata, Requirement, Table
 from udkjax.scene.joints import Revolute
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 
+LONGEST = 60  # characters of a value or a name in a message
 KnownNames = Mapping[str, Mapping[str, type | None]]  # the classes of elements, by kind (body, revolute) and by name
 
 
@@ -59,7 +61,7 @@ class SceneEntry(NamedTuple):
     def where(self) -> str:
         """The path of the entry, as in error messages."""
         place = f"{self.section}[{self.index}]"
-        return f"{self.section} {quote(self.name)} ({place})" if isinstance(self.name, str) and self.name else place
+        return f"{self.section} {abbreviate(self.name)} ({place})" if isinstance(self.name, str) and self.name else place
 
 
 def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
@@ -90,6 +92,20 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
     return found
 
 
+def completion_mistakes(where: str, before: eqx.Module, after: eqx.Module) -> Iterator[str]:
+    """Iterate over the mistakes of the numbers that an element left to the initial guess, from what they are there."""
+    for field in dataclasses.fields(after):
+        value = getattr(after, field.name)
+        if getattr(before, field.name, None) is not None or not isinstance(value, np.ndarray | jax.Array):
+            continue
+        known = np.asarray(value, float)
+        conditions = [Requirement("must be finite", np.isfinite), *field.metadata.get("require", ())]
+        unmet = next((c.text for c in conditions if not np.all(c.holds(known))), None)
+        if unmet:
+            given = f"{where}.{field.name}: {unmet}, and is {abbreviate(known)} in the initial guess"
+            yield f"{given}, from which it is taken: give it, or other positions of the bodies"
+
+
 def gravity_mistakes(gravity: object) -> list[str]:
     """Return what is wrong with the acceleration of gravity."""
     return list(_check_number("gravity", ["2"], gravity, {}, {}))
@@ -100,7 +116,7 @@ def check_table(where: str, cls: type, table: Table, known: KnownNames) -> Itera
     expected, sizes = keys(cls), {}
     for name in table:
         if name not in expected:
-            yield f"{where}.{name}: unknown key{suggestion(name, expected)}"
+            yield f"{where}.{name if len(name) <= LONGEST else abbreviate(name)}: unknown key{suggestion(name, expected)}"
     for name, key in expected.items():
         if name in table:
             yield from _check_value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes)
@@ -241,21 +257,22 @@ def suggestion(name: object, choices: Iterable[str]) -> str:
 
 
 def quote(name: str) -> str:
-    """Return a name in double quotes."""
-    return '"' + name.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
+    """Return a name in double quotes, what cannot be printed as in TOML."""
+    escaped = name.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
 
 
 def abbreviate(value: object) -> str:
-    """Return a value as the text of a message: as in a TOML file, and not longer than 60 characters."""
+    """Return a value as the text of a message: as in a TOML file, and not longer than `LONGEST`."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return quote(value)
+        return quote(value if len(value) <= LONGEST else value[: LONGEST - 3] + "...")
     if isinstance(value, list | tuple):
         text = f"[{', '.join(map(abbreviate, value))}]"
     else:
         text = f"shape {value.shape}" if isinstance(value, Tracer) else str(getattr(value, "tolist", lambda: value)())
-    return text if len(text) <= 60 else text[:57] + "..."
+    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
 
 
 def check_hashable(element: eqx.Module) -> Iterator[str]:

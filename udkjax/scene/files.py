@@ -1,7 +1,6 @@
 """Scene files: mechanisms and drawings as TOML, versions 1 and 2 of the format, read and written."""
 
 import os
-import tomllib
 from pathlib import Path
 
 from udkjax.scene import mechanism_tables as tables
@@ -10,6 +9,7 @@ from udkjax.scene.checks import SceneError, abbreviate
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawing_tables import drawing_of_tables, drawing_text
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.toml_text import parse_toml
 
 DRAWN_VERSION = 2
 
@@ -93,10 +93,7 @@ def dumps(mechanism: Mechanism | Drawing) -> str:
 
 
 def _read(text: str, source: str) -> Mechanism:
-    try:
-        scene = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SceneError([f"not valid TOML: {error}"], source) from None
+    scene = parse_toml(text, source, SceneError)
     version = scene.get("format")
     if version == tables.FORMAT_VERSION and version is not True:
         return tables.mechanism_of_tables(scene, source)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from udkjax.deprecation import renamed_attributes
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
-from udkjax.scene.checks import SceneEntry, SceneError, check_hashable, problems_of
+from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, check_hashable, completion_mistakes, problems_of
 from udkjax.scene.description import mechanism_table
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Numbers, StaticValue, given_number, number
@@ -137,8 +137,11 @@ class Mechanism(PrintsTable):
         self.name, self.gravity = name, number(gravity)
         self.body_names, self._bodies = _unzip(found["body"])
         known = dict(found["body"])
-        self.joint_names, self._joints = _unzip([(key, _complete(c, known)) for key, c in found["joint"]])
-        self.driver_names, self._drivers = _unzip([(key, _complete(c, known)) for key, c in found["driver"]])
+        completed = {section: [(key, _complete(c, known)) for key, c in found[section]] for section in ("joint", "driver")}
+        if mistakes := _completion_mistakes(found, completed):
+            raise SceneError(mistakes, name)
+        self.joint_names, self._joints = _unzip(completed["joint"])
+        self.driver_names, self._drivers = _unzip(completed["driver"])
         self.force_names, self._forces = _unzip(found["force"])
         self.origin = origin if any(isinstance(leaf, Tracer) for leaf in self.numbers) else None
         self.drawing, self.changed = drawing, changed
@@ -296,9 +299,20 @@ def _complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConst
     if known:  # NumPy has nothing to compile
         constraint, places = jax.tree.map(np.asarray, (constraint, places))
     frames = [Frame.at(*places[name]) if name in places else GROUND_FRAME for name in constraint.frame_names]
-    with jax.ensure_compile_time_eval() if known else nullcontext():  # known stays known while something else is traced
+    known_stays_known = jax.ensure_compile_time_eval() if known else nullcontext()  # while something else is traced
+    with known_stays_known, np.errstate(all="ignore"):
         completed = constraint.complete(*frames)
         return jax.tree.map(number, completed) if known else completed
+
+
+def _completion_mistakes(before: Mapping[str, list[tuple[str, Any]]], after: Mapping[str, list[tuple[str, Any]]]) -> list[str]:
+    """Return what is wrong with the numbers that constraints took from the initial guess; those that are traced pass."""
+    found = []
+    for section, elements in after.items():
+        for k, ((name, completed), (_, given)) in enumerate(zip(elements, before[section], strict=True)):
+            if completed is not given and not any(isinstance(x, Tracer) for x in jax.tree.leaves(completed)):
+                found.extend(completion_mistakes(f"{section} {abbreviate(name)} ({section}[{k}])", given, completed))
+    return found
 
 
 def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:

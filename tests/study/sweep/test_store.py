@@ -118,13 +118,38 @@ def test_another_sweep_is_refused_and_the_difference_spelled_out(tmp_path):
         pass
 
 
-def test_a_folder_with_something_else_is_refused(tmp_path):
-    (tmp_path / "chunks").mkdir()
-    (tmp_path / "chunks" / "0.npz").write_bytes(b"")
-    with pytest.raises(StoreError, match=r"no sweep\.json that says of which sweep"):
+@pytest.mark.parametrize("damage", [b"", b"{", b"[1]", b"\xff\xfe{", b"[" * 100_000, None])
+def test_a_damaged_description_is_made_again_where_all_chunks_are_of_the_sweep(tmp_path, damage):
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
+        for c in CHUNKS:
+            stored.write(c, data(c))
+        whole, description = collected(stored), (tmp_path / "sweep.json").read_bytes()
+
+    def spoil():
+        (tmp_path / "sweep.json").unlink()
+        if damage is not None:
+            (tmp_path / "sweep.json").write_bytes(damage)
+
+    spoil()
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
+        assert collected(stored) == whole
+    assert (tmp_path / "sweep.json").read_bytes() == description
+    spoil()
+    files(tmp_path)[0].write_bytes(b"")  # a damaged chunk is of no sweep
+    with FolderStore(tmp_path, FINGERPRINT) as stored, pytest.warns(UserWarning, match="is damaged"):
+        assert not_done(stored) == [CHUNKS[0]]
+    spoil()
+    with pytest.raises(StoreError, match=r"sweep\.json is (damaged|missing).* not of this sweep.*choose another folder"):
+        FolderStore(tmp_path, FINGERPRINT | {"scene": "another"})
+
+
+def test_what_is_no_file_is_named(tmp_path):
+    (tmp_path / "sweep.json").mkdir()
+    with pytest.raises(StoreError, match="cannot write to the folder"):
         FolderStore(tmp_path, FINGERPRINT)
-    (tmp_path / "sweep.json").write_text("{")
-    with pytest.raises(StoreError, match="no description of a sweep"):
+    (tmp_path / "sweep.json").rmdir()
+    (tmp_path / "chunks" / "0.npz").mkdir()
+    with pytest.raises(StoreError, match=r"0\.npz.*remove it"):
         FolderStore(tmp_path, FINGERPRINT)
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot write to the folder"):

@@ -2,7 +2,6 @@
 
 import math
 import os
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias, cast
@@ -12,6 +11,7 @@ from scipy import stats
 
 from udkjax.extras import OptionalImport
 from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion
+from udkjax.scene.toml_text import parse_toml
 from udkjax.study.choices import CHOICES, Choice, choice
 from udkjax.study.quantities import Angle, Length, Scaled, Setter
 from udkjax.study.sweep.axes import Axis, Design, Distribution, LatinHypercube, Random, Sobol, Values, Zipped
@@ -40,10 +40,7 @@ def load_grid(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def loads_grid(text: str, source: str = "") -> dict[str, Any]:
     """Read the arguments of `udkjax.sweep` from the text of a TOML file, as `load_grid` does."""
-    try:
-        given = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise GridError([f"not valid TOML: {error}"], source) from None
+    given = parse_toml(text, source, GridError)
     reader = _GridReader("design" in given, Path(source).parent)
     arguments = reader.sweep(given)
     if reader.problems:

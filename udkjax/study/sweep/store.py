@@ -1,7 +1,8 @@
 """What a sweep has finished, on disk: whatever ends the process, what is there is whole, and what is there is not computed again.
 
 A folder holds `sweep.json`, which says what the sweep is, and `chunks/`, one file for each chunk. A file comes into being under
-its name only when all of it is on the disk, and carries its SHA-256. No list says what is finished: the files are the list.
+its name only when all of it is on the disk, and carries its SHA-256, and that of the sweep: where `sweep.json` is damaged, the
+chunks tell whether they are of the same sweep. No list says what is finished: the files are the list.
 """
 
 import abc
@@ -19,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock, Timeout
 
+from udkjax.scene.checks import abbreviate
 from udkjax.study.sweep.fingerprint import Json, differences
 from udkjax.study.sweep.plan import Chunk
 
@@ -27,6 +29,7 @@ UNFINISHED = ".unfinished"  # what a file's name ends with while it is written
 DIGEST = 64  # characters of a SHA-256
 MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
 MEMBERS, STORED = "members", "kept/"  # in a file: whom its numbers belong to, and what goes before the names of these
+SWEEP = "sweep"  # in a file: the SHA-256 of what sweep.json says
 
 Data = Mapping[str, np.ndarray]
 
@@ -90,12 +93,16 @@ class FolderStore(ChunkStore):
             text = f"{self.folder} is being written to by {other}: wait for it, end it, or choose another folder"
             raise StoreError(text) from None
         except OSError as error:
-            raise StoreError(f"cannot write to the folder {self.folder}: {error.strerror or error}") from error
+            raise StoreError(_cannot_use(self.folder, error)) from error
         try:
             (self.folder / WRITER).write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
-            self._begin(json.loads(json.dumps({"format": FORMAT, **fingerprint})))
-        except BaseException:
+            sweep = json.loads(json.dumps({"format": FORMAT, **fingerprint}))
+            self._sweep = np.frombuffer(hashlib.sha256(json.dumps(sweep, sort_keys=True).encode()).digest(), np.uint8)
+            self._begin(sweep)
+        except BaseException as error:
             self._lock.release()
+            if isinstance(error, OSError) and not isinstance(error, StoreError):
+                raise StoreError(_cannot_use(self.folder, error)) from error
             raise
 
     def __exit__(self, *_: object) -> None:
@@ -113,38 +120,55 @@ class FolderStore(ChunkStore):
         members = np.asarray(chunk.members)
         self._write(
             f"{CHUNKS}/{_name(chunk.index, members)}",
-            pack({MEMBERS: members, **{STORED + name: values for name, values in data.items()}}),
+            pack({MEMBERS: members, SWEEP: self._sweep, **{STORED + name: values for name, values in data.items()}}),
         )
 
     def read_chunks(self) -> Iterator[tuple[np.ndarray, Data]]:
         """Iterate over what is finished, one file at a time: members, and their data. Damaged files are removed."""
         for file in self._files():
-            data = unpack(file.read_bytes())
+            data = self._read(file)
             if data is None:
                 warnings.warn(f"{file} is damaged: what it held is computed again", stacklevel=2)
                 file.unlink()
             else:
-                members = data.pop(MEMBERS)
-                yield members, {name.removeprefix(STORED): values for name, values in data.items()}
+                stored = {name.removeprefix(STORED): values for name, values in data.items() if name.startswith(STORED)}
+                yield data[MEMBERS], stored
 
     def _begin(self, sweep: dict[str, Json]) -> None:
         """Say what the sweep is; where something is there already, compare."""
         for file in (*self.folder.glob(f"*{UNFINISHED}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED}")):
             file.unlink(missing_ok=True)  # of a process that was killed while it wrote
         manifest = self.folder / MANIFEST
-        if manifest.exists():
-            try:
-                begun = json.loads(manifest.read_text(encoding="utf-8"))
-            except ValueError as error:
-                raise StoreError(f"{manifest} is no description of a sweep ({error}): choose another folder") from None
+        try:
+            begun = json.loads(manifest.read_text(encoding="utf-8"))
+        except (FileNotFoundError, ValueError, RecursionError):
+            begun = None
+        if isinstance(begun, dict):
             if found := differences(begun, sweep):
                 lines = "\n  ".join(found)
                 advice = "choose another folder, or remove this one to begin anew"
                 raise StoreError(f"another sweep was begun in {self.folder}: {advice}. What differs:\n  {lines}")
-        elif any(self._files()):
-            raise StoreError(f"{self.folder} holds chunks, but no {MANIFEST} that says of which sweep: choose another folder")
-        else:
-            self._write(MANIFEST, json.dumps(sweep, indent=1).encode())
+            return
+        others = [file.name for file in self._files() if not self._is_of_this_sweep(file)]
+        if others:
+            state = "damaged" if manifest.exists() else "missing"
+            advice = "choose another folder, or remove this one to begin anew"
+            raise StoreError(
+                f"{manifest} is {state}, and chunks beside it are not of this sweep ({abbreviate(others)}): {advice}"
+            )
+        self._write(MANIFEST, json.dumps(sweep, indent=1).encode())
+
+    def _is_of_this_sweep(self, file: Path) -> bool:
+        """Return whether a chunk is of this sweep, or damaged and so of none."""
+        data = self._read(file)
+        return data is None or np.array_equal(data.get(SWEEP, ()), self._sweep)
+
+    def _read(self, file: Path) -> dict[str, np.ndarray] | None:
+        """Return what a chunk's file holds, None where it is damaged."""
+        try:
+            return unpack(file.read_bytes())
+        except OSError as error:
+            raise StoreError(f"cannot read {file}: {error.strerror or error}; make it readable, or remove it") from error
 
     def _files(self) -> list[Path]:
         return sorted((self.folder / CHUNKS).glob("*.npz"))
@@ -177,6 +201,10 @@ def unfinished_chunks(chunks: Sequence[Chunk], done: np.ndarray) -> list[Chunk]:
 def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Json]) -> ChunkStore:
     """Return what stores the finished chunks: the folder `out`, or, without one, memory."""
     return MemoryStore() if out is None else FolderStore(out, fingerprint)
+
+
+def _cannot_use(folder: Path, error: OSError) -> str:
+    return f"cannot write to the folder {folder}: {error.strerror or error}"
 
 
 def _name(index: int, members: np.ndarray) -> str:
