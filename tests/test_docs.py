@@ -193,7 +193,7 @@ def exists(name: str) -> bool:
             if owner is None:  # a field
                 return True
         return True
-    if rest and (LONG.get(head, head) in sys.modules or head in ELSEWHERE):
+    if rest and head in ELSEWHERE:
         owner = importlib.import_module(LONG.get(head, head))
         for part in rest:
             if not has(owner, part):
