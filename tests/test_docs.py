@@ -218,7 +218,10 @@ def missing(text: str) -> Iterator[str]:
         if PATH.fullmatch(code):
             if not any(
                 (base / code).exists() for base in (ROOT, ROOT / "udkjax", ROOT / "docs", *{p.parent for p in SOURCES})
-            ) and not (exists(code.replace("/", ".")) or re.match(r"[A-Za-z]\w*\.(toml|py|md)$|[\w/]*[A-Z]+[/.]", code)):
+            ) and not (
+                ("." not in code and exists(code.replace("/", ".")))
+                or re.match(r"[A-Za-z]\w*\.(toml|py|md)$|[\w/]*[A-Z]+[/.]", code)
+            ):
                 yield code
         elif (found := NAME.fullmatch(code)) and not SCENE_NAMES.fullmatch(code) and not exists(found[1]):
             yield code
