@@ -105,7 +105,7 @@ def simulate(
             was, and why.
         events: what happens where a condition crosses zero: `Event`, `JointLimit`, `Contact`, one or a list of them, with
             actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. They are located to rounding, whatever `ts` is, and
-            the run starts anew behind each; several at one instant happen one after the other. Both engines serve them, and
+            the run starts anew behind each; contacts that act on one another are hit together. Both engines serve them, and
             batches: each member has its own events. Such runs have first derivatives, forward and reverse, through the times of
             the events (saltation), but none by `ts`.
         max_events: how many events may happen.
