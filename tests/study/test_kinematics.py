@@ -139,13 +139,97 @@ def test_redundant_linkages_keep_their_branch_where_branches_meet(name):
     np.testing.assert_allclose(np.asarray(found.v)[:, links, 2], 1.0, atol=1e-6)
 
 
-def test_a_position_where_branches_meet_says_so():
+@pytest.mark.parametrize("beside", [0.0, 1e-12, -1e-9, 1e-7, -1e-5, 1e-3, -1e-2])
+def test_the_branch_goes_on_where_branches_meet(beside):
+    """At the very value and at any distance from it: positions, velocities, accelerations and efforts."""
     values = np.linspace(-0.8, 5.1, 30)
-    values[19] = np.pi
-    found = udk.kinematics(udk.library.parallelogram(-0.8), "body.link1.angle", values)
-    assert list(np.flatnonzero(found.status)) == [19]
-    assert int(found.status[19]) == Reached.singular
-    np.testing.assert_allclose(found.q[:, 2, 2], values, atol=1e-7)
+    values[19] = np.pi + beside
+    mech = udk.library.parallelogram(-0.8)
+    found = udk.kinematics(mech, "body.link1.angle", values)
+    assert list(np.flatnonzero(found.status)) == [19] * (abs(beside) < 1e-4)
+    assert np.all(found.reached) and set(found.status.tolist()) <= {Reached.closed, Reached.singular}
+    links = [k for k, body in enumerate(found.bodies) if "link" in body]
+    angles = np.broadcast_to(values[:, None], (30, len(links)))
+    np.testing.assert_allclose(found.q[:, links, 2], angles, atol=1e-12)
+    np.testing.assert_allclose(found.v[:, links, 2], 1.0, atol=1e-10)
+    np.testing.assert_allclose(found.a[:, :, 2], 0.0, atol=1e-8)
+    needed = udk.inverse_dynamics(mech, values, found, ["body.link1.angle"])
+    rise = sum(body.mass * 9.81 * found.v[:, k, 1] for k, body in enumerate(mech.bodies.values()))  # at a constant kinetic energy
+    assert np.all(needed.determined)
+    np.testing.assert_allclose(needed.efforts["body.link1.angle"], rise, atol=1e-7)
+
+
+def slider_crank_of_equal_lengths(r):
+    """Where the crank is upright the slider is at its pivot, and may stay there while both turn: x = 2 r cos(s), or 0."""
+    angle, tip = 0.4, r * np.array([np.cos(0.4), np.sin(0.4)])
+    at = lambda position, angle: udk.Body(1.0, 0.1 * r**2, position, angle)  # noqa: E731
+    bodies = {"crank": at(tip / 2, angle), "rod": at(tip * [1.5, 0.5], -angle), "slider": at([2 * tip[0], 0.0], 0.0)}
+    joints = {
+        "O": udk.Revolute(["ground", "crank"], [[0.0, 0.0], [-r / 2, 0.0]]),
+        "P": udk.Revolute(["crank", "rod"], [[r / 2, 0.0], [-r / 2, 0.0]]),
+        "B": udk.Revolute(["rod", "slider"], [[r / 2, 0.0], [0.0, 0.0]]),
+        "guide": udk.Prismatic(["ground", "slider"], [[0.0, 0.0], [0.0, 0.0]], axis=0.0),
+    }
+    return udk.Mechanism(bodies, joints)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("r", [1e-6, 1.0, 1e3])
+def test_a_slider_passes_the_pivot_of_its_crank(r):
+    mech = slider_crank_of_equal_lengths(r)
+    batch = jax.jit(jax.vmap(lambda values: udk.kinematics(mech, "body.crank.angle", values)))
+    for first in (0.5, np.pi / 2):  # also where it starts in such a position
+        values = np.array([[first, np.pi / 2 + beside, 2.5] for beside in (0.0, 1e-9, 1e-5, 1e-2)])
+        found = batch(values)
+        assert np.all(Reached.has_position(found.status)) and found.status[0, 1] == Reached.singular
+        for x, exact, atol in (
+            (found.q, np.cos, 1e-12),
+            (found.v, lambda s: -np.sin(s), 1e-10),
+            (found.a, lambda s: -np.cos(s), 1e-8),
+        ):
+            np.testing.assert_allclose(x[:, 0:, 2, 0] / r, 2 * exact(values), atol=atol)
+
+
+@pytest.mark.slow
+def test_derivatives_where_branches_meet_are_right_or_not_numbers():
+    mech = udk.library.parallelogram(-0.8)
+
+    def f(number, x, first):
+        values = jnp.array([-0.8, first, 4.0])
+        found = udk.kinematics(mech.with_parameters({number: x}), "body.link1.angle", values)
+        return jnp.stack([found.q[:, 1, 2], found.v[:, 1, 2]])
+
+    by_value = jax.jit(jax.jacfwd(lambda s: f("body.link1.mass", 1.0, s)))(np.pi)
+    np.testing.assert_allclose(by_value, [[0, 1, 0], [0, 0, 0]], atol=1e-8)
+    for jac in (jax.jacfwd, jax.jacrev):
+        by_mass = jax.jit(jac(lambda m: f("body.link1.mass", m, np.pi)))(1.0)
+        np.testing.assert_array_equal(by_mass, 0.0)
+        by_length = jax.jit(jac(lambda x: f("joint.A1.points[0][0]", x, np.pi)))(mech.parameters()["joint.A1.points"][0, 0])
+        assert np.all(np.isnan(by_length[:, 1])) and np.all(np.isfinite(by_length[:, [0, 2]]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9, 1e-12])
+def test_branches_that_come_close_and_do_not_meet_are_no_crossing(gap):
+    """A ground that is longer than the coupler: the crank comes to a toggle before pi, and no value beyond is reached by it."""
+    mech = udk.library.four_bar(0.5, lengths=(1.0, 2.0, 1.0), ground=2.0 + gap)
+    found = udk.kinematics(mech, "body.crank.angle", [0.5, 2.0, np.pi, 4.0])
+    assert found.status[:2].tolist() == [0, 0]
+    assert not np.any(found.reached[2:]) and np.all(np.isnan(found.q[2:]))
+
+
+def test_where_velocities_do_not_follow_they_are_no_numbers():
+    a, b, c, g = STUCK
+    mech = udk.library.four_bar(np.pi / 3, lengths=(a, b, c), ground=g)
+    toggle = np.arccos((a**2 + g**2 - (b + c) ** 2) / (2 * a * g))
+    values = np.append(np.linspace(np.pi / 3, toggle - 1e-6, 8), [toggle - 1e-9, toggle, toggle + 1e-9, 2.0])  # 12
+    found = udk.kinematics(mech, "body.crank.angle", values)
+    assert int(found.status[9]) == Reached.not_determined and found.reached[9]
+    assert np.all(np.isfinite(found.q[9])) and np.all(np.isnan(found.v[9])) and np.all(np.isnan(found.a[9]))
+    needed = udk.inverse_dynamics(mech, values, found, ["body.crank.angle"])
+    assert needed.determined.tolist() == np.isfinite(np.asarray(found.v)[:, 0, 0]).tolist()
+    with pytest.raises(ValueError, match="not determined at"):
+        udk.feed_forward(mech, needed)
 
 
 @pytest.mark.slow  # in the fast tests: by the command line, and of a driven pendulum by inverse dynamics
@@ -270,8 +354,8 @@ ASK = {
     "kinematics": lambda mech, driver: udk.kinematics(mech, driver, [1.0]),
     "travel": udk.travel,
     "branches": lambda mech, driver: udk.branches(mech, driver, 1.0),
-    "coupler_curve": lambda mech, driver: udk.coupler_curve(mech, driver, [1.0], "rod"),
-    "workspace": lambda mech, driver: udk.workspace(mech, {driver: [1.0], "body.rod.angle": [0.1]}, "rod"),
+    "coupler_curve": lambda mech, driver: udk.coupler_curve(mech, driver, np.ones(1), "rod"),
+    "workspace": lambda mech, driver: udk.workspace(mech, {driver: np.ones(1), "body.rod.angle": np.ones(1)}, "rod"),
 }
 
 

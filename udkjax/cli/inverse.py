@@ -61,5 +61,10 @@ def inverse(
     }
     write(out, text, variables, {"time": ts, "driver": list(efforts)}, {})
     show(results, table(f"{mech.name or 'mechanism'}, {t0:g} to {t1:g} s", lines), json)
-    if not np.all(np.isfinite(power)):
-        fail(f"the drivers' motion ends at {ts[np.argmin(np.isfinite(power))]:g} s: no position follows")
+    determined = np.asarray(found.determined)
+    if not determined.all():
+        k = int(np.argmin(determined))
+        became = udk.Reached(int(found.motion.status[k])) if found.motion is not None else udk.Reached.closed
+        if became in (udk.Reached.closed, udk.Reached.singular, udk.Reached.not_determined):
+            fail(f"at {ts[k]:g} s what the drivers exert is not determined: the position is singular")
+        fail(f"the drivers' motion ends at {ts[k]:g} s: {became.label}")

@@ -65,8 +65,9 @@ def kinematics(
     }
     if not math.isnan(float(found.limit)):
         lines["toggle"] = f"{float(found.limit):.15g}"
-    if "singular" in names:
-        lines["singular at"] = ", ".join(f"{float(s):g}" for s, n in zip(found.values, names, strict=True) if n == "singular")
+    for name, words in (("singular", "singular at"), ("not_determined", "velocities open at")):
+        if name in names:
+            lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(found.values, names, strict=True) if n == name)
     if others is not None:
         lines["branches"] = f"{len(others)} at {first:g}"
     results: dict[str, object] = {
@@ -85,13 +86,13 @@ def kinematics(
         "q": (dims, found.q, "m, m, rad"),
         "v": (dims, found.v, "m/s, m/s, rad/s"),
         "a": (dims, found.a, "m/s2, m/s2, rad/s2"),
-        "status": (("value",), found.status, "0 closed, 1 singular, 2 beyond limit, 3 lost, 4 open"),
+        "status": (("value",), found.status, "0 closed, 1 singular, 2 beyond limit, 3 lost, 4 open, 5 not determined"),
     }
     coordinates = {"value": np.asarray(found.values), "body": list(found.bodies)}
     write(out, text, variables, coordinates, {"driver": driver, "rate": rate})
     show(results, table(f"{mech.name or 'mechanism'}, driven by {driver}", lines), json)
     if reached < count:
-        fail(f"{count - reached} values are not reached: {names[-1].replace('_', ' ')}")
+        fail(f"{count - reached} values are not reached: {names[int(np.argmin(np.asarray(found.reached)))].replace('_', ' ')}")
 
 
 def _default(given: float | None, limit: float, otherwise: float) -> float:

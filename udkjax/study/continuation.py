@@ -10,31 +10,27 @@ A step counts if the corrector converges near the prediction and the tangent has
 stays the same, or the curve is lost and says so. E^+ is truncated: redundant constraints do no harm, and where branches meet,
 which costs E rank, the old tangent leads across.
 
+A value so near to a meeting of branches that its own E is of no use is found across it (crossing.py).
+
 Source: Allgower, Georg, Introduction to Numerical Continuation Methods (2003), chapters 2 and 9.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.equations.constraints import gamma, psi
-from udkjax.equations.position_closure import ROUNDING_UNITS
-from udkjax.equations.scales import RANK_TOL
-from udkjax.pinv import SVD, Plus
 from udkjax.printing import PrintsWords
-from udkjax.scene.mechanism import Mechanism
-from udkjax.study.drive import Driven
+from udkjax.study.crossing import CLOSE, NEAR, UNRESOLVED, across
+from udkjax.study.curve import Curve, derivatives
 from udkjax.study.sequential import sequential
 
 FIRST, LONGEST, SHORTEST = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
 STRAIGHT = 0.95  # cosine of the angle by which the tangent may turn in a step: 18 degrees; branches that cross differ by more
 SLACK = 0.3  # of a step: how far its end may lie from the prediction
-NEWTON = 8  # corrections; three are usual
 SECANTS = 60  # until a root is rounding; ten are usual
 TRIALS = 2000  # steps besides those to the values asked for: some hundred turns
 SAME = 8.0  # units of rounding within which a value is that of a toggle
@@ -44,10 +40,16 @@ class Reached(PrintsWords):
     """What became of one value of a driver."""
 
     closed = 0
-    singular = 1  # closed; but branches meet here, or a toggle lies here: velocities do not follow from the driver's
+    singular = 1  # closed; branches meet here, and velocities are those of the one that is followed, from both of its sides
     beyond_limit = 2  # a toggle, the limit of travel, lies before it
     lost = 3  # no step, however short, follows the branch
     open = 4  # the mechanism cannot be closed where it starts
+    not_determined = 5  # closed; but velocities do not follow from the driver's: a toggle, or branches that cannot be told apart
+
+    @classmethod
+    def has_position(cls, status: Int[Array, "..."]) -> Bool[Array, "..."]:
+        """Tell of which values the position is known."""
+        return (status == cls.closed) | (status == cls.singular) | (status == cls.not_determined)
 
 
 class Points(NamedTuple):
@@ -67,78 +69,11 @@ class _State(NamedTuple):
     h: Float[Array, ""]
     k: Int[Array, ""]  # the next value
     trials: Int[Array, ""]
-    event: Int[Array, ""]  # a `Reached`; `_FOLD` where a toggle lies within the next step
+    event: Int[Array, ""]  # a `Reached`; `_FOLD` where a toggle lies within the next step, `_LANDS` where X is the next value's
     points: Points
 
 
-_FOLD = -1
-_Correction = tuple[Array, Array, Array]  # X, corrections so far, whether it is closed
-
-
-class Curve(eqx.Module):
-    """The positions of a driven mechanism, as a curve in scaled coordinates and value."""
-
-    mechanism: Mechanism
-    weights: Float[Array, "m"]
-    units: Float[Array, "n+1"]
-    rows: Float[Array, "m"]
-
-    @classmethod
-    def of(cls, driven: Driven) -> "Curve":
-        scales = driven.analysis.scales
-        units = jnp.append(scales.coordinates(driven.analysis.coordinates), driven.unit)
-        return cls(driven.mechanism, scales.weights, units, scales.rows)
-
-    def residual(self, X: Float[Array, "n+1"]) -> Float[Array, "m"]:
-        x = X * self.units
-        return self.weights * psi(self.mechanism, x[-1], x[:-1])
-
-    def slopes(self, X: Float[Array, "n+1"]) -> Float[Array, "m n+1"]:
-        return jax.jacfwd(self.residual)(X)
-
-    def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
-        """Whether the residual is what rounding leaves of it."""
-        size = jnp.max(jnp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
-        return size <= ROUNDING_UNITS * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
-
-    def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
-        """Return the nearest point of the curve; `fixed`: of the same value. And whether there is one."""
-        if not len(self.rows):  # nothing binds the coordinates
-            return X, jnp.asarray(True)
-
-        def body(state: _Correction) -> _Correction:
-            X, k, _ = state
-            E = self.slopes(X)
-            E = jnp.where(fixed & (jnp.arange(len(X)) == len(X) - 1), 0.0, E)
-            return X - plus(E) @ self.residual(X), k + 1, self.is_closed(X)
-
-        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last correction is that of a closed point, to rounding
-            _, k, closed = state
-            return (k < NEWTON) & ~closed
-
-        X, _, closed = jax.lax.while_loop(is_unfinished, body, (X, jnp.asarray(0), jnp.asarray(False)))
-        return X, closed
-
-    def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> Float[Array, "n+1"]:
-        E = self.slopes(X)
-        tau = before - plus(E) @ (E @ before)
-        size = jnp.linalg.norm(tau)
-        return tau / jnp.where(size > 0, size, 1.0)
-
-
-def plus(E: Float[Array, "m n"]) -> Plus:
-    """Return E^+, truncated."""
-    return SVD(RANK_TOL).plus(E)
-
-
-def derivatives(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
-    """Return q' = dq/ds and q'' (n,) at a closed position, and the rank of Psi_q: Psi_q q' = -Psi_s, Psi_q q'' = gamma."""
-    W, w, mechanism = curve.units[:-1], curve.weights, curve.mechanism
-    E = w[:, None] * jax.jacfwd(lambda q: psi(mechanism, s, q))(q) * W
-    inverse = plus(E)
-    rate = jax.jvp(lambda s: psi(mechanism, s, q), (s,), (jnp.ones_like(s),))[1]
-    dq = -W * (inverse @ (w * rate))
-    return dq, W * (inverse @ (w * gamma(mechanism, s, q, dq))), inverse.rank
+_FOLD, _LANDS = -1, -2
 
 
 def follow(
@@ -163,7 +98,7 @@ def _follow(
     targets = values / curve.units[-1]
     tau = curve.tangent(X, jnp.zeros_like(X).at[-1].set(1.0))
     one, first = jnp.asarray(FIRST, X.dtype), jnp.asarray(first)
-    start = jnp.where(closed, Reached.closed, Reached.open)
+    start = jnp.where(closed, _LANDS, Reached.open)  # where branches meet, one of them is taken
     state = _State(X, tau, one, first, jnp.asarray(0), start, points)
 
     def is_unfinished(state: _State) -> Bool[Array, ""]:
@@ -171,10 +106,11 @@ def _follow(
 
     def body(state: _State) -> _State:
         state = jax.lax.while_loop(is_unfinished, lambda state: _step(curve, targets, state), state)
-        return _find_fold(curve, targets, state)
+        state = jax.lax.cond(state.event == _FOLD, lambda: _find_fold(curve, targets, state), lambda: state)
+        return _record(curve, state)
 
     def goes_on(state: _State) -> Bool[Array, ""]:
-        return is_unfinished(state) & (state.trials < TRIALS + 4 * len(values))
+        return (is_unfinished(state) | (state.event == _LANDS)) & (state.trials < TRIALS + 4 * len(values))
 
     state = jax.lax.while_loop(goes_on, body, state)
     event = jnp.where(is_unfinished(state), Reached.lost, state.event)
@@ -198,6 +134,7 @@ def _step(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
     turned = curve.tangent(at, tau)
     near = jnp.linalg.norm(at - ahead) <= SLACK * eta + 64 * jnp.finfo(X.dtype).eps * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
     good = near & (turned @ tau >= STRAIGHT) & closed
+    good = good & ~(lands & (eta > CLOSE) & (curve.clearance(at) < NEAR))  # the tangent that leads across has to be a close one
     folds = good & (turned[-1] * tau[-1] < 0) & (eta > 0)
     passed = good & ~lands & ~folds & ((target - at[-1]) * way < 0)  # too far: the next one is shorter
     counts = good & ~folds & ~passed
@@ -209,26 +146,47 @@ def _step(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
         X=jnp.where(counts, at, X),
         tau=jnp.where(counts, turned, tau),
         h=jnp.where(folds, eta, jnp.where(counts, longer, shorter)),
-        k=k + lands,
+        k=k,
         trials=trials + 1,
-        event=jnp.where(folds, _FOLD, jnp.where(lost | (trials > TRIALS + 4 * len(targets)), Reached.lost, event)),
-        points=_record(curve, points, k, at, lands),
+        event=jnp.where(
+            folds,
+            _FOLD,
+            jnp.where(lands, _LANDS, jnp.where(lost | (trials > TRIALS + 4 * len(targets)), Reached.lost, event)),
+        ),
+        points=points,
     )
 
 
-def _record(curve: Curve, points: Points, k: Int[Array, ""], X: Float[Array, "n+1"], which: Bool[Array, ""]) -> Points:
-    """Store a point of the curve as that of values[k], where `which` is true."""
-    x = X * curve.units
-    dq, ddq, rank = derivatives(curve, x[-1], x[:-1])
-    new = x[:-1], dq, ddq, jnp.where(rank < len(x) - 1, Reached.singular, Reached.closed)
-    q, dq, ddq, status = (x.at[k].set(jnp.where(which, y, x[k])) for x, y in zip(points[:4], new, strict=True))
-    return Points(q, dq, ddq, status, points.limit, points.limit_q)
+def _record(curve: Curve, state: _State) -> _State:
+    """Store the point of the curve that is the next value's, where it is one, unless it is that of the start.
+
+    Near where branches meet, it and its derivatives are those of the branch's points on both sides.
+    """
+    X, tau, k, points, lands = state.X, state.tau, state.k, state.points, state.event == _LANDS
+    stores = lands & (state.trials > 0)
+    clearance = curve.clearance(X)
+    here = X, tau, *derivatives(curve, X[-1] * curve.units[-1], X[:-1] * curve.units[:-1])
+
+    def beside() -> tuple[Array, ...]:
+        at, slope, dq, ddq, is_known = across(curve, X, tau)
+        other = at, slope, dq, ddq, here[4]
+        return (*(jnp.where(is_known, x, y) for x, y in zip(other, here, strict=True)), is_known)
+
+    X, tau, dq, ddq, rank, is_known = jax.lax.cond(lands & (clearance < NEAR), beside, lambda: (*here, jnp.asarray(False)))
+    deficient = rank < len(X) - 1
+    doubtful = ~is_known & (deficient | (clearance < UNRESOLVED))
+    status = jnp.where(doubtful, Reached.not_determined, jnp.where(deficient, Reached.singular, Reached.closed))
+    dq, ddq = (jnp.where(doubtful, jnp.nan, x) for x in (dq, ddq))
+    new = X[:-1] * curve.units[:-1], dq, ddq, status
+    q, dq, ddq, status = (x.at[k].set(jnp.where(stores, y, x[k])) for x, y in zip(points[:4], new, strict=True))
+    points = Points(q, dq, ddq, status, points.limit, points.limit_q)
+    event = jnp.where(lands, Reached.closed, state.event)
+    return state._replace(X=X, tau=tau, k=k + stores, event=event, points=points)
 
 
 def _find_fold(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
-    """Find the toggle within the next step, if there is one, and the next value if it lies before."""
-    X, tau, h, k, _, event, points = state
-    folds, k = event == _FOLD, jnp.minimum(k, len(targets) - 1)
+    """Find the toggle within the next step, and the next value if it lies before."""
+    X, tau, h, k, _, _, points = state
     target, way = targets[k], jnp.sign(tau[-1])
 
     def point_at(sigma: Float[Array, ""]) -> tuple[Array, Array]:
@@ -248,19 +206,17 @@ def _find_fold(curve: Curve, targets: Float[Array, "T"], state: _State) -> _Stat
     _, (sigma, (fold, landed), (_, turned)) = jax.lax.scan(find, h, jnp.array([False, True]))
     room = SAME * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.abs(fold[-1]))
     before = (target - fold[-1]) * way <= room
-    lands, ends = folds & before, folds & ~before
     x = fold * curve.units
-    points = _record(curve, points, k, landed, lands)
+    landed = jnp.where(jnp.abs(target - fold[-1]) <= room, fold, landed)  # which is known to rounding, and not to its root
     points = points._replace(
-        limit=jnp.where(ends, x[-1], points.limit),
-        limit_q=jnp.where(ends, x[:-1], points.limit_q),
+        limit=jnp.where(before, points.limit, x[-1]),
+        limit_q=jnp.where(before, points.limit_q, x[:-1]),
     )
     return state._replace(
-        X=jnp.where(lands, landed, X),
-        tau=jnp.where(lands, turned, tau),
-        h=jnp.where(folds, jnp.maximum(h - sigma[1], SHORTEST), h),
-        k=state.k + lands,
-        event=jnp.where(lands, Reached.closed, jnp.where(ends, Reached.beyond_limit, event)),
+        X=jnp.where(before, landed, X),
+        tau=jnp.where(before, turned, tau),
+        h=jnp.maximum(h - sigma[1], SHORTEST),
+        event=jnp.where(before, _LANDS, Reached.beyond_limit),
         points=points,
     )
 

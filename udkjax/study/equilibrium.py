@@ -23,7 +23,7 @@ from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.continuation import Curve, plus
+from udkjax.study.curve import Curve, plus
 from udkjax.study.drive import Driven
 from udkjax.study.linearization import Linearization, linearize
 from udkjax.study.positions import distinct, random_positions

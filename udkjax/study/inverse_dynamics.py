@@ -7,7 +7,8 @@ the joints' rows J and the drivers' rows C of Psi_q, the motion's equation
 
 holds for all mu and f that there are: the joints can take what lies in the range of J^T, and what is left over must be driven.
 With N a basis of the null space of J, N^T (M a - F) = (C N)^T f: one equation for each degree of freedom. Of more drivers than
-that, f is of least weighted norm, sum_i w_i f_i^2.
+that, f is of least weighted norm, sum_i w_i f_i^2. Where branches meet, N has a column more, along the other branch, in which the
+joints take what drivers do not: with one degree of freedom the branch's own direction v takes the place of N.
 """
 
 import math
@@ -18,7 +19,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Scalar
 from udkjax.equations import constraints, loads
@@ -39,7 +41,11 @@ from udkjax.study.kinematics import Kinematics, kinematics
 
 
 class InverseDynamics(PrintsTable):
-    """What each driver exerts along its coordinate on a prescribed motion."""
+    """What each driver exerts along its coordinate on a prescribed motion; not a number where that is not determined.
+
+    It is not where the motion does not get, nor in a position where its velocities do not follow, nor where branches meet and
+    there is more than one degree of freedom.
+    """
 
     ts: Float[Array, "T"]  # s
     motion: Kinematics | None  # where it was found here
@@ -68,6 +74,11 @@ class InverseDynamics(PrintsTable):
         rows.append(("left over", f"{format_number(left, scale=1.0)} of the loads", "", ""))
         heads = "driver", "peak (N m or N)", "root mean square", "power (W)"
         return PrintedTable(f"inverse dynamics at {len(ts)} times from {ts[0]:g} to {ts[-1]:g} s", rows, heads)
+
+    @property
+    def determined(self) -> Bool[Array, "T"]:
+        """At which times the efforts follow from the motion."""
+        return jnp.all(jnp.isfinite(jnp.stack(list(self.efforts.values()))), 0)
 
     @property
     def power(self) -> Float[Array, "T"]:
@@ -163,6 +174,11 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
     A spline misses an effort by some h^4, h the time between its knots, and by h^2 near its ends: let the times begin a dozen
     knots before the run, and end as many after it. Simulated from a state of the prescribed motion it follows it.
     """
+    if not isinstance(found.ts, Tracer) and not np.all(found.determined):
+        t = float(found.ts[int(np.argmin(found.determined))])
+        raise ValueError(
+            f"what the drivers exert is not determined at {t:g} s: leave out the times where `found.determined` is not true"
+        )
     elements = {name: element_of(mechanism, name) for name in found.efforts}
     forces = dict(mechanism.forces)
     for name, effort in found.efforts.items():
@@ -183,12 +199,20 @@ def _efforts(
     def at(t: Array, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
         q, v, a = q.ravel(), v.ravel(), a.ravel()
         C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
+        J = scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units
+        free, known = free_part(J), jnp.asarray(True)
         missing = units * (loads.mass(mechanism) * a - loads.force(mechanism, t, q, v))
-        free = free_part(scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units)
+        if analysis.rank is not None:  # else it is not known how many directions there are
+            deficient = SVD(RANK_TOL).plus(J).rank < analysis.rank if len(J) else jnp.asarray(False)
+            u = v / units
+            speed = jnp.linalg.norm(jnp.where(deficient, u, 1.0))
+            u = u / jnp.where(speed > 0, speed, 1.0)
+            everywhere, known = free, ~deficient | ((analysis.degrees_of_freedom == 1) & (speed > 0))
+            free = lambda x: jnp.where(deficient, jnp.tensordot(u, u @ x, 0), everywhere(x))  # noqa: E731
         wanted, A = free(missing), free((C * units).T * share)
         f = share * (SVD(RANK_TOL).plus(A) @ wanted)
         size = jnp.max(jnp.abs(missing))
         left = jnp.max(jnp.abs(wanted - free((C * units).T @ f))) / jnp.where(size > 0, size, 1.0)
-        return f, C @ v, left
+        return jnp.where(known, f, jnp.nan), C @ v, left
 
     return jax.vmap(at)(ts, q, v, a)

@@ -1,6 +1,7 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TypeAlias
 
 import equinox as eqx
@@ -21,7 +22,8 @@ from udkjax.scene.bodies import Frame, frame_over_time
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.continuation import Curve, Points, Reached, derivatives, follow, no_points, plus
+from udkjax.study.continuation import Points, Reached, follow, no_points
+from udkjax.study.curve import Curve, derivatives, plus
 from udkjax.study.drive import Drive, Driven, drive
 
 FAR = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
@@ -33,8 +35,9 @@ Rows: TypeAlias = Float[Array, "T n"]
 class Kinematics(PrintsTable):
     """Positions over the values of a driver, and velocities and accelerations there; not a number where it does not get.
 
-    `status` is a `Reached` for each value. `limit` is the value at the toggle that ended it (not a number where none did), and
-    `limit_q` the position there, which has no derivative.
+    `status` is a `Reached` for each value; where velocities do not follow from the driver's (`not_determined`), they are not
+    numbers. `limit` is the value at the toggle that ended it (not a number where none did), and `limit_q` the position there,
+    which has no derivative.
 
     Attributes:
         q: x, y (m) and angle (rad) of each body.
@@ -77,7 +80,7 @@ class Kinematics(PrintsTable):
     @property
     def reached(self) -> Bool[Array, "T"]:
         """Which values were reached."""
-        return self.status <= Reached.singular
+        return Reached.has_position(self.status)
 
     @property
     def ts(self) -> Float[Array, "T"]:
@@ -279,9 +282,10 @@ def _solve(driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Fl
         s, q = jnp.where(some, values[last], s), jnp.where(some, found.q[last], q)
         points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=jnp.zeros_like(points.status))
     points = follow(*stop_gradients((curve, s, q, values)), points, first)
-    there = points.status <= Reached.singular
+    there = Reached.has_position(points.status)
     safe = jnp.where(there[:, None], points.q, jax.lax.stop_gradient(q))
-    found = _with_derivatives(curve, values, safe, points.dq, points.ddq)
+    regular = ~there | (points.status == Reached.closed)
+    found = _with_derivatives(curve, values, safe, points.dq, points.ddq, regular)
     q, dq, ddq = (jnp.where(there[:, None], x, jnp.nan) for x in found)
     limited = jnp.isfinite(points.limit)
     X = jnp.append(jnp.where(limited, points.limit_q, jax.lax.stop_gradient(safe[0])), points.limit)
@@ -290,24 +294,50 @@ def _solve(driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Fl
 
 
 @eqx.filter_custom_jvp
-def _with_derivatives(curve: Curve, values: Float[Array, "T"], q: Rows, dq: Rows, ddq: Rows) -> tuple[Rows, Rows, Rows]:
-    """Return closed positions, whose derivatives are those of one Newton step there."""
+def _with_derivatives(
+    curve: Curve, values: Float[Array, "T"], q: Rows, dq: Rows, ddq: Rows, regular: Bool[Array, "T"]
+) -> tuple[Rows, Rows, Rows]:
+    """Return closed positions, whose derivatives are those of one Newton step there.
+
+    Where branches meet (not `regular`), those by the value are q' and q''; those by numbers that move the constraints do not
+    exist, since the branches part, and are not numbers.
+    """
     return q, dq, ddq
 
 
 @_with_derivatives.def_jvp
 def _(primals, tangents):
-    curve, values, *_ = primals
+    curve, values, *points = primals
     found = _with_derivatives(*primals)
     moving = eqx.combine(tangents[:2], jax.tree.map(jnp.zeros_like, eqx.filter((curve, values), eqx.is_inexact_array)))
-    return found, _tangents(curve, values, found[0], moving)
 
-
-def _tangents(curve: Curve, values: Float[Array, "T"], q: Rows, moving: PyTree) -> tuple[Rows, Rows, Rows]:
     def positions(curve: Curve, values: Float[Array, "T"]) -> tuple[Rows, Rows, Rows]:
-        return jax.vmap(lambda s, q: _newton(curve, s, q))(values, q)
+        return jax.vmap(partial(_moved, curve))(values, *points)
 
-    return eqx.filter_jvp(positions, (curve, values), moving)[1]
+    return found, eqx.filter_jvp(positions, (curve, values), moving)[1]
+
+
+def _moved(
+    curve: Curve, s: Float[Array, ""], q: Array, dq: Array, ddq: Array, regular: Bool[Array, ""]
+) -> tuple[Array, Array, Array]:
+    """Return q, q' and q'' at a closed position, as functions of the curve and the value beside it."""
+    still = jax.lax.stop_gradient(s)
+    change, undetermined = s - still, ~regular
+    parts = _undetermined(curve.residual(jnp.append(q, still) / curve.units), undetermined)
+    bends = _undetermined(s[None], undetermined)
+    beside = q + dq * change + parts, dq + ddq * change + parts, ddq + parts + bends
+    return jax.tree.map(partial(jnp.where, regular), _newton(curve, s, q), beside)
+
+
+@jax.custom_jvp
+def _undetermined(x: Float[Array, "k"], which: Bool[Array, ""]) -> Float[Array, ""]:
+    """Return zero, whose derivatives by x are not numbers where `which` is true."""
+    return jnp.zeros(())
+
+
+@_undetermined.defjvp
+def _(primals, tangents):
+    return _undetermined(*primals), jnp.sum(jnp.where(primals[1], jnp.nan, 0.0) * tangents[0])
 
 
 def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:

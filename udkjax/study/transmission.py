@@ -16,7 +16,6 @@ from udkjax.scene.fields import Numbers, number
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Trajectory
-from udkjax.study.continuation import Reached
 from udkjax.study.drive import Coordinate, value_of
 from udkjax.study.kinematics import Kinematics, kinematics
 
@@ -124,7 +123,7 @@ def workspace(
 
     def across(value: Float[Array, ""], q: Float[Array, "bodies 3"]) -> tuple[Float[Array, "T 2"], Bool[Array, "T"]]:
         found = kinematics(mechanism, second, inner, State(q, jnp.zeros_like(q)), held={first: value})
-        return found.path(body, jnp.asarray(point)), found.status <= Reached.singular
+        return found.path(body, jnp.asarray(point)), found.reached
 
     safe = jnp.where(along.reached[:, None, None], along.q, mechanism.q0)
     points, reached = jax.vmap(across)(outer, safe)

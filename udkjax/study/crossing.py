@@ -1,0 +1,95 @@
+"""A point of a curve where branches meet, or close to it, from points of the same branch on both sides.
+
+There E has a second null vector: Newton's method leaves the root of rounding in q, and divides it by the distance in q', by the
+square of that in q''. A branch is smooth all the same. So it is followed to twelve values around the point, two to seven steps h
+away on either side, where E is of use, and q, q' and q'' are those of the polynomials through these, whose errors are as h^12.
+The difference from ten values bounds them; of several h the one where it is least counts, if it is small, and only if the
+position closes to rounding. Where branches merely come close to each other, the curve turns between them, and it does not.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from udkjax.study.curve import Curve, derivatives, plus
+
+NEAR = 1e-2  # of the largest singular value of E: nearer to a loss of rank, q'' has lost more than its sixth digit
+UNRESOLVED = 1e-5  # of it: q'' has no digit left
+CLOSE = 0.02  # scaled: how far the point before may lie, whose tangent leads across; it turns by a degree or so
+SPACINGS = (0.04, 0.015, 0.005)  # h, scaled values
+FIRST, LAST = 2, 7  # steps from the point to the nearest and to the farthest of the others
+# How far the polynomials through twelve and through ten values may differ in q, q' and q'', scaled: a hundred times their error.
+ACCEPTED = (1e-9, 1e-7, 1e-5)
+
+
+def _weights(last: int) -> np.ndarray:
+    """Return Lagrange's weights at zero of the nodes -last..-FIRST and FIRST..last."""
+    nodes = _nodes(last)
+    return np.array([np.prod([-m / (k - m) for m in nodes if m != k]) for k in nodes])
+
+
+def _nodes(last: int) -> np.ndarray:
+    side = np.arange(FIRST, last + 1)
+    return np.concatenate([-side[::-1], side])
+
+
+def across(curve: Curve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Array, Array, Array, Array, Bool[Array, ""]]:
+    """Find a point, q' and q'' from both sides of it.
+
+    Args:
+        curve: the curve.
+        X: the point as it is known so far, of the value that counts.
+        tau: the direction of the branch there, roughly.
+
+    Returns:
+        The point and the tangent (n + 1,), q' and q'' (n,), and whether they are known.
+    """
+
+    def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
+        return _interpolated(curve, X, tau, h)
+
+    at, dq, ddq, doubt = jax.lax.map(tried, jnp.asarray(SPACINGS, X.dtype))
+    at, dq, ddq, doubt = (x[jnp.argmin(doubt)] for x in (at, dq, ddq, doubt))
+    slope = jnp.append(dq * curve.units[-1] / curve.units[:-1], 1.0)
+    slope = slope / jnp.linalg.norm(slope) * jnp.where(slope @ tau < 0, -1.0, 1.0)
+    return at, slope, dq, ddq, doubt < 1.0
+
+
+def _interpolated(curve: Curve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the point, q' and q'' by values h apart, and how far they are from being accepted: below one they are."""
+    slope = tau / jnp.where(tau[-1] != 0, tau[-1], 1.0)
+    ends, closed = jax.lax.map(lambda k: curve.correct(X + FIRST * h * k * slope, fixed=True), jnp.array([-1.0, 1.0]))
+
+    def side(way: Array, nearest: Array) -> tuple[Array, Array]:
+        def onward(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+            before, last = state
+            ahead = (last + (last - before)).at[-1].set(X[-1] + way * k * h)
+            at, is_closed = curve.correct(ahead, fixed=True)
+            return (last, at), (at, is_closed)
+
+        middle = (ends[0] + ends[1]) / 2
+        inner = nearest + (middle - nearest) / FIRST  # a step h before the nearest
+        (_, _), (found, are_closed) = jax.lax.scan(onward, (inner, nearest), jnp.arange(FIRST + 1.0, LAST + 1.0))
+        return jnp.concatenate([nearest[None], found]), jnp.all(are_closed)
+
+    (down, up), good = jax.lax.map(lambda x: side(*x), (jnp.array([-1.0, 1.0]), ends))
+    points = jnp.concatenate([down[::-1], up])  # (12, n + 1)
+    units = curve.units
+
+    def at_point(x: Array) -> tuple[Array, Array]:
+        dq, ddq, _ = derivatives(curve, x[-1] * units[-1], x[:-1] * units[:-1])
+        return dq, ddq
+
+    slopes = jax.lax.map(at_point, points)
+    scaled = points[:, :-1], slopes[0] * units[-1] / units[:-1], slopes[1] * units[-1] ** 2 / units[:-1]
+    all_of, fewer = _weights(LAST), np.pad(_weights(LAST - 1), 1)
+    q, dq, ddq = (jnp.asarray(all_of @ x) for x in scaled)
+    doubts = [jnp.max(jnp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED, strict=True)]
+    at = jnp.append(q, X[-1])
+    E = curve.slopes(at).at[:, -1].set(0.0)
+    at = at - plus(E, NEAR) @ curve.residual(at)  # what E sees well is closed to rounding
+    known = jnp.all(closed) & jnp.all(good) & curve.is_closed(at) & (tau[-1] != 0)
+    doubt = jnp.where(known, jnp.max(jnp.stack(doubts)), jnp.inf)
+    doubt = jnp.where(jnp.isfinite(doubt), doubt, jnp.inf)
+    return at, dq * units[:-1] / units[-1], ddq * units[:-1] / units[-1] ** 2, doubt
