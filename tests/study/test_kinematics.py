@@ -205,7 +205,8 @@ def test_derivatives_where_branches_meet_are_right_or_not_numbers():
         by_mass = jax.jit(jac(lambda m: f("body.link1.mass", m, np.pi)))(1.0)
         np.testing.assert_array_equal(by_mass, 0.0)
         by_length = jax.jit(jac(lambda x: f("joint.A1.points[0][0]", x, np.pi)))(mech.parameters()["joint.A1.points"][0, 0])
-        assert np.all(np.isnan(by_length[:, 1])) and np.all(np.isfinite(by_length[:, [0, 2]]))
+        assert np.all(np.isnan(by_length[:, 1]))  # in reverse mode also of the values beside: zero times what is not a number
+        assert jac is jax.jacrev or np.all(np.isfinite(by_length[:, [0, 2]]))
 
 
 @pytest.mark.slow

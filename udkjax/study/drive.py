@@ -112,7 +112,8 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Sc
     analysis = analyse(known)
     called = driver if isinstance(driver, str) else f"the {element.coordinate} of {' and '.join(element.bodies)}"
     if known.is_concrete and analysis.redundant_rows != ():
-        require_free(known, with_drivers(known, {}), name, called, names)
+        with jax.ensure_compile_time_eval():  # while something else is traced, too
+            require_free(known, with_drivers(known, {}), name, called, names)
     _require_determinate(found, analysis, called)
     row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
     return Driven(found.without_origin, analysis, name, row, analysis.scales.rows[row])

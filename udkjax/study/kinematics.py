@@ -1,8 +1,7 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.constraints import psi
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.march import can_march, march, march_at_once, psi_at_once
@@ -307,37 +307,35 @@ def _with_derivatives(
 
 @_with_derivatives.def_jvp
 def _(primals, tangents):
-    curve, values, *points = primals
+    curve, values, *_, regular = primals
     found = _with_derivatives(*primals)
     moving = eqx.combine(tangents[:2], jax.tree.map(jnp.zeros_like, eqx.filter((curve, values), eqx.is_inexact_array)))
 
     def positions(curve: Curve, values: Float[Array, "T"]) -> tuple[Rows, Rows, Rows]:
-        return jax.vmap(partial(_moved, curve))(values, *points)
+        return jax.vmap(lambda s, q: _newton(curve, s, q))(values, found[0])
 
-    return found, eqx.filter_jvp(positions, (curve, values), moving)[1]
-
-
-def _moved(
-    curve: Curve, s: Float[Array, ""], q: Array, dq: Array, ddq: Array, regular: Bool[Array, ""]
-) -> tuple[Array, Array, Array]:
-    """Return q, q' and q'' at a closed position, as functions of the curve and the value beside it."""
-    still = jax.lax.stop_gradient(s)
-    change, undetermined = s - still, ~regular
-    parts = _undetermined(curve.residual(jnp.append(q, still) / curve.units), undetermined)
-    bends = _undetermined(s[None], undetermined)
-    beside = q + dq * change + parts, dq + ddq * change + parts, ddq + parts + bends
-    return jax.tree.map(partial(jnp.where, regular), _newton(curve, s, q), beside)
+    ordinary = eqx.filter_jvp(positions, (curve, values), moving)[1]
+    beside = _changes_beside(curve, values, found, regular, *tangents[:2])
+    return found, tuple(jnp.where(regular[:, None], x, y) for x, y in zip(ordinary, beside, strict=True))
 
 
-@jax.custom_jvp
-def _undetermined(x: Float[Array, "k"], which: Bool[Array, ""]) -> Float[Array, ""]:
-    """Return zero, whose derivatives by x are not numbers where `which` is true."""
-    return jnp.zeros(())
+def _changes_beside(
+    curve: Curve, values: Float[Array, "T"], points: tuple[Rows, Rows, Rows], regular: Bool[Array, "T"], moved: PyTree, ds: Any
+) -> tuple[Rows, Rows, Rows]:
+    """Return the changes of q, q' and q'' where branches meet: those with numbers of joints and drivers are not numbers."""
+    (q, dq, ddq), undetermined = points, jnp.where(regular, 0.0, jnp.nan)
+    parts, bends = jnp.zeros_like(values), jnp.zeros_like(values)
+    constraints = lambda m: [*m.joints.values(), *m.drivers.values()]  # noqa: E731  # all others leave positions as they are
+    if jax.tree.leaves(constraints(moved.mechanism)):
 
+        def residual(mechanism: Mechanism) -> Float[Array, "T"]:
+            return jax.vmap(lambda s, q: jnp.sum(curve.weights * psi(mechanism, s, q)))(values, q)
 
-@_undetermined.defjvp
-def _(primals, tangents):
-    return _undetermined(*primals), jnp.sum(jnp.where(primals[1], jnp.nan, 0.0) * tangents[0])
+        still = jax.tree.map(jnp.zeros_like, eqx.filter(curve.mechanism, eqx.is_inexact_array))
+        parts = undetermined * eqx.filter_jvp(residual, (curve.mechanism,), (eqx.combine(moved.mechanism, still),))[1]
+    ds, bends = (bends, bends) if ds is None else (ds, undetermined * ds)
+    changes = dq * ds[:, None], ddq * ds[:, None], jnp.broadcast_to(bends[:, None], q.shape)
+    return tuple(x + parts[:, None] for x in changes)  # pyright: ignore[reportReturnType]
 
 
 def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
