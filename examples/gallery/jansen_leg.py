@@ -1,6 +1,6 @@
 """Theo Jansen's leg in a batch: how the path of its foot depends on the length of its crank.
 
-Seven bodies, ten pins, and his "eleven holy numbers". The legs of a batch are computed together.
+Seven links, eight pins, and his "eleven holy numbers". The legs of a batch are computed together.
 """
 
 import jax
@@ -13,6 +13,15 @@ from udkjax.show import plots
 # Jansen's numbers in metres: a, l are where the crank's axle is, seen from the fixed pin; m is the crank.
 A, L, M = 0.380, 0.078, 0.150
 BARS = {"b": 0.415, "c": 0.393, "d": 0.401, "e": 0.558, "f": 0.394, "g": 0.367, "h": 0.657, "i": 0.490, "j": 0.500, "k": 0.619}
+BODIES = {  # each through its pins; of two it is a bar, of three a plate
+    "crank": "OA",
+    "upper bar": "AB",
+    "upper plate": "PBD",
+    "lower bar": "AC",
+    "inner bar": "PC",
+    "outer bar": "DE",
+    "foot": "CEF",
+}
 TURN = 2 * np.pi  # s, of the crank at 1 rad/s
 
 
@@ -34,58 +43,26 @@ def leg(angle=0.0, rate=1.0):
     side = meet(fixed, top, BARS["d"], BARS["e"], left=True)
     knee = meet(side, low, BARS["f"], BARS["g"], left=False)
     foot = meet(low, knee, BARS["i"], BARS["h"], left=True)
-    shapes = {  # each body through its points; of two it is a bar, of three a plate
-        "crank": (axle, crank),
-        "upper bar": (crank, top),
-        "upper plate": (fixed, top, side),
-        "lower bar": (crank, low),
-        "inner bar": (fixed, low),
-        "outer bar": (side, knee),
-        "foot": (low, knee, foot),
-    }
-    centres = {name: np.mean(points, axis=0) for name, points in shapes.items()}
-    bodies = {}
-    for name, points in shapes.items():
-        size = np.linalg.norm(np.subtract(points[0], points[-1]))
-        bodies[name] = udk.Body(size, size**3 / 12, centres[name])  # 1 kg/m
-
-    def pin(one, two, at):
-        return udk.Revolute((one, two), [at - centres.get(one, 0.0), at - centres.get(two, 0.0)])
-
-    joints = {
-        "O": pin("ground", "crank", axle),
-        "A1": pin("crank", "upper bar", crank),
-        "A2": pin("crank", "lower bar", crank),
-        "B": pin("upper bar", "upper plate", top),
-        "P1": pin("ground", "upper plate", fixed),
-        "P2": pin("ground", "inner bar", fixed),
-        "C1": pin("lower bar", "inner bar", low),
-        "C2": pin("lower bar", "foot", low),
-        "D": pin("upper plate", "outer bar", side),
-        "E": pin("outer bar", "foot", knee),
-    }
-    motor = udk.Driver(("ground", "crank"), "angle", udk.Polynomial([0.0, rate]))
-    mech = udk.Mechanism(bodies, joints, {"motor": motor}, name="Jansen's leg")
-    return mech, foot - centres["foot"]
-
-
-def path(q, mech, point):
-    """Return where the foot is (m) at coordinates q (..., bodies, 3)."""
-    x, y, angle = np.moveaxis(np.asarray(q)[..., mech.body_names.index("foot"), :], -1, 0)
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([x + cos * point[0] - sin * point[1], y + sin * point[0] + cos * point[1]], axis=-1)
+    pins = {"O": axle, "A": crank, "B": top, "P": fixed, "C": low, "D": side, "E": knee, "F": foot}
+    links = {}
+    for name, through in BODIES.items():
+        size = np.linalg.norm(pins[through[0]] - pins[through[-1]])
+        links[name] = udk.Link(list(through), mass=size, inertia=size**3 / 12)  # 1 kg/m
+    motors = {"motor": {"pin": "O", "speed": rate}}
+    return udk.Drawing(pins, links, ground=["O", "P"], motors=motors, name="Jansen's leg").mechanism()
 
 
 def make():
     """Return how flat the steps are, the player of one leg, and the feet's paths of all."""
-    mech, point = leg()
+    mech = leg()
     ts = np.linspace(0.0, TURN, 121)
     cranks = np.array([0.12, 0.135, M, 0.16])
 
     def motion(crank):
-        return udk.simulate(udk.with_length(mech, "crank", crank), ts, throw=False).q
+        moved = udk.with_length(mech, "crank", crank)
+        return udk.path(moved, udk.simulate(moved, ts, throw=False), "F")
 
-    paths = {f"crank {1e3 * crank:g} mm": path(q, mech, point) for crank, q in zip(cranks, jax.vmap(motion)(cranks), strict=True)}
+    paths = {f"crank {1e3 * crank:g} mm": np.asarray(p) for crank, p in zip(cranks, jax.vmap(motion)(cranks), strict=True)}
     figure = Figure(figsize=(7, 3.8), layout="constrained")
     plots.draw_coupler_curves(figure.subplots(), paths)
     walk = paths[f"crank {1e3 * M:g} mm"]
@@ -96,9 +73,7 @@ def make():
         "the foot comes back to where it was within (m)": float(np.abs(walk[-1] - walk[0]).max()),
     }
     sol = udk.simulate(mech, ts)
-    animation = udk.animate(
-        mech, sol, measures={"height of the foot (m)": walk[:, 1]}, traces=(("foot", point), "E"), shapes={"foot": [point]}
-    )
+    animation = udk.animate(mech, sol, measures={"height of the foot (m)": walk[:, 1]}, traces=("F", "E"))
     return facts, {"motion": animation, "paths": figure}
 
 
