@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND
+from udkjax.scene.drawing.link import Link
 from udkjax.scene.drivers import Driver, Polynomial
 from udkjax.scene.fields import array_namespace
 from udkjax.scene.forces import Spring
@@ -13,8 +14,8 @@ from udkjax.scene.joints import Prismatic, Revolute, Slot
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     apex,
-    bar_pose,
     bodies_on_pose,
+    draw_on_pose,
     gravity_vector,
     uniform_rod,
     unit_vector,
@@ -97,24 +98,13 @@ def four_bar(
     """
     a, b, c = lengths
 
-    def pose(s):
+    def places(s):
         start, end = a * unit_vector(s), ground * np.array([1.0, 0.0])
-        pin = apex(start, end, b, c)
-        return [bar_pose(np.zeros(2), start), bar_pose(start, pin), bar_pose(end, pin)]
+        return {"A": np.zeros(2), "B": start, "C": apex(start, end, b, c), "D": end}
 
-    return Mechanism(
-        bodies_on_pose(
-            ("crank", "coupler", "rocker"), [uniform_rod(density * k, k) for k in (a, b, c)], pose, angle, angular_velocity
-        ),
-        {
-            "A": Revolute((GROUND, "crank"), [(0.0, 0.0), (-0.5 * a, 0.0)]),
-            "B": Revolute(("crank", "coupler"), [(0.5 * a, 0.0), (-0.5 * b, 0.0)]),
-            "C": Revolute(("coupler", "rocker"), [(0.5 * b, 0.0), (0.5 * c, 0.0)]),
-            "D": Revolute((GROUND, "rocker"), [(ground, 0.0), (-0.5 * c, 0.0)]),
-        },
-        gravity=gravity_vector(gravity),
-        name="four-bar",
-    )
+    through = {"crank": ("AB", a), "coupler": ("BC", b), "rocker": ("DC", c)}
+    links = {name: Link(list(pins), mass=density * length) for name, (pins, length) in through.items()}
+    return draw_on_pose(places, angle, angular_velocity, links, ["A", "D"], gravity, "four-bar")
 
 
 @with_known_numbers

@@ -5,7 +5,7 @@ the velocity is the pose's derivative times the rate of s. NumPy computes it, wh
 the pose is traced, JAX does. So it is written in the functions of `array_namespace` of its numbers.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from inspect import signature
 from typing import ParamSpec, TypeAlias
@@ -17,6 +17,8 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from udkjax.scene.bodies import Body
+from udkjax.scene.drawing import Drawing
+from udkjax.scene.drawing.link import Link
 from udkjax.scene.fields import array_namespace, number
 from udkjax.scene.mechanism import Mechanism
 
@@ -65,6 +67,21 @@ def bodies_on_pose(names: Sequence[str], physics: Sequence[tuple], pose: Callabl
     places, rates = derivative(pose, as_array(s), rate)
     bodies = zip(names, physics, places, rates, strict=True)
     return {name: Body(mass, inertia, *place, *speed) for name, (mass, inertia), place, speed in bodies}
+
+
+def draw_on_pose(
+    places: Callable,
+    s: ArrayLike,
+    rate: ArrayLike,
+    links: Mapping[str, Link],
+    ground: Sequence[str],
+    gravity: ArrayLike,
+    name: str,
+) -> Mechanism:
+    """Draw links through pins at {name: place} of places(s), moving as s does at its rate."""
+    pins, velocities = derivative(places, as_array(s), rate)
+    drawing = Drawing(pins, links, ground, velocities=velocities, gravity=gravity_vector(gravity), name=name)
+    return drawing.mechanism()
 
 
 def as_array(numbers: Several) -> Array | np.ndarray:
