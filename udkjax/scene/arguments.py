@@ -364,6 +364,8 @@ def _require_mapping(name: str, value: Any, given: Given) -> None:
 
 
 def _require_point(name: str, value: Any, given: Given) -> None:
+    if "of" in given and (value is None or np.shape(value) != (2,)):
+        return  # `path` knows the points of pins, and says what a shape should be
     if array(name, value).shape != (2,):
         raise ValueError(f"{name} must be two numbers, x and y in m, {describe(value)}")
     require_finite(name, value)
