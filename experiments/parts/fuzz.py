@@ -118,7 +118,7 @@ def run(kind: str, seed: int, first: int, count: int, seconds: float) -> Iterato
     extra: list[Fault] = []
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])}
     while first < last and time.time() < end:
-        stop = min(last, first + 20_000)
+        stop = min(last, first + 4_000)
         code = f"from experiments.parts.fuzz import *; work({kind!r}, {seed}, {first}, {stop}, Path({str(report)!r}), {end})"
         with (folder / "errors").open("w") as errors:
             done = subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.DEVNULL, stderr=errors)

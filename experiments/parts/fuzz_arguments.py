@@ -214,6 +214,8 @@ def targets() -> list[tuple[str, Callable[..., Any], dict[str, Any]]]:
             given = {p.name: fitting()[p.name] for p in needed}
             if name == "mechanical_advantage":
                 given["motion"] = fitting()["turning"]
+            if name == "inverse_dynamics":
+                given |= {"motion": fitting()["motion"], "drivers": ["body.b.angle"]}
             found += [(name, function, given)] * (1 if name in SELDOM else 12)
     found += [("simulate", udk.simulate, {"mechanism": scene(), "ts": fitting()["ts"]})] * 60
     for name in ("psi", "psi_q", "psi_dot", "gamma", "force", "mass", "kinetic_energy", "potential_energy"):
@@ -282,9 +284,9 @@ def draw(rng: np.random.Generator) -> Case:
         given.setdefault("max_steps", 100)
     traced = [p for p, value in wrong.items() if isinstance(value, np.ndarray) and value.dtype.kind in "fic"]
     about = f"{name}({', '.join(wrong)})"
-    # What is right by itself, and does not belong to the rest, may be blamed on the rest; a parameter is called by its name.
+    # What is right by itself, and does not belong to the rest, may be blamed on anything.
     mismatched = any(isinstance(value, udk.Mechanism | udk.Analysis | udk.State | SimpleNamespace) for value in wrong.values())
-    names = known if mismatched else _names(wrong)
+    names = [] if mismatched else _names(wrong)
     if traced and rng.random() < 0.3:
         return Case(f"{about} traced", functools.partial(_traced, function, given, traced[0]), names)
     return Case(about, functools.partial(_call, function, given), names)
@@ -292,7 +294,7 @@ def draw(rng: np.random.Generator) -> Case:
 
 def _names(wrong: dict[str, Any]) -> list[str]:
     """Return how a message may call what is wrong: the arguments, texts among their values, and what they name."""
-    called = {"values": ["parameter"], "bodies": ["body"], "value": ["mass"]}
+    called = {"values": ["parameter"], "bodies": ["body"], "value": ["mass"], "driver": ["drivers"]}
     texts = [value for value in wrong.values() if isinstance(value, str) and value.strip()]
     return [*wrong, *texts, *(other for p in wrong for other in called.get(p, ()))]
 

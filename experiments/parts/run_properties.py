@@ -1,6 +1,7 @@
 """Properties of runs: both engines, batches, jit, derivatives, impacts. Each structure is compiled once, for many mechanisms."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 import udkjax as udk
 from experiments.parts.random_scenes import RandomScene, build, random_scene, state_of
-from experiments.parts.state_properties import solve
+from experiments.parts.state_properties import names_of, solve
 from experiments.parts.tally import Property, Tally
 from udkjax.equations.scales import traced_scales
 
@@ -93,7 +94,9 @@ def check_runs(tally: Tally, seed: int, structures: Iterable[int], members: int,
         _check_single(tally, scenes, batch, first, q, size, ended, unit)
         _check_energy(tally, scenes, batch, found, ended)
         if derivatives:
-            _check_derivatives(tally, scenes, batch, native, ended, np.random.default_rng([seed, structure, 3]))
+            _check_derivatives(
+                tally, scenes, names_of(build(scenes[0].table)), batch, native, ended, np.random.default_rng([seed, structure, 3])
+            )
     return count
 
 
@@ -131,18 +134,14 @@ def _check_energy(tally: Tally, scenes: Any, batch: Batch, found: Any, ended: An
             tally.add("energy of a run", np.max(abs(energy - energy[0])) / unit, scene.label)
 
 
-def _check_derivatives(tally: Tally, scenes: Any, batch: Batch, native: Any, ended: Any, rng: Any) -> None:
+def _check_derivatives(tally: Tally, scenes: Any, names: Any, batch: Batch, native: Any, ended: Any, rng: Any) -> None:
     """Change masses, inertias, gravity and forces, which open no loop, each relative to itself."""
     mechanisms, states, ts = batch
 
-    def direction(mechanism: udk.Mechanism) -> Any:
-        zero = jax.tree.map(jnp.zeros_like, mechanism)
-        random: Callable[[Any], Any] = lambda tree: jax.tree.map(lambda x: x * rng.standard_normal(x.shape), tree)  # noqa: E731
-        zero = eqx.tree_at(lambda m: (m.gravity, m._forces), zero, (random(mechanism.gravity), random(mechanism._forces)))
-        physics: Callable[[Any], Any] = lambda m: [(body.mass, body.inertia) for body in m._bodies]  # noqa: E731
-        return eqx.tree_at(physics, zero, random(physics(mechanism)))
-
-    along = direction(mechanisms)
+    leaves, tree = jax.tree.flatten(mechanisms)
+    loads = re.compile(r"gravity|force\..*|body\..*\.(mass|inertia)")
+    changes = [x * rng.standard_normal(x.shape) * bool(loads.fullmatch(name)) for name, x in zip(names, leaves, strict=True)]
+    along = jax.tree.unflatten(tree, changes)
     unit = np.array([[s.length, s.length, 1.0] for s in scenes])[:, None, :]
     end: Callable[[Any], Any] = lambda m: native(m, states, ts).q[:, -1] / unit  # noqa: E731
     move: Callable[[float], Any] = lambda h: jax.tree.map(lambda x, d: x + h * d, mechanisms, along)  # noqa: E731

@@ -150,13 +150,17 @@ class Programs:
         return found[:, change.shape[1] : 2 * change.shape[1]]
 
 
+def names_of(mechanism: udk.Mechanism) -> list[str]:
+    """Return the names of all leaves of a mechanism, in their order."""
+    name_of = {id(value): name for name, value in mechanism.parameters().items()}
+    name_of |= {id(j.constant): f"joint.{n}.constant" for n, j in mechanism.joints.items() if hasattr(j, "constant")}
+    return [name_of[id(leaf)] for leaf in jax.tree.leaves(mechanism)]
+
+
 def numbers_of(mechanism: udk.Mechanism, tables: Sequence[Table]) -> np.ndarray:
     """Return the numbers of tables in the order in which a mechanism of their structure has them: a hundred times sooner than
     mechanisms are made of them."""
-    name_of = {id(value): name for name, value in mechanism.parameters().items()}
-    name_of |= {id(j.constant): f"joint.{n}.constant" for n, j in mechanism.joints.items() if hasattr(j, "constant")}
-    names = [name_of[id(leaf)] for leaf in jax.tree.leaves(mechanism)]
-    found = []
+    names, found = names_of(mechanism), []
     for table in tables:
         entries = {f"{s}.{e['name']}": e for s in ("body", "joint", "driver", "force") for e in table[s]}
         frames = {"ground": (0.0, 0.0, 0.0)} | {b["name"]: (*b["position"], b["angle"]) for b in table["body"]}

@@ -10,12 +10,14 @@ import pytest
 pytest.importorskip("experiments", reason="not in a source tree")
 
 import udkjax as udk
+from experiments.common import HERE, load
 from experiments.parts import fuzz_arguments, state_properties
 from experiments.parts.fuzz import Case, cases_of, run, verdict
 from experiments.parts.random_scenes import build, random_scene, shrunk, state_of
 from experiments.parts.reference_equations import evaluate
 from experiments.parts.state_properties import PROPERTIES, check_large, check_states
 from experiments.parts.tally import Tally
+from experiments.properties import page
 
 SEED = 3
 
@@ -87,6 +89,10 @@ def test_shrinking_leaves_what_fails():
     body = table["joint"][0]["bodies"][1]
     small = shrunk(table, lambda t: any(body in j["bodies"] for j in t["joint"]) and build(t) is not None)
     assert len(small["joint"]) == 1 and not small["driver"] and not small["force"] and len(small["body"]) <= 2
+
+
+def test_the_page_is_that_of_the_data():
+    assert (HERE / "properties.md").read_text(encoding="utf-8") == page(load("properties"))
 
 
 def test_what_is_not_a_number_is_the_worst():

@@ -95,7 +95,8 @@ def _checks_of(function: Callable[..., object]) -> list[tuple[str, Check]]:
         if name in ("solution", "motion") and parameter.default is parameter.empty:
             found.append((name, require_history))
         elif name in CHECKS:
-            found.append((name, CHECKS[name]))
+            may_be_none = parameter.default is None or type(None) in get_args(annotation)
+            found.append((name, CHECKS[name] if may_be_none else _given(CHECKS[name])))
     return found
 
 
@@ -342,6 +343,17 @@ def _of_diffrax(kind: str, example: str) -> Check:
             raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}")
 
     return check
+
+
+def _given(check: Check) -> Check:
+    """Return the check of an argument that must not be None, by one that lets None pass."""
+
+    def applied(name: str, value: Any, given: Given):
+        if value is None:
+            raise TypeError(f"{name} must be given, {describe(value)}")
+        check(name, value, given)
+
+    return applied
 
 
 def _optional(check: Callable[..., None], **choices: Any) -> Check:

@@ -1,0 +1,228 @@
+"""Whatever mechanism is drawn, the identities of mechanics hold, and whatever is typed, whoever errs is answered.
+
+Claim: of random mechanisms, with loops, redundant copies, joints that others imply, all types of joints, drivers and forces, from
+a micrometre to a kilometre, the terms of the equations are those of an independent implementation (reference_equations.py), all
+methods, formulations and engines agree, and accelerations do not depend on names, orders, axes, units or copies of constraints.
+Power is balanced, a is nearest to a_F in the metric of M, impulses are reciprocal, impacts neither pull nor give energy, and
+derivatives are limits of differences. Scene files, arguments and command lines that are wrong neither hang nor abort a process.
+They are to end in a documented error that names the place, without a traceback and without part of a file: those that do not are
+faults, which the page lists.
+
+Most properties take no compilation: the scalar programs of a structure are run by NumPy on many mechanisms at once. Runs compile,
+and so there are fewer of them. The page properties.md lists what was found. A longer run, or one more:
+
+    python -m experiments properties --set mechanisms=20000 --set seed=1 --set minutes=60
+    python -m experiments properties --set mechanisms=0 --set runs=0 --set first=88000 --set add=1     # more input
+"""
+
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+import xarray
+from matplotlib.figure import Figure
+
+from experiments.common import data_file, described, load, panels
+from experiments.parts import run_properties, state_properties
+from experiments.parts.fuzz import KINDS, Fault, cases_of, run, verdict
+from experiments.parts.tally import Found, Tally
+
+PROPERTIES = state_properties.PROPERTIES | run_properties.PROPERTIES
+MARGINS = 50.0, 10_000.0  # tolerance over worst error: below it a tolerance is nearly met, above it says little
+MEMBERS = 100  # mechanisms of each structure
+LISTED, SHOWN = 100, 60  # faults that the data list, and kinds of faults that the page lists
+
+
+def study(
+    smoke: bool,
+    mechanisms: int = 10_000,
+    files: int = 88_000,
+    arguments: int = 12_000,
+    commands: int = 500,
+    runs: int = 8,
+    contacts: int = 64,
+    seed: int = 0,
+    first: int = 0,
+    minutes: float = 60.0,
+    add: bool = False,
+) -> xarray.Dataset:
+    """Check all properties.
+
+    Args:
+        smoke: Whether to do it in small.
+        mechanisms: How many mechanisms, at states.
+        files: How many scene files that are wrong.
+        arguments: How many calls with wrong arguments.
+        commands: How many wrong command lines.
+        runs: How many structures to integrate; every other one by diffrax, too, every third with derivatives.
+        contacts: How many plates to throw onto a floor, loose ones and pairs of jointed ones.
+        seed: Of everything.
+        first: The number of the first structure and of the first input.
+        minutes: When to stop, if it is not done.
+        add: Whether to add to the data that are there.
+    """
+    if smoke:
+        mechanisms, files, arguments, commands, runs, contacts, minutes = 20, 30, 10, 0, 0, 0, 5.0
+    members = 5 if smoke else MEMBERS
+    end, tally, count = time.time() + 60 * minutes, Tally(), {"mechanisms": 0, "large": 0, "runs": 0, "contacts": 0}
+    for structure in _until(end, first, mechanisms // members, "structures"):
+        count["mechanisms"] += state_properties.check_states(tally, seed, [structure], members, structure % 4 == 0)
+    for structure in _until(end, first, min(mechanisms // 250, 40), "large scenes"):
+        count["large"] += state_properties.check_large(tally, seed, [structure])
+    for structure in _until(end, first, runs, "structures of runs"):
+        choices = 24, structure % 2 == 0, structure % 3 == 0
+        count["runs"] += run_properties.check_runs(tally, seed, [structure], *choices)
+    if contacts and time.time() < end:
+        count["contacts"] += run_properties.check_contacts(tally, seed + first, contacts)
+    faults: list[Fault] = []
+    done = dict.fromkeys(KINDS, 0)
+    for kind, wanted in zip(KINDS, (files, arguments, commands), strict=True):
+        found: list[Fault] = []
+        for done[kind], found in run(kind, seed, first, wanted, max(1.0, end - time.time())):  # noqa: B020
+            print(f"{kind}: {done[kind]} of {wanted}, {len(found)} faults", file=sys.stderr, flush=True)
+        faults += found
+    data = _dataset(tally, count, done, faults)
+    if add and data_file("properties").exists():
+        data = _merged(load("properties"), data)
+    settings = {"mechanisms": mechanisms, "members": members, "runs": runs, "first": first}
+    return described(data, "random: experiments/parts/random_scenes.py", settings, seed)
+
+
+def _until(end: float, first: int, count: int, what: str) -> Iterator[int]:
+    for k in range(first, first + count):
+        if time.time() > end:
+            return
+        if (k - first) % 10 == 0:
+            print(f"{what}: {k - first} of {count}, {(end - time.time()) / 60:.0f} min left", file=sys.stderr, flush=True)
+        yield k
+
+
+def _dataset(tally: Tally, count: dict[str, int], done: dict[str, int], faults: list[Fault]) -> xarray.Dataset:
+    found = [tally.found.get(name, Found()) for name in PROPERTIES]
+    return xarray.Dataset(
+        {
+            "cases": ("property", [f.cases for f in found]),
+            "worst": ("property", [f.worst for f in found]),
+            "mechanisms": ("set", list(count.values())),
+            "inputs": ("kind", list(done.values())),
+            "faults": ("kind", [sum(f.kind == kind for f in faults) for kind in done]),
+        },
+        {"property": list(PROPERTIES), "set": list(count), "kind": list(done)},
+        {
+            "worst_at": json.dumps([f.at for f in found]),
+            "left_out": json.dumps(tally.left_out),
+            "listed": json.dumps(sorted(faults, key=_is_severe, reverse=True)[:LISTED]),
+        },
+    )
+
+
+def _merged(old: xarray.Dataset, new: xarray.Dataset) -> xarray.Dataset:
+    """Return what two runs found together."""
+    both = new.copy()
+    for name in ("cases", "mechanisms", "inputs", "faults"):
+        both[name] = old[name] + new[name]
+    both["worst"] = np.maximum(old.worst, new.worst)
+    at = zip(json.loads(old.worst_at), json.loads(new.worst_at), old.worst.values >= new.worst.values, strict=True)
+    out = Counter(json.loads(old.left_out)) + Counter(json.loads(new.left_out))
+    # What has been mended since is no fault any more.
+    faults = [Fault(*f) for f in json.loads(old.listed)]
+    stands = [f for f in faults if _is_severe(f) or verdict(cases_of(f.kind, f.seed)(f.case))[0]]
+    gone = Counter(f.kind for f in faults) - Counter(f.kind for f in stands)
+    both["faults"] = both.faults - [gone[str(kind)] for kind in both.kind.values]
+    return both.assign_attrs(
+        worst_at=json.dumps([a if is_old and a else b or a for a, b, is_old in at]),
+        left_out=json.dumps({reason: n for reason, n in out.items() if n}),
+        listed=json.dumps([*stands, *json.loads(new.listed)][:LISTED]),
+    )
+
+
+def holds(data: xarray.Dataset) -> dict[str, bool]:
+    """Return whether each property holds, of those that the run came to, and whether no input hangs or aborts a process."""
+    found = {
+        name: bool(worst <= PROPERTIES[name].tolerance)
+        for name, cases, worst in zip(data.property.values, data.cases.values, data.worst.values, strict=True)
+        if cases
+    }
+    faults = [Fault(*f) for f in json.loads(data.listed)]
+    severe = {f.kind for f in faults if _is_severe(f)}
+    return found | {f"{kind}: no hang, no abort": kind not in severe for kind in data.kind.values}
+
+
+def _is_severe(fault: Fault) -> bool:
+    return fault.wrong.startswith(("hangs", "ends the process"))
+
+
+def _margins(data: xarray.Dataset) -> np.ndarray:
+    tolerance = np.array([PROPERTIES[name].tolerance for name in data.property.values])
+    worst = data.worst.values
+    return np.where(worst > 0, tolerance / np.where(worst > 0, worst, 1.0), np.inf)
+
+
+def headline(data: xarray.Dataset) -> str:
+    """Return how much was tried, and how near to its tolerance any property came."""
+    margins = _margins(data)[data.cases.values > 0]
+    tried = f"{int(data.mechanisms.sum())} random mechanisms, {int(data.cases.sum())} comparisons in {len(margins)} properties"
+    smallest = f"smallest margin {margins.min(initial=np.inf):.2g}"
+    return f"{tried}, {smallest}; {int(data.inputs.sum())} fuzzed inputs, {int(data.faults.sum())} faults"
+
+
+def figure(data: xarray.Dataset) -> Figure:
+    """Draw the margin of each property: its tolerance over its worst error."""
+    names, margins, cases = data.property.values, _margins(data), data.cases.values
+    picture, axes = panels(1, 1, 8, 0.24 * len(names) + 1)
+    one = axes[0, 0]
+    shown = np.where(np.isfinite(margins), margins, 1e6)
+    one.barh(range(len(names)), np.where(cases > 0, shown, np.nan), color="tab:blue", left=1)
+    one.axvspan(*MARGINS, color="tab:green", alpha=0.15, lw=0)
+    one.set(xscale="log", xlim=(1, 1e6), xlabel="tolerance over worst error", yticks=range(len(names)))
+    one.set_yticklabels([f"{name} ({n:,})" for name, n in zip(names, cases, strict=True)], fontsize=7)
+    one.invert_yaxis()
+    return picture
+
+
+def page(data: xarray.Dataset) -> str:
+    """Return properties.md: what was found of each property, and each fault that stands."""
+    at, margins = json.loads(data.worst_at), _margins(data)
+    sets = dict(zip(data.set.values, map(int, data.mechanisms.values), strict=True))
+    kinds = zip(data.kind.values, map(int, data.inputs.values), map(int, data.faults.values), strict=True)
+    versions = ", ".join(f"{key[8:]} {data.attrs[key]}" for key in sorted(data.attrs) if key.startswith("version_"))
+    lines = [
+        "# Properties, of random mechanisms and of input that nobody means",
+        "",
+        f"Written by `python -m experiments properties` (seed {data.attrs['seed']}, {data.attrs['seconds']:.0f} s; {versions}).",
+        "",
+        f"{sets['mechanisms']:,} mechanisms at states, by programs that NumPy runs, and {sets['large']} large ones by loops; "
+        f"{sets['runs']} integrated by machine code, a part of them by diffrax and with derivatives; {sets['contacts']} thrown "
+        "onto a floor. A case is drawn again by what stands beside its error: `random_scene(seed, structure, numbers)` of "
+        "experiments/parts/random_scenes.py. Margin: tolerance over worst error; `!` where it is under 50, `?` where it is over "
+        "10,000. Errors are relative, in the scene's own units; where the condition number of the rows exceeds "
+        f"{state_properties.ORDINARY:g}, they are over what it makes of rounding.",
+        "",
+        "| Property | Claim | Cases | Worst error | Tolerance | Margin | Because | Worst at |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, cases, worst, margin, where in zip(
+        data.property.values, data.cases.values, data.worst.values, margins, at, strict=True
+    ):
+        it = PROPERTIES[name]
+        flag = "" if not cases or not worst else " !" if margin < MARGINS[0] else " ?" if margin > MARGINS[1] else ""
+        size = "not tried" if not cases else f"{worst:.1e}"
+        ratio = "none" if not worst else f"{margin:,.0f}{flag}"
+        lines.append(
+            f"| {name} | {it.claim} | {cases:,} | {size} | {it.tolerance:g} | {ratio} | {it.tolerance_because} | `{where}` |"
+        )
+    lines += ["", "Not compared:", "", *(f"- {n:,}: {reason}" for reason, n in json.loads(data.left_out).items())]
+    lines += ["", "| Input | Cases | Faults |", "|---|---|---|", *(f"| {kind} | {n:,} | {bad:,} |" for kind, n, bad in kinds)]
+    faults = [Fault(*f) for f in json.loads(data.listed)]
+    example = {f.signature: f for f in reversed(faults)}
+    if faults:
+        lines += ["", "Faults, each again by `python -m experiments.parts.fuzz KIND SEED CASE`:", ""]
+        lines += ["| Times | Kind, seed, case | About | Wrong | Text |", "|---|---|---|---|---|"]
+    for signature, times in Counter(f.signature for f in faults).most_common(SHOWN):
+        f = example[signature]
+        text = f.text[:120].replace("|", "\\|").replace("\n", " ").replace("`", "'")
+        lines.append(f"| {times} | {f.kind} {f.seed} {f.case} | `{f.about}` | {f.wrong} | `{text}` |")
+    return "\n".join(lines) + "\n"
