@@ -18,6 +18,7 @@ from experiments.parts.reference_equations import evaluate
 from experiments.parts.state_properties import PROPERTIES, check_large, check_states
 from experiments.parts.tally import Tally
 from experiments.properties import page
+from udkjax.cli import main
 
 SEED = 3
 
@@ -137,6 +138,14 @@ def test_every_number_is_named(make, name):
     for wrong in (object(), "text", udk.SVD):
         with pytest.raises((TypeError, udk.SceneError), match=name):
             make(wrong)
+
+
+def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    udk.save(udk.library.simple_pendulum(), "scene.toml")
+    with pytest.raises(SystemExit, match="2"):
+        main(["simulate", "scene.toml", "--t1", "0.1", "--out", "."])
+    assert "--out" in capsys.readouterr().err
 
 
 def test_verdicts():

@@ -64,6 +64,7 @@ def simulate(
         json: write the results as JSON.
     """
     ts = output_times(t0, t1, dt)
+    check_target(out)
     plot = plot or out.with_suffix(".png")
     if dt0 is not None and not 0 < dt0 < math.inf:
         refuse(f"the first step --dt0 {dt0:g} must be positive")
@@ -71,7 +72,6 @@ def simulate(
         refuse("--formulation partitioning keeps the constraints itself: take --stabilization projection or none")
     if plot == out:
         refuse(f"--out {out} and --plot {plot} are the same file")
-    check_target(out)
     check_target(plot, PICTURES, "--plot")
     require("xarray", "h5netcdf")
     mech, text = load(scene)
