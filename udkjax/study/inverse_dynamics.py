@@ -25,6 +25,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from udkjax.annotations import Scalar
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.load_scale import load_sizes
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
@@ -53,7 +54,7 @@ class InverseDynamics(PrintsTable):
     powers: dict[str, Float[Array, "T"]]  # W: effort times the coordinate's rate
     residual: Float[
         Array, "T"
-    ]  # the largest part of M a - F that neither joints nor drivers exert, relative to the largest of it
+    ]  # the largest part of M a - F that neither joints nor drivers exert, relative to M a and the single loads
 
     _units = units(ts="s", efforts="N m or N", powers="W")
 
@@ -211,7 +212,9 @@ def _efforts(
             free = lambda x: jnp.where(deficient, jnp.tensordot(u, u @ x, 0), everywhere(x))  # noqa: E731
         wanted, A = free(missing), free((C * units).T * share)
         f = share * (SVD(RANK_TOL).plus(A) @ wanted)
-        size = jnp.max(jnp.abs(missing))
+        # Of the parts, which may balance: what is left of them then is rounding.
+        parts = units * (loads.mass(mechanism) * jnp.abs(a) + load_sizes(mechanism, t, q, v))
+        size = jnp.maximum(jnp.max(parts), scales.mass * (scales.length * scales.rate) ** 2)
         left = jnp.max(jnp.abs(wanted - free((C * units).T @ f))) / jnp.where(size > 0, size, 1.0)
         return jnp.where(known, f, jnp.nan), C @ v, left
 

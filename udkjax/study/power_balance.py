@@ -44,8 +44,9 @@ class PowerBalance(NamedTuple):
     joints: dict[str, Float[Array, "T"]]  # of both bodies together: zero, to rounding and what the velocities violate
     kinetic: Float[Array, "T"]  # dT/dt
     potential: Float[Array, "T"]  # dV/dt
+    scale: Float[Array, ""]  # of powers: m L^2 / T^3 of the mechanism
 
-    _units = units(drivers="W", forces="W", joints="W", kinetic="W", potential="W")
+    _units = units(drivers="W", forces="W", joints="W", kinetic="W", potential="W", scale="W")
 
     def _table(self) -> PrintedTable:
         parts = {
@@ -73,8 +74,8 @@ class PowerBalance(NamedTuple):
 
     @property
     def relative(self) -> Float[Array, ""]:
-        """The largest residual over the largest of the powers that it is the difference of."""
-        parts = [self.kinetic, self.potential, *self.drivers.values(), *self.forces.values()]
+        """The largest residual over the largest of the powers that it is the difference of, or over the mechanism's own scale."""
+        parts = [self.kinetic, self.potential, *self.drivers.values(), *self.forces.values(), self.scale]
         size = jnp.max(jnp.stack([jnp.max(jnp.abs(part)) for part in parts]))
         return jnp.max(jnp.abs(self.residual)) / jnp.where(size > 0, size, 1.0)
 
@@ -109,6 +110,7 @@ def power_balance(
         joints={name: total(by_joint, name) for name in mechanism.joint_names},
         kinetic=kinetic,
         potential=potential,
+        scale=analysis.mass * analysis.length**2 * analysis.scales.rate**3,
     )
 
 
