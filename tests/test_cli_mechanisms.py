@@ -85,3 +85,40 @@ def test_statics_and_modes_of_the_papers_linkage(tmp_path, capsys):
     (row,) = csv.DictReader((tmp_path / "m.csv").open())
     assert float(row["omega2 [1/s2]"]) == found["omega2"][0]
     assert float(row["body.link2.x [m]"]) == found["q"][found["bodies"].index("link2")][0]
+
+
+def test_the_only_driver_is_meant_and_channels_are_written_and_drawn(tmp_path, capsys):
+    scene, out, plot = EXAMPLES / "slider_crank.toml", tmp_path / "k.csv", tmp_path / "k.png"
+    found = results(capsys, "kinematics", scene, "--count", 5, "--channels", "pin.P.x", "--out", out, "--plot", plot)
+    assert found["driver"] == "motor" and plot.stat().st_size > 1000
+    rows = list(csv.DictReader(out.open()))
+    x = [float(row["pin.P.x [m]"]) for row in rows]
+    np.testing.assert_allclose(x, [2 * float(row["body.crank.x [m]"]) for row in rows], atol=1e-12)  # from the crank's middle
+    np.testing.assert_allclose(found["channels"]["pin.P.x"], x)
+    assert udkjax("kinematics", EXAMPLES / "four_bar.toml") == 2
+    assert "name a coordinate, such as body.crank.angle" in capsys.readouterr().err
+    assert udkjax("kinematics", scene, "--channels", "pin.Q.x") == 2
+    assert '--channels pin.Q.x: no pin named "Q"' in capsys.readouterr().err
+
+
+def test_reactions_at_pins_carry_what_moves(tmp_path, capsys):
+    out, plot = tmp_path / "r.csv", tmp_path / "r.png"
+    found = results(capsys, "reactions", EXAMPLES / "six_bar.toml", "--t1", 0.1, "--out", out, "--plot", plot)
+    assert found["result"] == "successful" and plot.stat().st_size > 1000
+    rows = list(csv.DictReader(out.open()))
+    for pin, at in found["peaks"].items():
+        for body, peak in at.items():
+            force = [np.hypot(*(float(row[f"pin.{pin}.{body}.{c} [N]"]) for c in ("fx", "fy"))) for row in rows]
+            assert peak["force"] == pytest.approx(max(force))
+
+
+def test_inverse_and_simulate_draw_what_they_find(tmp_path, capsys):
+    plot = tmp_path / "i.png"
+    results(capsys, "inverse", EXAMPLES / "slider_crank.toml", "--t1", 0.2, "--dt", 0.1, "--plot", plot)
+    assert plot.stat().st_size > 1000
+    out = tmp_path / "s.csv"
+    scene = EXAMPLES / "slider_crank.toml"
+    found = results(capsys, "simulate", scene, "--t1", 0.2, "--dt", 0.1, "--out", out, "--channels", "driver.motor.load")
+    assert [Path(name).name for name in found["files"]] == ["s.csv", "s.png", "s-channels.png"]
+    for row in csv.DictReader(out.open()):
+        assert float(row["driver.motor.load [N m]"]) == pytest.approx(float(row["effort.motor [N m or N]"]), rel=1e-9)

@@ -135,6 +135,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.study.power_balance import PowerBalance as PowerBalance
     from udkjax.study.power_balance import power_balance as power_balance
     from udkjax.study.reaction_peaks import envelope as envelope
+    from udkjax.study.reaction_peaks import pin_reactions as pin_reactions
     from udkjax.study.reaction_peaks import reaction_peaks as reaction_peaks
     from udkjax.study.sweep import Axis as Axis
     from udkjax.study.sweep import LatinHypercube as LatinHypercube
@@ -167,7 +168,7 @@ _NAMES = {
     "udkjax.study.diagnosis": "diagnose Diagnosis",
     "udkjax.study.explain": "explain",
     "udkjax.study.explanation": "Explanation",
-    "udkjax.study.reaction_peaks": "reaction_peaks envelope",
+    "udkjax.study.reaction_peaks": "reaction_peaks pin_reactions envelope",
     "udkjax.study.power_balance": "power_balance PowerBalance",
     "udkjax.study.identify": """
         identify Record Start Parameter length Quantity Estimate IdentificationError check_gradients GradientCheck

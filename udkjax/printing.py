@@ -31,12 +31,12 @@ class PrintedTable(NamedTuple):
     heads: Sequence[str] = ()
 
 
-def text_table(table: PrintedTable) -> str:
+def text_table(table: PrintedTable, most: int = MOST_ROWS) -> str:
     """Return a table as text, its columns below each other; of many rows the first ones, and how many more there are."""
-    cells = [[_shorten(str(cell)) for cell in row] for row in table.rows[:MOST_ROWS]]
+    cells = [[_shorten(str(cell)) for cell in row] for row in table.rows[:most]]
     lines = align_columns([list(table.heads), *cells] if table.heads else cells)
-    if len(table.rows) > MOST_ROWS:
-        lines.append(f"  and {len(table.rows) - MOST_ROWS} more")
+    if len(table.rows) > most:
+        lines.append(f"  and {len(table.rows) - most} more")
     return "\n".join([table.title, *lines])
 
 

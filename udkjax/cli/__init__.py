@@ -19,6 +19,7 @@ COMMANDS = (
     "identify",
     "kinematics",
     "inverse",
+    "reactions",
     "statics",
     "modes",
     "check",

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
-from udkjax.cli.datasets import check_target, write
+from udkjax.cli.datasets import PICTURES, check_target, write
 
 
 def inverse(
@@ -16,6 +16,7 @@ def inverse(
     dt: float = 0.01,
     drivers: tuple[str, ...] = (),
     out: Path | None = None,
+    plot: Path | None = None,
     json: Json = False,
 ) -> None:
     """Find the torques and forces that the motion of a scene's drivers takes; exit with 1 where the motion is not possible.
@@ -27,17 +28,20 @@ def inverse(
         dt: time between two instants (s).
         drivers: who exerts: drivers or coordinates, such as body.crank.angle; by default the scene's drivers.
         out: file to write (.nc, .h5, .csv or .npz): effort and power (time, driver).
+        plot: picture to write (.png, .svg, .pdf or .jpg): efforts and powers over time.
         json: write the results as JSON.
     """
     ts = output_times(t0, t1, dt)
     check_target(out)
+    check_target(plot, PICTURES, "--plot")
     mech, text = load(scene)
     if not mech.drivers:
         refuse("the scene has no driver that prescribes a motion")
     import numpy as np
 
     import udkjax as udk
-    from udkjax.show.summary import table
+    from udkjax.show.summary import format_error, format_peak, table
+    from udkjax.study.drive import element_of
 
     try:
         found = udk.inverse_dynamics(mech, ts, drivers=list(drivers) or None)
@@ -52,13 +56,20 @@ def inverse(
         k = int(np.nanargmax(np.abs(x))) if good.any() else 0
         rms = float(np.sqrt(np.mean(x[good] ** 2))) if good.any() else math.nan
         results["peaks"][name] = {"effort": x[k], "time": ts[k], "rms": rms}
-        lines[name] = f"peak {x[k]:.6g} at {ts[k]:g} s, root mean square {rms:.6g} (N m or N)"
+        lines[name] = format_peak(ts, x, element_of(mech, name).coordinate)
     lines["power"] = f"{np.nanmin(power):.6g} to {np.nanmax(power):.6g} W"
-    lines["left over"] = f"{float(np.nanmax(np.asarray(found.residual))):.2e} of the loads"
+    lines["left over"] = f"{format_error(float(np.nanmax(np.asarray(found.residual))), 1.0)} of the loads"
     variables = {
         "effort": (("time", "driver"), np.stack(list(efforts.values()), 1), "N m or N"),
         "power": (("time", "driver"), np.stack([np.asarray(x) for x in found.powers.values()], 1), "W"),
     }
+    if plot is not None:
+        from udkjax.show.figures import channels_figure
+
+        torques = {name: element_of(mech, name).coordinate == "angle" for name in efforts}
+        shown = {name: (x, "N m" if torques[name] else "N") for name, x in efforts.items()}
+        shown |= {f"power of {name}": (np.asarray(x), "W") for name, x in found.powers.items()}
+        channels_figure(ts, shown, title=mech.name).savefig(plot, dpi=150)
     write(out, text, variables, {"time": ts, "driver": list(efforts)}, {})
     show(results, table(f"{mech.name or 'mechanism'}, {t0:g} to {t1:g} s", lines), json)
     determined = np.asarray(found.determined)

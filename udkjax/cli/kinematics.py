@@ -4,11 +4,14 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from udkjax.cli.channels import channels_of, choose_driver, measure_channels
 from udkjax.cli.common import Json, Scene, fail, load, refuse, show
-from udkjax.cli.datasets import check_target, write
+from udkjax.cli.datasets import PICTURES, check_target, write
 from udkjax.extras import OptionalImport
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from udkjax import Mechanism
 
 with OptionalImport():
@@ -18,32 +21,38 @@ with OptionalImport():
 def kinematics(
     scene: Scene,
     /,
-    driver: str,
+    driver: str | None = None,
     first: Annotated[float | None, tyro.conf.arg(name="from")] = None,
     last: Annotated[float | None, tyro.conf.arg(name="to")] = None,
     count: int = 361,
     rate: float = 1.0,
     branches: bool = False,
+    channels: tuple[str, ...] = (),
     out: Path | None = None,
+    plot: Path | None = None,
     json: Json = False,
 ) -> None:
     """Drive a scene through its positions: limits of travel, positions, velocities and accelerations; exit with 1 if it stops.
 
     Args:
         scene: the mechanism.
-        driver: a driver of the scene, or a coordinate, such as body.crank.angle, joint.B.angle, body.slider.x.
+        driver: a driver of the scene, by default its only one; or a coordinate: body.crank.angle, joint.B.angle, pin.C.x.
         first: first value (rad, m); by default the lower limit of travel, or where it starts if there is none.
         last: last value; by default the upper limit, or one turn after the first.
         count: how many values.
         rate: of the driver (rad/s, m/s), for velocities and accelerations.
         branches: find all ways to put it together for the first value, too.
+        channels: what else is written, such as pin.C.x, pin.C.vy or body.coupler(0.1, 0).ay.
         out: file to write (.nc, .h5, .csv or .npz): value, q, v and a (value, body, coordinate), status.
+        plot: picture to write (.png, .svg, .pdf or .jpg): poses and angles, or the channels.
         json: write the results as JSON.
     """
     if count < 1:
         refuse(f"--count {count}: must be positive")
     check_target(out)
+    check_target(plot, PICTURES, "--plot")
     mech, text = load(scene)
+    driver, measured = choose_driver(mech, driver), channels_of(mech, channels)
     import numpy as np
 
     import udkjax as udk
@@ -59,8 +68,9 @@ def kinematics(
         refuse(problem)
     names = [udk.Reached(int(code)).name for code in found.status]
     reached = int(np.sum(np.asarray(found.reached)))
+    free = math.isinf(float(travel.lower)) and math.isinf(float(travel.upper))
     lines = {
-        "travel": f"{float(travel.lower):.15g} to {float(travel.upper):.15g}",
+        "travel": "no limits" if free else f"{float(travel.lower):.15g} to {float(travel.upper):.15g} {travel.unit}",
         "reached": f"{reached} of {count} values from {first:g} to {last:g}",
     }
     if not math.isnan(float(found.limit)):
@@ -70,6 +80,7 @@ def kinematics(
             lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(found.values, names, strict=True) if n == name)
     if others is not None:
         lines["branches"] = f"{len(others)} at {first:g}"
+    columns = measure_channels(mech, found, measured)
     results: dict[str, object] = {
         "driver": driver,
         "travel": [travel.lower, travel.upper],
@@ -78,17 +89,25 @@ def kinematics(
         "limit": found.limit,
         "bodies": list(found.bodies),
         **{name: getattr(found, name) for name in ("q", "v", "a")},
+        "channels": {name: values for name, (values, _) in columns.items()},
     }
     if others is not None:
         results["branches"] = others
     dims = ("value", "body", "coordinate")
-    variables = {
+    variables: "dict[str, tuple[tuple[str, ...], ArrayLike, str]]" = {
         "q": (dims, found.q, "m, m, rad"),
         "v": (dims, found.v, "m/s, m/s, rad/s"),
         "a": (dims, found.a, "m/s2, m/s2, rad/s2"),
         "status": (("value",), found.status, "0 closed, 1 singular, 2 beyond limit, 3 lost, 4 open, 5 not determined"),
     }
     coordinates = {"value": np.asarray(found.values), "body": list(found.bodies)}
+    variables |= {name: (("value",), values, unit) for name, (values, unit) in columns.items()}
+    if plot is not None:
+        from udkjax.show.figures import channels_figure, driven_figure
+
+        label = f"{driver} ({found.unit})"
+        picture = channels_figure(found.values, columns, label, mech.name) if columns else driven_figure(mech, found, driver)
+        picture.savefig(plot, dpi=150)
     write(out, text, variables, coordinates, {"driver": driver, "rate": rate})
     show(results, table(f"{mech.name or 'mechanism'}, driven by {driver}", lines), json)
     if reached < count:

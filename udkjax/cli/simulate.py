@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
+from udkjax.cli.channels import channels_of, measure_channels
 from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
 from udkjax.cli.datasets import PICTURES, check_target, save
 from udkjax.extras import require
@@ -37,6 +38,7 @@ def simulate(
     beta: float = 5.0,
     dt0: float | None = None,
     max_steps: int | None = None,
+    channels: tuple[str, ...] = (),
     plot: Path | None = None,
     json: Json = False,
 ) -> None:
@@ -60,6 +62,7 @@ def simulate(
         beta: Baumgarte's gain on the constraints (1/s).
         dt0: first step to try (s); by default it is chosen.
         max_steps: give up after so many steps.
+        channels: what else is written, such as pin.C.x, joint.A.fx or driver.motor.load; they have a picture of their own.
         plot: picture to write (.png, .svg, .pdf or .jpg); by default a .png beside the file.
         json: write the results as JSON.
     """
@@ -75,11 +78,13 @@ def simulate(
     check_target(plot, PICTURES, "--plot")
     require("xarray", "h5netcdf")
     mech, text = load(scene)
+    measured = channels_of(mech, channels)
 
     import numpy as np
 
     import udkjax as udk
     from udkjax.integrate.assembly_moves import AssemblyWarning, moves_of_assembly
+    from udkjax.show.figures import channels_figure
     from udkjax.show.plots import trajectory
     from udkjax.show.summary import run_summary
     from udkjax.study.accuracy import accuracy
@@ -105,8 +110,14 @@ def simulate(
 
     data = sol.to_xarray(mech)
     data.attrs |= {"scene": text, "scene_file": scene.name}
+    columns, files = measure_channels(mech, sol, measured), [out, plot]
+    for name, (values, unit) in columns.items():
+        data[name] = ("time", values, {"units": unit})
     save(data, out)
     trajectory(mech, sol).savefig(plot, dpi=150)
+    if columns:
+        files.append(plot.with_stem(f"{plot.stem}-channels"))
+        channels_figure(sol.ts, columns, title=mech.name).savefig(files[-1], dpi=150)
     found = accuracy(mech, sol)
     moved = () if t0 and mech.drivers else moves_of_assembly(mech, udk.assemble(mech, t0, throw=False).q)
     results = {
@@ -117,10 +128,10 @@ def simulate(
         **found._asdict(),
         "seconds": seconds["all"],
         "seconds_compiling": seconds["compiling"],
-        "files": [out, plot],
+        "files": files,
     }
     text = run_summary(mech, sol, found, seconds["all"], seconds["compiling"], moved)
-    show(results, f"{text}\nwrote {out} and {plot}", json)
+    show(results, f"{text}\nwrote {' and '.join(map(str, files))}", json)
     if sol.result:
         fail(sol.cause)
 

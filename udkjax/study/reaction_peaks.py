@@ -19,8 +19,9 @@ from jaxtyping import Array, Float, Int
 from udkjax.equations.reactions import reactions
 from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
+from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import Trajectory
+from udkjax.study.channels import Trajectory, has_point
 
 UNITS = units(force="N", rms_force="N", torque="N m", rms_torque="N m", force_time="s", torque_time="s")
 
@@ -76,6 +77,38 @@ def reaction_peaks(mechanism: Mechanism, solution: Trajectory, **choices: Any) -
     return {name: {body: _peak(ts, load) for body, load in loads.items()} for name, loads in found.items()}
 
 
+@checked
+def pin_reactions(mechanism: Mechanism, solution: Trajectory, **choices: Any) -> dict[str, dict[str, Float[Array, "T 3"]]]:
+    """Return the load at each pin on each body that meets there, in ground axes: `pin_reactions(mech, sol)["B"]["coupler"]`.
+
+    Where k bodies share a pin there are k - 1 joints, such as B, B-2: their loads on one body are added up.
+
+    Args:
+        mechanism: the mechanism.
+        solution: ts (T,), q and v (T, bodies, 3).
+        **choices: those of `reactions`: method, stabilization, compliances.
+
+    Returns:
+        Force x, force y (N), and the torque (N m) about the pin (T, 3), by pin and body. Joints without a point have no pin.
+    """
+    found: dict[str, dict[str, Array]] = {}
+    loads = reactions(mechanism, solution, **{"about": "joint", **choices})
+    for name, joint in mechanism.joints.items():
+        if has_point(joint):
+            at = found.setdefault(_pin_of(mechanism, name), {})
+            for body, load in loads[name].items():
+                at[body] = at[body] + load if body in at else load
+    return found
+
+
+def _pin_of(mechanism: Mechanism, joint: str) -> str:
+    """Return the first joint at the pin of a revolute: that without the number behind it, which drawings add."""
+    base, _, number = joint.rpartition("-")
+    pair = [mechanism.joints.get(name) for name in (base, joint)]
+    return base if number.isdigit() and all(isinstance(one, Revolute) for one in pair) else joint
+
+
+@checked
 def envelope(cases: Peaks | Sequence[Peaks]) -> dict[str, dict[str, Envelope]]:
     """Return the largest peaks over load cases; cases that failed are left out.
 

@@ -1,0 +1,75 @@
+"""`udkjax reactions`."""
+
+from pathlib import Path
+from typing import Any
+
+from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
+from udkjax.cli.datasets import PICTURES, check_target, write
+
+
+def reactions(
+    scene: Scene,
+    /,
+    t1: float,
+    t0: float = 0.0,
+    dt: float = 0.01,
+    out: Path | None = None,
+    plot: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Simulate a scene and find the forces at its pins, in ground axes; exit with 1 where the run fails.
+
+    Args:
+        scene: the mechanism.
+        t1: end of the run (s).
+        t0: start of the run (s).
+        dt: time between two instants (s).
+        out: file to write (.nc, .h5, .csv or .npz): fx, fy and torque (time) at each pin on each body.
+        plot: picture to write (.png, .svg, .pdf or .jpg): the size of the force at each pin over time.
+        json: write the results as JSON.
+    """
+    ts = output_times(t0, t1, dt)
+    check_target(out)
+    check_target(plot, PICTURES, "--plot")
+    mech, text = load(scene)
+    import numpy as np
+
+    import udkjax as udk
+    from udkjax.printing import PrintedTable, format_number, text_table
+    from udkjax.study.channels import LOADS
+
+    sol = udk.simulate(mech, ts, throw=False)
+    found = {pin: {body: np.asarray(x) for body, x in at.items()} for pin, at in udk.pin_reactions(mech, sol).items()}
+    if not found:
+        refuse("the scene has no joint that is at a point")
+    unique = udk.unique_reactions(mech, sol, about="joint")
+    parts = {pin: [x for name, x in unique.items() if name == pin or name.startswith(f"{pin}-")] for pin in found}
+    variables: dict[str, Any] = {}
+    rows: list[tuple[str, ...]] = []
+    results: dict[str, dict[str, Any]] = {}
+    for pin, at in found.items():
+        for body, x in at.items():
+            for k, (name, unit) in enumerate(LOADS.items()):
+                variables[f"pin.{pin}.{body}.{name}"] = (("time",), x[:, k], unit)
+            force = np.hypot(x[:, 0], x[:, 1])
+            top, size = int(np.nanargmax(force)) if np.isfinite(force).any() else 0, float(np.nanmax(force, initial=0.0))
+            known = all(
+                bool(np.asarray(by_body[body])[np.isfinite(force), :2].all()) for by_body in parts[pin] if body in by_body
+            )
+            cells = [format_number(value, scale=size) for value in (force[top], x[top, 0], x[top, 1])]
+            rows.append((pin, body, *cells, f"{ts[top]:g}", "" if known else "not unique: of least norm"))
+            peak = {"force": force[top], "fx": x[top, 0], "fy": x[top, 1], "time": ts[top], "unique": known}
+            results.setdefault(pin, {})[body] = peak
+    write(out, text, variables, {"time": ts}, {})
+    if plot is not None:
+        from udkjax.show.figures import reactions_figure
+
+        reactions_figure(ts, found, mech.name).savefig(plot, dpi=150)
+    heads = "pin", "on", "largest force (N)", "fx (N)", "fy (N)", "at (s)", ""
+    show(
+        {"result": sol.result, "peaks": results},
+        text_table(PrintedTable(f"{mech.name or 'mechanism'}, forces at its pins", rows, heads), len(rows)),
+        json,
+    )
+    if not sol.result.is_success:
+        fail(sol.cause)

@@ -1,0 +1,59 @@
+"""Figures of the command line: a driven motion, channels over time, and reactions."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from udkjax.extras import OptionalImport
+from udkjax.scene import Mechanism
+from udkjax.show.plots import draw_angles, draw_motion, draw_reactions
+from udkjax.show.style import COLOURS, DASHES, legend, plain
+from udkjax.study.kinematics import Kinematics
+
+with OptionalImport():
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def driven_figure(mech: Mechanism, motion: Kinematics, driver: str) -> Figure:
+    """Draw a mechanism over the values of a driver: its poses, and its angles."""
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    scene, angles = figure.subplots(1, 2)
+    q = np.asarray(motion.q)
+    draw_motion(scene, mech, q[np.isfinite(q).all((1, 2))])
+    draw_angles(angles, mech, motion.values, q)
+    angles.set_xlabel(f"{driver} ({motion.unit})")
+    figure.suptitle(mech.name)
+    return figure
+
+
+def draw_channels(axes: Axes, x: ArrayLike, channels: Mapping[str, Float[ArrayLike, "T"]], unit: str = "") -> Axes:
+    """Draw quantities of one unit under their names over time, or over the values of a driver."""
+    for k, (name, values) in enumerate(channels.items()):
+        axes.plot(np.asarray(x), np.asarray(values), DASHES[k % 4], color=COLOURS[k % len(COLOURS)], lw=1.3, label=name)
+    axes.set(ylabel=unit)
+    legend(axes)
+    return plain(axes)
+
+
+def channels_figure(
+    x: ArrayLike, channels: Mapping[str, tuple[ArrayLike, str]], label: str = "time (s)", title: str = ""
+) -> Figure:
+    """Draw quantities, each its values and its unit, under their names: one panel for each unit."""
+    kinds = list(dict.fromkeys(unit for _, unit in channels.values()))
+    figure = Figure(figsize=(8, 1.2 + 2.2 * len(kinds)), layout="constrained")
+    panels = np.ravel(figure.subplots(len(kinds), 1, sharex=True))
+    for axes, unit in zip(panels, kinds, strict=True):
+        draw_channels(axes, x, {name: values for name, (values, own) in channels.items() if own == unit}, unit)
+    panels[-1].set_xlabel(label)
+    figure.suptitle(title)
+    return figure
+
+
+def reactions_figure(ts: ArrayLike, loads: Mapping[str, Mapping[str, ArrayLike]], title: str = "") -> Figure:
+    """Draw the size of the force at each pin over time."""
+    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    draw_reactions(figure.subplots(), ts, loads)
+    figure.suptitle(title)
+    return figure
