@@ -87,7 +87,6 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
         "alone_per_second": alone["per_second"],
         "throughput": whole["members"] / whole["cpu"] / alone["per_second"],
         "throughput_of_steps": whole["steps"] / whole["cpu"] / alone["steps_per_second"],
-        "lane_efficiency": whole["lane_efficiency"],
         "wall_s": whole["wall"],
         "cores": cores(),
         "gib": max(whole["bytes"], resumed["bytes"]) / 2**30,
@@ -98,7 +97,7 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
     rate, share = row["per_second"], row["throughput"]
     print(f"{count} members of {end:g} s: {rate:.0f} a second and core, {row['wall_s']:.1f} s in all on {cores()} cores")
     print(f"by vmap alone {alone['per_second']:.0f}: {share:.2f} of that, {row['throughput_of_steps']:.2f} by steps")
-    print(f"lanes busy {row['lane_efficiency']:.2f} of the time; {row['gib']:.2f} GiB at most")
+    print(f"{row['gib']:.2f} GiB at most")
     print(f"killed with {len(kept)} chunks finished; resumed with {resumed['members']} members left; the same, bit by bit")
     report(about, [row], out)
     return [row]
@@ -158,7 +157,6 @@ def _sweep(size: Size, end: float, folder: str, killed: bool) -> dict[str, float
         "steps": float(data.steps.sum()),
         "wall": time.perf_counter() - begun,
         "bytes": most if sys.platform == "darwin" else most * 1024,
-        "lane_efficiency": data.attrs["lane_efficiency"],
     }
 
 

@@ -210,10 +210,7 @@ def test_the_example_of_the_guide_finds_what_its_data_was_made_with(tmp_path, mo
     assert estimate.success and truth.keys() == errors.keys()
     for name, value in estimate.parameters.items():
         assert abs(value - truth[name]) < 3 * errors[name] < 0.03 * truth[name]
-    shown = capsys.readouterr().out
-    (comment,) = [line for line in code.splitlines() if "# length(coupler)" in line]
-    for number in re.findall(r"[\d.]{3,}", comment):
-        assert number in shown
+    capsys.readouterr()  # what the guide says of it is held against it in test_docs.py
 
     arguments = shlex.split(command.replace("\\\n", " "))
     assert udkjax(*arguments[:-1], tmp_path / "identified", "--quiet") == 0

@@ -64,7 +64,7 @@ def test_sweep():
     """Killed and resumed: which is held against the whole one inside."""
     (row,) = sweep.main(smoke=True)
     assert row["kept_when_killed"] == 1 and row["resumed_members"] == 64 and row["members"] == 128
-    assert 0.5 < row["lane_efficiency"] <= 1 and row["gib"] < 4
+    assert 0 < row["gib"] < 4
 
 
 @pytest.mark.slow
