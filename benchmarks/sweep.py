@@ -141,7 +141,7 @@ def _sweep(size: Size, end: float, folder: str, killed: bool) -> dict[str, float
 
     def progress(status: Any) -> None:
         seen.append((status.done, time.process_time()))
-        if killed and status.done >= KILLED * status.members:
+        if killed and status.done >= KILLED * status.total:
             os.kill(os.getpid(), signal.SIGKILL)
 
     memory = MEMORY * int(np.prod(size))
