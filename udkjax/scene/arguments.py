@@ -6,6 +6,7 @@ real, finite and of the right sign. Of traced values the shapes and dtypes are c
 """
 
 import dataclasses
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
@@ -108,12 +109,12 @@ def _classes(annotation: Any) -> tuple[type, ...]:
 
 
 def _is_ours(x: type) -> bool:
-    return x.__module__.startswith("udkjax.") and (issubclass(x, eqx.Module) or hasattr(x, "_fields"))
+    return x.__module__.startswith("udkjax.") and not getattr(x, "_is_protocol", False)
 
 
 def _instance(classes: tuple[type, ...]) -> Check:
     kinds = (*classes, np.bool_) if bool in classes else classes
-    meant = " or ".join(_meant(x) for x in classes)
+    meant = " or ".join(_meant(x) for x in classes).removesuffix(",")
 
     def check(name: str, value: Any, given: Given):
         if not isinstance(value, kinds):
@@ -350,7 +351,7 @@ def _given(check: Check) -> Check:
 
     def applied(name: str, value: Any, given: Given):
         if value is None:
-            raise TypeError(f"{name} must be given, {describe(value)}")
+            raise ArgumentTypeError(f"{name} must be given, {describe(value)}")
         check(name, value, given)
 
     return applied
@@ -372,23 +373,60 @@ def _require_array(name: str, value: Any, given: Given) -> None:
 
 def _require_mapping(name: str, value: Any, given: Given) -> None:
     if value is not None and not isinstance(value, Mapping):
-        raise TypeError(f"{name} must map names to numbers, such as {{name: number}}, {describe(value)}")
+        raise ArgumentTypeError(f"{name} must map names to numbers, such as {{name: number}}, {describe(value)}")
 
 
 def _require_point(name: str, value: Any, given: Given) -> None:
     if "of" in given and (value is None or np.shape(value) != (2,)):
         return  # `path` knows the points of pins, and says what a shape should be
     if array(name, value).shape != (2,):
-        raise ValueError(f"{name} must be two numbers, x and y in m, {describe(value)}")
+        raise ArgumentError(f"{name} must be two numbers, x and y in m, {describe(value)}")
     require_finite(name, value)
 
 
 def _require_names(name: str, value: Any, given: Given) -> None:
     if not isinstance(value, str) and not (isinstance(value, list | tuple) and all(isinstance(x, str) for x in value)):
-        raise TypeError(f"{name} must be the name of a body, or a list of names, {describe(value)}")
+        raise ArgumentTypeError(f"{name} must be the name of a body, or a list of names, {describe(value)}")
+
+
+def _require_drivers(name: str, value: Any, given: Given) -> None:
+    """Names of drivers with their values, or, where they have none here, names alone."""
+    if isinstance(value, Mapping):
+        for driver, values in value.items():
+            require_finite(f"{name}[{driver!r}]", values)
+    elif "body" in given or isinstance(value, str | np.ndarray) or not isinstance(value, Sequence | None):
+        meant = "map two drivers to their values" if "body" in given else "be a list of names"
+        raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
+
+
+def _require_path(name: str, value: Any, given: Given) -> None:
+    if value is not None and not isinstance(value, str | os.PathLike):
+        raise ArgumentTypeError(f"{name} must be a path, or None, {describe(value)}")
+
+
+def _require_client(name: str, value: Any, given: Given) -> None:
+    if value is not None and (isclass(value) or not hasattr(value, "submit")):
+        raise ArgumentTypeError(f"{name} must be a dask.distributed.Client, or None, {describe(value)}")
+
+
+def _require_parameters(name: str, value: Any, given: Given) -> None:
+    """What is to be identified: a name, an object that stands for one, or a list of these."""
+    if not isinstance(value, str | list | tuple) and not callable(value) and not dataclasses.is_dataclass(value):
+        raise ArgumentTypeError(f"{name} must be the name of a parameter, a Parameter, or a list of these, {describe(value)}")
+
+
+def _require_texts(name: str, value: Any, given: Given) -> None:
+    if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(x, str) for x in value):
+        raise ArgumentTypeError(f"{name} must be a list of names, {describe(value)}")
 
 
 CHECKS: dict[str, Check] = {
+    "out": _require_path,
+    "memory": _optional(require_count),
+    "drivers": _require_drivers,
+    "parameters": _require_parameters,
+    "ignore": _require_texts,
+    "client": _require_client,
     "mechanism": _check_mechanism,
     "method": _check_thresholds,
     "stabilization": _check_thresholds,

@@ -163,6 +163,8 @@ def inverse_dynamics(
     joints = without_drivers(mechanism)
     analysis = analyse(joints)
     q, v, a = (jnp.asarray(x) for x in (motion.q, motion.v, motion.a))
+    if len(q) != len(ts):
+        raise ValueError(f"motion has {len(q)} states, and ts {len(ts)} times: give the times of the motion")
     efforts, rates, residual = _efforts(joints.without_origin, analysis, values, w, ts, q, v, a)
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     return InverseDynamics(ts, found, columns, {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}, residual)

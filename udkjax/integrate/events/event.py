@@ -261,7 +261,7 @@ def _check(event: Event, mechanism: Mechanism) -> None:
         if sees_velocity(event, mechanism):
             raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
         require_restitution(f"{where}: the restitution", action.restitution)
-        if action.at_rest not in ("hold", "stop"):
+        if not isinstance(action.at_rest, str) or action.at_rest not in ("hold", "stop"):
             raise ValueError(f'{where}: at_rest must be "hold" or "stop", is {action.at_rest!r}')
     elif isinstance(action, Lock):
         require_name_text(f"{where}: the joint of Lock", action.joint)
