@@ -175,7 +175,7 @@ def test_plain_LU_on_redundant_rows():
     """A joint given twice: the first right-hand side is not a number, and the run says so."""
     single = udk.library.compound_pendulum()
     mech = udk.Mechanism(single.bodies, {"pin": single.joints["pin"], "again": single.joints["pin"]})
-    with pytest.raises(udk.SimulationError, match=r"not finite at t = 0 s.*redundant joints"):
+    with pytest.raises(udk.SimulationError, match=r"not finite at t = 0 s: .*plain LU, and they are singular: 4 rows of rank 2"):
         tsit5(mech, udk.Augmented())
 
 

@@ -130,8 +130,6 @@ def _split_by_body(
     about: About,
 ) -> ByBody:
     """Split the loads of rows by joints and bodies, (rows, T, 3) each, in other axes and about another point."""
-    if frame not in ("ground", "body", "joint") or about not in ("centre", "joint"):
-        raise ValueError(f'frame is "ground", "body" or "joint", not {frame!r}; about is "centre" or "joint", not {about!r}')
     places = {name: k for k, name in enumerate(mechanism.body_names)}
     seen = {name: _frame(q, place) for name, place in places.items()} | {GROUND: GROUND_FRAME}
     found: ByBody = {}

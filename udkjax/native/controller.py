@@ -128,7 +128,8 @@ def first_step(t: Module, f: Function, s: Lane) -> Value:
         def both(r: Value) -> list[Value]:
             per_unit, found = t.vector(f, "inverse unit", r), []
             for name, y, per in ((of_q, "X q", per_unit), (of_v, "O v", per_unit / omega)):
-                x = f.max(f.abs(t.vector(f, name, r)) * per, f.const(least, DOUBLE, t.plan.vector))
+                floor = f.select(per > 0.0, f.const(least, DOUBLE, t.plan.vector), 0.0)  # none of what fills up a register
+                x = f.max(f.abs(t.vector(f, name, r)) * per, floor)
                 found.append(x / f.fma(rtol, f.abs(t.vector(f, y, r)) * per, atol))
             return found
 

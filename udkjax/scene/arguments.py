@@ -409,6 +409,11 @@ def _require_client(name: str, value: Any, given: Given) -> None:
         raise ArgumentTypeError(f"{name} must be a dask.distributed.Client, or None, {describe(value)}")
 
 
+def _require_optimizer(name: str, value: Any, given: Given) -> None:
+    if value is not None and not isinstance(value, str) and (isclass(value) or not hasattr(value, "init")):
+        raise ArgumentTypeError(f"{name} must be an optimizer of optax's, a solver of optimistix's, or None, {describe(value)}")
+
+
 def _require_parameters(name: str, value: Any, given: Given) -> None:
     """What is to be identified: a name, an object that stands for one, or a list of these."""
     if not isinstance(value, str | list | tuple) and not callable(value) and not dataclasses.is_dataclass(value):
@@ -427,6 +432,7 @@ CHECKS: dict[str, Check] = {
     "parameters": _require_parameters,
     "ignore": _require_texts,
     "client": _require_client,
+    "optimizer": _require_optimizer,
     "mechanism": _check_mechanism,
     "method": _check_thresholds,
     "stabilization": _check_thresholds,

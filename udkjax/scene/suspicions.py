@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
+import jax
 import numpy as np
 
 from udkjax.scene.bodies import GROUND
@@ -23,6 +24,7 @@ def suspicions(mechanism: Mechanism) -> list[str]:
 
 def body_sizes(mechanism: Mechanism) -> dict[str, float]:
     """Return how far each body reaches from its centre of mass (m): to its farthest point, or twice its radius of gyration."""
+    mechanism = jax.tree.map(np.asarray, mechanism)  # by NumPy: JAX would trace known numbers while something else is traced
     return {
         name: max(2 * _gyration(body), *(_length(p) for _, p in attachments(mechanism, name)), 0.0)
         for name, body in mechanism.bodies.items()
