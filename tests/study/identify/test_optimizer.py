@@ -1,11 +1,11 @@
 """Fits by optimizers of optax: the minimum of least squares, and those of other losses."""
 
 from functools import partial
-from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
 import optax
+import optimistix
 import pytest
 
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
@@ -80,4 +80,4 @@ def test_identify_takes_them(noisy):
         estimate = identify(first, record, NAMES, progress=False, **choices)
         assert estimate.converged and estimate.values == pytest.approx(squares.values, rel=1e-5)
     with pytest.raises(IdentificationError, match="give an optimizer of optax"):
-        identify(first, record, NAMES, progress=False, loss=jnp.sum, optimizer=cast(Any, 3))
+        identify(first, record, NAMES, progress=False, loss=jnp.sum, optimizer=optimistix.LevenbergMarquardt(1e-6, 1e-6))
