@@ -30,9 +30,10 @@ from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
-from udkjax.scene.arguments import checked, describe, require_output_times
+from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number, optional_number
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.requirements import describe, require_output_times
 
 if TYPE_CHECKING:
     import diffrax

@@ -32,11 +32,11 @@ from udkjax.integrate.events.checks import (
 )
 from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_of, joint_coordinate, require_name
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
-from udkjax.scene.arguments import describe
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.fields import Number, number
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.requirements import describe
 
 
 class Event(PrintsLine):

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from udkjax.scene import Mechanism
-from udkjax.scene.arguments import checked, require_history, require_mechanism
+from udkjax.scene.arguments import checked, require_mechanism
+from udkjax.scene.requirements import require_history
 from udkjax.show.player import pictures
 from udkjax.show.player.marks import Shapes
 from udkjax.show.player.measures import Measures, Trajectory

@@ -1,0 +1,201 @@
+"""What arguments of these names must be in every public function, whatever their annotations say."""
+
+import dataclasses
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from inspect import isclass
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.requirements import (
+    ArgumentError,
+    ArgumentTypeError,
+    Check,
+    Given,
+    array,
+    describe,
+    require_coordinates,
+    require_count,
+    require_finite,
+    require_history,
+    require_number,
+    require_times,
+)
+
+
+def _check_state(name: str, value: Any, given: Given) -> None:
+    if value is not None:
+        value = getattr(value, "state", value)  # a closure has one
+        for part in ("q", "v"):
+            require_coordinates(f"{name}.{part}", getattr(value, part), given, flat=False)
+        shapes = np.shape(value.q), np.shape(value.v)
+        if shapes[0] != shapes[1]:
+            raise ArgumentError(f"{name}.v must have the shape of {name}.q, {shapes[0]}; it has the shape {shapes[1]}")
+
+
+def _check_mechanism(name: str, value: Any, given: Given) -> None:
+    if isinstance(value, Mechanism) and (shape := np.shape(value.gravity)) != (2,):
+        cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
+        raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
+
+
+def _check_thresholds(name: str, value: Any, given: Given) -> None:
+    """The thresholds of a pseudoinverse, or the gains of a stabilization."""
+    for field in dataclasses.fields(value) if isinstance(value, eqx.Module) else ():
+        x = getattr(value, field.name)
+        if eqx.is_array(x) or isinstance(x, float):
+            require_number(f"{name}.{field.name}", x, "not negative")
+
+
+def _optional_history(name: str, value: Any, given: Given) -> None:
+    if value is not None:
+        require_history(name, value, given)
+
+
+def _check_analysis(name: str, value: Any, given: Given) -> None:
+    mechanism = given.get("mechanism")
+    if value is None or not isinstance(mechanism, Mechanism):
+        return
+    owners = list(dict.fromkeys(owner for owner, _ in value.row_names))
+    if value.coordinates != 3 * len(mechanism.body_names) or owners != list(mechanism.constraints):
+        raise ArgumentError(f"{name} is that of another mechanism: give udk.analyse(mechanism), or leave it out")
+
+
+def _of_diffrax(kind: str, example: str) -> Check:
+    def check(name: str, value: Any, given: Given):
+        diffrax = sys.modules.get("diffrax")  # who has an instance of its classes has imported it
+        if value is not None and not (diffrax and isinstance(value, getattr(diffrax, kind))):
+            meant = f"an instance of diffrax's, such as {name}={example}, or None"
+            raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}")
+
+    return check
+
+
+def required(check: Check) -> Check:
+    """Return the check of an argument that must not be None, by one that lets None pass."""
+
+    def applied(name: str, value: Any, given: Given):
+        if value is None:
+            raise ArgumentTypeError(f"{name} must be given, {describe(value)}")
+        check(name, value, given)
+
+    return applied
+
+
+def _optional(check: Callable[..., None], **choices: Any) -> Check:
+    """Return the check of an argument that may be None."""
+
+    def applied(name: str, value: Any, given: Given):
+        if value is not None:
+            check(name, value, **choices)
+
+    return applied
+
+
+def _require_array(name: str, value: Any, given: Given) -> None:
+    require_finite(name, value)
+
+
+def _require_mapping(name: str, value: Any, given: Given) -> None:
+    if value is not None and not isinstance(value, Mapping):
+        raise ArgumentTypeError(f"{name} must map names to numbers, such as {{name: number}}, {describe(value)}")
+
+
+def _require_point(name: str, value: Any, given: Given) -> None:
+    if "of" in given and (value is None or np.shape(value) != (2,)):
+        return  # `path` knows the points of pins, and says what a shape should be
+    if array(name, value).shape != (2,):
+        raise ArgumentError(f"{name} must be two numbers, x and y in m, {describe(value)}")
+    require_finite(name, value)
+
+
+def _require_names(name: str, value: Any, given: Given) -> None:
+    if not isinstance(value, str) and not (isinstance(value, list | tuple) and all(isinstance(x, str) for x in value)):
+        raise ArgumentTypeError(f"{name} must be the name of a body, or a list of names, {describe(value)}")
+
+
+def _require_drivers(name: str, value: Any, given: Given) -> None:
+    """Names of drivers with their values, or, where they have none here, names alone."""
+    if isinstance(value, Mapping):
+        for driver, values in value.items():
+            require_finite(f"{name}[{driver!r}]", values)
+    elif "body" in given or isinstance(value, str | np.ndarray) or not isinstance(value, Sequence | None):
+        meant = "map two drivers to their values" if "body" in given else "be a list of names"
+        raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
+
+
+def _require_path(name: str, value: Any, given: Given) -> None:
+    if value is not None and not isinstance(value, str | os.PathLike):
+        raise ArgumentTypeError(f"{name} must be a path, or None, {describe(value)}")
+
+
+def _require_client(name: str, value: Any, given: Given) -> None:
+    if value is not None and (isclass(value) or not hasattr(value, "submit")):
+        raise ArgumentTypeError(f"{name} must be a dask.distributed.Client, or None, {describe(value)}")
+
+
+def _require_optimizer(name: str, value: Any, given: Given) -> None:
+    if value is not None and not isinstance(value, str) and (isclass(value) or not hasattr(value, "init")):
+        raise ArgumentTypeError(f"{name} must be an optimizer of optax's, a solver of optimistix's, or None, {describe(value)}")
+
+
+def _require_parameters(name: str, value: Any, given: Given) -> None:
+    """What is to be identified: a name, an object that stands for one, or a list of these."""
+    if not isinstance(value, str | list | tuple) and not callable(value) and not dataclasses.is_dataclass(value):
+        raise ArgumentTypeError(f"{name} must be the name of a parameter, a Parameter, or a list of these, {describe(value)}")
+
+
+def _require_texts(name: str, value: Any, given: Given) -> None:
+    if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(x, str) for x in value):
+        raise ArgumentTypeError(f"{name} must be a list of names, {describe(value)}")
+
+
+CHECKS: dict[str, Check] = {
+    "out": _require_path,
+    "memory": _optional(require_count),
+    "drivers": _require_drivers,
+    "parameters": _require_parameters,
+    "ignore": _require_texts,
+    "client": _require_client,
+    "optimizer": _require_optimizer,
+    "mechanism": _check_mechanism,
+    "method": _check_thresholds,
+    "stabilization": _check_thresholds,
+    "t": _optional(require_number),
+    "ts": _optional(require_times),
+    "q": require_coordinates,
+    "v": require_coordinates,
+    "state": _check_state,
+    "solution": _optional_history,
+    "motion": _optional_history,
+    "analysis": _check_analysis,
+    "rtol": _optional(require_number, sign="not negative"),
+    "atol": _optional(require_number, sign="not negative"),
+    "drift_tol": _optional(require_number, sign="positive", infinite=True),
+    "rank_tol": _optional(require_number, sign="not negative"),
+    "time_tol": _optional(require_number, sign="positive"),
+    "dt0": _optional(require_number, sign="positive"),
+    "max_steps": _optional(require_count),
+    "max_events": _optional(require_count),
+    "starts": _optional(require_count),
+    "seed": _optional(require_count, least=0),
+    "values": _require_array,
+    "axes": _require_mapping,
+    "rate": _require_array,
+    "acceleration": _require_array,
+    "value": _optional(require_number),
+    "length": _optional(require_number, sign="positive"),
+    "angle": _optional(require_number),
+    "angular_velocity": _optional(require_number),
+    "held": _require_mapping,
+    "weights": _require_mapping,
+    "compliances": _require_mapping,
+    "point": _require_point,
+    "bodies": _require_names,
+    "solver": _of_diffrax("AbstractSolver", "diffrax.Tsit5()"),
+    "adjoint": _of_diffrax("AbstractAdjoint", "diffrax.ForwardMode()"),
+}

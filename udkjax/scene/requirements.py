@@ -1,0 +1,161 @@
+"""What arguments must be: real, finite, of a shape and a sign; and the errors that say which was not, with what was given."""
+
+from collections.abc import Callable, Mapping, Sequence
+from inspect import isclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.checks import abbreviate, quote
+from udkjax.scene.mechanism import Mechanism
+
+Given = Mapping[str, Any]  # all arguments of a call by name, defaults among them
+Check = Callable[[str, Any, Given], None]
+Sign = Literal["any", "positive", "not negative"]
+
+
+class ArgumentError(ValueError):
+    """An argument of a public function cannot be used; the message names it, what was given and what is meant."""
+
+
+class ArgumentTypeError(ArgumentError, TypeError):
+    """It is of a wrong type."""
+
+
+def describe(value: Any) -> str:
+    """Return what a value is, for the end of a message: 'not the class SVD', 'not "SVD", a text'."""
+    if isclass(value):
+        return f"not the class {value.__name__}"
+    if isinstance(value, str):
+        return f"not the text {abbreviate(value)}"
+    if value is None or isinstance(value, bool | int | float):
+        return f"not {value}"
+    kind = type(value).__name__
+    shape = f" of the shape {np.shape(value)}" if isinstance(value, np.ndarray | jax.Array) else ""
+    return f"not {article(kind)} {kind}{shape}"
+
+
+def article(noun: str) -> str:
+    """Return "a" or "an", as a noun takes it."""
+    return "an" if noun[0].lower() in "aeiou" else "a"
+
+
+def array(name: str, value: Any) -> "np.ndarray | Tracer":
+    """Return real numbers as an array; a traced one as it is. Raises TypeError where they are none, and names the argument."""
+    if isinstance(value, Tracer):
+        found: Any = value
+    elif any(isinstance(x, Tracer) for x in jax.tree.leaves(value)):
+        found = jnp.asarray(value)  # a list of traced numbers
+    else:
+        try:
+            found = np.asarray(value)
+        except ValueError:
+            raise ArgumentTypeError(f"{name} must be an array of numbers; its rows have different lengths") from None
+        except TypeError:
+            raise ArgumentTypeError(f"{name} must be an array of numbers, {describe(value)}") from None
+    if not (jnp.issubdtype(found.dtype, jnp.floating) or jnp.issubdtype(found.dtype, jnp.integer)):
+        kind = "complex numbers" if jnp.issubdtype(found.dtype, jnp.complexfloating) else None
+        raise ArgumentTypeError(f"{name} must be real numbers, {f'not {kind}' if kind else describe(value)}")
+    return found
+
+
+def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = False) -> None:
+    """Require one real number, finite unless said otherwise, of a sign; of a traced one, the shape and the dtype alone."""
+    found = array(name, value)
+    if found.shape != ():
+        cure = "a batch is for jax.vmap, or for udk.sweep"
+        raise ArgumentError(f"{name} must be one number, not an array of the shape {found.shape}; {cure}")
+    if isinstance(found, Tracer):
+        return
+    x = float(found)
+    bad = np.isnan(x) or (np.isinf(x) and not infinite)
+    if bad or (sign == "positive" and not x > 0) or (sign == "not negative" and not x >= 0):
+        meant = {"any": "a finite number", "positive": "positive", "not negative": "zero or positive"}[sign]
+        raise ArgumentError(f"{name} must be {meant}{' and finite' if sign != 'any' and not infinite else ''}, not {x:g}")
+
+
+def require_count(name: str, value: Any, least: int = 1) -> None:
+    """Require a whole number that is not below `least`; of a traced one, the shape and the dtype alone."""
+    found = None if isinstance(value, bool | np.bool_) else array(name, value)
+    if found is None or found.shape != () or not jnp.issubdtype(found.dtype, jnp.integer):
+        raise ArgumentTypeError(f"{name} must be a whole number, {describe(value)}")
+    if not isinstance(found, Tracer) and int(found) < least:
+        raise ArgumentError(f"{name} must be at least {least}, not {int(found)}")
+
+
+def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "") -> None:
+    """Require finite numbers where they are known; `place` says in words which entry it is."""
+    found = array(name, value)
+    if isinstance(found, Tracer) or (finite := np.isfinite(found)).all():
+        return
+    index = tuple(int(k) for k in np.argwhere(~finite)[0])
+    where = f"[{', '.join(map(str, index))}]" if index else ""
+    raise ArgumentError(f"{name}{where} is {found[index]:g}{place(*index)}: it must be finite")
+
+
+def require_coordinates(name: str, value: Any, given: Given, flat: bool = True) -> None:
+    """Require x, y and angle of each body of the mechanism, or their rates, (bodies, 3); or (n,), if `flat`."""
+    mechanism, found = given["mechanism"], array(name, value)
+    if not isinstance(mechanism, Mechanism):  # a system of the user's own has coordinates as many as he gives
+        if found.ndim != 1:
+            raise ArgumentError(f"{name} must be a vector (n,), not an array of the shape {found.shape}")
+        require_finite(name, value)
+        return
+    names = mechanism.body_names
+    right = (len(names), 3)
+    if found.shape != right and not (flat and found.shape == (3 * len(names),)):
+        rest = f": x, y and angle of {', '.join(map(quote, names[:4]))}{', ...' if len(names) > 4 else ''}"
+        cure = "; a batch of states is for jax.vmap" if found.ndim > 2 and found.shape[-2:] == right else ""
+        raise ArgumentError(f"{name} must have the shape {right}{rest}; it has the shape {found.shape}{cure}")
+    require_finite(name, found, lambda *k: _place(names, k))
+
+
+def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
+    body, coordinate = index if len(index) == 2 else divmod(index[0], 3)
+    return f" ({COORDINATES[coordinate]} of {quote(names[body])})"
+
+
+def require_times(name: str, value: Any) -> None:
+    """Require a vector of finite times; of a traced one, the shape alone."""
+    found = array(name, value)
+    if found.ndim != 1 or not len(found):
+        raise ArgumentError(f"{name} must be a vector of times in s; its shape is {found.shape}")
+    require_finite(name, found)
+
+
+def require_output_times(name: str, value: Any) -> None:
+    """Require at least two finite times, each after the one before; of traced ones, the shape alone."""
+    found = array(name, value)
+    if found.ndim != 1 or len(found) < 2:
+        what = "a vector of at least two output times, from the start on"
+        raise ArgumentError(f"{name} must be {what}; its shape is {found.shape}")
+    require_finite(name, found)
+    if not isinstance(found, Tracer) and not np.all(steps := np.diff(found) > 0):
+        k = int(np.argmin(steps))
+        after = f"{name}[{k + 1}] = {found[k + 1]:g} s follows {found[k]:g} s"
+        raise ArgumentError(f"{name} must increase from each output time to the next: {after}")
+
+
+def require_history(name: str, value: Any, given: Given) -> None:
+    """Require a solution, or whatever has times ts (T,) and states q and v (T, bodies, 3) of the mechanism."""
+    mechanism = given["mechanism"]
+    missing = [part for part in ("ts", "q", "v") if not hasattr(value, part)]
+    if missing or isclass(value):
+        raise ArgumentTypeError(f"{name} must have times and states, ts, q and v, as a Solution: {describe(value)}")
+    bodies = getattr(value, "bodies", None)
+    if isinstance(mechanism, Mechanism) and isinstance(bodies, tuple) and bodies and bodies != mechanism.body_names:
+        listed = [", ".join(map(quote, x[:6])) + (", ..." if len(x) > 6 else "") for x in (bodies, mechanism.body_names)]
+        raise ArgumentError(f"{name} is of another mechanism: its bodies are {listed[0]}, those of the mechanism {listed[1]}")
+    ts, q, v = (array(f"{name}.{part}", getattr(value, part)) for part in ("ts", "q", "v"))
+    right = (*ts.shape, len(mechanism.body_names), 3) if isinstance(mechanism, Mechanism) else q.shape
+    if q.ndim == 4:
+        one, all_of_them = "jax.tree.map(lambda x: x[0], batch)", "jax.vmap(lambda one: function(mechanism, one))(batch)"
+        raise ArgumentError(f"{name} is a batch of {len(q)} solutions: take one of them, {one}, or map over them, {all_of_them}")
+    if ts.ndim != 1 or q.shape[:1] != ts.shape or q.shape != right or v.shape != q.shape:
+        meant = "ts (T,), q and v (T, bodies, 3)" if isinstance(mechanism, Mechanism) else "ts (T,), q and v (T, n)"
+        is_of = f" of {len(mechanism.body_names)} bodies" if isinstance(mechanism, Mechanism) else ""
+        raise ArgumentError(f"{name} must have {meant}{is_of}; the shapes are {ts.shape}, {q.shape} and {v.shape}")
