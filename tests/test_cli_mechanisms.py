@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -108,7 +109,7 @@ def test_reactions_at_pins_carry_what_moves(tmp_path, capsys):
     rows = list(csv.DictReader(out.open()))
     for pin, at in found["peaks"].items():
         for body, peak in at.items():
-            force = [np.hypot(*(float(row[f"pin.{pin}.{body}.{c} [N]"]) for c in ("fx", "fy"))) for row in rows]
+            force = [math.hypot(*(float(row[f"pin.{pin}.{body}.{c} [N]"]) for c in ("fx", "fy"))) for row in rows]
             assert peak["force"] == pytest.approx(max(force))
 
 

@@ -3,6 +3,7 @@
 import inspect
 import re
 from html.parser import HTMLParser
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -31,6 +32,10 @@ class Balance(HTMLParser):
         assert self.open.pop() == tag
 
 
+def anything(*arguments: Any) -> Any:
+    """Stand for a function of the user's own."""
+
+
 def cells(text: str) -> list[list[str]]:
     Balance(text)
     return [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", text)]
@@ -54,15 +59,15 @@ def objects() -> dict[str, object]:
         *(run, run.events, udk.assemble(free), udk.check(free), udk.analyse(free), udk.energy(free, run)),
         *(motion, udk.travel(linkage, "joint.C.angle"), rest, udk.modes(free, rest.state), driven, udk.power_balance(free, run)),
         *(udk.diagnose(free), udk.explain(free), _workspace()),
-        *(udk.Baumgarte(), udk.Projection(), udk.Coordinate(("ground", "a")), udk.Event(len, udk.Stop())),
+        *(udk.Baumgarte(), udk.Projection(), udk.Coordinate(("ground", "a")), udk.Event(anything, udk.Stop())),
         *(udk.JointLimit("a", 0.1), udk.Contact("a"), udk.Impact(0.5), udk.Release("a"), udk.Lock("a")),
-        *(udk.Attach(JOINTS["weld"], "a"), udk.Start(), udk.Parameter("body.a.mass"), udk.Quantity("x", len)),
+        *(udk.Attach(JOINTS["weld"], "a"), udk.Start(), udk.Parameter("body.a.mass"), udk.Quantity("x", anything)),
         *(udk.Record(ts, {"body.a.x": ts}), udk.Candidate({"a": ts}), udk.Axis(ts), udk.Zipped({"a": udk.Axis(ts)})),
         *(udk.Sobol(4), udk.LatinHypercube(4), udk.Random(4), udk.Point(1.0, 2.0), free.bodies[free.body_names[0]].frame()),
         *(method() for method in (udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination, udk.Auto)),
         *(kind() for kind in (udk.Augmented, udk.NullSpaceQR, udk.NullSpaceSVD, udk.CoordinatePartitioning)),
         *(udk.Stop(), udk.Log(), udk.Verner65(), udk.Adams(), udk.BDF(), run.result, udk.Reached.lost),
-        udk.ConstrainedSystem(mass=jnp.diag, force=len),
+        udk.ConstrainedSystem(mass=jnp.diag, force=anything),
         *(part for joint in JOINTS.values() for part in vars(joint).values() if isinstance(part, udk.Profile)),
         *(drawing, drawing.links["bar"]),
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import numpy as np
@@ -121,7 +122,7 @@ def test_what_drivers_cannot_reach_is_given_up_soon(monkeypatch, large):
     choose, solved = redundancy.kinematic_rows, []
 
     def counted(mechanism):
-        rows = choose(mechanism, large)
+        rows: Any = choose(mechanism, large)
         correction = rows.correction
         rows.correction = lambda t, q: solved.append(t) or correction(t, q)
         return rows

@@ -1,5 +1,7 @@
 """Paths, velocities and accelerations of points and pins, by any name and in every transformation."""
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ import udkjax as udk
 from udkjax.study.channel_values import measure
 from udkjax.study.channels import channel_of
 
+ORDERS: tuple[Literal[0, 1, 2], ...] = (0, 1, 2)  # positions, velocities, accelerations
 TIP = (0.3, -0.1)
 TS = np.linspace(0.0, 0.2, 41)
 
@@ -31,7 +34,7 @@ def test_a_path_is_where_the_point_is_and_its_derivatives_are_its_rates(linkage)
     turned = np.stack(
         [np.cos(q[:, 2]) * TIP[0] - np.sin(q[:, 2]) * TIP[1], np.sin(q[:, 2]) * TIP[0] + np.cos(q[:, 2]) * TIP[1]], 1
     )
-    x, v, a = (np.asarray(udk.path(mech, sol, "coupler", TIP, derivative=k)) for k in range(3))
+    x, v, a = (np.asarray(udk.path(mech, sol, "coupler", TIP, derivative=k)) for k in ORDERS)
     assert_allclose(x, q[:, :2] + turned, rtol=0, atol=1e-14)
     assert_allclose(sol.path("coupler", TIP), x, rtol=0, atol=1e-14)
     assert_allclose(v[2:-2], slope(x), rtol=0, atol=1e-6 * np.abs(v).max())
@@ -41,7 +44,7 @@ def test_a_path_is_where_the_point_is_and_its_derivatives_are_its_rates(linkage)
 def test_a_pin_is_where_both_of_its_bodies_have_it(linkage):
     mech, sol = linkage
     for name, joint in mech.joints.items():
-        for k in range(3):
+        for k in ORDERS:
             one, other = (
                 np.asarray(udk.path(mech, sol, f"body.{body}", point, derivative=k))
                 for body, point in zip(joint.bodies, joint.points, strict=True)
@@ -54,7 +57,7 @@ def test_a_pin_is_where_both_of_its_bodies_have_it(linkage):
 def test_the_accelerations_of_a_kinematic_motion_are_its_own():
     mech = udk.library.slider_crank(angular_velocity=3.0)
     motion = udk.kinematics(mech, None, TS)
-    x, v, a = (np.asarray(udk.path(mech, motion, "P", derivative=k)) for k in range(3))
+    x, v, a = (np.asarray(udk.path(mech, motion, "P", derivative=k)) for k in ORDERS)
     assert_allclose(v[2:-2], slope(x), rtol=0, atol=1e-6 * np.abs(v).max())
     assert_allclose(a[2:-2], slope(v), rtol=0, atol=1e-5 * np.abs(a).max())
     assert_allclose(motion.path("crank", TIP), udk.path(mech, motion, "crank", TIP), rtol=0, atol=1e-14)

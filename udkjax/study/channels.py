@@ -77,6 +77,10 @@ class Quantity:
     function: Callable[[Mechanism, Trajectory], Float[Array, "T"]]
     units: str = ""
 
+    def __repr__(self) -> str:
+        function = getattr(self.function, "__name__", type(self.function).__name__)
+        return f"Quantity(name={self.name!r}, function={function}, units={self.units!r})"
+
     def __str__(self) -> str:
         return self.name
 

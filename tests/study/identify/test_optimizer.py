@@ -1,6 +1,7 @@
 """Fits by optimizers of optax: the minimum of least squares, and those of other losses."""
 
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
