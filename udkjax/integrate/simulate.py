@@ -33,7 +33,7 @@ from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number, optional_number
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import describe, require_output_times
+from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
 
 if TYPE_CHECKING:
     import diffrax
@@ -127,7 +127,7 @@ def simulate(
     require_output_times("ts", ts)
     rtol, atol, ts = number(rtol), number(atol), number(ts)
     if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and float(rtol) + float(atol) < LEAST_ATOL:
-        raise ValueError(f"rtol = {rtol:g} and atol = {atol:g} are below rounding, which no step can meet: raise one of them")
+        raise ArgumentError(f"rtol = {rtol:g} and atol = {atol:g} are below rounding, which no step can meet: raise one of them")
     if state is None and isinstance(mechanism, ConstrainedSystem):
         raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
     drift = number((DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE) if drift_tol is None else drift_tol)
@@ -325,6 +325,6 @@ def _meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":
     import diffrax
 
     if not isinstance(progress, bool | diffrax.AbstractProgressMeter):
-        raise TypeError(f"progress must be True, False or a progress meter of diffrax's, {describe(progress)}")
+        raise ArgumentTypeError(f"progress must be True, False or a progress meter of diffrax's, {describe(progress)}")
     meter: Any = diffrax.TextProgressMeter() if progress is True else progress
     return None if isinstance(meter, diffrax.NoProgressMeter) else meter

@@ -138,7 +138,7 @@ def test_lanes_are_busy_and_a_sweep_takes_what_a_plain_batch_takes(spread):
     for candidate in candidates:
         candidate()
     # The least of several, in turn: waiting for a thread that another program keeps from its core counts as time of this one.
-    # Eight chunks are cut, called and joined in Python: 1.09 times the plain batch on an idle machine, 1.20 on a busy one.
+    # Eight chunks are cut, called and joined in Python: 1.09 to 1.20 times the plain batch on a busy machine.
     times = np.array([[cpu(candidate) for candidate in candidates] for _ in range(9)])
     assert times[:, 0].min() < 1.3 * times[:, 1].min(), times
 
