@@ -16,7 +16,7 @@ from udkjax.extras import EXTRAS
 
 ROOT = Path(udkjax.__file__).parent
 
-GROUND_FLOOR = {"annotations", "deprecation", "extras", "printing"}  # every floor may import them
+GROUND_FLOOR = {"annotations", "extras", "printing"}  # every floor may import them
 BELOW = {
     **{module: set() for module in GROUND_FLOOR},
     "expressions": set(),
@@ -207,13 +207,6 @@ def test_every_optional_package_has_its_extra():
     }  # comes with it
     for package, extra in EXTRAS.items():
         assert transitive.get(package, package) in extras[extra]
-
-
-def test_an_old_name_works_and_warns_of_the_new_one(monkeypatch):
-    monkeypatch.setitem(udkjax._RENAMED, "Mechanismus", "udkjax.scene.Mechanism")
-    with pytest.warns(DeprecationWarning, match=r"udkjax\.Mechanismus is now udkjax\.scene\.Mechanism") as seen:
-        assert udkjax.Mechanismus is udkjax.Mechanism
-    assert seen[0].filename == __file__
 
 
 def test_no_warning_is_given_by_importing_and_running():

@@ -186,7 +186,6 @@ _NAMES = {
     "udkjax.study.transmission": "coupler_curve mechanical_advantage transmission_angle workspace Workspace",
     "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
 }
-_RENAMED: dict[str, str] = {}  # old public names and what they are now, with their module: see udkjax.deprecation
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __version__ = "0.1.0"
@@ -199,7 +198,7 @@ def __getattr__(name: str):
     elif name in _HOME:
         value = getattr(import_module(_HOME[name]), name)
     else:
-        return import_module("udkjax.deprecation").deprecated_getattr(__name__, _RENAMED, stacklevel=3)(name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value
     return value
 

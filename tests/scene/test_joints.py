@@ -131,23 +131,3 @@ def _derivative(function, order):
     for _ in range(order):
         function = jax.grad(function)
     return function
-
-
-def test_a_joint_that_overrides_old_names_works_and_says_the_new_ones():
-    with pytest.warns(DeprecationWarning) as warned:
-
-        class Old(udk.Joint):
-            @property
-            def attached(self):
-                return (*self.bodies, udk.GROUND)
-
-            def resolved(self, *frames):
-                return "completed"
-
-            def residual(self, t, *frames):
-                return [0.0]
-
-    assert {str(w.message) for w in warned} == {"Old.attached is now Old.frame_names", "Old.resolved is now Old.complete"}
-    old = Old(("a", "b"))
-    assert old.frame_names == ("a", "b", udk.GROUND)
-    assert old.complete() == "completed"

@@ -1,5 +1,4 @@
 import pickle
-import re
 from typing import Any
 
 import equinox as eqx
@@ -220,10 +219,3 @@ def test_it_can_be_sent_to_another_process(everything, same):
     error = pickle.loads(pickle.dumps(udk.SceneError(["one", "two"], "scene.toml")))
     assert error.problems == ["one", "two"]
     assert str(error) == str(udk.SceneError(["one", "two"], "scene.toml"))
-
-
-@pytest.mark.parametrize(("old", "new"), [("bare", "without_origin"), ("is_known", "is_concrete")])
-def test_old_attributes_work_and_warn_of_the_new_ones(old, new):
-    mech = udk.library.simple_pendulum()
-    with pytest.warns(DeprecationWarning, match=re.escape(f"Mechanism.{old} is now Mechanism.{new}")):
-        assert getattr(mech, old) is (True if old == "is_known" else mech)

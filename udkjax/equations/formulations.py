@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from udkjax.deprecation import renamed_attributes, renamed_methods
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import Pseudoinverse
@@ -27,9 +26,6 @@ from udkjax.scene.fields import number, number_called
 
 class Formulation(PrintsLine):
     """A method to find the accelerations of a system, for `simulate(..., formulation=...)`."""
-
-    __getattr__ = renamed_attributes("Formulation", of="formulate")
-    __init_subclass__ = renamed_methods(of="formulate")
 
     @abstractmethod
     def formulate(self, equations: AbstractSystem) -> AbstractSystem:

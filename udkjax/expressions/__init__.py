@@ -1,6 +1,5 @@
 """Graphs of scalar expressions, recorded once: structural zeros vanish, and equal expressions are computed once."""
 
-from udkjax.deprecation import deprecated_getattr
 from udkjax.expressions.differential import Differential as Differential
 from udkjax.expressions.differential import cotangents as cotangents
 from udkjax.expressions.differential import tangents as tangents
@@ -11,5 +10,3 @@ from udkjax.expressions.jaxpr_reader import trace as trace
 from udkjax.expressions.scalar_program import ScalarProgram as ScalarProgram
 from udkjax.expressions.scalar_program import frontier as frontier
 from udkjax.expressions.scalar_program import operations as operations
-
-__getattr__ = deprecated_getattr(__name__, {"Program": "ScalarProgram", "read": "read_jaxpr"})

@@ -1,6 +1,5 @@
 """Pseudoinverses that are differentiable at every constant rank: D^+ b, D^+ and the rank, by interchangeable methods."""
 
-from udkjax.deprecation import deprecated_getattr
 from udkjax.pinv.auto import Auto as Auto
 from udkjax.pinv.elimination import Elimination as Elimination
 from udkjax.pinv.gram_schmidt import GramSchmidt as GramSchmidt
@@ -12,5 +11,3 @@ from udkjax.pinv.rule import Plus as Plus
 from udkjax.pinv.rule import Pseudoinverse as Pseudoinverse
 from udkjax.pinv.svd import SVD as SVD
 from udkjax.pinv.varga import Varga as Varga
-
-__getattr__ = deprecated_getattr(__name__, {"LeastSquares": "LeastSquaresSolution"})

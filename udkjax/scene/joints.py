@@ -14,7 +14,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.deprecation import renamed_attributes, renamed_methods
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import (
@@ -42,9 +41,6 @@ class Constraint(PrintsLine):
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
     n_bodies: ClassVar[int] = 2  # how many `bodies` a type of the scene format names
-
-    __getattr__ = renamed_attributes("Constraint", attached="frame_names", resolved="complete")
-    __init_subclass__ = renamed_methods(attached="frame_names", resolved="complete")
 
     @abstractmethod
     def residual(self, t: Number, *frames: Frame) -> Sequence[Number]:

@@ -13,7 +13,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from udkjax.deprecation import renamed_attributes
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
 from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, check_hashable, completion_mistakes, problems_of
@@ -205,8 +204,6 @@ class Mechanism(PrintsTable):
     def is_concrete(self) -> bool:
         """Whether no number is traced."""
         return not any(isinstance(leaf, Tracer) for leaf in self.numbers)
-
-    __getattr__ = renamed_attributes("Mechanism", bare="without_origin", is_known="is_concrete")
 
     @property
     def numbers(self) -> list[Array]:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.deprecation import deprecated_getattr
 from udkjax.equations import energy, violation
 from udkjax.equations.quantities import Energy
 from udkjax.extras import OptionalImport
@@ -43,8 +42,6 @@ __all__ = [
     "to_ground",
     "trajectory",
 ]  # and every function that draws
-__getattr__ = deprecated_getattr(__name__, {"apart": "farthest_instants", "placed": "to_ground"})
-
 WIDE = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
 ROUNDING = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
 SMALLEST = 1e-18  # singular values below it are drawn as it

@@ -135,14 +135,6 @@ def test_a_notebook_shows_the_same_as_a_table(estimate):
     assert "<linkage>: 4 parameters" in said and "a & b" in said and "chi^2: 39.5 with 35 degrees of freedom" in said
 
 
-@pytest.mark.parametrize(("old", "new"), [("knowledge", "uncertainty"), ("start_values", "initial_state_values")])
-def test_old_attributes_work_with_a_warning(estimate, old, new):
-    with pytest.warns(DeprecationWarning, match=f"Estimate.{old} is now Estimate.{new}"):
-        assert getattr(estimate, old) is getattr(estimate, new)
-    with pytest.raises(AttributeError):
-        estimate.nothing  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
-
-
 def test_a_name_that_was_not_identified_has_no_profile(estimate):
     with pytest.raises(udk.IdentificationError, match='"aa" was not identified'):
         estimate.profile("aa")

@@ -123,10 +123,3 @@ def test_mistakes_are_told(candidates):
         design_experiment(scene(), [3], NAMES, [CHANNEL], TS, NOISE)  # pyright: ignore[reportArgumentType]
     with pytest.raises(udk.IdentificationError, match="of: mass is not among the parameters"):
         design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, of=["mass"])
-
-
-def test_the_old_name_of_the_initial_state_works_with_a_warning():
-    start = released(ANGLES[1])
-    with pytest.warns(DeprecationWarning, match="Candidate: start is now initial_state"):
-        candidate = Candidate(start=start)  # pyright: ignore[reportCallIssue]
-    assert candidate.initial_state is start

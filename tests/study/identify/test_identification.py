@@ -295,19 +295,7 @@ def test_a_start_for_all_records(measured):
     assert float(estimate.initial_states[0].q[0, 2]) == pytest.approx(measured[1][0], abs=1e-10)
 
 
-# --- old names, and progress
-
-
-def test_old_names_of_arguments_work_with_a_warning(measured):
-    data = {"time": TS, ANGLE: measured[1]}
-    with pytest.warns(DeprecationWarning, match="identify: starts is now n_starts"):
-        estimate = found(pendulum(0.5, 0.15), data, starts=[[0.3, 0.1]])  # as arrays of guesses were given
-    assert estimate.guesses == 2 and off(estimate) < 1e-9
-    with (
-        pytest.warns(DeprecationWarning, match="identify: start is now initial_state"),
-        pytest.raises(udk.IdentificationError, match="estimate must be one of"),
-    ):
-        found(pendulum(), data, start="angle")
+# --- progress
 
 
 def test_progress_is_that_of_every_other_function(measured, capsys):

@@ -120,9 +120,3 @@ def test_every_mistake_is_told(linkage):
         assert part in told, part
     with pytest.raises(udk.IdentificationError, match="none to identify"):
         unknowns_of(linkage, [])
-
-
-def test_the_old_name_of_the_guess_works_with_a_warning():
-    with pytest.warns(DeprecationWarning, match="Parameter: start is now guess"):
-        old = udk.Parameter("body.a.mass", start=2.0)  # pyright: ignore[reportCallIssue]
-    assert old == udk.Parameter("body.a.mass", guess=2.0)

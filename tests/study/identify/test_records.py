@@ -51,12 +51,3 @@ def test_all_mistakes_at_once_with_the_record_named():
 def test_what_a_start_estimates():
     with pytest.raises(IdentificationError, match="nothing, position, velocity, both"):
         Start(estimate="angle")  # pyright: ignore[reportArgumentType]
-
-
-def test_the_old_name_of_the_initial_state_works_with_a_warning():
-    start = Start(estimate="both")
-    with pytest.warns(DeprecationWarning, match="Record: start is now initial_state"):
-        record = Record([0.0, 1.0], {"y": [1.0, 2.0]}, start=start)  # pyright: ignore[reportCallIssue]
-    assert record.start is start
-    with pytest.raises(TypeError, match="start is now initial_state; give only that"):
-        Record([0.0], {"y": [1.0]}, start=start, initial_state=start)  # pyright: ignore[reportCallIssue]

@@ -40,5 +40,3 @@ def test_a_sample_of_some_groups_says_how_long_all_take(tried):
     assert found.compiling == pytest.approx(15.0)
     assert found.computing == pytest.approx(5000 * 2.0 * 0.75 / 64 / 2)
     assert found.memory > 2 * 500_000
-    with pytest.warns(DeprecationWarning, match="SweepCost.kept is now SweepCost.stored"):
-        assert found.kept == found.stored

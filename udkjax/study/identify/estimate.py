@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.deprecation import renamed_attributes
 from udkjax.extras import OptionalImport
 from udkjax.integrate.assembly import State
 from udkjax.integrate.solution import scene_text, versions
@@ -94,10 +93,6 @@ class Estimate:
     z: Float[np.ndarray, "K"]
     problem: Problem
     loss: Loss
-
-    __getattr__ = renamed_attributes(
-        "Estimate", knowledge="uncertainty", start_values="initial_state_values", starts="initial_states"
-    )
 
     @cached_property
     def mechanism(self) -> Mechanism:

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from udkjax.deprecation import renamed_arguments, renamed_attributes
 from udkjax.integrate.assembly import State
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import suggestion
@@ -30,7 +29,6 @@ from udkjax.study.identify.uncertainty import PART
 Criterion = Literal["D", "A", "E"]
 
 
-@renamed_arguments(start="initial_state")
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """An experiment that may be made: what of the scene is different in it (`conditions`, by name), and how it begins.
@@ -44,8 +42,6 @@ class Candidate:
     conditions: Mapping[str, ArrayLike] = field(default_factory=dict)
     initial_state: Start | State | None = None
     name: str = ""
-
-    __getattr__ = renamed_attributes("Candidate", start="initial_state")
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udkjax.deprecation import renamed_attributes
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.printing import align_columns
 from udkjax.scene.arguments import checked
@@ -86,10 +85,6 @@ class GradientCheck:
     places: tuple[tuple[Place, ...], ...]
     tol: Tolerances
     other_tol: Tolerances
-
-    __getattr__ = renamed_attributes(
-        "GradientCheck", said="labels", differs="discrepancy", own="derivative_error", other="other_tol"
-    )
 
     @property
     def ok(self) -> bool:

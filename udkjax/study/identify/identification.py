@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from udkjax.deprecation import renamed_arguments
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
@@ -31,7 +30,6 @@ SAME_WEIGHTS = 1.05  # ratio of weights, compared with each other, that moves no
 ROUNDING = 1e-8  # of what a channel shows: smaller residuals are errors of the integration, which need not be noise
 
 
-@renamed_arguments(start="initial_state", starts="n_starts")
 @checked
 def identify(
     mechanism: Mechanism,
@@ -88,8 +86,6 @@ def identify(
         IdentificationError: with every mistake; also where a parameter would open a loop that has more constraints than it needs.
     """
     start = time.perf_counter()
-    if not isinstance(n_starts, int | np.integer):  # as `starts` was, before there were `guesses`
-        n_starts, guesses = 0, n_starts
     problem = build_problem(mechanism, data, parameters, settings, noise, ignore, seed, strategy, initial_state, tol)
     first = _first_guesses(problem, n_starts, guesses)
     residual_loss = squares if callable(loss) else named_loss(loss, len(problem.index))

@@ -8,7 +8,6 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from udkjax.deprecation import renamed_arguments
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.mechanism import Mechanism
@@ -29,7 +28,6 @@ def length(*bodies: str, as_rod: bool = False) -> Length:
     return Length(bodies, as_rod)
 
 
-@renamed_arguments(start="guess")
 @dataclass(frozen=True)
 class Parameter:
     """What is to be identified.

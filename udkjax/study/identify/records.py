@@ -9,7 +9,6 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from typing_extensions import TypeAliasType
 
-from udkjax.deprecation import renamed_arguments
 from udkjax.extras import OptionalImport
 from udkjax.integrate.assembly import State
 from udkjax.scene.checks import Mistakes, quote
@@ -77,7 +76,6 @@ class Record:
         IdentificationError: with every mistake.
     """
 
-    @renamed_arguments(start="initial_state")
     def __init__(
         self,
         times: ArrayLike | Sequence[float],

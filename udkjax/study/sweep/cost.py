@@ -13,7 +13,6 @@ from itertools import combinations_with_replacement
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.deprecation import renamed_attributes
 from udkjax.pinv import Auto, Elimination
 from udkjax.study.machine import concurrent_chunks
 from udkjax.study.sweep.dataset import bytes_per_member
@@ -142,8 +141,6 @@ class SweepCost:
     memory: int  # bytes of this process, at most
     compiling: float  # s; less where programs are in the cache
     computing: float  # s
-
-    __getattr__ = renamed_attributes("SweepCost", kept="stored")
 
 
 def estimate_cost(plan: Plan, memory: int = MEMORY) -> SweepCost:
