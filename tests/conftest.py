@@ -17,12 +17,11 @@ CACHE = os.environ.setdefault("UDKJAX_CACHE", str(Path(__file__).parents[1] / ".
 CACHE_SIZE = 2**30  # bytes; a cache that is larger before a run begins anew
 # XLA compiles in less than half of the time what it does not optimize; no test is about how fast that runs.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
-jax.config.update("jax_compilation_cache_dir", f"{CACHE}/jax")
-jax.config.update(
-    "jax_persistent_cache_min_compile_time_secs", 0.0
-)  # what one process has compiled, however small, serves the other
+from udkjax.native import code_cache, operation
 
-from udkjax.native import operation
+if folder := code_cache.cache_folder():  # what one process has compiled, however small, serves the other
+    jax.config.update("jax_compilation_cache_dir", f"{folder}/jax")
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 # Tracing makes many small objects that live; Python looks through all of them again and again, a tenth of the time.
 gc.collect()

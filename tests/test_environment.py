@@ -2,9 +2,11 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+CONFTEST = str(Path(__file__).with_name("conftest.py"))
 SHOW = "import os; print(jax.numpy.result_type(float), jax.config.jax_compilation_cache_dir, os.environ.get('XLA_FLAGS'))"
 JAX_FIRST, UDKJAX_FIRST = "import jax, udkjax", "import udkjax, jax"
 
@@ -53,3 +55,8 @@ def test_the_environment_says_where_machine_code_is_kept(tmp_path, choice):
     if choice == "0":
         python(code, HOME=home)
         assert list((home / ".cache" / "udkjax").iterdir())
+
+
+def test_without_a_cache_the_tests_keep_none_either(tmp_path):
+    code = f"import jax, runpy; runpy.run_path({CONFTEST!r}); print(jax.config.jax_compilation_cache_dir)"
+    assert python(code, HOME=tmp_path, UDKJAX_CACHE="0") == "None"
