@@ -139,8 +139,8 @@ def _require_client(name: str, value: Any, given: Given) -> None:
 
 
 def _require_optimizer(name: str, value: Any, given: Given) -> None:
-    if value is not None and not isinstance(value, str) and (isclass(value) or not hasattr(value, "init")):
-        raise ArgumentTypeError(f"{name} must be an optimizer of optax's, a solver of optimistix's, or None, {describe(value)}")
+    if value is not None and not isinstance(value, str) and (isclass(value) or not hasattr(value, "update")):
+        raise ArgumentTypeError(f"{name} must be an optimizer of optax's, or None, {describe(value)}")
 
 
 def _require_parameters(name: str, value: Any, given: Given) -> None:

@@ -71,7 +71,7 @@ def identify(
         guesses: first guesses (B, P) to try besides the first, in place of `n_starts`.
         loss: "least_squares"; "huber" or "soft_l1", for which single wrong numbers count less; or a function of the weighted
             residuals (R,) by JAX (standard errors stay those of squares).
-        optimizer: another least-squares solver of optimistix, or any optimizer of optax.
+        optimizer: of optax, instead of Levenberg-Marquardt (for a loss of your own: of L-BFGS); one without a line search.
         strategy: "pieces" cuts the records into pieces at once; "auto": only where nothing else leads to a fit.
         tol: tolerance of the integration at the end, relative and absolute.
         seed: of further first guesses.

@@ -1,33 +1,23 @@
-"""Methods and losses of a fit: least squares, plain or robust, and losses of the user's own by optimizers of scipy or optax."""
+"""Losses of a fit, and their minimization: least squares, plain or robust; losses of the user's own by their gradients."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias, Union, cast
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from udkjax.extras import OptionalImport
-from udkjax.study.identify.least_squares import (
-    EXACT_STEP,
-    FINE_STEP,
-    STEPS,
-    Fit,
-    History,
-    Objective,
-    Report,
-    minimize_squares,
-)
+from udkjax.study.identify.least_squares import EXACT_STEP, FINE_STEP, STEPS, End, Fit, Objective, Report, minimize_squares
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.problem import INVISIBLE, Residuals
 from udkjax.study.identify.records import IdentificationError
 
 if TYPE_CHECKING:  # imported where a fit begins: it takes a second
     import optax
-    import optimistix
 
 GRADIENT_STEPS = 2000  # at most, of an optimizer that knows no curvature
 FAILED_COST = 100.0  # times the first cost: what is taken for the cost where nothing can be computed
@@ -35,33 +25,31 @@ TUNING = 1.345  # standard deviations: of noise that is Gaussian after all, esti
 
 Loss: TypeAlias = Callable[[Residuals], Residuals]  # residuals whose squares are minimized, of plain ones
 UserLoss: TypeAlias = Callable[[Array], Array]
-Optimizer: TypeAlias = Union["optimistix.AbstractLeastSquaresSolver", "optax.GradientTransformation", None]
+Optimizer: TypeAlias = "optax.GradientTransformation | None"
 
 
 class GradientMethod(NamedTuple):
     """An optimizer of optax (None: L-BFGS of scipy), and the loss that it minimizes: rho(r) of the residuals (None: r.r / 2)."""
 
-    optimizer: "optax.GradientTransformation | None"
+    optimizer: Optimizer
     loss: UserLoss | None = None
 
 
-Method: TypeAlias = Union["optimistix.AbstractLeastSquaresSolver", GradientMethod, None]
-
-
-def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> Method:
-    """Return the method for an optimizer and a loss; a loss of the user's own is minimized by L-BFGS unless told otherwise.
+def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> GradientMethod | None:
+    """Return the method for an optimizer and a loss: None is Levenberg-Marquardt.
 
     Raises:
-        IdentificationError: the optimizer cannot minimize such a loss.
+        IdentificationError: the optimizer searches along lines, for which it would have to call the loss itself.
     """
-    own_loss = loss if callable(loss) else None
-    if hasattr(optimizer, "init") and hasattr(optimizer, "update"):
-        return GradientMethod(cast("optax.GradientTransformation", optimizer), own_loss)
-    if own_loss is None:
-        return cast("optimistix.AbstractLeastSquaresSolver | None", optimizer)
-    if optimizer is not None:
-        raise IdentificationError(["optimizer: a loss of your own is no sum of squares; give an optimizer of optax, or none"])
-    return GradientMethod(None, own_loss)
+    if optimizer is None:
+        return GradientMethod(None, loss) if callable(loss) else None
+    method = GradientMethod(optimizer, loss if callable(loss) else None)
+    try:
+        jax.eval_shape(lambda z: _update(optimizer, optimizer.init(z), z, jnp.zeros(()), z), jnp.zeros(1))
+    except TypeError as error:
+        cure = "take one without a line search, as optax.lbfgs(linesearch=None) is, or leave it out"
+        raise IdentificationError([f"optimizer: needs more than the value and gradient of the loss ({error}); {cure}"]) from None
+    return method
 
 
 # --- losses
@@ -134,9 +122,9 @@ def weighted_residuals(problem: Evaluated, tol: Tolerances, loss: Loss, horizon:
 
 @dataclass(frozen=True)
 class Minimizer:
-    """How all fits of an identification are made: by Levenberg-Marquardt (None), or another `method`."""
+    """How all fits of an identification are made: by Levenberg-Marquardt (None), or by gradients."""
 
-    method: Method = None
+    method: GradientMethod | None = None
     loss: Loss = squares
     report: Report = lambda text: None
 
@@ -152,24 +140,13 @@ class Minimizer:
     ) -> Fit:
         """Fit the first `horizon` seconds of each record (None: all of it) from several first guesses: see `minimize_squares`."""
         evaluate = weighted_residuals(problem, tol, self.loss, horizon)
-        if isinstance(self.method, GradientMethod):
+        if self.method is not None:
             return minimize_by_gradient(self.method, evaluate, z, settled=settled, report=self.report)
-        return minimize_squares(evaluate, z, steps, settled, undamped, self.method, self.report)
+        return minimize_squares(evaluate, z, steps, settled, undamped, self.report)
 
     def with_label(self, what: str) -> "Minimizer":
         """Return the same one, with reports that begin with what is fitted."""
         return replace(self, report=lambda text: self.report(f"{what}: {text}"))
-
-
-# --- gradients
-
-
-class _LossPoint(NamedTuple):
-    """Value and gradient (K,) of a loss, and the largest entry of the Gauss-Newton step."""
-
-    value: float
-    gradient: np.ndarray
-    step: float
 
 
 def minimize_by_gradient(
@@ -185,101 +162,77 @@ def minimize_by_gradient(
     A fit has settled where (J^T J)^-1 J^T d rho / dr is small, but no smaller than first-order methods come. Derivatives are
     taken forward here too: in reverse mode a gradient costs a fifth of it with 20 unknowns, but takes 20 to 40 s to compile.
     """
-    settled = max(settled, FINE_STEP)
-    walks = [_LossAlongWalk(evaluate, method.loss or _half_square, settled, report) for _ in z]
-    step_on = _walk_by_scipy if method.optimizer is None else partial(_walk_by_optax, method.optimizer)
-    for first, walk in zip(z, walks, strict=True):
-        step_on(walk, first, steps)
-    best = min(walks, key=lambda walk: walk.best.value)
-    return Fit(
-        np.array([walk.best_z for walk in walks]),
-        np.array([walk.best.value for walk in walks]),
-        np.array([walk.best.step <= settled for walk in walks]),
-        best.history,
-    )
+    descents = [_Descent(evaluate, method.loss or _half_square, max(settled, FINE_STEP), report) for _ in z]
+    for first, descent in zip(z, descents, strict=True):
+        if method.optimizer is None:
+            _descend_by_scipy(descent, first, steps)
+        else:
+            _descend_by_optax(method.optimizer, descent, first, steps)
+    return Fit.of([descent.end for descent in descents])
 
 
-def _walk_by_scipy(walk: "_LossAlongWalk", first: np.ndarray, steps: int) -> None:
+def _descend_by_scipy(descent: "_Descent", first: np.ndarray, steps: int) -> None:
     import scipy.optimize
 
     def after_step(_) -> None:
-        if walk.after_step():
+        if descent.is_over():
             raise StopIteration
 
-    if np.isfinite(walk(first).value):
+    if np.isfinite(descent(first)[0]):
         options = {"maxiter": steps, "maxfun": 20 * steps, "ftol": 0.0, "gtol": 0.0}
-        scipy.optimize.minimize(lambda z: walk(z)[:2], first, jac=True, method="L-BFGS-B", callback=after_step, options=options)
+        scipy.optimize.minimize(descent, first, jac=True, method="L-BFGS-B", callback=after_step, options=options)
 
 
-def _walk_by_optax(given: "optax.GradientTransformation", walk: "_LossAlongWalk", first: np.ndarray, steps: int) -> None:
+def _descend_by_optax(optimizer: "optax.GradientTransformation", descent: "_Descent", first: np.ndarray, steps: int) -> None:
+    at, state = jnp.asarray(first), optimizer.init(jnp.asarray(first))
+    update = jax.jit(partial(_update, optimizer))
+    for _ in range(steps):
+        value, gradient = descent(np.asarray(at))
+        if descent.is_over():
+            return
+        at, state = update(state, at, value, gradient)
+
+
+def _update(optimizer: "optax.GradientTransformation", state, at, value, gradient):
+    """Return where an optimizer of optax goes next, and its state then."""
     with OptionalImport():
         import optax
-    optimizer = optax.with_extra_args_support(given)
-    at, state = jnp.asarray(first), optimizer.init(jnp.asarray(first))
-
-    def step(at: Array, state: PyTree, value: Array, gradient: Array, **more: Callable[[Array], Array]) -> tuple[Array, PyTree]:
-        change, state = optimizer.update(gradient, state, at, value=value, grad=gradient, **more)
-        return cast(Array, optax.apply_updates(at, change)), state
-
-    try:
-        jax.eval_shape(step, at, state, jnp.zeros(()), at)
-        compiled = jax.jit(step)
-    except TypeError:  # a line search asks for the function itself: of numbers, not compiled
-        compiled = jax.disable_jit()(partial(step, value_fn=walk.differentiable))
-    for _ in range(steps):
-        point = walk(np.asarray(at))
-        if walk.after_step():
-            return
-        at, state = compiled(at, state, jnp.asarray(point.value), jnp.asarray(point.gradient))
+    change, state = optax.with_extra_args_support(optimizer).update(gradient, state, at, value=value, grad=gradient)
+    return optax.apply_updates(at, change), state
 
 
-class _LossAlongWalk:
-    """A loss and its gradient at the points of one walk: it stores the best, and the last few, for line searches that repeat."""
+class _Descent:
+    """A loss and its gradient at the points of one descent, of which `end` is the best."""
 
     def __init__(self, evaluate: Objective, rho: UserLoss, settled: float, report: Report):
         self.evaluate, self.settled, self.report = evaluate, settled, report
         self.value_and_slope = jax.value_and_grad(rho)
-        self.worst = np.inf
-        self.best, self.best_z = _LossPoint(np.inf, np.zeros(0), np.inf), np.zeros(0)
-        self.history: History = []
-        self._at = lru_cache(maxsize=8)(self._compute)
+        self.failed_cost, self.step = np.inf, np.inf
+        self.end = End(np.zeros(0), np.inf, False, [])
 
-        @jax.custom_vjp
-        def differentiable(z):
-            return jnp.asarray(self(np.asarray(z)).value)
-
-        def forward(z):
-            point = self(np.asarray(z))
-            return jnp.asarray(point.value), jnp.asarray(point.gradient)
-
-        differentiable.defvjp(forward, lambda gradient, bar: (bar * gradient,))
-        self.differentiable = differentiable
-
-    def __call__(self, z: np.ndarray) -> _LossPoint:
-        point = self._at(tuple(z.tolist()))
-        if point.value < self.best.value or not self.best_z.size:
-            self.best, self.best_z = point, np.array(z)
-        return point
-
-    def after_step(self) -> bool:
-        """Note how far the walk is; return whether it has ended."""
-        self.history.append((self.best.value, self.best.step))
-        self.report(f"step {len(self.history)}, cost {self.best.value:.4g}")
-        return self.best.step <= self.settled or not np.isfinite(self.best.value)
-
-    @jax.disable_jit(False)
-    def _compute(self, z: tuple[float, ...]) -> _LossPoint:
-        found = self.evaluate(np.array([z]))
+    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the value of the loss, and its gradient (K,)."""
+        if not self.end.z.size:
+            self.end = self.end._replace(z=z.copy())
+        found = self.evaluate(z[None])
         if not found.ok[0]:
-            return _LossPoint(self.worst, np.zeros(len(z)), np.inf)
+            return self.failed_cost, np.zeros(len(z))
         value, slope = self.value_and_slope(jnp.asarray(found.r[0]))
-        if not np.isfinite(self.worst):
-            self.worst = FAILED_COST * (abs(float(value)) + 1.0)
-        gradient = found.J[0].T @ np.asarray(slope)
-        _, s, vt = np.linalg.svd(found.J[0], full_matrices=False)
-        shows = s > INVISIBLE * s.max(initial=0.0)
-        step = vt[shows].T @ (vt[shows] @ gradient / s[shows] ** 2)
-        return _LossPoint(float(value), gradient, float(np.abs(step).max(initial=0.0)))
+        value, gradient = float(value), found.J[0].T @ np.asarray(slope)
+        if not np.isfinite(self.failed_cost):
+            self.failed_cost = FAILED_COST * (abs(value) + 1.0)
+        if value < self.end.cost:
+            _, s, vt = np.linalg.svd(found.J[0], full_matrices=False)
+            shows = s > INVISIBLE * s.max(initial=0.0)
+            self.step = float(np.abs(vt[shows].T @ (vt[shows] @ gradient / s[shows] ** 2)).max(initial=0.0))
+            self.end = End(z.copy(), value, self.step <= self.settled, self.end.history)
+        return value, gradient
+
+    def is_over(self) -> bool:
+        """Note how far the descent is; return whether it has ended."""
+        self.end.history.append((self.end.cost, self.step))
+        self.report(f"step {len(self.end.history)}, cost {self.end.cost:.4g}")
+        return self.end.settled or not np.isfinite(self.end.cost)
 
 
 def _half_square(r: Array) -> Array:
