@@ -84,13 +84,14 @@ def test_conditions_of_position_velocity_and_time(f, engine, outputs):
 
 
 def test_stop_stops_at_the_first_crossing_and_jumps_and_kinks_count_once():
-    end = udk.simulate(POINT, [0, 3.0], events=udk.Event(lambda t, at: jnp.sin(1000 * at["b"].x + 0.1)))
-    assert abs(float(end.time) - (np.pi - 0.1) / 1000) < 1e-12
+    """The fast condition is a constant up to 0.99 m, and ends the run where it crosses first."""
     events = [
+        udk.Event(lambda t, at: jnp.sin(1000 * jnp.maximum(at["b"].x - 0.99, 0) + 0.1), name="end"),
         udk.Event(lambda t, at: jnp.where(at["b"].x > 0.4137, -1.0, 1.0), udk.Log(), name="jump"),
         udk.Event(lambda t, at: jnp.abs(jnp.sin(20 * at["b"].x)) - 0.01, udk.Log(), name="kink"),
     ]
-    sol = udk.simulate(POINT, [0, 1.0], events=events)
+    sol = udk.simulate(POINT, [0, 3.0], events=events)
+    assert sol.result == udk.Result.event_stop and abs(float(sol.time) - (0.99 + (np.pi - 0.1) / 1000)) < 1e-12
     kinks = np.arange(0, 7) * np.pi / 20
     expected = np.sort(np.concatenate([kinks + np.arcsin(0.01) / 20, kinks[1:] - np.arcsin(0.01) / 20]))
     assert np.abs(sol.events.of("jump") - 0.4137).max() < 1e-12 and len(sol.events.of("jump")) == 1
@@ -117,30 +118,6 @@ def test_what_is_too_fast_is_said():
     assert sol.events.unresolved[0] < 1e-6
 
 
-@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
-def test_a_condition_that_is_not_a_number_ends_the_run(engine):
-    """Of a batch as data, of one run by a cause that names it and the time."""
-    where = np.array([0.5, 2.0, -0.1])
-
-    def run(x):
-        events = [
-            udk.Event(RootOf(x), udk.Log(), name="root"),
-            udk.Event(lambda t, at: at["b"].x - 0.25, udk.Log(), name="quarter"),
-        ]
-        return udk.simulate(POINT, [0, 0.3, 1.0], events=events, max_events=4, throw=False, engine=engine)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        sol = jax.jit(jax.vmap(run))(where)
-    codes = [udk.Result.undefined_condition, udk.Result.successful, udk.Result.undefined_condition]
-    assert (np.asarray(sol.code) == codes).all() and np.abs(sol.time - np.array([0.5, 1.0, 0.0])).max() < 1e-8
-    assert (np.asarray(sol.events.count) == [1, 1, 0]).all() and (
-        np.asarray(sol.events.undefined) == [[1, 0], [0, 0], [1, 0]]
-    ).all()
-    assert np.isfinite(sol.q[0, :2]).all() and np.isnan(sol.q[0, 2]).all()
-    assert run(0.5).cause.startswith('undefined condition at t = 0.5 s: the condition of event "root" is not a number')
-
-
 class RootOf(eqx.Module):
     """1 + sqrt(end - x)."""
 
@@ -148,3 +125,33 @@ class RootOf(eqx.Module):
 
     def __call__(self, t, at):
         return 1 + jnp.sqrt(self.end - at["b"].x)
+
+
+def quarter(t, at):
+    return at["b"].x - 0.25
+
+
+def rooted(x, engine="native"):
+    """A run with a condition that is a number up to x."""
+    events = [udk.Event(RootOf(x), udk.Log(), name="root"), udk.Event(quarter, udk.Log(), name="quarter")]
+    return udk.simulate(POINT, [0, 0.3, 1.0], events=events, max_events=4, throw=False, engine=engine)
+
+
+def test_a_condition_that_is_not_a_number_is_named():
+    cause = 'undefined condition at t = 0.5 s: the condition of event "root" is not a number'
+    assert rooted(0.5).cause.startswith(cause) and rooted(2.0).result == udk.Result.successful
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["native", "diffrax"])
+def test_a_condition_that_is_not_a_number_is_data_in_a_batch(engine):
+    where = np.array([0.5, 2.0, -0.1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sol = jax.jit(jax.vmap(lambda x: rooted(x, engine)))(where)
+    codes = [udk.Result.undefined_condition, udk.Result.successful, udk.Result.undefined_condition]
+    assert (np.asarray(sol.code) == codes).all() and np.abs(sol.time - np.array([0.5, 1.0, 0.0])).max() < 1e-8
+    assert (np.asarray(sol.events.count) == [1, 1, 0]).all() and (
+        np.asarray(sol.events.undefined) == [[1, 0], [0, 0], [1, 0]]
+    ).all()
+    assert np.isfinite(sol.q[0, :2]).all() and np.isnan(sol.q[0, 2]).all()

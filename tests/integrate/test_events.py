@@ -226,8 +226,8 @@ def test_two_at_one_instant():
     assert np.abs(sol.v[-1, 1]).max() < 1e-12
 
 
-def test_a_thousand_pendulums_each_with_its_own_events():
-    speeds, ts = np.linspace(-6.0, 6.0, 1000), np.linspace(0.0, 4.0, 5)
+def test_pendulums_of_a_batch_have_events_of_their_own():
+    speeds, ts = np.linspace(-6.0, 6.0, 200), np.linspace(0.0, 4.0, 5)
     stops = [
         udk.JointLimit("A", lower=-2.0, restitution=0.5, at_rest="stop"),
         udk.Event(lambda t, at: at["link"].angle - 1.0, udk.Stop(), name="turned"),
@@ -237,15 +237,17 @@ def test_a_thousand_pendulums_each_with_its_own_events():
         numbers = {"body.link.velocity": jnp.stack([0 * speed, speed / 2]), "body.link.angular_velocity": speed}
         return udk.simulate(PENDULUM.with_parameters(numbers), ts, events=stops, max_events=8)
 
-    all_of_them = jax.jit(jax.vmap(run))(speeds)
+    batch = jax.jit(jax.vmap(run))
+    all_of_them = batch(speeds)
     codes, counts = np.asarray(all_of_them.code), np.asarray(all_of_them.events.count)
     assert set(codes) == {udk.Result.successful, udk.Result.event_stop} and len(set(counts)) >= 2
-    alone = jax.jit(run)
-    for k in (0, 250, 999):
-        one = alone(speeds[k])
-        assert one.code == codes[k] and one.events.count == counts[k]
-        assert np.allclose(one.q, all_of_them.q[k], rtol=0, atol=1e-7, equal_nan=True)
-        assert np.allclose(np.asarray(one.events.time)[: counts[k]], all_of_them.events.time[k, : counts[k]], rtol=0, atol=1e-8)
+    # Beside other members each is what it is beside these: three of them again, as often as a batch has members.
+    chosen = np.resize([0, 50, 199], len(speeds))
+    again = batch(speeds[chosen])
+    for name in ("code", "q", "v", "time"):
+        assert np.array_equal(getattr(again, name), np.asarray(getattr(all_of_them, name))[chosen], equal_nan=True), name
+    assert np.array_equal(again.events.time, np.asarray(all_of_them.events.time)[chosen], equal_nan=True)
+    for k in chosen[:3]:
         assert np.isnan(all_of_them.events.time[k, counts[k] :]).all()
     # Those that turn over do so where energy and an elliptic integral say.
     fast = np.flatnonzero(codes == udk.Result.event_stop)

@@ -91,7 +91,7 @@ def expected():
     return derivatives(closed_form)(POINTS)
 
 
-@pytest.mark.parametrize("method", fast("Auto"))  # SVD: tests/equations/test_accelerations.py
+@pytest.mark.parametrize("method", fast())  # in the fast tests: SVD, in tests/equations/test_accelerations.py
 def test_derivatives_of_accelerations(method, expected):
     """Finite at all angles; equal to the closed form, and so among the methods, wherever the rank is constant nearby."""
     found = derivatives(partial(accelerations, LINKAGE, method))(POINTS)
@@ -147,7 +147,7 @@ def test_projection_has_derivatives(method):
     np.testing.assert_allclose(reverse, jacobian, atol=1e-9)
 
 
-@pytest.mark.parametrize("method", fast("Auto", "Greville"))
+@pytest.mark.parametrize("method", fast("Auto"))
 @pytest.mark.parametrize("copies", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_a_duplicated_joint_changes_no_acceleration_and_no_gradient(method, copies):
     p = jnp.array([[-0.8, 1.2, 0.9], [2.1, 0.7, 1.1]])

@@ -131,7 +131,10 @@ def test_under_jit_a_call_computes_the_same(given):
 SMALL = [0.0, 5e-324, 1e-300, 1e-100, 1e-30, 1e-17, 3e-16, 1e-12, 1e-8, -1e-17, -1e-9]
 
 
-@pytest.mark.parametrize("engine", ["native", "diffrax"])
+ENGINES = ["native", pytest.param("diffrax", marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("tol", [(1e-8, 1e-8), (1e-10, 0.0), (0.0, 1e-8)], ids=["both", "relative", "absolute"])
 def test_a_body_at_rest_at_the_origin_but_for_rounding_falls(engine, tol):
     y0 = np.array([(y, v) for y in SMALL for v in SMALL])
@@ -147,7 +150,7 @@ def test_a_body_at_rest_at_the_origin_but_for_rounding_falls(engine, tol):
     np.testing.assert_allclose(q[:, ::2], y0 @ np.array([[1, 1], [1, 1]]), atol=2e-8)
 
 
-@pytest.mark.parametrize("engine", ["native", "diffrax"])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_a_slider_at_the_origin_follows_its_driver(engine):
     """sin(pi/2) - 1 and cos(pi/2) are zero but for rounding."""
 

@@ -251,7 +251,7 @@ def counted(held):
     [
         pytest.param(diffrax.Dopri8(), False, id="Dopri8-free", marks=pytest.mark.slow),
         pytest.param(diffrax.Tsit5(), True, id="Tsit5-projected"),
-        pytest.param(diffrax.Tsit5(), False, id="Tsit5-free"),
+        pytest.param(diffrax.Tsit5(), False, id="Tsit5-free", marks=pytest.mark.slow),
         *(
             pytest.param(s(), held, marks=pytest.mark.slow)
             for s, held in ((diffrax.Dopri8, True), (diffrax.Heun, True), (diffrax.Heun, False))
