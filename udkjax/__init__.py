@@ -92,6 +92,8 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import library as library
     from udkjax.scene import load as load
     from udkjax.scene import loads as loads
+    from udkjax.scene import mjcf_text as mjcf_text
+    from udkjax.scene import read_mjcf as read_mjcf
     from udkjax.scene import save as save
     from udkjax.scene import with_angle as with_angle
     from udkjax.scene import with_length as with_length
@@ -153,7 +155,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
 _MODULES = {"pinv": "udkjax.pinv", "equations": "udkjax.equations", "library": "udkjax.scene.library"}
 _NAMES = {
     "udkjax.scene": """
-        load loads save dumps with_length with_angle SceneError
+        load loads save dumps read_mjcf mjcf_text with_length with_angle SceneError
         Drawing Link Mechanism Body GROUND Frame Point Constraint Joint Driver Motion ForceElement
         Revolute Prismatic Slot Weld Distance Angle Gear Rack Cam
         Polynomial Sine Spline Profile

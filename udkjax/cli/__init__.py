@@ -23,6 +23,7 @@ COMMANDS = (
     "statics",
     "modes",
     "check",
+    "convert",
     "diagnose",
     "explain",
     "doctor",

@@ -45,7 +45,7 @@ def animate(
     A run that failed is shown as far as it came, how it ended is said, and the exit code is 1.
 
     Args:
-        files: runs that `udkjax simulate` wrote (NetCDF), or scenes (TOML), which are simulated.
+        files: runs that `udkjax simulate` wrote (NetCDF), or scenes (TOML, or MJCF), which are simulated.
         out: what to write: .html, a page that needs no network; .gif or .mp4, a film; .svg, .png or .dxf, one pose.
         t1: end of the run of a scene (s).
         dt: time between two of its instants (s).
@@ -103,7 +103,7 @@ def animate(
 
 def _run(file: Path, t1: float, dt: float) -> "ShownRun":
     """Return the mechanism of a file, its run, and further measures."""
-    if file.suffix.lower() == ".toml":
+    if file.suffix.lower() in (".toml", ".xml"):
         mechanism, _ = load(file)
 
         import udkjax as udk

@@ -24,7 +24,8 @@ udkjax raises by itself (`SceneError`, `SimulationError`, ...) need no handling:
 import json as json_text
 import math
 import sys
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["BAD_INPUT", "BAD_RUN", "INTERRUPTED", "Json", "Quiet", "Scene"]
 __all__ += ["fail", "load", "output_times", "refuse", "say", "show"]
 
-Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml")]
+Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml|MODEL.xml")]
 JsonValue = dict[str, "JsonValue"] | list["JsonValue"] | str | float | bool | None
 Json = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 MOST_TIMES = 10**7  # that a command writes: some gigabytes for a few bodies
@@ -57,12 +58,18 @@ def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[s
     )
 
 
-def load(scene: Path) -> tuple["Mechanism", str]:
-    """Read a scene and its text, or say everything that is wrong with it and exit."""
+def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> tuple["Mechanism", str]:
+    """Read a scene and its text, or say everything that is wrong with it and exit; the options are those of `read_mjcf`."""
     import udkjax as udk
+    from udkjax.scene import MjcfWarning
 
     try:
-        return udk.load(scene), scene.read_text(encoding="utf-8")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", MjcfWarning)
+            mechanism = udk.read_mjcf(scene, leave_out, key) if leave_out or key is not None else udk.load(scene)
+        for warning in caught:
+            say(f"{scene}: {warning.message}")
+        return mechanism, scene.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as problem:
         refuse(f"cannot read {scene}: {problem}")
     except udk.SceneError as problem:

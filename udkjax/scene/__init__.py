@@ -37,5 +37,8 @@ from udkjax.scene.joints import Revolute as Revolute
 from udkjax.scene.joints import Slot as Slot
 from udkjax.scene.joints import Weld as Weld
 from udkjax.scene.mechanism import Mechanism as Mechanism
+from udkjax.scene.mjcf import MjcfWarning as MjcfWarning
+from udkjax.scene.mjcf import mjcf_text as mjcf_text
+from udkjax.scene.mjcf import read_mjcf as read_mjcf
 from udkjax.scene.reshaping import with_angle as with_angle
 from udkjax.scene.reshaping import with_length as with_length

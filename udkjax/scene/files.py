@@ -1,4 +1,4 @@
-"""Scene files: mechanisms and drawings as TOML, versions 1 and 2 of the format, read and written."""
+"""Scene files: mechanisms and drawings as TOML, versions 1 and 2 of the format, and MJCF models, read and written."""
 
 import os
 from pathlib import Path
@@ -9,16 +9,18 @@ from udkjax.scene.checks import SceneError, abbreviate
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawing_tables import drawing_of_tables, drawing_text
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.mjcf.mjcf_reader import is_xml, mechanism_of_text
+from udkjax.scene.mjcf.mjcf_writer import mjcf_text
 from udkjax.scene.toml_text import parse_toml
 
 DRAWN_VERSION = 2
 
 
 def load(path: str | os.PathLike[str]) -> Mechanism:
-    """Read a mechanism from a TOML file of format 1, or of format 2: a drawing.
+    """Read a mechanism from a TOML file of format 1, or of format 2: a drawing; or from an MJCF model, as `read_mjcf`.
 
     Args:
-        path: The file.
+        path: The file; what begins as XML is MJCF.
 
     Returns:
         The mechanism; that of a drawing has it as `drawing`.
@@ -34,7 +36,7 @@ def load(path: str | os.PathLike[str]) -> Mechanism:
 
 
 def loads(text: str) -> Mechanism:
-    """Read a mechanism from the text of a TOML file, as `load` does.
+    """Read a mechanism from the text of a file, as `load` does.
 
     Args:
         text: The text.
@@ -50,17 +52,18 @@ def loads(text: str) -> Mechanism:
 
 @checked
 def save(mechanism: Mechanism | Drawing, path: str | os.PathLike[str]) -> None:
-    """Write a mechanism to a TOML file, whole or not at all: one that was drawn as a drawing, as in `dumps`.
+    """Write a mechanism to a file, whole or not at all: to TOML as in `dumps`, or to an MJCF model as in `mjcf_text`.
 
     Args:
         mechanism: The scene.
-        path: The file; an older one is replaced.
+        path: The file; an older one is replaced. An MJCF model ends in ".xml".
 
     Raises:
-        SceneError: The format cannot hold the mechanism, as in `dumps`.
+        SceneError: The format cannot hold the mechanism, as in `dumps` and `mjcf_text`.
         OSError: The file cannot be written.
     """
-    text, path = dumps(mechanism), Path(path)
+    path = Path(path)
+    text = (mjcf_text if path.suffix.lower() == ".xml" else dumps)(mechanism)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_text(text, encoding="utf-8", newline="\n")
@@ -93,6 +96,8 @@ def dumps(mechanism: Mechanism | Drawing) -> str:
 
 
 def _read(text: str, source: str) -> Mechanism:
+    if is_xml(text):
+        return mechanism_of_text(text, source, stacklevel=4)
     scene = parse_toml(text, source, SceneError)
     version = scene.get("format")
     if version == tables.FORMAT_VERSION and version is not True:

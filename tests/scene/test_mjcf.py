@@ -1,0 +1,298 @@
+"""MJCF in and out: held against MuJoCo's own accelerations where it is installed, against mechanisms, and against bad input."""
+
+import importlib
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from tests.command_line import udkjax
+from udkjax.scene import MjcfWarning, library
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+# --- against MuJoCo
+
+
+def text(values) -> str:
+    return " ".join(repr(float(value)) for value in np.atleast_1d(values))
+
+
+def random_tree(seed: int) -> str:
+    """A tree of bodies in a plane that is tilted in the world, with all kinds of joints, geoms, springs and actuators."""
+    rng = np.random.default_rng(seed)
+    joints, actuators = [], []
+
+    def turned():
+        return f'quat="{text(rng.normal(size=4))}"'
+
+    def geom():
+        kind = rng.choice(["sphere", "capsule", "cylinder", "box", "ellipsoid"])
+        mass = f'mass="{text(rng.uniform(0.2, 2))}"' if rng.random() < 0.5 else f'density="{text(rng.uniform(300, 3000))}"'
+        if kind != "sphere" and rng.random() < 0.5:
+            return f'<geom type="{kind}" fromto="{text(rng.normal(0, 0.3, 6))}" size="0.07" {mass}/>'
+        size = text(rng.uniform(0.05, 0.2, 3 if kind in ("box", "ellipsoid") else 2))
+        return f'<geom type="{kind}" size="{size}" pos="{text(rng.normal(0, 0.2, 3))}" {turned()} {mass}/>'
+
+    def joint(kind, kinds):
+        name, degrees = f"j{len(joints)}", 50.0 if kind == "hinge" else 1.0
+        joints.append(name)
+        given = {"pos": rng.normal(0, 0.2, 3), "axis": [0, 0, -1] if kind == "hinge" else [*rng.normal(size=2), 0]}
+        if len(kinds) == 1:
+            given |= {"stiffness": rng.uniform(1, 20), "springref": degrees * rng.uniform(-0.5, 0.5)}
+            given |= {"ref": degrees * rng.uniform(-0.5, 0.5), "damping": rng.uniform(0.1, 2)}
+            gains = rng.choice(["motor", 'position kp="3" kv="0.5"', 'velocity kv="0.7"', 'general gainprm="2"'])
+            actuators.append(f'<{gains} name="{name}" joint="{name}" gear="{text(rng.uniform(-2, 2))}"/>')
+        if kind == "hinge" and kinds != "hh":
+            given["armature"] = rng.uniform(0.01, 0.5)
+        numbers = " ".join(f'{key}="{text(value)}"' for key, value in given.items())
+        return f'<joint name="{name}" type="{kind}" {numbers}/>'
+
+    def body(k, inner):
+        kinds = rng.choice(["h", "h", "s", "sh", "hs", "ss", "hh", "ssh"])
+        held = "".join(joint({"h": "hinge", "s": "slide"}[kind], kinds) for kind in kinds)
+        inertial = f'<inertial pos="{text(rng.normal(0, 0.2, 3))}" mass="1.5" diaginertia="0.1 0.12 0.14" {turned()}/>'
+        fixed = f'<body {turned()} pos="{text(rng.normal(0, 0.3, 3))}">{geom()}</body>'
+        parts = [held, geom(), rng.choice([inertial, geom()]), rng.choice([fixed, ""]), f'<site name="s{k}" pos="0.1 0.2 0"/>']
+        angle = rng.uniform(-100, 100)
+        pose = rng.choice(
+            [f'euler="0 0 {angle}"', f'axisangle="0 0 2 {angle}"', f'zaxis="0 0 1" pos="{text(rng.normal(size=2))} 0"']
+        )
+        return f'<body name="b{k}" {pose}>{"".join(parts)}{inner}</body>'
+
+    arm = body(
+        0, body(1, body(2, "")) + body(3, "<body><joint name='last' armature='0.2'/><geom size='0.1' pos='0.3 0 0'/></body>")
+    )
+    joints.append("last")
+    return f"""<mujoco><option gravity="{text(rng.normal(0, 5, 3))}"><flag contact="disable"/></option><worldbody>
+        <frame {turned()}>{arm}</frame></worldbody><tendon>
+        <spatial name="t" stiffness="7" damping="0.5"><site site="s0"/><site site="s2"/></spatial>
+        <fixed stiffness="2" springlength="0.3"><joint joint="{joints[-1]}" coef="1.5"/></fixed></tendon>
+        <actuator>{"".join(actuators)}</actuator></mujoco>"""
+
+
+LOOPS = """<mujoco><compiler angle="radian" eulerseq="XYZ"/><option gravity="1 2 -9"><flag contact="disable"/></option>
+<default><geom type="capsule" size="0.05"/><default class="stiff"><joint damping="0.1"/><geom density="5000"/></default></default>
+<worldbody><frame euler="0.3 -0.7 1.1"><site name="base" pos="2.5 0 0"/>
+ <body name="crank" childclass="stiff" axisangle="0 0 1 0.7"><joint name="A"/><geom fromto="0 0 0 1 0 0"/>
+  <body name="coupler" pos="1 0 0" euler="0 0 -0.5"><joint name="B" axis="0 0 -1" ref="0.2" stiffness="3" springref="0.4"/>
+   <geom fromto="0 0 0 2.5 0 0" class="main"/>
+   <body name="rocker" pos="2.5 0 0" xyaxes="1 2 0 0 1 0"><joint/><geom fromto="0 0 0 0.3 -2 0"/>
+    <site name="tip" pos="0.35 -2.1 0"/></body></body></body>
+ <body name="w1" pos="0 3 0"><joint name="W1"/><geom type="cylinder" size="0.4 0.05" pos="0.1 0 0"/></body>
+ <body name="w2" pos="1 3 0.2"><joint name="W2" axis="0 0 -1"/><geom type="cylinder" size="0.6 0.05"/>
+  <body name="w3" pos="0 1 0"><joint name="W3"/><geom type="box" size="0.1 0.2 0.3"/></body></body>
+ <body name="block" pos="0 -2 0"><joint type="slide" axis="1 0 0" name="x"/><joint type="slide" axis="0 1 0" name="y"/>
+  <joint name="turn"/><geom type="box" size="0.1 0.2 0.3"/></body>
+ <body name="flag" pos="0.5 -2.5 0"><joint type="slide" axis="1 0 0" name="u"/><joint type="slide" axis="0 1 0" name="v"/>
+  <joint name="w"/><geom type="sphere" size="0.2"/><site name="f"/></body>
+</frame></worldbody>
+<tendon><spatial name="rod"><site site="base"/><site site="f"/></spatial>
+ <fixed name="sum"><joint joint="W1" coef="2"/><joint joint="W3" coef="1"/><joint joint="W2" coef="-1"/></fixed></tendon>
+<equality><connect name="D" site1="base" site2="tip"/><joint name="g" joint1="W1" joint2="W2" polycoef="0 -1.5 0 0 0"/>
+ <weld name="weld" body1="block" body2="flag" relpose="0.4 -0.6 0 0.98 0 0 0.2" anchor="0.1 0.1 0"/>
+ <tendon tendon1="rod"/><tendon tendon1="sum"/></equality></mujoco>"""
+
+
+def differences(xml, count, seed, method):
+    """The largest relative differences of velocities and accelerations of bodies from MuJoCo's, at random states of each."""
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+
+    def forward(q, v):
+        data.qpos, data.qvel = q, v
+        mujoco.mj_forward(model, data)
+        return data.efc_J.reshape(-1, model.nv).copy()
+
+    for _ in range(count):
+        q, v = model.qpos0 + rng.normal(0, 0.3, model.nq), rng.normal(0, 2, model.nv)
+        data.ctrl = rng.normal(size=model.nu)
+        for _ in range(12 if model.neq else 0):  # equalities are met exactly, by MuJoCo's own residuals
+            q = q - np.linalg.pinv(forward(q, v), 1e-9) @ data.efc_pos
+        J, h = forward(q, v), 1e-3
+        v = v - np.linalg.pinv(J, 1e-9) @ (J @ v)
+        one, two = (forward(q + k * h * v, v) - forward(q - k * h * v, v) for k in (1, 2))
+        forward(q, v)
+        if model.neq:  # in place of soft constraints: M a + J' lambda = F, J a = -J_dot v
+            M = np.zeros((model.nv, model.nv))
+            mujoco.mj_fullM(model, data, M)
+            A = np.block([[M, J.T], [J, np.zeros((len(J), len(J)))]])
+            b = np.concatenate([data.qfrc_smooth, -(8 * one - two) @ v / (12 * h)])
+            data.qacc = np.linalg.lstsq(A, b, 1e-11)[0][: model.nv]
+        mujoco.mj_rnePostConstraint(model, data)
+        key = f'<keyframe><key name="k" qpos="{text(q)}" qvel="{text(v)}" ctrl="{text(data.ctrl)}"/></keyframe></mujoco>'
+        mech = udk.read_mjcf(xml.replace("</mujoco>", key if model.nu else key.replace(' ctrl=""', "")), key="k")
+        a = np.asarray(udk.accelerations(mech, 0.0, mech.q0, mech.v0, method=method))
+        normal = data.xaxis[list(model.jnt_type).index(mujoco.mjtJoint.mjJNT_HINGE)]
+        up = np.array([0, 0, 1]) - normal[2] * normal  # as `read_mjcf` says: y is the world's z, and x is along its x
+        up = up / np.linalg.norm(up)
+        x = np.cross(up, normal) * np.sign(np.cross(up, normal)[0])
+        flat = x + 1j * up
+        for name in set(mech.body_names) & {model.body(k).name for k in range(model.nbody)}:
+            k, moving = mech.body_names.index(name), np.zeros((2, 6))
+            for function, into in zip((mujoco.mj_objectVelocity, mujoco.mj_objectAcceleration), moving, strict=True):
+                function(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(name).id, into, 0)
+            (omega, alpha), (rate, change) = moving[:, :3] @ np.cross(x, up), moving[:, 3:] @ flat
+            (px, py, _), (vx, vy, spin), (ax, ay, turn) = np.asarray(mech.q0[k]), np.asarray(mech.v0[k]), a[k]
+            arm = data.xipos[model.body(name).id] @ flat - complex(px, py)  # from the centre with all that is fixed to the body
+            change += model.opt.gravity @ flat
+            yield abs(complex(vx, vy) + 1j * spin * arm - rate) / (1 + abs(rate))
+            yield abs(complex(ax, ay) + (1j * turn - spin**2) * arm - change) / (1 + abs(change))
+            yield from (abs(spin - omega), abs(turn - alpha) / (1 + abs(alpha)))
+
+
+@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
+def test_a_tree_has_the_accelerations_of_mujoco(seed):
+    assert max(differences(random_tree(seed), 60, seed, udk.Auto())) < 1e-10
+
+
+@pytest.mark.filterwarnings("ignore::udkjax.scene.MjcfWarning")  # of what rounding leaves open
+def test_loops_have_the_accelerations_of_mujoco_with_hard_constraints():
+    assert max(differences(LOOPS, 12, 0, udk.SVD())) < 1e-10
+
+
+# --- there and back
+
+SLOW = set(library.__all__) - {"excavator", "planetary_gear", "driven_pendulum", "elliptic_trammel"}
+CANNOT = {"driven_pendulum": 'driver "motor": MJCF prescribes no motion', "elliptic_trammel": 'joint "B": MJCF has no equality'}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in library.__all__])
+def test_a_scene_of_the_library_is_the_same_there_and_back(name):
+    mech = library.slider_crank(0.7, driven=False) if name == "slider_crank" else getattr(library, name)()
+    if name in CANNOT:
+        with pytest.raises(udk.SceneError, match=CANNOT[name]):
+            udk.mjcf_text(mech)
+        return
+    is_there_and_back(mech, np.asarray(mech.q0), np.asarray(mech.v0))
+
+
+def is_there_and_back(mech, q, v):
+    text = udk.mjcf_text(mech)
+    if importlib.util.find_spec("mujoco"):
+        assert importlib.import_module("mujoco").MjModel.from_xml_string(text).nv >= len(mech.bodies)
+    found = udk.loads(text)
+    order = [mech.body_names.index(name) for name in found.body_names]
+    assert sorted(found.joints) == sorted(mech.joints)
+    assert_allclose(found.q0, np.asarray(mech.q0)[order], atol=1e-14)
+    assert_allclose(found.v0, np.asarray(mech.v0)[order], atol=1e-13)
+    a = np.asarray(udk.accelerations(mech, 0.0, q, v, method=udk.SVD()))
+    b = np.asarray(udk.accelerations(found, 0.0, q[order], v[order], method=udk.SVD()))
+    assert_allclose(b, a[order], atol=1e-12 * np.abs(a).max())
+
+
+@pytest.mark.filterwarnings("ignore::udkjax.scene.MjcfWarning")  # it is open in places
+def test_all_kinds_of_equalities_and_tendons_are_the_same_there_and_back():
+    drawn = udk.read_mjcf(LOOPS)
+    more = {
+        "far": udk.TorsionSpring(("ground", "w3"), 2.0, 0.3, -0.4),  # over several hinges: a tendon
+        "push": udk.Torque(("w3", "rocker"), 0.7),
+        "B": udk.TorsionSpring(("coupler", "crank"), 1.0, angle=0.2),  # beside the hinge's own
+    }
+    guides = {
+        "rail": udk.Prismatic(("ground", "block"), [drawn.bodies["block"].position, (0, 0)], 0.3),
+        "pin": udk.Slot(("flag", "ground"), [(0, 0), drawn.bodies["flag"].position], 0.2),
+    }
+    held = {"shaft": udk.Angle(("ground", "w3"), 0.1), "bar": udk.Distance(("w1", "block"), [(0.1, 0.2), (0.0, 0.3)])}
+    mech = udk.Mechanism(drawn.bodies, guides | dict(drawn.joints) | held, {}, dict(drawn.forces) | more, drawn.gravity)
+    rng = np.random.default_rng(0)
+    q = np.asarray(mech.q0) + rng.normal(0, 0.2, mech.q0.shape)
+    is_there_and_back(mech, q, rng.normal(size=q.shape))
+
+
+# --- what is not ours
+
+BODY = '<body name="a"><joint name="h" axis="0 1 0"{joint}/><geom name="g" size="0.1" pos="0.3 0 0"{geom}/>{body}</body>'
+
+
+def model(joint="", geom="", body="", world="", rest="") -> str:
+    held = BODY.format(joint=f" {joint}", geom=f" {geom}", body=body)
+    return f"<mujoco>\n<worldbody>\n{held}\n{world}</worldbody>\n{rest}\n</mujoco>"
+
+
+FREE = '<body name="b"><freejoint/><geom size="0.1"/></body>'
+TILTED = '<body name="b"><joint name="t" axis="0 1 1"/><geom size="0.1" pos="1 0 0"/></body>'
+TWO = '<body name="b"><joint name="h2" axis="0 1 0" pos="1 0 0"/><joint name="h1" axis="0 1 0"/><geom size="0.1"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (model(world=FREE), '<freejoint> (line 4): not taken over: a planar body that is free has two <joint type="slide"/>'),
+        (model(world=FREE.replace("freejoint", 'joint type="ball"')), "a ball joint does not stay in a plane"),
+        (model(world=TILTED), '<joint> "t" (line 4): leaves the plane in which the other joints move'),
+        (model("range='-90 30'"), 'give the event `udk.JointLimit("h", -0.523599, 1.5708)`; leave_out=["limits"]'),
+        (model("frictionloss='1'"), 'frictionloss is not taken over: give `udk.Friction`; leave_out=["frictionloss"]'),
+        (model("springdamper='1 1'"), 'springdamper="1 1" is not taken over: give stiffness and damping'),
+        (model("damping='1 0 2'"), "grows with powers of the motion"),
+        (model("dampign='1'"), 'dampign="1" is not taken over'),
+        (model("stiffness='1 m'"), 'stiffness="1 m" must be 1 to 3 finite numbers'),
+        (model(geom="type='mesh' mesh='m'"), "the mass of a mesh is not computed: give its body an <inertial>"),
+        (model(geom="type='capsule'"), 'the sizes of a capsule must be greater than zero'),
+        (model(geom="type='bowl'"), 'type="bowl" is none of sphere, capsule'),
+        (model(geom="euler='0 0 1' quat='1 0 0 0'"), "has several orientations: quat, euler"),
+        (model(geom="class='c'"), 'no default has the class "c"'),
+        (model(geom="mass='0'"), '<body> "a" (line 3): must have mass and inertia'),
+        (model(world=TWO, rest="<actuator><motor joint='h1'/></actuator>"), "one of two hinges of a body: not taken over"),
+        (model(rest="<equality><joint joint1='h' joint2='x'/></equality>"), 'joint2="x": no joint has this name'),
+        (model(rest="<equality><joint joint1='h' polycoef='0 1 2'/></equality>"), "polycoef=\"0 1 2\" is no straight line"),
+        (model(rest="<actuator><muscle joint='h'/></actuator>"), "<muscle> (line 5): not taken over"),
+        (model(rest="<actuator><motor joint='h' forcerange='-1 1'/></actuator>"), "forcerange is not taken over"),
+        (model(rest="<option density='1.2'/>"), 'density="1.2" is not taken over'),
+        (model(rest="<include file='more.xml'/>"), "a text has no folder to find it in"),
+        ("<mujoco><worldbody/></mujoco>", "no body has a joint: nothing moves"),
+        ("<mujoco>\n<worldbody></mujoco>", "not valid XML: mismatched tag: line 2"),
+        ("<robot/>", "<robot> (line 1): an MJCF model begins with <mujoco>"),
+    ],
+)  # fmt: skip
+def test_what_is_not_ours_is_refused_by_name_and_line(text, said):
+    with pytest.raises(udk.SceneError) as error:
+        udk.loads(text)
+    assert said in str(error.value)
+
+
+def test_all_mistakes_are_named_at_once_and_what_is_left_out_is_asked_for():
+    text = model("range='-90 30' frictionloss='1'", rest="<actuator><motor joint='h' forcerange='-1 1'/></actuator>")
+    with pytest.raises(udk.SceneError) as error:
+        udk.read_mjcf(text)
+    assert len(error.value.problems) == 3
+    assert udk.read_mjcf(text, leave_out=["limits", "frictionloss", "forceranges"]).body_names == ("a",)
+    with pytest.raises(udk.SceneError, match="leave_out: must be a list of limits, frictionloss"):
+        udk.read_mjcf(text, leave_out=["limit"])
+
+
+def test_contacts_and_open_loops_are_warned_of():
+    floor = '<geom name="floor" type="plane" size="1 1 1"/><site name="s" pos="0.5 0 0"/>'
+    text = model(
+        body='<site name="tip" pos="0.4 0 0"/>', world=floor, rest="<equality><connect site1='tip' site2='s'/></equality>"
+    )
+    with pytest.warns(MjcfWarning) as caught:
+        udk.loads(text)
+    assert ["a-ground is open by 0.1 (m, rad)" in str(w.message) for w in caught] == [True, False]
+    assert "contacts are not taken over, of g and floor" in str(caught[1].message)
+    assert {w.filename for w in caught} == {__file__}
+    with pytest.warns(MjcfWarning, match="open"):
+        udk.read_mjcf(text, leave_out=["contacts"])
+
+
+def test_files_and_the_command_line(tmp_path, capsys):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "arm.xml").write_text(f"<mujocoinclude>{BODY.format(joint='', geom='', body='')}</mujocoinclude>")
+    path, back, scene = tmp_path / "model.xml", tmp_path / "back.xml", tmp_path / "scene.toml"
+    key = "<keyframe><key name='up' qpos='0.5' qvel='2'/></keyframe>"
+    path.write_text(f"<mujoco><worldbody><include file='parts/arm.xml'/></worldbody>{key}</mujoco>")
+    assert udkjax("check", path) == 0
+    assert "degrees of freedom  1" in capsys.readouterr().out
+    assert udkjax("convert", path, scene, "--key", "up") == 0
+    assert udkjax("convert", scene, back) == 0
+    mech, found = udk.load(scene), udk.load(back)
+    assert_allclose(found.q0, mech.q0, atol=1e-15)
+    assert_allclose(mech.bodies["a"].angular_velocity, -2.0)
+    assert_allclose(found.v0, mech.v0, atol=1e-15)
+    (tmp_path / "parts" / "arm.xml").write_text("<mujocoinclude><include file='parts/arm.xml'/></mujocoinclude>")
+    assert udkjax("check", path) == 2
+    assert "(line 1 of parts/arm.xml): file=" in capsys.readouterr().err

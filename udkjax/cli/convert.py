@@ -1,0 +1,45 @@
+"""`udkjax convert`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from udkjax.cli.common import Json, Scene, load, show
+from udkjax.cli.datasets import check_target
+
+
+def convert(
+    scene: Scene,
+    target: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET.toml|TARGET.xml")],
+    /,
+    leave_out: tuple[Literal["limits", "frictionloss", "forceranges", "contacts"], ...] = (),
+    key: str | None = None,
+    json: Json = False,
+) -> None:
+    """Write a scene or an MJCF model to a file of the other kind, closed; refuse what the other kind cannot hold.
+
+    Args:
+        scene: a scene file, or an MJCF model.
+        target: what to write: .toml, a scene file; .xml, an MJCF model.
+        leave_out: of an MJCF model, what may be passed over.
+        key: the keyframe of an MJCF model from which the initial state is taken.
+        json: write the results as JSON.
+    """
+    check_target(target, (".toml", ".xml"))
+    mechanism, _ = load(scene, leave_out, key)
+
+    import udkjax as udk
+
+    if target.suffix.lower() == ".xml":
+        state = udk.assemble(mechanism)
+        fields = ("position", "angle", "velocity", "angular_velocity")
+        values = (state.q[:, :2], state.q[:, 2], state.v[:, :2], state.v[:, 2])
+        moved = {
+            f"body.{name}.{f}": x[k] for k, name in enumerate(mechanism.body_names) for f, x in zip(fields, values, strict=True)
+        }
+        mechanism = mechanism.with_parameters(moved)
+    udk.save(mechanism, target)
+    counts = {"bodies": len(mechanism.bodies), "joints": len(mechanism.joints), "forces": len(mechanism.forces)}
+    text = ", ".join(f"{count} {name}" for name, count in counts.items())
+    show({"file": target, **counts}, f"wrote {target} ({text})", json)

@@ -1,0 +1,106 @@
+"""The coordinates of an MJCF model that springs, motors and equalities act on: those of its joints, and lengths of tendons."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from udkjax.scene.mjcf.body_tree import TreeJoint, unique_name
+from udkjax.scene.mjcf.model_settings import merged
+from udkjax.scene.mjcf.motion_plane import AXES_TOL
+from udkjax.scene.mjcf.plane_model import Ends, PlaneModel, gap_of
+from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
+
+EVEN = 1e-12  # of the largest term: what angles that cancel leave
+
+
+class CoupledLength(NamedTuple):
+    """A coordinate that springs, motors and equalities act on: that of a joint, or the length of a tendon.
+
+    It is made of angles of bodies, by their factors; or it is a slide; or the distance of two points; or none of these.
+    """
+
+    length: float  # rad or m, where the model is written down
+    at_rest: float  # likewise, where its springs are
+    angles: Mapping[int, float] = {}
+    slide: TreeJoint | None = None
+    ends: Ends | None = None
+
+
+class CoupledLengths:
+    """The coordinates by the names of joints, `joints`, and of tendons, `tendons`; None where one is refused."""
+
+    def __init__(self, root: XmlElement, model: PlaneModel):
+        self.model, self.settings = model, model.tree.settings
+        self.joints = {joint.name: self._joint_length(joint) for joint in model.joints}
+        self.tendons: dict[str, CoupledLength | None] = {}
+        self.tendon_attributes: dict[str, AttributeReader] = {}
+        for element in merged(root, ("tendon",)).children:
+            if element.tag in ("fixed", "spatial"):
+                read = self.settings.read(element, section="tendon")
+                name = unique_name(read.text("name") or element.tag, self.tendons)
+                self.tendons[name], self.tendon_attributes[name] = self._tendon_length(read), read
+
+    def named_joint(self, read: AttributeReader, attribute: str) -> CoupledLength | None:
+        """Return the coordinate of the joint that an attribute names; None, and refuse it, where there is none."""
+        return self.model.tree.find(read, attribute, self.joints, "joint")
+
+    def named_tendon(self, read: AttributeReader, attribute: str) -> CoupledLength | None:
+        """Return the length of the tendon that an attribute names; None, and refuse it, where there is none."""
+        return self.model.tree.find(read, attribute, self.tendons, "tendon")
+
+    def _joint_length(self, joint: TreeJoint) -> CoupledLength:
+        lengths = self.model.reference(joint), self.model.reference(joint, "springref")
+        if joint.kind == "slide":
+            return CoupledLength(*lengths, slide=joint)
+        if self.model.has_rod(joint.body):
+            return CoupledLength(*lengths)
+        sign = self.model.sign(joint)
+        return CoupledLength(*lengths, angles={self.model.holder(joint.body): -sign, joint.body: sign})
+
+    def _tendon_length(self, read: AttributeReader) -> CoupledLength | None:
+        parts = [AttributeReader(child, child.attributes, self.settings.problems) for child in read.element.children]
+        if read.element.tag == "fixed":
+            found = [(self.named_joint(part, "joint"), part.number("coef")) for part in parts]
+            length = self.sum_lengths([(joint, coef) for joint, coef in found if joint], read)
+        else:
+            length = self._distance(parts, read)
+        given = read.numbers("springlength", (-1.0, -1.0), fewest=1)
+        if "springlength" in read and len(read.text("springlength").split()) == 2 and given[1] > given[0]:
+            read.refuse("a springlength of two different values, between which a tendon is slack, is not taken over")
+        return length if length is None or given[0] == -1 else length._replace(at_rest=float(given[0]))
+
+    def _distance(self, sites: list[AttributeReader], read: AttributeReader) -> CoupledLength | None:
+        ends = self._ends(sites, read)
+        if ends is None:
+            return None
+        at_rest = {joint.name: self.model.reference(joint, "springref") for joint in self.model.joints}
+        return CoupledLength(ends.distance, gap_of(ends, self.model.motions(at_rest, {})), ends=ends)
+
+    def _ends(self, sites: list[AttributeReader], read: AttributeReader) -> Ends | None:
+        if [site.element.tag for site in sites] != ["site", "site"]:
+            read.refuse("a spatial tendon between two sites is a spring; over more sites, geoms or pulleys it is not taken over")
+            return None
+        known = self.model.tree.sites
+        found = [known[site.text("site")] for site in sites if self.model.tree.find(site, "site", known, "site")]
+        if len(found) < 2:
+            return None
+        (one, first), (two, second) = found
+        if abs((second.origin - first.origin) @ self.model.plane.normal) > AXES_TOL * self.model.size:
+            read.refuse("its sites are not at one height above the plane of the motion")
+        hosts = self.model.tree.hosts
+        return Ends((hosts[one], hosts[two]), (self.model.plane.flat(first.origin), self.model.plane.flat(second.origin)))
+
+    def sum_lengths(self, terms: list[tuple[CoupledLength, float]], read: AttributeReader) -> CoupledLength | None:
+        """Return a sum of coordinates, each times its factor; None, and refuse it, where it is made of slides."""
+        if not all(term.angles for term, _ in terms):
+            if len(terms) == 1 and terms[0][1] == 1.0:
+                return terms[0][0]
+            read.refuse("couples slides, or one of two hinges of a body: not taken over")
+            return None
+        angles: dict[int, float] = {}
+        for term, factor in terms:
+            for body, part in term.angles.items():
+                angles[body] = angles.get(body, 0.0) + factor * part
+        largest = max(map(abs, angles.values()), default=0.0)
+        angles = {body: part for body, part in sorted(angles.items()) if abs(part) > EVEN * largest}
+        length, at_rest = (sum(factor * getattr(term, name) for term, factor in terms) for name in ("length", "at_rest"))
+        return CoupledLength(length, at_rest, angles)

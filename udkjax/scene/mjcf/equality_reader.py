@@ -1,0 +1,127 @@
+"""Equalities of an MJCF model as joints: connect, weld, and angles and distances that are held."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from udkjax.scene.checks import quote
+from udkjax.scene.joints import Angle, Distance, Gear, Joint, Revolute, Weld
+from udkjax.scene.mjcf.body_tree import unique_name
+from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
+from udkjax.scene.mjcf.model_settings import merged
+from udkjax.scene.mjcf.motion_plane import AXES_TOL, PlaneMotion
+from udkjax.scene.mjcf.plane_model import Ends
+from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
+
+MESHED = 1e-9  # rad; what rounding leaves between gears
+
+
+class EqualityReader:
+    """The joints, `joints`, that hold what the equalities of a model hold, by name; `taken` has the names of its other joints.
+
+    `motions` are those of the initial state.
+    """
+
+    def __init__(self, root: XmlElement, lengths: CoupledLengths, motions: Mapping[int, PlaneMotion], taken: list[str]):
+        self.lengths, self.model, self._motions, self._taken = lengths, lengths.model, motions, taken
+        self.joints: dict[str, Joint] = {}
+        kinds = {"connect": self._add_connect, "weld": self._add_weld, "joint": self._add_joint, "tendon": self._add_tendon}
+        for element in merged(root, ("equality",)).children:
+            read = self.model.tree.settings.read(element, section="equality")
+            if (
+                "equality" not in self.model.tree.settings.disabled
+                and element.tag in kinds
+                and read.choice("active", ("true", "false"), "true") == "true"
+            ):
+                kinds[element.tag](read)
+
+    def _add_connect(self, read: AttributeReader) -> None:
+        ends, _ = self._attachment(read, "body1")
+        self._put_joint(read, ends, Revolute(*self.model.attached(ends)))
+
+    def _add_weld(self, read: AttributeReader) -> None:
+        ends, turned = self._attachment(read, "body2")
+        if not read.number("torquescale", 1.0):
+            read.refuse("with a torquescale of 0 it is a connect: write one")
+        normal = self.model.plane.normal
+        if np.linalg.norm(turned @ normal - normal) > AXES_TOL:
+            read.refuse("turns its bodies out of the plane of the motion")
+        angle = self.model.relative_angle(*ends.bodies) + float(np.angle(self.model.plane.flat(turned @ self.model.plane.across)))
+        self._put_joint(read, ends, Weld(*self.model.attached(ends), angle))
+
+    def _attachment(self, read: AttributeReader, anchored: str) -> tuple[Ends, np.ndarray]:
+        """Return the points that an equality holds together, and by which rotation (3, 3) it turns body 2 from where it is."""
+        tree, turned = self.model.tree, np.eye(3)
+        if "site1" in read or "site2" in read:
+            found = [tree.find(read, f"site{k}", tree.sites, "site") or (0, tree.bodies[0].frame) for k in (1, 2)]
+            (one, first), (two, second) = found
+            points, turned = (first.origin, second.origin), first.axes @ second.axes.T
+        else:
+            one, two = tree.index_of(read, "body1", ""), tree.index_of(read, "body2")
+            frames = {"body1": tree.bodies[one].frame, "body2": tree.bodies[two].frame}
+            anchor = frames[anchored].point(read.numbers("anchor", (0.0, 0.0, 0.0)))
+            points = anchor, anchor
+            pose = read.numbers("relpose", (0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+            if pose[3:].any():
+                values = {"pos": " ".join(map(repr, pose[:3].tolist())), "quat": " ".join(map(repr, pose[3:].tolist()))}
+                wanted = frames["body1"].within(self.model.tree.settings.frame(AttributeReader(read.element, values, [])))
+                points, turned = (wanted.origin, anchor), wanted.axes @ frames["body2"].axes.T
+        if abs((points[1] - points[0]) @ self.model.plane.normal) > AXES_TOL * self.model.size:
+            read.refuse("its two points are not at one height above the plane of the motion")
+        if tree.hosts[one] == tree.hosts[two]:
+            read.refuse("connects a body to itself")
+        flat = self.model.plane.flat(points[0]), self.model.plane.flat(points[1])
+        return Ends((tree.hosts[one], tree.hosts[two]), flat), turned
+
+    def _add_joint(self, read: AttributeReader) -> None:
+        offset, slope = self._line(read)
+        one = self.lengths.named_joint(read, "joint1")
+        two = self.lengths.named_joint(read, "joint2") if "joint2" in read else None
+        terms = [(length, factor) for length, factor in ((one, 1.0), (two, -slope)) if length]
+        if one and (two or "joint2" not in read):
+            self._hold(read, self.lengths.sum_lengths(terms, read), offset)
+
+    def _add_tendon(self, read: AttributeReader) -> None:
+        offset, _ = self._line(read)
+        if "tendon2" in read:
+            read.refuse("couples two tendons: not taken over")
+        self._hold(read, self.lengths.named_tendon(read, "tendon1"), offset)
+
+    def _line(self, read: AttributeReader) -> tuple[float, float]:
+        found = read.numbers("polycoef", (0.0, 1.0, 0.0, 0.0, 0.0), fewest=1)
+        if found[2:].any():
+            read.refuse(f"polycoef={quote(read.text('polycoef'))} is no straight line: only its first two numbers are taken over")
+        return float(found[0]), float(found[1])
+
+    def _hold(self, read: AttributeReader, length: CoupledLength | None, offset: float) -> None:
+        """Add the joint that holds a length where it is written down, and an offset more."""
+        if length is None:
+            return
+        angles = length.angles
+        if length.ends:
+            self._put_joint(read, length.ends, Distance(*self.model.attached(length.ends), length.ends.distance + offset))
+        elif len(angles) == 2:
+            (one, _), (two, factor) = angles.items()
+            angle = self.model.relative_angle(one, two) + offset / factor
+            self.joints[self._joint_name(read)] = Angle(self.model.names((one, two)), angle)
+        elif len(angles) == 3:
+            turned = sum(factor * self._motions[body].angle for body, factor in angles.items())
+            if offset or abs(turned) > MESHED * max(map(abs, angles.values())):
+                read.refuse(
+                    "is not satisfied in the initial state, and gears start in mesh: change the ref or the key of a joint"
+                )
+            # The three factors add up to zero: any body may be the carrier. The ground, or else the one with the largest.
+            carrier = 0 if 0 in angles else max(angles, key=lambda body: abs(angles[body]))
+            one, two = (body for body in angles if body != carrier)
+            radii, internal = (abs(angles[one]), abs(angles[two])), angles[one] * angles[two] < 0
+            self.joints[self._joint_name(read)] = Gear(
+                self.model.names((one, two)), radii, internal, self.model.names((carrier,))[0]
+            )
+        else:
+            read.refuse("holds a slide, or couples more than three bodies: not taken over")
+
+    def _put_joint(self, read: AttributeReader, ends: Ends, joint: Joint) -> None:
+        self.joints[self._joint_name(read, "-".join(self.model.names(ends.bodies)))] = joint
+
+    def _joint_name(self, read: AttributeReader, default: str = "") -> str:
+        return unique_name(read.text("name") or default or read.element.tag, {*self.joints, *self._taken})

@@ -1,0 +1,166 @@
+"""Springs, dampers and actuators of an MJCF model as force elements; what they have beside is refused or left out by name."""
+
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.scene.checks import quote
+from udkjax.scene.forces import Force, ForceElement, Spring, Torque, TorsionSpring
+from udkjax.scene.mjcf.body_tree import unique_name
+from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
+from udkjax.scene.mjcf.model_settings import merged
+from udkjax.scene.mjcf.vocabulary import ACTUATORS
+from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
+
+LEFT_OUT = ("limits", "frictionloss", "forceranges", "contacts")  # what a caller may have passed over
+FAR_AWAY = 16.0  # times the size of a model: a point of a slide that it does not reach, but no number that looks mistyped
+
+
+class LinearForce(NamedTuple):
+    """The force -stiffness (length - at_rest) - damping rate + constant along a coordinate; without a motor constant is None."""
+
+    stiffness: float = 0.0
+    damping: float = 0.0
+    at_rest: float = 0.0
+    constant: float | None = None
+
+
+class ForceReader:
+    """The force elements of a model, `forces`, by name."""
+
+    def __init__(self, root: XmlElement, lengths: CoupledLengths, controls: Mapping[str, float], leave_out: Collection[str]):
+        self.lengths, self.model, self.settings, self.leave_out = lengths, lengths.model, lengths.settings, leave_out
+        self.forces: dict[str, ForceElement] = {}
+        for joint in self.model.joints:
+            self._add_passive(joint.name, lengths.joints[joint.name], joint.read)
+        for name, length in lengths.tendons.items():
+            if length:
+                self._add_passive(name, length, lengths.tendon_attributes[name])
+        for element in merged(root, ("actuator",)).children:
+            if element.tag in ACTUATORS and "actuation" not in self.settings.disabled:
+                self._add_actuator(self.settings.read(element), controls.get(element.attributes.get("name", ""), 0.0))
+
+    def _add_passive(self, name: str, length: CoupledLength, read: AttributeReader) -> None:
+        """Add the spring and the damper of a joint or a tendon, and refuse what else it may have."""
+        off = self.settings.disabled
+        if "limit" not in off and self.settings.is_limited(read, "limited", "range"):
+            self._leave_or_refuse("limits", read, f"range is not taken over: {self._limit_cure(name, length, read)}")
+        if "frictionloss" not in off and read.number("frictionloss"):
+            self._leave_or_refuse("frictionloss", read, "frictionloss is not taken over: give `udk.Friction`")
+        if "actuation" not in off and self.settings.is_limited(read, "actuatorfrclimited", "actuatorfrcrange"):
+            self._leave_or_refuse("forceranges", read, "actuatorfrcrange is not taken over: forces are not cut off")
+        stiffness, damping = (
+            0.0 if flag in off else self._linear_term(read, key) for key, flag in (("stiffness", "spring"), ("damping", "damper"))
+        )
+        self._add_force(name, length, read, LinearForce(stiffness, damping, length.at_rest))
+
+    def _linear_term(self, read: AttributeReader, name: str) -> float:
+        value = read.numbers(name, (0.0, 0.0, 0.0), fewest=1)
+        if value[1:].any():
+            read.refuse(f"{name}={quote(read.text(name))} grows with powers of the motion: only its first number is taken over")
+        return float(value[0])
+
+    def _limit_cure(self, name: str, length: CoupledLength, read: AttributeReader) -> str:
+        low, high = read.numbers("range", (0.0, 0.0))
+        if len(length.angles) == 2 and read.element.tag == "joint":
+            holder, body = sorted(length.angles)
+            sign, radians = length.angles[body], self.settings.radians
+            ends = sorted(self.model.relative_angle(holder, body) + sign * (x * radians - length.length) for x in (low, high))
+            return f'give the event `udk.JointLimit("{name}", {ends[0]:.6g}, {ends[1]:.6g})`'
+        return "give an event, `udk.JointLimit` or `udk.Stop`"
+
+    def _leave_or_refuse(self, kind: str, read: AttributeReader, text: str) -> None:
+        """Refuse a part of the model, unless the caller has named its kind as one to leave out."""
+        if kind not in self.leave_out:
+            read.refuse(f'{text}; leave_out=["{kind}"] reads the model without')
+
+    def _add_actuator(self, read: AttributeReader, control: float) -> None:
+        kind = read.element.tag
+        gain, bias = read.numbers("gainprm", (1.0, 0.0, 0.0), fewest=1)[0], np.zeros(3)
+        if kind == "position":
+            gain = read.number("kp", 1.0)
+            bias[1:] = -gain, -read.number("kv")
+        elif kind == "velocity":
+            gain = read.number("kv", 1.0)
+            bias[2] = -gain
+        elif kind == "general":
+            read.choice("gaintype", ("fixed",), "fixed")
+            if read.choice("biastype", ("none", "affine"), "none") == "affine":
+                bias = read.numbers("biasprm", (0.0, 0.0, 0.0), fewest=1)
+        if self.settings.is_limited(read, "forcelimited", "forcerange"):
+            self._leave_or_refuse("forceranges", read, "forcerange is not taken over: forces are not cut off")
+        if self.settings.is_limited(read, "ctrllimited", "ctrlrange"):
+            control = float(np.clip(control, *read.numbers("ctrlrange", (0.0, 0.0))))
+        if "tendon" in read:
+            length = self.lengths.named_tendon(read, "tendon")
+        else:
+            length = self.lengths.named_joint(read, "joint")
+        if length is None or kind not in ACTUATORS:
+            return
+        gear = read.numbers("gear", (1.0, 0.0, 0.0, 0.0, 0.0, 0.0), fewest=1)[0]
+        constant, at_rest = gear * (gain * control + bias[0]), 0.0
+        if bias[1] and gear:
+            constant, at_rest = 0.0, -constant / (bias[1] * gear**2)
+        is_motor = not np.any(bias[1:]) or constant
+        force = LinearForce(-bias[1] * gear**2, -bias[2] * gear**2, at_rest, constant if is_motor else None)
+        self._add_force(read.text("name") or kind, length, read, force)
+
+    def _add_force(self, name: str, length: CoupledLength, read: AttributeReader, force: LinearForce) -> None:
+        stiffness, damping, at_rest, constant = force
+        if not stiffness and not damping and constant is None:
+            return
+        if stiffness < 0 or damping < 0:
+            read.refuse("pushes away from where it is, or along the motion: stiffness and damping must not be negative")
+        elif length.slide:
+            self._add_slide_force(name, length, read, force)
+        elif length.ends and constant is None:
+            self._put(name, Spring(*self.model.attached(length.ends), stiffness, max(at_rest, 0.0), damping or None))
+        elif len(length.angles) == 2:
+            (one, _), (two, factor) = length.angles.items()
+            bodies, angle = self.model.names((one, two)), self.model.relative_angle(one, two)
+            if stiffness or damping:
+                free = angle + (at_rest - length.length) / factor
+                self._put(name, TorsionSpring(bodies, factor**2 * stiffness, factor**2 * damping or None, free))
+            if constant is not None:
+                self._put(name, Torque(bodies, factor * constant))
+        else:
+            what = "with a constant force between two sites" if length.ends else "on angles of more bodies than two"
+            read.refuse(f"acts {what}, or on one of two hinges of a body: not taken over")
+
+    def _add_slide_force(self, name: str, length: CoupledLength, read: AttributeReader, force: LinearForce) -> None:
+        stiffness, damping, at_rest, constant = force
+        joint = length.slide
+        assert joint is not None
+        held, holder = joint.body, self.model.holder(joint.body)
+        kinds = "".join(j.kind[0] for j in self.model.tree.bodies[held].joints)
+        hinges = [j for j in self.model.tree.bodies[held].joints if j.kind == "hinge"]
+        pin, axis = self.model.plane.flat((hinges or [joint])[0].anchor), self.model.plane.flat(joint.axis)
+        if kinds not in ("s", "sh", "hs"):
+            read.refuse("acts on a slide of a body that has several: not taken over")
+            return
+        owner, other, axis = (held, holder, -axis) if kinds == "hs" else (holder, held, axis)
+        bodies, end = self.model.names((owner, other)), self.model.local(other, pin)
+        if stiffness:  # of no length, from where it is at rest: along the slide it is linear on both sides
+            self._put(
+                name, Spring(bodies, [self.model.local(owner, pin + axis * (at_rest - length.length)), end], stiffness, 0.0)
+            )
+        if damping:  # from a point far along the slide, which it does not reach
+            self._put(
+                name, Spring(bodies, [self.model.local(owner, pin - FAR_AWAY * self.model.size * axis), end], 0.0, 0.0, damping)
+            )
+        if constant is None:
+            return
+        push = constant * axis
+        if not owner:
+            self._put(name, Force(bodies[1], (push.real, push.imag), end))
+        elif kinds == "s":
+            for body, sign in ((other, 1), (owner, -1)):
+                turned = sign * push * np.exp(-1j * self.model.bodies[body].angle)
+                pushed = Force(self.model.bodies[body].name, (turned.real, turned.imag), self.model.local(body, pin), "body")
+                self._put(name, pushed)
+        else:
+            read.refuse("acts on a slide between two moving bodies that turn against each other: not taken over")
+
+    def _put(self, name: str, force: ForceElement) -> None:
+        self.forces[unique_name(name, self.forces)] = force

@@ -1,0 +1,226 @@
+"""MJCF models, the XML of MuJoCo, as mechanisms: those that move in a plane."""
+
+import os
+import warnings
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+
+from udkjax.scene.bodies import Body
+from udkjax.scene.checks import SceneError, abbreviate, suggestion
+from udkjax.scene.joints import Angle, Distance, Gear, Joint, Prismatic, Revolute, Slot
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.mjcf.body_tree import BodyTree, TreeJoint, unique_name
+from udkjax.scene.mjcf.contact_pairs import contact_pairs
+from udkjax.scene.mjcf.coupled_lengths import CoupledLengths
+from udkjax.scene.mjcf.equality_reader import EqualityReader
+from udkjax.scene.mjcf.force_reader import LEFT_OUT, ForceReader
+from udkjax.scene.mjcf.model_settings import ModelSettings, merged
+from udkjax.scene.mjcf.motion_plane import AXES_TOL, PlaneMotion, plane_of
+from udkjax.scene.mjcf.plane_model import PlaneModel
+from udkjax.scene.mjcf.vocabulary import unknown_parts
+from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
+
+INITIAL = "initial"  # the keyframe that `mjcf_text` writes velocities and controls into
+CLOSED = 1e-9  # of the model's size: what rounding leaves open of a loop
+ROTOR_MASS = 0.01  # of the mass of the body that carries it
+
+
+class MjcfWarning(UserWarning):
+    """Something in an MJCF model is not as its author may take it to be: loops that are open, contacts that are not there."""
+
+
+def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), key: str | None = None) -> Mechanism:
+    """Read a planar mechanism from an MJCF model, the XML of MuJoCo.
+
+    Its axes may lie in any plane of the world: y of the mechanism is the world's z, or y where the plane is level. The motion is
+    that of ideal constraints; MuJoCo's own are soft. Loops that are open as written are named in a `MjcfWarning`.
+
+    Args:
+        source: The file, or its text.
+        leave_out: What may be passed over, of "limits", "frictionloss", "forceranges" and "contacts"; the first three are else
+            refused, and contacts are warned of.
+        key: The keyframe of the initial state; by default that of the name "initial", or else the model as it is written.
+
+    Returns:
+        The mechanism.
+
+    Raises:
+        SceneError: The model is wrong, does not stay in a plane, or has what a mechanism cannot hold: all of it, with its lines.
+        OSError: The file cannot be read.
+    """
+    path = "" if isinstance(source, str) and is_xml(source) else os.fspath(source)
+    wrong = [name for name in leave_out if name not in LEFT_OUT]
+    if isinstance(leave_out, str) or wrong:
+        raise SceneError([f"leave_out: must be a list of {', '.join(LEFT_OUT)}, is {abbreviate(leave_out)}"], path)
+    try:
+        return mechanism_of_text(Path(path).read_text(encoding="utf-8") if path else str(source), path, leave_out, key)
+    except UnicodeDecodeError as error:
+        raise SceneError([f"not a text file in UTF-8 ({error})"], path) from None
+
+
+def is_xml(text: str) -> bool:
+    """Return whether a text is XML rather than TOML, or the name of a file."""
+    return text.removeprefix("\ufeff").lstrip().startswith("<")
+
+
+def mechanism_of_text(
+    text: str, source: str, leave_out: Collection[str] = (), key: str | None = None, stacklevel: int = 3
+) -> Mechanism:
+    """Return the mechanism of the text of a model; as `read_mjcf`, whose caller is `stacklevel` away."""
+    root = parse_xml(text, source)
+    problems = unknown_parts(root)
+    unknown = len(problems)
+    settings = ModelSettings(root, problems)
+    tree = BodyTree(root, settings)
+    plane = plane_of(list(tree.joints.values()), settings.gravity)
+    if not tree.joints:
+        problems.append("<mujoco>: no body has a joint: nothing moves")
+    if len(problems) > unknown:
+        raise SceneError(problems, source)
+    model = PlaneModel(tree, plane)
+    values, rates, controls = _initial_state(root, model, key)
+    motions = model.motions(values, rates)
+    held = {name: joint for name, body, joints in model.named_joints() if (joint := _tree_joint(model, body, joints))}
+    lengths = CoupledLengths(root, model)
+    forces = ForceReader(root, lengths, controls, leave_out).forces
+    loops = EqualityReader(root, lengths, motions, list(held)).joints
+    bodies = {model.bodies[k].name: _body(model, k, motions[k]) for k, _ in tree.moving()}
+    joints = held | loops
+    for name, body, of_body in model.named_joints():
+        for joint in of_body:
+            _add_armature(model, joint, name, body, bodies, joints)
+    if problems:
+        raise SceneError(problems, source)
+    gravity = plane.flat(settings.gravity)
+    name = root.attributes.get("model", "")
+    mechanism = Mechanism(bodies, joints, {}, forces, (gravity.real, gravity.imag), name)
+    said = [
+        f"{loop} is open by {gap:.3g} (m, rad), which assembly closes" for loop, gap in _gaps(mechanism, list(loops), model.size)
+    ]
+    if "contact" not in settings.disabled and "contacts" not in leave_out and (pairs := contact_pairs(root, tree, plane)):
+        more = f" and {len(pairs) - 3} more pairs" * (len(pairs) > 3)
+        said.append(
+            f"contacts are not taken over, of {'; '.join(pairs[:3])}{more}: `udk.Contact` is an event for each point that hits"
+        )
+    for text in said:
+        warnings.warn(text, MjcfWarning, stacklevel=stacklevel)
+    return mechanism
+
+
+def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tuple[dict[str, float], ...]:
+    """Return the values and the rates of joints, and the controls of actuators, by name, of a keyframe."""
+    keys = {element.attributes.get("name", ""): element for element in merged(root, ("keyframe",)).children}
+    problems, joints = model.tree.settings.problems, [joint.name for joint in model.joints]
+    if key is not None and key not in keys:
+        problems.append(f"<keyframe>: no key has the name {abbreviate(key)}{suggestion(key, keys)}")
+    element = keys.get(INITIAL if key is None else key)
+    if element is None:
+        return {}, {}, {}
+    read = AttributeReader(element, element.attributes, problems)
+    actuators = [child.attributes.get("name", "") for child in merged(root, ("actuator",)).children]
+    found = []
+    for attribute, names in (("qpos", joints), ("qvel", joints), ("ctrl", actuators)):
+        given = attribute in read and names
+        found.append(dict(zip(names, read.numbers(attribute, np.zeros(len(names))).tolist(), strict=True)) if given else {})
+    return tuple(found)
+
+
+def _tree_joint(model: PlaneModel, body: int, joints: list[TreeJoint]) -> Joint | None:
+    """Return what holds a body to the one that it hangs on, by its hinges and slides in their order; None: it is free."""
+    holder, kinds = model.holder(body), "".join(joint.kind[0] for joint in joints)
+    names, angle = model.names((holder, body)), model.relative_angle(holder, body)
+    anchors, axes = [model.plane.flat(joint.anchor) for joint in joints], [model.plane.flat(joint.axis) for joint in joints]
+    slides = [axis for axis, joint in zip(axes, joints, strict=True) if joint.kind == "slide"]
+    parallel = len(slides) == 2 and abs((slides[0] * np.conj(slides[1])).imag) < AXES_TOL
+    if sorted(kinds) == ["h", "s", "s"] and not parallel:
+        return None
+    pin = anchors[kinds.find("h")] if "h" in kinds else anchors[0]
+    points = [model.local(holder, pin), model.local(body, pin)]
+    if kinds == "h":
+        return Revolute(names, points)
+    if kinds == "s":
+        return Prismatic(names, points, model.direction(holder, axes[0]), angle)
+    if kinds == "sh":
+        return Slot(names, points, model.direction(holder, axes[0]))
+    if kinds == "hs":
+        return Slot(names[::-1], points[::-1], model.direction(body, axes[1]))
+    if kinds == "ss" and not parallel:
+        return Angle(names, angle)
+    if kinds == "hh" and abs(anchors[1] - anchors[0]) > AXES_TOL * model.size:
+        ends = [model.local(holder, anchors[0]), model.local(body, anchors[1])]
+        return Distance(names, ends, abs(anchors[1] - anchors[0]))
+    text = "its joints are more than a body has in a plane: one hinge and two slides that are not parallel, at most"
+    model.tree.settings.problems.append(f"{model.tree.bodies[body].where}: {text}")
+    return None
+
+
+def _body(model: PlaneModel, number: int, motion: PlaneMotion) -> Body:
+    """Return a moving body in its initial state."""
+    body = model.bodies[number]
+    place = motion.point(body.centre)
+    speed = motion.velocity(place)
+    angle = body.angle + motion.angle
+    return Body(body.mass, body.inertia, (place.real, place.imag), angle, (speed.real, speed.imag), motion.omega)
+
+
+def _add_armature(
+    model: PlaneModel, joint: TreeJoint, name: str, number: int, bodies: dict[str, Body], joints: dict[str, Joint]
+) -> None:
+    """Add a joint's rotor, whose energy is 1/2 A w^2, with w the rate of the joint and A its `armature`.
+
+    On the ground it is inertia, or mass, of the body. Between body 1 and body 2 it is a rotor that is pinned to the centre of
+    body 1 and geared to turn N = 1 + 2 A / I2 times as fast against it as body 2: with inertia J = A / (N (N - 1)) it has
+
+        1/2 J (w1 + N (w2 - w1))^2 = 1/2 A (w2 - w1)^2 - 1/2 (A / N) w1^2 + 1/2 (A / (N - 1)) w2^2,
+
+    so body 1 gets A / N of inertia, and body 2 gives up A / (N - 1), half of its own. Its mass is taken from body 1.
+    """
+    armature, holder = joint.read.number("armature"), model.holder(number)
+    if not armature:
+        return
+    one, two = model.names((holder, number))
+    body, alone = bodies[two], len(model.tree.bodies[number].joints) == 1
+    if armature < 0:
+        joint.read.refuse("armature must not be negative")
+    elif model.has_rod(number):
+        joint.read.refuse("the armature of one of two hinges of a body is not taken over")
+    elif joint.kind == "slide":
+        weight = model.plane.flat(model.tree.settings.gravity) * np.conj(model.plane.flat(joint.axis))
+        if holder or not alone or abs(weight.real) > AXES_TOL * abs(weight):
+            joint.read.refuse(
+                "the armature of a slide is taken over on the ground and across gravity, of a body without other joints"
+            )
+        bodies[two] = _with_mass(body, body.mass + armature, body.inertia)
+    elif not holder:
+        bodies[two] = _with_mass(body, body.mass, body.inertia + armature)
+    else:
+        carrier, ratio = bodies[one], float(1 + 2 * armature / body.inertia)
+        spin = carrier.angular_velocity + ratio * (body.angular_velocity - carrier.angular_velocity)
+        rotor, axle = unique_name(f"{joint.name} rotor", bodies), unique_name(f"{joint.name} axle", joints)
+        mass = ROTOR_MASS * carrier.mass
+        inertia = armature / (ratio * (ratio - 1))
+        bodies[rotor] = Body(mass, inertia, carrier.position, carrier.angle, carrier.velocity, spin)
+        bodies[one] = _with_mass(carrier, carrier.mass - mass, carrier.inertia + armature / ratio)
+        bodies[two] = _with_mass(body, body.mass, body.inertia / 2)
+        joints[axle] = Revolute((one, rotor), [(0.0, 0.0), (0.0, 0.0)])
+        joints[unique_name(f"{joint.name} gear", joints)] = Gear((rotor, two), (1.0, ratio), internal=True, carrier=one)
+
+
+def _with_mass(body: Body, mass: object, inertia: object) -> Body:
+    return Body(mass, inertia, body.position, body.angle, body.velocity, body.angular_velocity)  # pyright: ignore[reportArgumentType]
+
+
+def _gaps(mechanism: Mechanism, loops: list[str], size: float) -> list[tuple[str, float]]:
+    """Return the joints of loops that are open in the initial guess, and by how much (m, rad)."""
+    found = []
+    for name in loops:
+        joint = mechanism.joints[name]
+        frames = [
+            Body(1.0, 1.0).frame() if body not in mechanism.bodies else mechanism.bodies[body].frame()
+            for body in joint.frame_names
+        ]
+        gap = float(np.max(np.abs(np.asarray(joint.residual(0.0, *frames)))))
+        found += [(name, gap)] if gap > CLOSED * max(size, 1.0) else []
+    return found

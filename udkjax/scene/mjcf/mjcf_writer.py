@@ -1,0 +1,328 @@
+"""Mechanisms as MJCF models: a tree of bodies in the world's x-z plane, closed by equalities."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.scene.arguments import checked
+from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Point, between
+from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.fields import Number
+from udkjax.scene.forces import Spring, Torque, TorsionSpring
+from udkjax.scene.joints import Angle, Constraint, Distance, Gear, Prismatic, Revolute, Slot, Weld
+from udkjax.scene.mechanism import AbstractDrawing, Mechanism
+from udkjax.scene.mechanism_tables import check_known
+from udkjax.scene.mjcf.body_tree import unique_name
+from udkjax.scene.mjcf.coupled_lengths import EVEN
+from udkjax.scene.mjcf.mjcf_reader import CLOSED, INITIAL
+from udkjax.scene.reshaping import attachments
+from udkjax.scene.suspicions import body_sizes
+
+NORMAL = "0 -1 0"  # of the x-z plane: angles are anticlockwise about it, seen from where x is to the right and z is up
+IN_TREE = ((Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,))  # what no equality can express comes before the others
+THICKNESS = 0.04  # of bars that are drawn, beside the largest body
+
+Values = dict[str, str]
+
+
+class _TreeJoint(NamedTuple):
+    """A hinge or a slide as it is written, and its initial rate (rad/s, m/s)."""
+
+    name: str
+    attributes: Values
+    rate: Number
+
+
+@checked
+def mjcf_text(mechanism: Mechanism | AbstractDrawing) -> str:
+    """Return a mechanism as an MJCF model, the XML of MuJoCo, in the world's x-z plane; `read_mjcf` reads it again.
+
+    Joints make a tree as far as they go, of hinges and slides; the others are equalities: `connect`, `weld`, or of tendons.
+    Bodies are drawn as thin bars without mass and contacts. Initial velocities, and torques as controls of motors, are in the
+    keyframe "initial". MuJoCo holds equalities softly: see its `solref`.
+
+    Args:
+        mechanism: The scene.
+
+    Returns:
+        The text.
+
+    Raises:
+        SceneError: The mechanism has what MJCF has no element for, or what is not closed along the tree; all of it, by name.
+    """
+    mechanism = mechanism.mechanism() if isinstance(mechanism, AbstractDrawing) else mechanism
+    check_known(mechanism, mechanism.name)
+    return _Writer(jax.tree.map(np.asarray, mechanism)).text()
+
+
+class _Writer:
+    def __init__(self, mechanism: Mechanism):
+        self.mechanism, self.problems = mechanism, list[str]()
+        self.size = max(body_sizes(mechanism).values())
+        self.frames = {GROUND: GROUND_FRAME_AT_REST} | {
+            name: body.frame()._replace(vx=body.velocity[0], vy=body.velocity[1], omega=body.angular_velocity)
+            for name, body in mechanism.bodies.items()
+        }
+        self.sites: dict[str, list[Values]] = {name: [] for name in self.frames}
+        self.springs: dict[str, Values] = {}  # attributes of hinges, by their names
+        self.sections: dict[str, list[str]] = {"tendon": [], "equality": [], "actuator": []}
+        self.controls: list[float] = []
+        self.taken: set[str] = set()  # names of sites and tendons
+        self.parents, self.holders = self._tree()
+        self.turns: dict[str, dict[str, float]] = {GROUND: {}}  # hinges whose sum is the angle of a body
+        self.joints = {name: self._joints(name) for name in self.parents}
+        for name, joint in mechanism.joints.items():
+            if name not in self.holders.values():
+                self._add_loop(name, joint)
+        for name, force in mechanism.forces.items():
+            self._add_force(name, force)
+        if "world" in mechanism.bodies:
+            self.problems.append('body "world": in MJCF this is the name of the ground')
+        self.problems += [
+            f"driver {quote(name)}: MJCF prescribes no motion; a <velocity> actuator comes near it" for name in mechanism.drivers
+        ]
+
+    def text(self) -> str:
+        """Return the model; raise `SceneError` where it is not all of the mechanism."""
+        gravity = _numbers(self.mechanism.gravity[0], 0.0, self.mechanism.gravity[1])
+        lines = [
+            f"<mujoco{_attributes(model=self.mechanism.name) if self.mechanism.name else ''}>",
+            '  <compiler angle="radian"/>',
+            f"  <option{_attributes(gravity=gravity)}/>",
+            "  <worldbody>",
+            *(f"    <site{_attributes(**site)}/>" for site in self.sites[GROUND]),
+        ]
+        rates: list[Number] = []
+        children = {name: [child for child in self.parents if self.parents[child] == name] for name in self.frames}
+        pending = [(name, 2) for name in reversed(children[GROUND])]
+        while pending:
+            name, depth = pending.pop()
+            if name in self.frames:
+                lines += ["  " * depth + line for line in self._body_lines(name)]
+                rates += [joint.rate for joint in self.joints[name]]
+                pending += [("", depth), *((child, depth + 1) for child in reversed(children[name]))]
+            else:
+                lines.append("  " * depth + "</body>")
+        lines.append("  </worldbody>")
+        for section, parts in self.sections.items():
+            lines += [f"  <{section}>", *(f"    {part}" for part in parts), f"  </{section}>"] if parts else []
+        if any(rates) or any(self.controls):
+            given = {"qvel": _numbers(*rates)} | ({"ctrl": _numbers(*self.controls)} if self.controls else {})
+            lines += ["  <keyframe>", f"    <key{_attributes(name=INITIAL, **given)}/>", "  </keyframe>"]
+        if self.problems:
+            raise SceneError(self.problems, self.mechanism.name)
+        return "\n".join([*lines, "</mujoco>", ""])
+
+    def _tree(self) -> tuple[dict[str, str], dict[str, str]]:
+        """Return the body on which each hangs, from the ground on, and the joint by which; without one it is free."""
+        groups, edges = {name: name for name in self.frames}, dict[str, list[tuple[str, str]]]()
+
+        def group(name: str) -> str:
+            while groups[name] != name:
+                name = groups[name]
+            return name
+
+        orders = {
+            name: next((k for k, kinds in enumerate(IN_TREE) if isinstance(joint, kinds)), None)
+            for name, joint in self.mechanism.joints.items()
+        }
+        for name in sorted((name for name, order in orders.items() if order is not None), key=lambda name: orders[name] or 0):
+            one, two = self.mechanism.joints[name].bodies
+            if group(one) != group(two):
+                groups[group(one)] = group(two)
+                edges.setdefault(one, []).append((two, name))
+                edges.setdefault(two, []).append((one, name))
+        parents, holders = dict[str, str](), dict[str, str]()
+        for root in (GROUND, *self.mechanism.body_names):
+            reached = [root] if root == GROUND or root not in parents else []
+            if reached and root != GROUND:
+                parents[root] = GROUND
+            for name in reached:
+                for other, joint in edges.get(name, []):
+                    if other != GROUND and other not in parents:
+                        parents[other], holders[other] = name, joint
+                        reached.append(other)
+        return parents, holders
+
+    def _joints(self, name: str) -> list[_TreeJoint]:
+        """Return the hinges and slides by which a body hangs on its parent."""
+        parent, held = self.parents[name], self.holders.get(name)
+        one, two = self.frames[parent], self.frames[name]
+        self.turns[name] = dict(self.turns[parent])
+        found: list[_TreeJoint] = []
+
+        def hinge(title: str, pin: Point, rate: Number) -> None:
+            self.turns[name][title] = 1.0
+            found.append(_TreeJoint(title, {"axis": NORMAL, "pos": _in_space(two.local((pin.x - two.x, pin.y - two.y)))}, rate))
+
+        def slide(title: str, direction: Point, pin: Point) -> None:
+            there = [frame.velocity(frame.local((pin.x - frame.x, pin.y - frame.y))) for frame in (one, two)]
+            rate = direction.dot(Point(there[1].x - there[0].x, there[1].y - there[0].y))
+            found.append(_TreeJoint(title, {"type": "slide", "axis": _in_space(two.local(direction))}, rate))
+
+        turning = two.omega - one.omega
+        if held is None:
+            slide(f"{name}.x", Point(1.0, 0.0), Point(two.x, two.y))
+            slide(f"{name}.y", Point(0.0, 1.0), Point(two.x, two.y))
+            hinge(f"{name}.angle", Point(two.x, two.y), turning)
+            return found
+        joint = self.mechanism.joints[held]
+        gap = float(np.max(np.abs(joint.residual(0.0, *(self.frames[body] for body in joint.bodies)))))
+        if gap > CLOSED * max(self.size, 1.0):
+            cure = "MJCF takes bodies where they stand: start them from `udk.assemble`"
+            self.problems.append(f"joint {quote(held)}: is open by {gap:.3g} (m, rad), and {cure}")
+        first, second = (self.frames[body] for body in joint.bodies)
+        if isinstance(joint, Revolute):
+            hinge(held, two.point(joint.points[joint.bodies.index(name)]), turning)
+        elif isinstance(joint, Prismatic | Slot):
+            pin, along = second.point(joint.points[1]), first.vector((float(np.cos(joint.axis)), float(np.sin(joint.axis))))
+            slide(held if isinstance(joint, Prismatic) else f"{held}.slide", along, pin)
+            if isinstance(joint, Slot):
+                hinge(held, pin, turning)
+                found = found if name == joint.bodies[1] else found[::-1]
+        elif isinstance(joint, Distance):
+            here = [two.point(joint.points[joint.bodies.index(name)]), one.point(joint.points[joint.bodies.index(parent)])]
+            rod = Point(here[0].x - here[1].x, here[0].y - here[1].y)
+            ends = [frame.velocity(joint.points[joint.bodies.index(body)]) for frame, body in ((two, name), (one, parent))]
+            spin = (rod.x * (ends[0].y - ends[1].y) - rod.y * (ends[0].x - ends[1].x)) / rod.dot(rod)
+            hinge(f"{held}.rod", here[1], spin - one.omega)
+            hinge(held, here[0], two.omega - spin)
+        elif isinstance(joint, Angle):
+            slide(f"{held}.x", Point(1.0, 0.0), Point(two.x, two.y))
+            slide(f"{held}.y", Point(0.0, 1.0), Point(two.x, two.y))
+        return found
+
+    def _body_lines(self, name: str) -> list[str]:
+        """Return the lines of a body, but for those that hang on it and its end."""
+        body, one, two = self.mechanism.bodies[name], self.frames[self.parents[name]], self.frames[name]
+        place = _in_space(one.local((two.x - one.x, two.y - one.y)))
+        inertia = _numbers(body.inertia, body.inertia, body.inertia)
+        radius = 0.5 * THICKNESS * self.size
+        points = [Point(*np.asarray(point).tolist()) for _, point in attachments(self.mechanism, name)]
+        ends = {_in_space(point) for point in points if point.norm() > radius}
+        look = {"mass": "0", "contype": "0", "conaffinity": "0", "size": _numbers(radius)}
+        return [
+            f"<body{_attributes(name=name, pos=place, axisangle=f'{NORMAL} {_numbers(two.angle - one.angle)}')}>",
+            *(f"  <joint{_attributes(name=j.name, **j.attributes, **self.springs.get(j.name, {}))}/>" for j in self.joints[name]),
+            f"  <inertial{_attributes(pos='0 0 0', mass=_numbers(body.mass), diaginertia=inertia)}/>",
+            *(f"  <geom{_attributes(type='capsule', fromto=f'0 0 0 {end}', **look)}/>" for end in sorted(ends)),
+            *([] if ends else [f"  <geom{_attributes(**look)}/>"]),
+            *(f"  <site{_attributes(**site)}/>" for site in self.sites[name]),
+        ]
+
+    # --- what closes loops, and forces
+
+    def _add_loop(self, name: str, joint: Constraint) -> None:
+        section = self.sections["equality"]
+        if isinstance(joint, Revolute | Weld):
+            kind = "connect" if isinstance(joint, Revolute) else "weld"
+            angle = float(joint.angle) if isinstance(joint, Weld) else 0.0  # by which body 2 is turned against body 1
+            one, two = self._add_sites(name, joint.bodies, joint.points, angle)
+            section.append(f"<{kind}{_attributes(name=name, site1=one, site2=two)}/>")
+        elif isinstance(joint, Distance):
+            tendon = self._add_spatial(name, joint.bodies, joint.points)
+            offset = float(joint.length) - between(joint.points, *(self.frames[body] for body in joint.bodies)).norm()
+            section.append(f"<tendon{_attributes(name=name, tendon1=tendon, polycoef=_numbers(offset, 0.0))}/>")
+        elif isinstance(joint, Gear | Angle):
+            one, two = joint.bodies
+            if isinstance(joint, Gear):
+                first, second = float(joint.radii[0]), float(joint.radii[1]) * (-1 if joint.internal else 1)
+                parts, offset = {one: first, two: second, joint.carrier: -first - second}, 0.0
+            else:
+                parts = {two: 1.0, one: -1.0}
+                offset = float(joint.angle - self.frames[two].angle + self.frames[one].angle)
+            if tendon := self._add_fixed(name, self._hinges(parts), "joint"):
+                section.append(f"<tendon{_attributes(name=name, tendon1=tendon, polycoef=_numbers(offset, 0.0))}/>")
+        else:
+            closes = " that closes a loop" if isinstance(joint, Slot | Prismatic) else ""
+            self.problems.append(f"joint {quote(name)}: MJCF has no equality for a {type(joint).__name__.lower()}{closes}")
+
+    def _add_force(self, name: str, force: object) -> None:
+        if isinstance(force, Spring):
+            rest = {"springlength": _numbers(force.length), "stiffness": _numbers(force.stiffness)}
+            self._add_spatial(name, force.bodies, force.points, **rest, **_damping(force.damping))
+        elif isinstance(force, TorsionSpring | Torque):
+            one, two = force.bodies
+            hinges = self._hinges({two: 1.0, one: -1.0})
+            (hinge, sign), *others = [*hinges.items(), ("", 0.0)]
+            alone = len(others) == 1 and abs(sign) == 1
+            if isinstance(force, Torque):
+                tendon = "" if alone else self._add_fixed(name, hinges, "force")
+                target = {"joint": hinge, "gear": _numbers(sign)} if alone else {"tendon": tendon}
+                if alone or tendon:
+                    self.sections["actuator"].append(f"<motor{_attributes(name=name, **target)}/>")
+                    self.controls.append(float(force.value))
+                return
+            rest = float(force.angle - self.frames[two].angle + self.frames[one].angle)
+            spring = {"stiffness": _numbers(force.stiffness)} | _damping(force.damping)
+            if alone and hinge not in self.springs:
+                self.springs[hinge] = {"springref": _numbers(sign * rest), **spring}
+            else:
+                turned = -1.0 if rest < 0 else 1.0  # a springlength of -1 says that it is the length as written
+                parts = {joint: turned * part for joint, part in hinges.items()}
+                self._add_fixed(name, parts, "force", springlength=_numbers(abs(rest)), **spring)
+        else:
+            self.problems.append(f"force {quote(name)}: MJCF has no element for a {type(force).__name__.lower()}")
+
+    def _hinges(self, parts: dict[str, float]) -> dict[str, float]:
+        """Return a sum of angles of bodies, each times its factor, as one of hinges."""
+        found: dict[str, float] = {}
+        for body, factor in parts.items():
+            for hinge, part in self.turns[body].items():
+                found[hinge] = found.get(hinge, 0.0) + factor * part
+        least = EVEN * max(map(abs, found.values()), default=0.0)
+        return {hinge: part for hinge, part in found.items() if abs(part) > least}
+
+    def _add_fixed(self, name: str, hinges: dict[str, float], what: str, **attributes: str) -> str:
+        """Add a tendon that is a sum of hinges; return its name, or nothing where there are none."""
+        if not hinges:
+            self.problems.append(
+                f"{what} {quote(name)}: its bodies do not turn against each other, and MJCF knows angles of hinges alone"
+            )
+            return ""
+        title = self._unique(name)
+        parts = "".join(f"<joint{_attributes(joint=hinge, coef=_numbers(part))}/>" for hinge, part in hinges.items())
+        self.sections["tendon"].append(f"<fixed{_attributes(name=title, **attributes)}>{parts}</fixed>")
+        return title
+
+    def _add_spatial(self, name: str, bodies: Sequence[str], points: Array | np.ndarray, **attributes: str) -> str:
+        """Add a tendon between two points; return its name."""
+        title = self._unique(name)
+        ends = "".join(f"<site{_attributes(site=site)}/>" for site in self._add_sites(name, bodies, points))
+        self.sections["tendon"].append(f"<spatial{_attributes(name=title, **attributes)}>{ends}</spatial>")
+        return title
+
+    def _add_sites(self, name: str, bodies: Sequence[str], points: Array | np.ndarray, angle: float = 0.0) -> list[str]:
+        """Add a site for each of two points, the first turned by an angle (rad); return their names."""
+        titles = [self._unique(f"{name}.{body}") for body in bodies]
+        for title, body, point, turn in zip(titles, bodies, points, (angle, 0.0), strict=True):
+            turned = {"axisangle": f"{NORMAL} {_numbers(turn)}"} if turn else {}
+            self.sites[body].append({"name": title, "pos": _in_space(Point(*point.tolist())), **turned})
+        return titles
+
+    def _unique(self, name: str) -> str:
+        """Return a name of its own for a site or a tendon."""
+        found = unique_name(name, self.taken)
+        self.taken.add(found)
+        return found
+
+
+def _damping(value: object) -> Values:
+    return {} if value is None else {"damping": _numbers(value)}
+
+
+def _in_space(point: Point) -> str:
+    return _numbers(point.x, 0.0, point.y)
+
+
+def _numbers(*values: object) -> str:
+    """Return numbers as text that reads back as the same numbers."""
+    return " ".join(repr(float(value)) for value in values)  # pyright: ignore[reportArgumentType]
+
+
+def _attributes(**values: str) -> str:
+    return "".join(f" {name}={quoteattr(value)}" for name, value in values.items())

@@ -1,0 +1,86 @@
+"""What holds for a whole MJCF model: its compiler's settings, what its options switch off, and its defaults."""
+
+import math
+
+from udkjax.scene.checks import abbreviate, suggestion
+from udkjax.scene.mjcf.orientations import SpaceFrame, frame_of
+from udkjax.scene.mjcf.vocabulary import ACTUATORS
+from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
+
+MAIN = "main"  # the class of defaults that stands for none
+_COMMON_TO_ACTUATORS = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")
+_STANDARD = "constraint equality limit contact spring damper gravity actuation frictionloss".split()
+
+
+class ModelSettings:
+    """The settings of a model, and its elements' attributes with the defaults of their classes."""
+
+    def __init__(self, root: XmlElement, problems: list[str]):
+        self.problems = problems
+        self._defaults: dict[str, dict[str, dict[str, str]]] = {MAIN: {}}
+        compilers, options, flags = (merged(root, path) for path in (("compiler",), ("option",), ("option", "flag")))
+        read = AttributeReader(compilers, compilers.attributes, problems)
+        self.radians = math.pi / 180 if read.choice("angle", ("degree", "radian"), "degree") == "degree" else 1.0
+        self.sequence = read.text("eulerseq", "xyz")
+        if len(self.sequence) != 3 or not set(self.sequence.lower()) <= set("xyz"):
+            read.refuse(f"eulerseq={abbreviate(self.sequence)} must be three of x, y, z, X, Y, Z")
+            self.sequence = "xyz"
+        self.autolimits = read.choice("autolimits", ("true", "false"), "true") == "true"
+        self.mass_from_geoms = read.choice("inertiafromgeom", ("true", "false", "auto"), "auto")
+        self.mass_groups = read.numbers("inertiagrouprange", (0, 5))
+        read = AttributeReader(flags, flags.attributes, problems)
+        off = {name for name in _STANDARD if read.choice(name, ("enable", "disable"), "enable") == "disable"}
+        self.disabled = off | ({"equality", "limit", "contact", "frictionloss"} if "constraint" in off else set())
+        self.gravity = AttributeReader(options, options.attributes, problems).numbers("gravity", (0.0, 0.0, -9.81))
+        if "gravity" in self.disabled:
+            self.gravity = 0 * self.gravity
+        pending = [(child, MAIN) for child in root.children if child.tag == "default"]
+        while pending:
+            element, parent = pending.pop()
+            name = element.attributes.get("class", MAIN if element in root.children else "")
+            if not name:
+                problems.append(f"{element.where}: needs a class")
+            found = self._defaults.setdefault(name, {tag: dict(values) for tag, values in self._defaults[parent].items()})
+            for child in element.children:
+                if child.tag == "default":
+                    pending.append((child, name))
+                else:
+                    found.setdefault(child.tag, {}).update(child.attributes)
+
+    def read(self, element: XmlElement, childclass: str = MAIN, section: str = "") -> AttributeReader:
+        """Return the attributes of an element with their defaults: of its class, or of that of the body that holds it.
+
+        `section` is the tag that its defaults stand under, where it is another one than its own.
+        """
+        name = element.attributes.get("class", childclass)
+        if name not in self._defaults:
+            self.problems.append(
+                f"{element.where}: no default has the class {abbreviate(name)}{suggestion(name, self._defaults)}"
+            )
+        defaults = self._defaults.get(name, {})
+        values: dict[str, str] = {}
+        if element.tag in ACTUATORS:
+            for tag in ACTUATORS:
+                values |= {key: value for key, value in defaults.get(tag, {}).items() if key in _COMMON_TO_ACTUATORS}
+        values |= defaults.get(section or element.tag, {})
+        return AttributeReader(element, values | dict(element.attributes), self.problems)
+
+    def frame(self, read: AttributeReader) -> SpaceFrame:
+        """Return the frame of an element in the one that it stands in."""
+        return frame_of(read, self.radians, self.sequence)
+
+    def is_limited(self, read: AttributeReader, limited: str, range_name: str) -> bool:
+        """Return whether a range is in force, by the attribute that says so or because it is given."""
+        word = read.choice(limited, ("true", "false", "auto"), "auto")
+        return word == "true" or (word == "auto" and self.autolimits and range_name in read)
+
+
+def merged(root: XmlElement, path: tuple[str, ...]) -> XmlElement:
+    """Return all elements at a path below the outermost one as a single one: later attributes override earlier ones."""
+    found = [root]
+    for tag in path:
+        found = [child for element in found for child in element.children if child.tag == tag]
+    attributes = {name: value for element in found for name, value in element.attributes.items()}
+    whole = XmlElement(path[-1], attributes, found[0].line if found else root.line)
+    whole.children = [child for element in found for child in element.children]
+    return whole

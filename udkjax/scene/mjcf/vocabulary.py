@@ -1,0 +1,145 @@
+"""What of MJCF is taken over, what has no effect on a motion, and what is refused wherever it says more than nothing.
+
+An element or an attribute that stands nowhere here is refused by its name.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from udkjax.scene.checks import quote
+from udkjax.scene.mjcf.xml_tree import XmlElement
+
+WITHOUT_EFFECT = ("visual", "statistic", "asset", "sensor", "custom", "size", "light", "camera")  # on the motion
+TOLD_BY_PARENT = ("equality", "spatial", "fixed")  # whose children are called as other elements are
+ACTUATORS = ("motor", "position", "velocity", "general")
+SHAPELESS = ("material", "mesh", "pair")  # in defaults alone
+
+_POSE = "pos quat axisangle xyaxes zaxis euler"
+_LOOK = "group material rgba user"
+_SOFT = "solref solimp"  # how soft a constraint is: here constraints are ideal
+
+
+class _Attributes(NamedTuple):
+    used: str
+    idle: str = ""  # without effect on the motion
+    nothing: Mapping[str, str] = {}  # refused unless they say nothing: their value then
+
+
+def _actuator(used: str = "", **nothing: str) -> _Attributes:
+    shared = "name class joint tendon gear ctrlrange ctrllimited forcerange forcelimited"
+    idle = "group user lengthrange input actlimited actrange"
+    return _Attributes(f"{shared} {used}", idle, {"damping": "0", "armature": "0", "delay": "0", "nsample": "0", **nothing})
+
+
+_EQUALITY = _Attributes("name class active", _SOFT)
+_TENDON = _Attributes(
+    "name class limited range springlength stiffness damping frictionloss",
+    f"width margin solreflimit solimplimit solreffriction solimpfriction {_LOOK}",
+    {"armature": "0", "springyield": "0"},
+)
+_KNOWN: dict[str, _Attributes] = {
+    "compiler": _Attributes(
+        "angle eulerseq autolimits inertiafromgeom inertiagrouprange",
+        "meshdir texturedir assetdir strippath discardvisual usethread fusestatic saveinertial savecompiled savecanonical "
+        "conflict passthrough fitaabb alignfree convexhull exactmeshinertia",
+        {"coordinate": "local", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0", "balanceinertia": "false"},
+    ),
+    "option": _Attributes(
+        "gravity",
+        "timestep apirate impratio wind magnetic o_margin o_solref o_solimp o_friction integrator cone jacobian solver "
+        "iterations tolerance ls_iterations ls_tolerance noslip_iterations noslip_tolerance mpr_iterations mpr_tolerance "
+        "ccd_iterations ccd_tolerance sleep_tolerance sdf_iterations sdf_initpoints",
+        {"density": "0", "viscosity": "0"},
+    ),
+    "flag": _Attributes(
+        "constraint equality limit contact spring damper gravity actuation frictionloss",
+        "clampctrl warmstart filterparent refsafe sensor midphase nativeccd island eulerdamp autoreset energy fwdinv invdiscrete "
+        "multiccd sleep diagexact override",
+    ),
+    "mujoco": _Attributes("model"),
+    "default": _Attributes("class"),
+    "worldbody": _Attributes(""),
+    "body": _Attributes(f"name childclass {_POSE}", "user sleep simple fuse", {"mocap": "false", "gravcomp": "0"}),
+    "frame": _Attributes(f"name childclass {_POSE}"),
+    "inertial": _Attributes(f"mass diaginertia fullinertia {_POSE}"),
+    "joint": _Attributes(
+        "name class type pos axis range limited ref springref stiffness damping armature frictionloss actuatorfrcrange "
+        "actuatorfrclimited",
+        "group user margin solreflimit solimplimit solreffriction solimpfriction actuatorgravcomp",
+        {"springdamper": "0 0", "springyield": "0"},
+    ),
+    "geom": _Attributes(
+        f"name class type size fromto mass density contype conaffinity group {_POSE}",
+        f"mesh hfield condim priority friction solmix margin gap fluidcoef {_SOFT} {_LOOK}",
+        {"shellinertia": "false", "fluidshape": "none"},
+    ),
+    "site": _Attributes(f"name class fromto {_POSE}", f"type mesh size {_LOOK}"),
+    "equality": _Attributes(""),
+    "connect": _EQUALITY._replace(used=f"{_EQUALITY.used} body1 body2 anchor site1 site2"),
+    "weld": _EQUALITY._replace(
+        used=f"{_EQUALITY.used} body1 body2 anchor relpose site1 site2 torquescale",
+    ),
+    "equality/joint": _EQUALITY._replace(used=f"{_EQUALITY.used} joint1 joint2 polycoef"),
+    "equality/tendon": _EQUALITY._replace(used=f"{_EQUALITY.used} tendon1 tendon2 polycoef"),
+    "tendon": _TENDON,
+    "spatial": _TENDON,
+    "spatial/site": _Attributes("site"),
+    "fixed": _TENDON,
+    "fixed/joint": _Attributes("joint coef"),
+    "actuator": _Attributes(""),
+    "motor": _actuator(),
+    "position": _actuator("kp kv", timeconst="0", dampratio="0", inheritrange="0"),
+    "velocity": _actuator("kv"),
+    "general": _actuator("gainprm biasprm gaintype biastype", dyntype="none", dynprm="1", actdim="-1", inheritrange="0"),
+    "contact": _Attributes(""),
+    "pair": _Attributes("name class geom1 geom2", f"condim friction gap margin solreffriction {_SOFT}"),
+    "exclude": _Attributes("name body1 body2"),
+    "keyframe": _Attributes(""),
+    "key": _Attributes("name qpos qvel ctrl", "time act mpos mquat plastic"),
+}
+_CURES = {
+    "freejoint": 'a planar body that is free has two <joint type="slide"/> and a hinge',
+    "springdamper": "give stiffness and damping",
+    "dampratio": "give kv",
+    "gravcomp": "leave out the weight by a <motor>",
+}
+
+
+def unknown_parts(root: XmlElement) -> list[str]:
+    """Return what of a model is not taken over, each with its line: elements and attributes that could change its motion."""
+    found: list[str] = []
+    if root.tag != "mujoco":
+        return [f"{root.where}: an MJCF model begins with <mujoco>"]
+    skipped: set[int] = set()
+    for element, parent in [(root, root), *root.walk()]:
+        if id(parent) in skipped or element.tag in WITHOUT_EFFECT or (parent.tag == "default" and element.tag in SHAPELESS):
+            skipped.add(id(element))
+            continue
+        told = f"{parent.tag}/{element.tag}"
+        key = told if parent.tag in TOLD_BY_PARENT and element.tag in ("joint", "tendon", "site", "geom") else element.tag
+        if key not in _KNOWN:
+            skipped.add(id(element))
+            found.append(f"{element.where}: not taken over{_cure(element.tag)}")
+            continue
+        known = _KNOWN[key]
+        words = {*known.used.split(), *known.idle.split()}
+        for name, value in element.attributes.items():
+            if name not in words and not _says_nothing(value, known.nothing.get(name)):
+                found.append(f"{element.where}: {name}={quote(value)} is not taken over{_cure(name)}")
+    return found
+
+
+def _cure(name: str) -> str:
+    return f": {_CURES[name]}" if name in _CURES else ""
+
+
+def _says_nothing(value: str, nothing: str | None) -> bool:
+    if nothing is None or value == nothing:
+        return nothing is not None
+    try:
+        given, empty = ([float(word) for word in text.split()] for text in (value, nothing))
+    except ValueError:
+        return False
+    return all(x == (empty[k] if k < len(empty) else 0.0) for k, x in enumerate(given)) or (
+        len(given) == 1 and given[0] < 0 >= empty[0]
+    )

@@ -1,0 +1,121 @@
+"""XML with the line of each element, and attributes read as numbers; what is wrong is collected, not raised."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from udkjax.scene.checks import SceneError, abbreviate, quote, suggestion
+
+
+class XmlElement:
+    """An element: its tag, attributes, children, and the line where it begins, in the included file of this name if in one."""
+
+    def __init__(self, tag: str, attributes: Mapping[str, str], line: int, file: str = ""):
+        self.tag, self.attributes, self.line, self.file = tag, attributes, line, file
+        self.children: list[XmlElement] = []
+
+    @property
+    def where(self) -> str:
+        """What the element is and where, as in error messages."""
+        name = self.attributes.get("name", "")
+        return f"<{self.tag}> {f'{quote(name)} ' if name else ''}(line {self.line}{f' of {self.file}' if self.file else ''})"
+
+    def walk(self) -> Iterator[tuple["XmlElement", "XmlElement"]]:
+        """Iterate over all elements below this one, in their order, each with the one that holds it."""
+        pending: list[tuple[XmlElement, XmlElement]] = [(child, self) for child in reversed(self.children)]
+        while pending:
+            element, parent = pending.pop()
+            yield element, parent
+            pending.extend((child, element) for child in reversed(element.children))
+
+
+def parse_xml(text: str, source: str, file: str = "", within: tuple[str, ...] = ()) -> XmlElement:
+    """Return the outermost element of a text, each <include> in it replaced by what is in that file.
+
+    Args:
+        text: XML; a byte order mark before it is passed over.
+        source: The model's file, in whose folder others are looked for; or empty.
+        file: The name of the file that is included, if it is one.
+        within: The files that it is included in.
+
+    Raises:
+        SceneError: The text is not XML, or a file cannot be included.
+    """
+    parser, found, opened = expat.ParserCreate(), [], []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        element = XmlElement(tag, attributes, parser.CurrentLineNumber, file)
+        (opened[-1].children if opened else found).append(element)
+        opened.append(element)
+
+    parser.StartElementHandler, parser.EndElementHandler = start, lambda tag: opened.pop()
+    try:
+        parser.Parse(text.removeprefix("\ufeff"), True)
+    except expat.ExpatError as error:
+        raise SceneError([f"{f'{file}: ' if file else ''}not valid XML: {error}"], source) from None
+    for parent in [found[0], *(element for element, _ in found[0].walk())]:
+        if any(child.tag == "include" for child in parent.children):
+            parts = [_included(c, source, within) if c.tag == "include" else [c] for c in parent.children]
+            parent.children = [child for part in parts for child in part]
+    return found[0]
+
+
+def _included(element: XmlElement, source: str, within: tuple[str, ...]) -> list[XmlElement]:
+    """Return the elements of the file that an <include> names."""
+    name = element.attributes.get("file", "")
+    try:
+        if not source or name in within:
+            why = "it includes itself" if source else "a text has no folder to find it in: read the model from its file"
+            raise SceneError([f"{element.where}: file={quote(name)} cannot be included: {why}"], source)
+        text = (Path(source).parent / name).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError([f"{element.where}: file={quote(name)} cannot be read: {error}"], source) from None
+    return parse_xml(text, source, name, (*within, name)).children
+
+
+class AttributeReader:
+    """The attributes of one element, its defaults among them; mistakes are added to `problems`."""
+
+    def __init__(self, element: XmlElement, values: Mapping[str, str], problems: list[str]):
+        self.element, self.values, self._problems = element, values, problems
+
+    def refuse(self, text: str) -> None:
+        """Add a mistake of this element."""
+        self._problems.append(f"{self.element.where}: {text}")
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.values
+
+    def text(self, name: str, default: str = "") -> str:
+        """Return an attribute as it is."""
+        return self.values.get(name, default)
+
+    def choice(self, name: str, choices: Sequence[str], default: str) -> str:
+        """Return an attribute that is one of some words."""
+        value = self.values.get(name, default)
+        if value in choices:
+            return value
+        self.refuse(f"{name}={quote(value)} is none of {', '.join(choices)}{suggestion(value, choices)}")
+        return default
+
+    def numbers(self, name: str, default: Sequence[float] | np.ndarray, fewest: int | None = None) -> np.ndarray:
+        """Return an attribute of as many finite numbers as the default has, or `fewest`: the rest is the default's."""
+        if name not in self.values:
+            return np.array(default, float)
+        words = self.values[name].split()
+        try:
+            found = np.array([float(word) for word in words])
+        except ValueError:
+            found = np.array([np.nan])
+        most, least = len(default), len(default) if fewest is None else fewest
+        if np.all(np.isfinite(found)) and least <= len(found) <= most:
+            return np.concatenate([found, np.array(default[len(found) :], float)])
+        wanted = f"{least} to {most}" if least < most else f"{most}"
+        self.refuse(f"{name}={abbreviate(self.values[name])} must be {wanted} finite number{'s' * (most > 1)}")
+        return np.array(default, float)
+
+    def number(self, name: str, default: float = 0.0) -> float:
+        """Return an attribute that is one number."""
+        return float(self.numbers(name, [default])[0])
