@@ -69,7 +69,7 @@ def objects() -> dict[str, object]:
         *(udk.Stop(), udk.Log(), udk.Verner65(), udk.Adams(), udk.BDF(), run.result, udk.Reached.lost),
         udk.ConstrainedSystem(mass=jnp.diag, force=anything),
         *(part for joint in JOINTS.values() for part in vars(joint).values() if isinstance(part, udk.Profile)),
-        *(drawing, drawing.links["bar"]),
+        *(drawing, drawing.links["bar"], udk.Held(ts, 0.1)),
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),
     ]
     return {type(one).__name__: one for one in found}

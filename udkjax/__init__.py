@@ -36,6 +36,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.integrate import Solution as Solution
     from udkjax.integrate import Verner65 as Verner65
     from udkjax.integrate import simulate as simulate
+    from udkjax.integrate import step as step
     from udkjax.integrate.assembly import AssemblyError as AssemblyError
     from udkjax.integrate.assembly import State as State
     from udkjax.integrate.assembly import assemble as assemble
@@ -70,6 +71,7 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.scene import Frame as Frame
     from udkjax.scene import Friction as Friction
     from udkjax.scene import Gear as Gear
+    from udkjax.scene import Held as Held
     from udkjax.scene import Joint as Joint
     from udkjax.scene import Link as Link
     from udkjax.scene import Mechanism as Mechanism
@@ -159,7 +161,7 @@ _NAMES = {
         Drawing Link Mechanism Body GROUND Frame Point Constraint Joint Driver Motion ForceElement
         Revolute Prismatic Slot Weld Distance Angle Gear Rack Cam
         Polynomial Sine Spline Profile
-        Spring TorsionSpring Force Torque Friction""",
+        Spring TorsionSpring Force Torque Friction Held""",
     "udkjax.pinv": "SVD Varga Greville Householder GramSchmidt Elimination Auto",
     "udkjax.integrate.assembly": "AssemblyError State assemble check",
     "udkjax.integrate.events": "Event Events JointLimit Contact Stop Log Impact Release Attach Lock",
@@ -186,7 +188,7 @@ _NAMES = {
     "udkjax.study.modes": "modes Modes",
     "udkjax.study.kinematics": "kinematics Kinematics travel Travel",
     "udkjax.study.transmission": "coupler_curve mechanical_advantage transmission_angle workspace Workspace",
-    "udkjax.integrate": "simulate Solution Projection Result SimulationError Verner65 Adams BDF",
+    "udkjax.integrate": "simulate step Solution Projection Result SimulationError Verner65 Adams BDF",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 

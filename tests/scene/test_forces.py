@@ -79,3 +79,40 @@ def test_forces_in_either_frame(everything, at):
     x, y = turn @ np.asarray(everything.forces["push"].point)
     push = [*force, x * force[1] - y * force[0]]
     assert_allclose(total_loads(everything, "push", at, everything.q0, V)["a"], push, rtol=1e-14)
+
+
+def held(value):
+    return udk.Mechanism(
+        {"a": udk.Body(1.0, 1.0)}, forces={"motor": udk.Torque(["ground", "a"], value), "push": udk.Force("a", [0, 0])}
+    )
+
+
+def test_a_number_that_is_held_between_samples(same):
+    """The first and the last hold beyond; it stands in for a number and gives way to one, and comes back from a file."""
+    mechanism = held(udk.Held([1.0, 2.0, -1.0], 0.1, t0=0.5))
+    times = [0.0, 0.5, np.nextafter(0.6, 0.0), 0.6, 0.7, 9.0]
+    assert [float(mechanism.forces["motor"].value(t)) for t in times] == [1.0, 1.0, 1.0, 2.0, -1.0, -1.0]
+    assert_allclose(np.asarray(mechanism.breakpoints), [0.6, 0.7])
+    assert same(udk.loads(udk.dumps(mechanism)), mechanism)
+    assert same(held(0.0).with_parameters({"force.motor.value": mechanism.forces["motor"].value}), mechanism)
+    assert same(mechanism.with_parameters({"force.motor.value": 3.0}), held(3.0))
+    changed = mechanism.with_parameters({"force.motor.value.values[1]": 5.0, "force.push.vector": udk.Held([[1.0, 2.0]], 0.2)})
+    assert_allclose(changed.parameters()["force.motor.value.values"], [1.0, 5.0, -1.0])
+    assert held(udk.Held([1.0], 0.1)).breakpoints is None
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (udk.Held([1.0], 0.0), r"force\[0\]\).value.dt: must be > 0"),
+        (udk.Held([1.0], "fast"), "value.dt: must be a number"),  # pyright: ignore[reportArgumentType]
+        (udk.Held([], 0.1), "value.values: needs at least 1"),
+        (udk.Held([1.0, np.nan], 0.1), r"value.values\[1\]: must be finite"),
+        (udk.Held([[1.0, 2.0]], 0.1), "value.values: each sample must be a number, has the shape"),
+    ],
+)
+def test_wrong_samples_are_refused(value, said):
+    with pytest.raises(udk.SceneError, match=said):
+        held(value)
+    with pytest.raises(udk.SceneError, match="a motion that is held jumps at each sample"):
+        udk.Mechanism({"a": udk.Body(1.0, 1.0)}, drivers={"d": udk.Driver(["ground", "a"], "x", value)})

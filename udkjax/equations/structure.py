@@ -42,8 +42,8 @@ Result = TypeVar("Result")
 
 
 def structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
-    """Return the tree of a mechanism, and the shape and the type of each of its numbers."""
-    leaves, tree = jax.tree.flatten(mechanism.without_origin)
+    """Return the tree of a mechanism, and the shape and the type of each of its numbers: the same for any number of samples."""
+    leaves, tree = jax.tree.flatten(mechanism.without_origin.with_first_samples)
     return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
 
 

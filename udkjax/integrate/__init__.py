@@ -13,6 +13,7 @@ from udkjax.integrate.solution import Result as Result
 from udkjax.integrate.solution import SimulationError as SimulationError
 from udkjax.integrate.solution import Solution as Solution
 from udkjax.integrate.solvers import OWN, own_solver
+from udkjax.integrate.stepping import step as step
 
 if TYPE_CHECKING:
     import diffrax

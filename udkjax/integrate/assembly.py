@@ -138,7 +138,7 @@ def close(
     if not _is_known((mechanism, t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
         within_jit = isinstance(jax.device_put(0.0), Tracer)  # where a program of its own would trace the known numbers, too
-        return (_close if within_jit else _close_compiled)(mechanism.without_origin, analysis, t, state)
+        return (_close if within_jit else _close_compiled)(mechanism.without_origin.with_first_samples, analysis, t, state)
     key, time = id(mechanism), np.asarray(t).item()
     cached = _cache.get(key)
     if state is None and cached is not None and cached.mechanism() is mechanism and cached.time == time:

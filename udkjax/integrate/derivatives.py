@@ -48,7 +48,8 @@ def _(primals, tangents):
     def in_parts(at: Any, *directions: list[Array]) -> tuple[list[Any], ...]:
         """The run, and linear maps of the directions."""
         raw, record = at[0].recorded(stop_gradients(at[1]), active)
-        linear = Linear(function=at[0], xs=at[1], run=(raw, record), active=active)
+        states = (raw.q, raw.v) if raw.q.shape[0] > 2 else ()  # of outputs between the first and the last alone
+        linear = Linear(function=at[0], xs=at[1], run=(states, record), active=active)
         return list(_as_run(*at, raw)), *(linear.applied(direction) for direction in directions)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:

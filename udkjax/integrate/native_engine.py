@@ -16,11 +16,13 @@ from udkjax.equations.scene_programs import EliminationPrograms, elimination_pro
 from udkjax.equations.structure import is_large, numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.held_rows import breakpoints_of, first_rows, rows_of, sampled_places, with_cotangents
 from udkjax.integrate.native_numbers import active_numbers, active_tangents, cotangent_tree
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.solvers import is_explicit, method_of
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS
 from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
+from udkjax.native.record import PER_BREAKPOINT, STORED
 from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
 from udkjax.pinv import Auto, Elimination
 from udkjax.pinv.rank_policy import RankPolicy
@@ -85,6 +87,11 @@ def serves_derivatives(active: Problem) -> bool:
 
 
 def _numbers_of(problem: Any) -> tuple[Any, Any]:
+    """The numbers of a run, or what stands for them, with the first of all samples."""
+    return first_rows(_all_numbers_of(problem))
+
+
+def _all_numbers_of(problem: Any) -> tuple[Any, Any]:
     return problem.equations.mechanism, problem.equations.baumgarte
 
 
@@ -94,26 +101,32 @@ def jvp(problem: Problem, active: Problem, change: Problem) -> tuple[IntegratorO
     tangents = active_tangents(_numbers_of(problem), _numbers_of(active), _numbers_of(change), kind.active or ())
     along = jnp.asarray(numbers_as_vector(tangents))
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
+    directions = [along, dq, dv]
+    if kind.sampled:
+        directions.insert(0, rows_of(_all_numbers_of(problem), _all_numbers_of(change), breakpoints_of(problem, jnp), jnp))
     *found, dys, dend = native_p.bind(
-        *_inputs(problem, kind.code), *(x[None, None] for x in (along, dq, dv)), kind=kind, times=len(problem.ts)
+        *_inputs(problem, kind.code), *(x[None, None] for x in directions), kind=kind, times=len(problem.ts)
     )
     return _output(found), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
 
 
-def vjp(problem: Problem, active: Problem, run: tuple[IntegratorOutput, Array], ys: Array, end: Array) -> Problem:
+def vjp(problem: Problem, active: Problem, run: tuple[Sequence[Array], Array], ys: Array, end: Array) -> Problem:
     """The cotangents of what is `active`, from those of the states at the output times (T, 2n) and of the end (2n,).
 
-    `run` is what `integrate_for_vjp` has left.
+    `run` is what `integrate_for_vjp` has left: q and v (T, n), if there are outputs between the first and the last; the record.
     """
-    kind, (raw, record) = _kind(problem, _active(problem, active), "reverse"), run
-    given = [x[None] for x in (record, raw.q, raw.v, ys, end)]
-    numbersbar, qbar, vbar, _ = native_p.bind(*_inputs(problem, kind.code), *given, kind=kind, times=len(problem.ts))[
-        len(OUTPUTS) :
-    ]
+    kind, (states, record) = _kind(problem, _active(problem, active), "reverse"), run
+    states = states or [np.zeros((len(problem.ts), len(problem.q)))] * 2
+    given = [x[None] for x in (record, *states, ys, end)]
+    found = native_p.bind(*_inputs(problem, kind.code), *given, kind=kind, times=len(problem.ts))
+    numbersbar, qbar, vbar = found[len(OUTPUTS) : len(OUTPUTS) + 3]
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
     numbers = cotangent_tree(numbersbar[0], _numbers_of(problem), _numbers_of(active), kind.active or ())
+    if kind.sampled:
+        of_problem, breaks = _all_numbers_of(problem), breakpoints_of(problem, jnp)
+        numbers = with_cotangents(numbers, of_problem, _numbers_of(active), found[len(OUTPUTS) + 3][0], breaks, jnp)
     q, v = qbar[0] if active.q is True else None, vbar[0] if active.v is True else None
-    return eqx.tree_at(lambda p: (*_numbers_of(p), p.q, p.v), none, (*numbers, q, v), is_leaf=lambda x: x is None)
+    return eqx.tree_at(lambda p: (*_all_numbers_of(p), p.q, p.v), none, (*numbers, q, v), is_leaf=lambda x: x is None)
 
 
 def _active(problem: Problem, active: Problem) -> tuple[bool, ...]:
@@ -136,7 +149,9 @@ def _kind(problem: Any, active: tuple[bool, ...] | None = None, mode: str = "run
     programs, mechanism = _programs(problem), problem.equations.mechanism
     breaks = problem.breakpoints is not None or _has_pieces(mechanism)
     method = Tableau(method_of(problem.solver))
-    return Kind(programs if active is None else programs.for_derivatives, method, problem.projected, breaks, active, mode)
+    code, places = programs if active is None else programs.for_derivatives, sampled_places(_all_numbers_of(problem))
+    points = problem.points or STORED + PER_BREAKPOINT * (0 if problem.breakpoints is None else len(problem.breakpoints))
+    return Kind(code, method, problem.projected, breaks, active, places, points, mode)
 
 
 def _has_pieces(mechanism: Mechanism) -> bool:
@@ -171,9 +186,11 @@ def _inputs(problem: Any, code: Any = None, xp: ModuleType = jnp) -> list[Any]:
         "v": problem.v,
         "settings": numbers_as_vector(settings),
         "rows": equations.scales.rows,
-        "breaks": xp.zeros(0) if problem.breakpoints is None else problem.breakpoints,
+        "breaks": breakpoints_of(problem, xp),
     }
     arrays = [xp.asarray(given[name], float)[None] for name in INPUTS]
+    if sampled_places(whole := _all_numbers_of(problem)):
+        arrays.append(rows_of(whole, whole, given["breaks"], xp)[None])
     return arrays if xp is np else stop_gradients(arrays)
 
 

@@ -32,6 +32,7 @@ class Problem(eqx.Module):
     projected: bool = eqx.field(static=True)
     max_steps: Int[ArrayLike, ""]
     breakpoints: Float[Array, "k"] | None = None  # the times where the motion is not smooth, in any order; None: it is
+    points: int | None = eqx.field(static=True, default=None)  # that a record for reverse mode has room for; None: by breakpoints
 
     def units(self) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """Return the units of `atol` for coordinates and for velocities."""

@@ -254,7 +254,7 @@ def _simulate(
     # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
     loose_rtol, loose_atol = (xp.where(good & closed, tol, 1e3) for tol in (rtol, xp.maximum(atol, LEAST_ATOL)))
     ulp = np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1]))
-    numbers: Any = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *_units(analysis, ts, v, xp))
+    numbers: Any = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *units_of_run(analysis, ts, v, xp))
     problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, breakpoints=mechanism.breakpoints)
     why = "it was asked for" if engine == "diffrax" else reason_for_diffrax(problem, adjoint, meter)
     if engine == "native" and why:
@@ -294,7 +294,7 @@ def _by_numpy(leaf: Any) -> Any:
 _compiled = eqx.filter_jit(partial(_simulate, jnp))
 
 
-def _units(analysis: Analysis | None, ts: Any, v: Any, xp: Any) -> tuple[Any, Any]:
+def units_of_run(analysis: Analysis | None, ts: Any, v: Any, xp: Any) -> tuple[Any, Any]:
     """The length and the rate that `atol` is relative to."""
     if analysis is None:
         return None, xp.ones(())

@@ -14,11 +14,12 @@ Members walk back side by side, in lanes; the next ones follow when all are back
 
 from collections.abc import Sequence
 
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.layout import Plan
 from udkjax.native.prologue import REVERSE, write_prologue_reverse
 from udkjax.native.record import Recorded
 from udkjax.native.runge_kutta import stage_state
+from udkjax.native.samples import ARGUMENTS, count_breakpoints, numbers_of_row
 from udkjax.native.steps import DONE, POINTS, STRETCH
 
 
@@ -30,6 +31,8 @@ class Reverse(Recorded):
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
         super().__init__(plan, active)
+        if plan.sampled:
+            self.outputs = (*self.outputs[:-1], "samplesbar", self.outputs[-1])
         p, n = self.places, self.n
         for name in ("before", "any"):
             p.add(name)
@@ -52,6 +55,9 @@ class Reverse(Recorded):
             write_prologue_reverse(self, self.active_numbers, self.active)
         self._write_transposed_differences()
         self._write_step_back()
+        self._write_leave_row()
+        if self.plan.sampled:
+            self._write_find_rows()
         self._write_backpropagate()
 
     # --- the way back
@@ -132,9 +138,11 @@ class Reverse(Recorded):
         step = f.select((s.begin > 0.5) | ~active, 0.0, s.T3 - s.T2)
         h, last = self.broadcast(f, step), self.last
         stages = range(1, last)
-        for i in stages:
-            stage_state(self, f, s, i, "P2", step)
-            self.evaluate_stage(f, i)
+        steps = f.any_of(active & (s.begin < 0.5))  # where runs only begin there are no stages
+        with f.if_(steps):
+            for i in stages:
+                stage_state(self, f, s, i, "P2", step)
+                self.evaluate_stage(f, i)
         setattr(s, "X t", s.T3)
         with f.each(self.rowcount) as r:
             for x in "qv":
@@ -146,10 +154,11 @@ class Reverse(Recorded):
                 self.put(f, f"Y {x}", r, self.vector(f, f"B3 {x}", r) + self.vector(f, f"G {x}", r))
         self._pull_projection(f, active)
         self._accumulate_stage(f, h, last, range(last), active, first=True)
-        for i in reversed(stages):
-            stage_state(self, f, s, i, "P2", step)
-            self._pull_accelerations(f, f"K{i}", f"S{i}", active)
-            self._accumulate_stage(f, h, i, range(i), active)
+        with f.if_(steps):
+            for i in reversed(stages):
+                stage_state(self, f, s, i, "P2", step)
+                self._pull_accelerations(f, f"K{i}", f"S{i}", active)
+                self._accumulate_stage(f, h, i, range(i), active)
         with f.each(self.rowcount) as r:
             old = self.vector(f, "B2 a", r)
             self.put(f, "B2 a", r, f.select(active, old + self.vector(f, "S0", r), old))
@@ -209,7 +218,19 @@ class Reverse(Recorded):
             s.due = f.select((s.at > 0.5) & (s.written > s.before), yes, 0.0)
             return f.any_of(s.due > 0.5)
 
+        if self.plan.sampled:
+            rows = (f.load(call, self.call_fields.index("knots"), base=INT) + 1) * len(self.plan.sampled)
+        for k in self._each_lane(f, s.ready > 0.5):
+            cleared = [("numbersbar", f.const(sum(self.active_numbers), INT))]
+            if self.plan.sampled:
+                cleared.append(("samplesbar", rows))
+            for name, length in cleared:
+                to = self._result(f, call, name, k, length)
+                with f.each(length) as i:
+                    f.store(0.0, to, i)
         with f.while_(lambda: f.any_of(s.at > 0.5)):
+            if self.plan.sampled:
+                f.call("find_rows", f.given["work"], call)
             s.any = f.const(0.0, DOUBLE, f.width)
             with f.while_(due):
                 s.any = yes
@@ -260,21 +281,52 @@ class Reverse(Recorded):
                 self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1), "P0")
                 self._load_head(f, k)
         # What is left is that of the first state as it was given, which is the first output, too.
-        constants, bars = (Value(f, f.reserve(DOUBLE, max(c, 1)), POINTER) for c in (self.constants, self.count))
         for k in self._each_lane(f, s.ready > 0.5):
             given(k, f.const(0, INT), "B3")
             for x in "qv":
                 self.copy_lane(f, self._result(f, call, f"{x}bar", k, n), 0, f"B3 {x}", k)
             if self.count:
-                self.copy_lane(f, constants, 0, "constants", k, count=self.constants)
-                self.copy_lane(f, bars, 0, "cbar", k, count=self.count)
-                numbers = self.member_address(f, call, "numbers", self._lane(f, "member", k))
-                to = self._result(f, call, "numbersbar", k, sum(self.active_numbers))
-                f.call(REVERSE, numbers, constants, bars, to)
+                f.call("leave_row", f.given["work"], call, k)
             self.free_record(f, k)
         s.ready = f.const(0.0, DOUBLE, f.width)
 
-    def _result(self, f: Function, call: Value, name: str, k: Value, length: int) -> Value:
+    def _write_find_rows(self):
+        """`find_rows(work, call)`: the rows of samples that hold where lanes are, each with its constants."""
+        f, s = self.function("find_rows", ARGUMENTS[:2])
+        work, call = f.given["work"], f.given["call"]
+        for k in self._each_lane(f, s.at > 0.5):
+            knot = count_breakpoints(self, f, self.to_int(f, self._lane(f, "member", k)), self._lane(f, "T3", k))
+            self._put_lane(f, "knot", k, f.like(knot, DOUBLE, 1))
+            with f.if_(self._lane(f, "knot", k).is_not(self._lane(f, "row", k))):
+                if self.count:
+                    f.call("leave_row", work, call, k)
+                f.call("enter", work, call, k)
+
+    def _write_leave_row(self):
+        """`leave_row(work, call, lane)`: the cotangents of a lane's constants, to those of the numbers and of the samples."""
+        if not self.count:
+            return
+        f, _ = self.function("leave_row", ARGUMENTS)
+        call, k, count = f.given["call"], f.given["lane"], sum(self.active_numbers)
+        constants, bars, found = (Value(f, f.reserve(DOUBLE, c), POINTER) for c in (max(self.constants, 1), self.count, count))
+        self.copy_lane(f, constants, 0, "constants", k, count=self.constants)
+        self.copy_lane(f, bars, 0, "cbar", k, count=self.count)
+        member, row = self.to_int(f, self._lane(f, "member", k)), self._lane(f, "row", k)
+        sampled = self.plan.sampled
+        numbers = numbers_of_row(self, f, member, row) if sampled else self.member_address(f, call, "numbers", member)
+        f.call(REVERSE, numbers, constants, bars, found)
+        if sampled:
+            rows = (f.load(call, self.call_fields.index("knots"), base=INT) + 1) * len(sampled)
+            to = f.at(self._result(f, call, "samplesbar", k, rows), self.to_int(f, row) * len(sampled))
+            for column, place in self.active_samples.items():
+                f.store(f.load(to, column) + f.load(found, place), to, column)
+        to = self._result(f, call, "numbersbar", k, count)
+        with f.each(count) as i:
+            f.store(f.load(to, i) + f.load(found, i), to, i)
+        with f.each(self.count) as i:
+            f.store(0.0, f.given["work"], (i + self.places["cbar"]) * f.width + k)
+
+    def _result(self, f: Function, call: Value, name: str, k: Value, length: Operand) -> Value:
         """Where an output of the member in lane k begins, that has so many numbers of each."""
         number = self.to_int(f, self._lane(f, "member", k))
         return f.at(f.load(call, self.call_fields.index(name), base=POINTER), number * length)

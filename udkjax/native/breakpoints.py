@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from udkjax.native.ir import DOUBLE, INT, Function, Value
+from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
 from udkjax.native.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS, SHORTEST_LAST
@@ -28,6 +28,7 @@ def aim(t: Module, f: Function, s: Lane):
         parts = f.max(float(POINTS - 1) - s.steps, 1.0)
         share = here + rest / parts
         several = (s.steps < float(POINTS - 2)) & (t1 > share) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
+        several = several & (s.next < stop - s.smallest)  # for the sake of outputs in between
         if t.pieces:
             several = several & s.aim.is_not(float(AIM_ACROSS))
         t1 = where(several, share, t1 if t.pieces else halve(f, s, t1, begin | last | several))
@@ -52,15 +53,16 @@ def halve(f: Function, s: Lane, t1: Value, otherwise: Value) -> Value:
 
 def next_breakpoint(t: Module, f: Function, s: Lane, here: Value):
     """t1: just before the next breakpoint; behind: just behind all of those that are here."""
-    call = f.given["call"]
-    knots, width = f.load(call, t.call_fields.index("knots"), base=INT), f.width
-    with f.each(knots) as k:
-        if width == 1:
-            at = t.input_number(f, call, "breaks", s.member, k)
-        else:
-            f.call("gather", f.given["work"], call, k)
-            at = s.due
-        ahead = at > here + s.smallest
-        s.t1 = f.select(ahead, f.min(at - s.smallest * ENDS_BEFORE, s.t1), s.t1)
-        passed = at <= here + s.smallest
-        s.behind = f.select(passed, f.max(at + s.smallest * BEGINS_BEHIND, s.behind), s.behind)
+    work, call = f.given["work"], f.given["call"]
+    f.call("next_breakpoint", work, call)
+    with f.while_(lambda: f.any_of(s.due <= here + s.smallest)):
+        here_too = s.due <= here + s.smallest
+        s.where(here_too, knot=s.knot + 1.0, passed=s.due)
+        f.call("next_breakpoint", work, call)
+    s.t1 = s.due - s.smallest * ENDS_BEFORE
+    s.behind = f.max(s.passed + s.smallest * BEGINS_BEHIND, here)
+    if t.plan.sampled:
+        with f.each(f.width) as k:
+            stale = (s.active > 0.5) & s.row.is_not(s.knot)
+            with f.if_(f.lane(f.select(stale, f.const(1.0, DOUBLE, f.width), 0.0), k) > 0.5):
+                f.call("enter", work, call, k)

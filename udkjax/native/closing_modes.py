@@ -57,9 +57,9 @@ class ForwardMode(ClosingDerivative):
     def _record_correction(self, f: Function, kind: int, scale: Value, limited: Value):
         f.call("push_velocity" if kind == VELOCITY else "push_position", f.given["work"], scale, limited)
 
-    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
+    def begin_member(self, f: Function, lane: Value, member: Value):
         del lane
-        call = self.call_record(f)
+        call, constants = self.call_record(f), self.address(f, "constants")
         with self._each_tangent(f) as p:
             for name, to, count in (("dnumbers", "numbers", self.active_numbers), ("dq", "X q", self.n), ("dv", "X v", self.n)):
                 start = self.member_address(f, call, name, member)
@@ -123,8 +123,8 @@ class ReverseMode(ClosingDerivative):
         self.copy_lane(f, row, 3 + self.n, "X v", f.const(0, INT))
         self._set(f, "records", 0, self._at(f, "records", 0) + 1.0)
 
-    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
-        del lane, constants
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        del lane
         self._set(f, "records", 0, f.const(0.0))
         with f.each(self.constants) as i:
             self._set(f, "cbar", i, f.const(0.0))

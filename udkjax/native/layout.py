@@ -23,6 +23,7 @@ class Plan:
     breaks: bool
     width: int  # lanes
     vector: int  # numbers that a register holds
+    sampled: tuple[int, ...] = ()  # places of the numbers of the scene that have samples
 
 
 @dataclass
@@ -63,6 +64,9 @@ LANE_NUMBERS = {  # numbers of each lane, and what they are
     "last": "whether the attempt ends at the end of the run",
     "lands": "whether it ends at a breakpoint",
     "behind": "time behind the breakpoints at the current time (s)",
+    "knot": "number of breakpoints that have been passed",
+    "passed": "the last of them (s)",
+    "row": "of the samples, from which the constants are",
     "steps": "accepted steps since the run began anew",
     "error": "of the attempt, relative to the tolerance",
     "rate": "error of the step before over its length to the power of the order",

@@ -4,15 +4,17 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function
 from udkjax.native.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.manifold import largest_violation, project_output
 from udkjax.native.module import Module
+from udkjax.native.samples import count_breakpoints, write_enter
 from udkjax.native.steps import DONE, LOOK_AHEAD, NOT_FINITE, POINTS, STEP_LIMIT
 
 
 def write_begin(t: Module):
     """Take a member into a lane."""
+    write_enter(t)
     arguments = [(POINTER, "work"), (POINTER, "call"), (INT, "lane"), (INT, "member")]
     f, _ = t.function("begin", arguments)
     p, width, call, k, member = t.places, t.plan.width, f.given["call"], f.given["lane"], f.given["member"]
@@ -28,10 +30,6 @@ def write_begin(t: Module):
     settings = {name: f.load(given, j) for j, name in enumerate(SETTINGS)}
     for name, value in settings.items():
         put(name, value)
-    constants = Value(f, f.reserve(DOUBLE, max(t.constants, 1)), POINTER)
-    f.call("prologue", t.member_address(f, call, "numbers", member), constants)
-    with f.each(t.constants) as i:
-        put("constants", f.load(constants, i), i)
     q, v = t.member_address(f, call, "q", member), t.member_address(f, call, "v", member)
     with f.each(t.n) as i:
         angle = f.arithmetic("sub", i, f.arithmetic("div", i, 3) * 3).is_(2)
@@ -50,7 +48,8 @@ def write_begin(t: Module):
     ts = t.member_address(f, call, "ts", member)
     times = f.load(call, t.call_fields.index("times"), base=INT)
     start, end = f.load(ts), f.load(ts, times - 1)
-    for name, value in (("start", start), ("end", end), ("next", f.load(ts, 1)), ("rate", np.inf), ("crossing", np.inf)):
+    first = {"start": start, "end": end, "next": f.load(ts, 1), "rate": np.inf, "crossing": np.inf, "passed": -np.inf}
+    for name, value in first.items():
         put(name, value)
     for j in range(POINTS):
         put(f"T{j}", start)
@@ -61,7 +60,10 @@ def write_begin(t: Module):
     put("active", 1.0)
     put("tolerance", settings["atol"])
     put("member", f.op(f"sitofp i64 {member.name} to double", DOUBLE))
-    t.begin_member(f, k, member, constants)
+    if t.plan.breaks:
+        put("knot", f.like(count_breakpoints(t, f, member, start - settings["smallest"]), DOUBLE, 1))
+    f.call("enter", work, call, k)
+    t.begin_member(f, k, member)
 
 
 def write_finish(t: Module):
@@ -117,11 +119,6 @@ def write_finish(t: Module):
 
 def write_run(t: Module):
     """`run(call)`: members one after another, until there are none left."""
-    if t.plan.breaks and t.plan.width > 1:
-        f, s = t.function("gather", [(POINTER, "work"), (POINTER, "call"), (INT, "which")])
-        with f.each(f.width) as k:
-            at = t.input_number(f, f.given["call"], "breaks", f.lane(s.member, k), f.given["which"])
-            f.store(at, f.given["work"], k + t.places["due"] * f.width)
     f = Function("run", [(POINTER, "call")], t.plan.width)
     t.functions.append(f)
     call, width = f.given["call"], t.plan.width

@@ -35,6 +35,8 @@ class Module(Memory):
         code, n, m = plan.code, plan.code.coordinate_count, plan.code.row_count
         self.n, self.m = n, m
         self.constants = len(code.constants)
+        if plan.sampled:
+            self.inputs = ("samples", *self.inputs)
         p = self.places = Layout(plan.width, plan.vector)
         for name in LANE_NUMBERS:
             p.add(name)
@@ -55,6 +57,8 @@ class Module(Memory):
         self.pieces = len(code.equations.pieces) if isinstance(code, ScenePrograms) and plan.breaks else 0
         for name in ("G", "G0"):
             p.add(name, self.pieces)
+        if plan.sampled:
+            p.add("numbers", -(-self.number_count // plan.width))
         if isinstance(code, LoopPrograms):
             for name, count in code.scratch.items():
                 p.add(name, count)
@@ -74,6 +78,11 @@ class Module(Memory):
         functions = [*self.functions, *self.loops.functions]
         declared = sorted(set().union(*(f.declared for f in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
         return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
+
+    @property
+    def number_count(self) -> int:
+        """How many numbers the prologue takes."""
+        return self.code.prologue_input_count if isinstance(self.code, LoopPrograms) else len(self.code.prologue.inputs)
 
     @property
     def falls_back(self) -> bool:
@@ -185,8 +194,11 @@ class Module(Memory):
     def record_output(self, f: Function, s: Lane):
         """What it does with a state between steps, in X t, X q and O v, of lanes that are `due`."""
 
-    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
-        """What it does with a member that is taken into a lane; where its constants are, one after the other."""
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        """Hook: called with a member that is taken into a lane; does nothing by default."""
+
+    def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
+        """Hook: called with the addresses of the numbers and constants that a lane goes on with; does nothing by default."""
 
     def end_members(self, f: Function, s: Lane):
         """What it does with members that are done, in lanes that are `due`."""

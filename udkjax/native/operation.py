@@ -27,7 +27,7 @@ from udkjax.native.ffi import handler
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS, Plan
 from udkjax.native.marching import Marching
 from udkjax.native.program import UnsupportedError
-from udkjax.native.record import record_length
+from udkjax.native.record import STORED, record_length
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
 from udkjax.native.trajectory import Trajectory
@@ -43,6 +43,8 @@ class Kind(NamedTuple):
     projected: bool
     breaks: bool
     active: tuple[bool, ...] | None = None  # of a run with derivatives: along which numbers of the scene
+    sampled: tuple[int, ...] = ()  # places of the numbers that have samples
+    points: int = STORED  # that the record of a run has room for
     mode: str = "run"  # or "forward", "reverse", "closing" and its derivatives, "marching"
 
 
@@ -78,7 +80,7 @@ def generate(kind: Kind, width: int, several: bool) -> Trajectory:
     elif kind.mode in CLOSING:
         trajectory = (CLOSING_BY_LOOPS if loops else CLOSING)[kind.mode](kind.code, kind.active, machine.lanes())
     else:
-        plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes())
+        plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes(), kind.sampled)
         if kind.mode == "forward":
             assert kind.active is not None
             trajectory = Forward(plan, kind.active, machine.lanes() if several else width)
@@ -183,7 +185,11 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
     if kind.mode == "reverse":
         assert kind.active is not None
         is_first = not inputs[-1].shape[0]  # without cotangents
-        shapes += [(members, sum(kind.active)), (members, n), (members, n), (members, record_length(n) if is_first else 0)]
+        shapes += [(members, sum(kind.active)), (members, n), (members, n)]
+        if kind.sampled:
+            rows = 0 if is_first else inputs[INPUTS.index("breaks")].shape[1] + 1
+            shapes.append((members, rows, len(kind.sampled)))
+        shapes.append((members, record_length(n, kind.points) if is_first else 0))
     return shapes
 
 
@@ -211,7 +217,7 @@ def _batch(inputs: Sequence[Any], axes: Sequence[int | None], kind: Kind, times:
     """A batch is more members; but one of directions alone, more directions."""
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
-    tangents = 3 if kind.mode.endswith("forward") else 0  # the last inputs, which have directions
+    tangents = (4 if kind.sampled else 3) if kind.mode.endswith("forward") else 0  # the last inputs, which have directions
     results = len(Closing.results if kind.mode.startswith("closing") else OUTPUTS)  # the first outputs, which have none
     shared = len(inputs) - tangents
     if tangents and all(axis is None for axis in axes[:shared]):

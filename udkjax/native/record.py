@@ -10,15 +10,16 @@ from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
 from udkjax.native.tangents import Differentiated
 
-FIRST = 512  # points that a record has room for while a member runs, before it grows
+FIRST = 32  # points that a record has room for while a member runs, before it grows
 STORED = 200  # points up to which a record is given to the second call: as much memory as 300 outputs
+PER_BREAKPOINT = 3  # further points for each breakpoint: where a run begins anew, and two steps
 TITLE = 3  # numbers of a record before its points: how many points, how the run ended, how many outputs it wrote
 HEAD = 3  # numbers of a point before its state: its time, how many outputs were written before its step, whether it begins anew
 
 
-def record_length(n: int) -> int:
-    """How many numbers the record of a member has, of n coordinates."""
-    return TITLE + STORED * (HEAD + 3 * n)
+def record_length(n: int, points: int) -> int:
+    """How many numbers the record of a member has, of n coordinates and so many points."""
+    return TITLE + points * (HEAD + 3 * n)
 
 
 class Recorded(Differentiated):
@@ -39,8 +40,7 @@ class Recorded(Differentiated):
     def _leaves_record(self, f: Function) -> Value:
         return f.load(self.call_record(f), self.call_fields.index("record length"), base=INT) > 0
 
-    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
-        del constants
+    def begin_member(self, f: Function, lane: Value, member: Value):
         call = self.call_record(f)
         self._put_lane(f, "given", lane, f.const(0.0))
         with f.if_(f.load(call, self.call_fields.index("given record length"), base=INT) > 0):

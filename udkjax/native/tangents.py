@@ -17,6 +17,7 @@ from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Layout, Plan
 from udkjax.native.linearization import Linearized, linearization
 from udkjax.native.prologue import FORWARD, active_constants, write_prologue_forward
+from udkjax.native.samples import row_address
 from udkjax.native.steps import POINTS
 from udkjax.native.trajectory import Trajectory
 
@@ -31,6 +32,8 @@ class Differentiated(Trajectory):
         super().__init__(plan)
         self.active_numbers, self.active = active, active_constants(self, active)
         self.count, self.last = sum(self.active), plan.method.stages
+        # Of each active number that has samples: its column there, and its place among the active numbers.
+        self.active_samples = {k: sum(active[:place]) for k, place in enumerate(plan.sampled) if active[place]}
         self.of_accelerations = linearization(self, "accelerations")
         self.of_projection = linearization(self, "projection") if plan.projected else None
         for i in range(1, self.last + 1):  # the last: of the end
@@ -72,6 +75,8 @@ class Forward(Differentiated):
 
     def __init__(self, plan: Plan, active: tuple[bool, ...], lanes: int):
         super().__init__(plan, active)
+        if plan.sampled:
+            self.inputs = (*self.inputs[:-3], "dsamples", *self.inputs[-3:])
         self.tangents = w = Layout(lanes, plan.vector)
         self.group = lanes // plan.width  # directions of a tangent
         w.add("constants", self.count)
@@ -201,15 +206,35 @@ class Forward(Differentiated):
             self.copy_lane(f, to, 0, q, lane, "tangent")
             self.copy_lane(f, to, self.n, v, lane, "tangent")
 
-    def begin_member(self, f: Function, lane: Value, member: Value, constants: Value):
-        call = self.call_record(f)
-        dconstants = Value(f, f.reserve(DOUBLE, max(self.count, 1)), POINTER)
+    def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
+        """The changes of the constants along all directions."""
+        if not self.count:
+            return
+        dconstants = Value(f, f.reserve(DOUBLE, self.count), POINTER)
         with self._each_tangent(f) as p, self._each_direction(f, p, lane) as (direction, place):
-            if self.count:
-                dnumbers = f.at(self.member_address(f, call, "dnumbers", member), direction * sum(self.active_numbers))
-                f.call(FORWARD, self.member_address(f, call, "numbers", member), constants, dnumbers, dconstants)
+            f.call(FORWARD, numbers, constants, self._changes_of_numbers(f, member, direction), dconstants)
             with f.each(self.count) as i:
                 f.store(f.load(dconstants, i), f.given["tangent"], (i + self.tangents["constants"]) * self.tangents.width + place)
+
+    def _changes_of_numbers(self, f: Function, member: Value, direction: Value) -> Value:
+        """The address of the changes of a member's active numbers along a direction; of samples, those of their row."""
+        call, count = f.given["call"], sum(self.active_numbers)
+        given = f.at(self.member_address(f, call, "dnumbers", member), direction * count)
+        places = self.active_samples
+        if not places:
+            return given
+        copy = Value(f, f.reserve(DOUBLE, count), POINTER)
+        with f.each(count) as i:
+            f.store(f.load(given, i), copy, i)
+        rows = f.load(call, self.call_fields.index("knots"), base=INT) + 1
+        row = f.load(f.given["work"], f.given["lane"] + self.places["row"] * f.width)
+        samples = f.at(row_address(self, f, "dsamples", member, row), direction * rows * len(self.plan.sampled))
+        for k, place in places.items():
+            f.store(f.load(samples, k), copy, place)
+        return copy
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        with self._each_tangent(f) as p, self._each_direction(f, p, lane) as (direction, place):
             for x in "qv":
                 self._read_state(f, f"d{x}", member, direction, place, [f"P{k} {x}" for k in range(POINTS)])
             with f.each(self.n) as i:

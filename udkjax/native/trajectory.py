@@ -30,6 +30,7 @@ from udkjax.native.members import write_begin, write_finish, write_run
 from udkjax.native.module import Module
 from udkjax.native.pieces import write_leave
 from udkjax.native.runge_kutta import write_attempt
+from udkjax.native.samples import write_next_breakpoint
 from udkjax.native.steps import RUNNING
 
 
@@ -53,6 +54,8 @@ class Trajectory(Module):
                 self.functions.append(least_norm())
                 write_solve(self)
                 write_fallback(self)
+        if self.plan.breaks:
+            write_next_breakpoint(self)
         write_begin(self)
         write_finish(self)
         self.write_derivatives()

@@ -24,6 +24,7 @@ from udkjax.scene.forces import Friction as Friction
 from udkjax.scene.forces import Spring as Spring
 from udkjax.scene.forces import Torque as Torque
 from udkjax.scene.forces import TorsionSpring as TorsionSpring
+from udkjax.scene.held import Held as Held
 from udkjax.scene.joints import Angle as Angle
 from udkjax.scene.joints import Cam as Cam
 from udkjax.scene.joints import Constraint as Constraint

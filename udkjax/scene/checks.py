@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import UnionType
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from jax.core import Tracer
 
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import FieldMetadata, Requirement, Table
+from udkjax.scene.held import Held
 from udkjax.scene.joints import Revolute
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 
@@ -129,6 +131,11 @@ def check_table(where: str, cls: type, table: Table, known: KnownNames) -> Itera
 
 def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
     """Iterate over the mistakes of one value. `sizes` holds the lengths of a table's named dimensions so far."""
+    if get_origin(annotation) is UnionType:  # a number, or samples of it
+        annotation, held = get_args(annotation)
+        if isinstance(value, held | dict):
+            yield from _check_held(path, annotation.dim_str.split(), value)
+            return
     if hasattr(annotation, "dim_str"):
         yield from _check_number(path, annotation.dim_str.split(), value, metadata, sizes)
     elif get_origin(annotation) is Literal:
@@ -147,7 +154,9 @@ def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetad
 
 def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
     """Iterate over the mistakes of a motion law or a profile: a module in Python, a table in a file."""
-    if isinstance(value, annotation) and isinstance(value, eqx.Module):
+    if isinstance(value, Held) and annotation is not Held:
+        yield f"{path}: a motion that is held jumps at each sample: give a Spline through its values"
+    elif isinstance(value, annotation) and isinstance(value, eqx.Module):
         yield from check_table(path, type(value), table_of(value), {})
     elif not isinstance(value, dict):
         yield f"{path}: must be a table, is {abbreviate(value)}"
@@ -159,6 +168,21 @@ def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
             yield problem
         else:
             yield from check_table(path, cls, {name: v for name, v in value.items() if name != "type"}, {})
+
+
+def _check_held(path: str, dims: Sequence[str], value: Any) -> Iterator[str]:
+    """Iterate over the mistakes of a number that is held between samples, each of which has the shape `dims`."""
+    table = table_of(value) if isinstance(value, Held) else value
+    found, expected = list(check_table(path, Held, table, {})), keys(Held)
+    for name in ("dt", "t0"):
+        if isinstance(time := table.get(name, 0.0 if name == "t0" else 1.0), Tracer):
+            found.append(f"{path}.{name}: must be known when a function is traced")
+        else:
+            found.extend(_check_number(f"{path}.{name}", [], time, expected[name].metadata, {}))
+    yield from found
+    if not found and (shape := np.shape(table["values"])[1:]) != tuple(map(int, dims)):  # pyright: ignore[reportArgumentType]
+        each = f"{' x '.join(dims)} numbers" if dims else "a number"
+        yield f"{path}.values: each sample must be {each}, has the shape {shape}"
 
 
 def find_class(path: str, choices: Mapping[str, type], table: Table) -> tuple[type | None, str]:
@@ -176,6 +200,8 @@ def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMet
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(value))
     array = jnp.asarray(value) if traced else _as_array(value)
     fixed = all(dim.isdigit() for dim in dims)
+    if array is not None and dims[-1:] == ["..."]:
+        dims = [*dims[:-1], *map(str, array.shape[len(dims) - 1 :])]
     if array is None or array.ndim != len(dims) or (fixed and array.shape != tuple(map(int, dims))):
         expected = f"{' x '.join(dims)} numbers" if fixed else "numbers"
         yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, is {abbreviate(value)}"

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.printing import PrintedTable, format_number, format_numbers, has_numbers
+from udkjax.scene.held import Held
 from udkjax.scene.number_fields import Sections
 from udkjax.scene.schema import numbers_in
 from udkjax.scene.units import field_unit
@@ -64,7 +65,8 @@ def _format_element(element: eqx.Module) -> str:
         owner = element
         for field in path[:-1]:
             owner = getattr(owner, field)
-        unit = field_unit(type(owner).__name__, path[-1], driven)
+        held = isinstance(owner, Held)
+        unit = field_unit(type(element if held else owner).__name__, path[-2] if held else path[-1], driven)
         shown.append(f"{' '.join(path)} {format_numbers(value, unit)}".replace("_", " "))
     return ", ".join(shown)
 

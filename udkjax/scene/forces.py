@@ -19,6 +19,7 @@ from udkjax.scene.fields import (
     given_number,
     given_or_none,
 )
+from udkjax.scene.held import Held, given_sampled, value_at
 
 Load = tuple[Number, Number, Number]  # force x, force y (N), torque about the centre of mass (N m), in ground axes
 
@@ -97,16 +98,16 @@ class TorsionSpring(ForceElement):
         bodies: the names of the two bodies; "ground" is the fixed frame.
         stiffness: in N m/rad, not negative.
         damping: in N m s/rad, not negative; None: no damper.
-        angle: theta2 - theta1 without load (rad).
+        angle: theta2 - theta1 without load (rad); a `Held` is what a servo is told.
     """
 
     stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)
     damping: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
-    angle: Float[Array, ""] = eqx.field(converter=given_number, default=0.0)
+    angle: Float[Array, ""] | Held = eqx.field(converter=given_sampled, default=0.0)
 
     def potential(self, t, *frames):
         one, two = frames
-        return 0.5 * self.stiffness * (two.angle - one.angle - self.angle) ** 2
+        return 0.5 * self.stiffness * (two.angle - one.angle - value_at(self.angle, t)) ** 2
 
     def loads(self, t, *frames):
         if self.damping is None:
@@ -116,18 +117,18 @@ class TorsionSpring(ForceElement):
 
 
 class Force(ForceElement):
-    """A constant force `vector` (N) at a `point` of a body, in the axes of the ground, or of the body: it then turns with it.
+    """A force `vector` (N) at a `point` of a body, in the axes of the ground, or of the body: it then turns with it.
 
     Args:
         body: the name of the body.
-        vector: the force (N).
+        vector: the force (N): constant, or a `Held` of values (N, 2).
         point: where it acts, in the body's frame (m).
         frame: the axes of the vector: "ground", or "body", with which it turns.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)
     body: str = eqx.field(static=True, metadata=BODY)
-    vector: Float[Array, "2"] = eqx.field(converter=given_number)
+    vector: Float[Array, "2"] | Held = eqx.field(converter=given_sampled)
     point: Float[Array, "2"] = eqx.field(converter=given_number, default=(0.0, 0.0))
     frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")
 
@@ -136,22 +137,23 @@ class Force(ForceElement):
 
     def loads(self, t, *frames):
         (body,) = frames
-        force = body.vector(self.vector) if self.frame == "body" else Point(self.vector[0], self.vector[1])
+        vector = value_at(self.vector, t)
+        force = body.vector(vector) if self.frame == "body" else Point(vector[0], vector[1])
         return [_load(body, self.point, force)]
 
 
 class Torque(ForceElement):
-    """A constant torque `value` (N m) on body 2, and its reaction on body 1.
+    """A torque `value` (N m) on body 2, and its reaction on body 1.
 
     Args:
         bodies: the names of two bodies: it acts on the second, its reaction on the first.
-        value: in N m, anticlockwise.
+        value: in N m, anticlockwise: constant, or a `Held`.
     """
 
-    value: Float[Array, ""] = eqx.field(converter=given_number)
+    value: Float[Array, ""] | Held = eqx.field(converter=given_sampled)
 
     def loads(self, t, *frames):
-        return _couple(self.value)
+        return _couple(value_at(self.value, t))
 
 
 class Friction(ForceElement):

@@ -20,6 +20,7 @@ from udkjax.scene.description import mechanism_table
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Numbers, StaticValue, given_number, number
 from udkjax.scene.forces import ForceElement, Friction
+from udkjax.scene.held import Held, held_fields
 from udkjax.scene.joints import AnyConstraint, Constraint, Joint
 from udkjax.scene.number_fields import (
     groups_of,
@@ -33,6 +34,7 @@ from udkjax.scene.number_fields import (
 from udkjax.scene.schema import table_of, type_name
 
 Element = TypeVar("Element", bound=eqx.Module)
+Module = TypeVar("Module", bound=eqx.Module)
 
 
 class Origin:
@@ -142,7 +144,7 @@ class Mechanism(PrintsTable):
         self.joint_names, self._joints = _unzip(completed["joint"])
         self.driver_names, self._drivers = _unzip(completed["driver"])
         self.force_names, self._forces = _unzip(found["force"])
-        self.origin = origin if any(isinstance(leaf, Tracer) for leaf in self.numbers) else None
+        self.origin = None if self.is_concrete else origin
         self.drawing, self.changed = drawing, changed
 
     @property
@@ -187,28 +189,49 @@ class Mechanism(PrintsTable):
     @property
     def breakpoints(self) -> Float[Array, "k"] | None:
         """The times (s) where the motion is not smooth, as the elements name them, in any order; None where none does."""
-        named = [jnp.ravel(number(e.breakpoints)) for e in (*self.constraints.values(), *self._forces) if len(e.breakpoints)]
-        return jnp.concatenate(named) if named else None
+        named = [number(e.breakpoints).reshape(-1) for e in (*self.constraints.values(), *self._forces) if len(e.breakpoints)]
+        samples = [getattr(self._forces[k], name).breakpoints for k, name in held_fields(self._forces)]
+        if any(map(len, samples)):
+            named.append(number(np.unique(np.concatenate(samples))))
+        if not named:
+            return None
+        known = not any(isinstance(x, Tracer) for x in named)  # and stays so while something else is traced
+        return number(np.concatenate(named)) if known else jnp.concatenate(named)
+
+    @property
+    def with_first_samples(self) -> "Mechanism":
+        """The same mechanism with the first sample in place of each `Held`: what programs are made from, one for all samples."""
+        places = held_fields(self._forces)
+        if not places:
+            return self
+        forces = list(self._forces)
+        for k, name in places:
+            forces[k] = _copy(forces[k], {name: getattr(forces[k], name).first})
+        return _copy(self, {"_forces": tuple(forces)})
 
     @property
     def without_origin(self) -> "Mechanism":
         """The same mechanism without its `origin` and its `drawing`: a program compiled for it serves all of them."""
         if self.origin is None and self.drawing is None:
             return self
-        copy = object.__new__(type(self))
-        for field, value in (vars(self) | {"origin": None, "drawing": None, "changed": ()}).items():
-            object.__setattr__(copy, field, value)
-        return copy
+        return _copy(self, {"origin": None, "drawing": None, "changed": ()})
 
     @property
     def is_concrete(self) -> bool:
         """Whether no number is traced."""
-        return not any(isinstance(leaf, Tracer) for leaf in self.numbers)
+        return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self._own_numbers))
 
     @property
     def numbers(self) -> list[Array]:
-        """All numbers of the equations, in the order in which programs take them: leaves without those of the drawing."""
-        return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
+        """All numbers of the equations, in the order in which programs take them: leaves without those of the drawing.
+
+        Of each `Held` it is the first sample.
+        """
+        return jax.tree.leaves(self.with_first_samples._own_numbers)
+
+    @property
+    def _own_numbers(self) -> tuple[Any, ...]:
+        return self.gravity, self._bodies, self._joints, self._drivers, self._forces
 
     def _table(self) -> PrintedTable:
         return mechanism_table(self, self.frames_of)
@@ -219,13 +242,14 @@ class Mechanism(PrintsTable):
         """Return every number of the scene under its name, such as `body.link1.mass`; absent ones (a damping) are left out."""
         return {name: p.value for name, p in parameters_of(self).items() if p.value is not None}
 
-    def with_parameters(self, values: Mapping[str, Numbers]) -> "Mechanism":
+    def with_parameters(self, values: Mapping[str, Numbers | Held]) -> "Mechanism":
         """Return the mechanism with some of its numbers replaced; pure, and values may be traced.
 
         `values` maps names as in `parameters`, or those of one entry (`joint.A.points[1][0]`), to values of exactly the same
-        shape: a batch of values belongs inside `vmap`. A mechanism with traced values remembers the known numbers that it was
-        made from (`origin`), so that their analysis serves it. A number that was absent is then there. Numbers that a joint
-        once took from the initial guess stay as they are; the constants of gears and racks follow the guess.
+        shape: a batch of values belongs inside `vmap`. A number that may have samples may be given as a `Held`. A mechanism with
+        traced values remembers the known numbers that it was made from (`origin`), so that their analysis serves it. A number
+        that was absent is then there. Numbers that a joint once took from the initial guess stay as they are; the constants of
+        gears and racks follow the guess.
 
         Numbers of a drawing (`pin.A`, `link.crank.width`) change all that follows from them. A number that follows from the
         drawing (`body.crank.mass`) may be changed as well, and keeps its value when the drawing changes. Raises `SceneError`.
@@ -240,7 +264,7 @@ class Mechanism(PrintsTable):
         elements = new["body"], new["joint"], new["driver"], new["force"]
         return Mechanism(*elements, gravity, self.name, origin, base.drawing, changed)
 
-    def _drawn_again(self, drawing: AbstractDrawing, values: Mapping[str, Numbers]) -> tuple[Any, dict[str, Numbers], Any]:
+    def _drawn_again(self, drawing: AbstractDrawing, values: Mapping[str, Any]) -> tuple[Any, dict[str, Any], Any]:
         """Return the mechanism of the drawing with its share of the values, the other values, and the names of these."""
         drawn, known = parameters_in(drawing.groups), parameters_of(self)
         of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in (*drawn, "gravity")}
@@ -253,7 +277,7 @@ class Mechanism(PrintsTable):
         replace_numbers(groups_of(self), self.gravity, own, known, self.name)  # all mistakes in names before anything else
         drawn["gravity"] = known["gravity"]
         groups, gravity = replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name)
-        own = {name: value_of(known, name) for name in before} | own
+        own = {name: value_of(known, name, groups_of(self)) for name in before} | own
         return drawing.with_groups(groups, gravity).mechanism(), own, changed
 
 
@@ -341,6 +365,14 @@ def _coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Ar
     if known:
         return number(np.column_stack([np.stack([np.asarray(x) for x in vectors]), [np.asarray(x) for x in numbers]]))
     return jnp.column_stack([jnp.stack(vectors), jnp.stack(numbers)])
+
+
+def _copy(module: Module, changes: dict[str, object]) -> Module:
+    """Return a module with other values in some fields, without checking anything."""
+    copy = object.__new__(type(module))
+    for field, value in (vars(module) | changes).items():
+        object.__setattr__(copy, field, value)
+    return copy
 
 
 def _unzip(items: Sequence[tuple[str, Element]]) -> tuple[tuple[str, ...], tuple[Element, ...]]:

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from udkjax.scene.checks import SceneError, abbreviate, quote, suggestion
 from udkjax.scene.fields import Numbers, number
+from udkjax.scene.held import Held, given_sampled
 from udkjax.scene.schema import numbers_in
 
 _SECTIONS = {"body": "bodies", "joint": "joints", "driver": "drivers", "force": "forces"}
@@ -90,7 +91,7 @@ def require_values(values: object, name: str) -> None:
 def replace_numbers(
     groups: Mapping[str, Mapping[str, Any]],
     gravity: Array,
-    values: Mapping[str, Numbers],
+    values: Mapping[str, Any],
     known: Mapping[str, NumberField],
     name: str,
 ) -> tuple[Groups, Array]:
@@ -110,9 +111,16 @@ def replace_numbers(
         SceneError: A name is unknown, or a value does not fit.
     """
     groups, problems, scene = {section: dict(elements) for section, elements in groups.items()}, [], name
+    sampled = {held_name: _field_of_held(known[f"{held_name}.values"]) for held_name in _held_names(known)}
     # Whole arrays before their entries, whatever the order of the keys: jit sorts them.
     for given in sorted(values, key=lambda name: name not in known and name.count("[")):
         name, index = split_index(given, known)
+        if name in sampled or isinstance(values[given], Held):  # a number with samples in place of one without, or the reverse
+            field = sampled.get(name) or known.get(name)
+            if field is not None and field.path:
+                element = groups[field.section][field.owner]
+                groups[field.section][field.owner] = _set(element, field.path, given_sampled(values[given]))
+                continue
         if name not in known:
             problems.append(f"no parameter {quote(given)}{suggestion(given, known)}")
             continue
@@ -130,8 +138,19 @@ def replace_numbers(
     return groups, gravity
 
 
-def value_of(known: Mapping[str, NumberField], name: str) -> Array:
-    """Return the value of a number, or of one of its entries, by its name."""
+def _held_names(known: Collection[str]) -> list[str]:
+    return [name.removesuffix(".values") for name in known if name.endswith(".values") and name.startswith("force.")]
+
+
+def _field_of_held(values: NumberField) -> NumberField:
+    return values._replace(path=values.path[:-1], shape=None)
+
+
+def value_of(known: Mapping[str, NumberField], name: str, groups: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return the value of a number, with its samples if it has any, or of one of its entries, by its name."""
+    if name in _held_names(known):
+        section, owner, path, *_ = _field_of_held(known[f"{name}.values"])
+        return _at(groups[section][owner], path)
     owner, index = split_index(name, known)
     value = known[owner].value
     assert value is not None  # only what is there has been set
@@ -170,4 +189,5 @@ def _at(element: eqx.Module, path: Sequence[str]) -> Any:
 
 
 def _set(element: eqx.Module, path: Sequence[str], value: Array) -> eqx.Module:
-    return eqx.tree_at(lambda e: _at(e, path), element, value, is_leaf=lambda leaf: leaf is None)
+    old = _at(element, path)
+    return eqx.tree_at(lambda e: _at(e, path), element, value, is_leaf=lambda leaf: leaf is None or leaf is old)

@@ -16,6 +16,7 @@ import jax
 from udkjax.scene import drivers, forces, joints
 from udkjax.scene.bodies import Body
 from udkjax.scene.fields import FieldMetadata
+from udkjax.scene.held import Held
 
 SECTIONS = ("body", "joint", "driver", "force")
 
@@ -44,6 +45,7 @@ CLASSES_WITHOUT_TYPE: dict[str, type] = {
     "body": Body,
     "driver": drivers.Driver,
     "profile": joints.Profile,
+    "held": Held,
 }  # tables without a `type`
 
 
@@ -84,6 +86,8 @@ def build(annotation: Any, value: object) -> Any:
     """Make an element, and the modules within it, of a table that has been checked."""
     if not isinstance(value, dict):
         return value
+    if get_origin(annotation) is types.UnionType:  # a number, or samples of it
+        annotation = get_args(annotation)[1]
     cls = CLASSES_BY_TYPE["motion"][value["type"]] if "type" in value else annotation
     expected = keys(cls)
     return cls(**{name: build(expected[name].annotation, item) for name, item in value.items() if name != "type"})

@@ -9,6 +9,7 @@ import re
 from typing import NamedTuple
 
 from udkjax.scene.checks import quote
+from udkjax.scene.held import Held
 from udkjax.scene.number_fields import Sections, owner_of, parameters_of, split_index
 
 # The settings of a run that are numbers: one program serves all their values.
@@ -77,6 +78,9 @@ def units_of(mechanism: Sections, name: str) -> str:
         return _FIELDS[name.partition("[")[0]]
     driven = getattr(mechanism.drivers.get(found.owner), "coordinate", "")
     owner = owner_of(mechanism, found)
+    if isinstance(owner, Held):
+        found = found._replace(path=found.path[:-1])
+        owner = owner_of(mechanism, found)
     return field_unit(getattr(owner, "measured_as", type(owner).__name__), found.path[-1], driven)
 
 

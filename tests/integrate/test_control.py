@@ -1,0 +1,210 @@
+"""Numbers held between samples, in a run and step by step: the same motion, and its derivatives by every sample."""
+
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations.textbook import prepare
+from udkjax.integrate.native_engine import _kind
+from udkjax.integrate.problem import Problem
+from udkjax.native.operation import generate
+
+TORQUE, FORCE = np.array([1.0, 2.0, -1.0, 0.5]), np.array([[1.0, 0.0], [-2.0, 0.5], [3.0, 0.0]])
+NAMES = ("force.motor.value", "force.push.vector")
+EXACT: Any = {"rtol": 1e-12, "atol": 1e-12}
+TS = np.linspace(0.0, 0.6, 14).round(9)  # most of them between samples
+
+
+def cart(torque, force, links=1) -> udk.Mechanism:
+    """A pendulum, or a chain of links, on a cart, with a motor in its pin; the cart is pushed."""
+    bodies, before = {"cart": udk.Body(1.0, 1.0)}, "cart"
+    joints: dict[str, Any] = {"rail": udk.Prismatic(["ground", "cart"], np.zeros((2, 2)), 0.0, 0.0)}
+    for k in range(links):
+        bodies[f"link{k}"] = udk.Body(1.0, 1 / 12, [0.0, -0.5 - k], -np.pi / 2)
+        joints[f"pin{k}"] = udk.Revolute([before, f"link{k}"], [[0.0, 0.0] if k == 0 else [0.5, 0.0], [-0.5, 0.0]])
+        before = f"link{k}"
+    forces = {"motor": udk.Torque(["cart", "link0"], torque), "push": udk.Force("cart", force)}
+    return udk.Mechanism(bodies, joints, forces=forces)
+
+
+def held_cart(links=1) -> udk.Mechanism:
+    return cart(udk.Held(TORQUE, 0.1, 0.05), udk.Held(FORCE, 0.15), links)
+
+
+def restarted(mechanism, ts, tolerances=EXACT):
+    """The states at ts, by a run of constant forces from each sample or output to the next."""
+    values = [mechanism.forces[name].value if name == "motor" else mechanism.forces[name].vector for name in ("motor", "push")]
+    breakpoints = np.concatenate([x.breakpoints for x in values])
+    cuts = np.sort(np.append(ts, [t for t in np.unique(breakpoints.round(9)) if t < ts[-1] and abs(t - ts).min() > 1e-9]))
+    state, found = udk.assemble(mechanism), {}
+    found[ts[0]] = state
+    for a, b in pairwise(cuts):
+        now = mechanism.with_parameters({name: x((a + b) / 2) for name, x in zip(NAMES, values, strict=True)})
+        run = udk.simulate(now, [a, b], state, **tolerances)
+        state = found[b] = udk.State(run.q[-1], run.v[-1])
+    return np.stack([found[t].q for t in ts]), np.stack([found[t].v for t in ts])
+
+
+@pytest.mark.parametrize("engine", ["native", "diffrax"])
+def test_a_run_is_the_one_that_is_started_anew_at_each_sample(engine):
+    mechanism = held_cart()
+    found = udk.simulate(mechanism, TS, engine=engine, **EXACT)
+    q, v = restarted(mechanism, TS)
+    tol = {"native": 1e-11, "diffrax": 1e-10}[engine]  # of diffrax it is the interpolation between steps that errs
+    assert_allclose(found.q, q, rtol=0, atol=tol)
+    assert_allclose(found.v, v, rtol=0, atol=10 * tol)
+
+
+@pytest.mark.slow
+def test_a_run_of_a_large_scene():
+    mechanism, ts = held_cart(links=42), TS[[0, 3, 6]]
+    tolerances: Any = {"rtol": 1e-10, "atol": 1e-10}
+    found = udk.simulate(mechanism, ts, engine="native", **tolerances)
+    assert_allclose(found.q, restarted(mechanism, ts, tolerances)[0], rtol=0, atol=1e-8)
+    loss = jax.jit(lambda torque, force: _loss(mechanism, torque, force, ts, tolerances))
+    _check_gradient(loss, jax.jit(jax.grad(loss, (0, 1))), 1e-4)
+
+
+def _loss(mechanism, torque, force, ts=TS, tolerances=EXACT):
+    named = dict(zip((f"{name}.values" for name in NAMES), (torque, force), strict=True))
+    run = udk.simulate(mechanism.with_parameters(named), ts, **tolerances)
+    weights = np.cos(np.arange(3.0 * len(ts))).reshape(-1, 3)
+    return jnp.sum(weights * run.q[:, 1]) + jnp.sum(run.v[-1])
+
+
+def _check_gradient(loss, gradient, h):
+    torque, force = gradient(TORQUE, FORCE)
+    for k, e in enumerate(h * np.eye(4)):
+        assert_allclose(torque[k], (loss(TORQUE + e, FORCE) - loss(TORQUE - e, FORCE)) / (2 * h), rtol=1e-6, atol=1e-7)
+    for k, e in enumerate(h * np.eye(6).reshape(6, 3, 2)):
+        assert_allclose(force.ravel()[k], (loss(TORQUE, FORCE + e) - loss(TORQUE, FORCE - e)) / (2 * h), rtol=1e-6, atol=1e-7)
+
+
+@pytest.fixture(scope="module")
+def loss():
+    mechanism = held_cart()
+    return jax.jit(lambda torque, force: _loss(mechanism, torque, force))
+
+
+def test_derivatives_by_the_samples_forward_in_reverse_and_in_lanes(loss):
+    gradient = jax.jit(jax.grad(loss, (0, 1)))
+    _check_gradient(loss, gradient, 1e-4)
+    forward = jax.jit(jax.jacfwd(loss, (0, 1)))
+    for a, b in zip(gradient(TORQUE, FORCE), forward(TORQUE, FORCE), strict=True):
+        assert_allclose(a, b, rtol=1e-10)
+    batch = TORQUE * np.linspace(0.0, 1.0, 11)[:, None]
+    for function in (gradient, forward):  # eleven members in eight lanes
+        found = jax.jit(jax.vmap(function, (0, None)))(batch, FORCE)
+        for k in (0, 7, 10):
+            for a, b in zip(jax.tree.map(lambda x, k=k: x[k], found), function(batch[k], FORCE), strict=True):
+                assert_allclose(a, b, rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_second_derivatives_by_the_samples(loss):
+    h, gradient = 1e-4, jax.jit(jax.grad(loss))
+    second = jax.jit(jax.jacfwd(jax.grad(loss)))(TORQUE, FORCE)
+    differences = [(gradient(TORQUE + h * e, FORCE) - gradient(TORQUE - h * e, FORCE)) / (2 * h) for e in np.eye(4)]
+    assert_allclose(second, np.stack(differences, 1), rtol=1e-5, atol=1e-6)
+
+
+def code_of(samples: int) -> list[str]:
+    """The text of machine code of a run, and of its reverse mode."""
+    mechanism = cart(udk.Held(np.ones(samples), 0.01), [0.0, 0.0])
+    state, equations = udk.assemble(mechanism), prepare(mechanism)
+    tolerances = map(jnp.asarray, (1e-8, 1e-8, 1e-14))
+    numbers: Any = (equations, TS, state.q.ravel(), state.v.ravel(), *tolerances, None, None, jnp.ones(()))
+    problem = Problem(*numbers, solver=None, projected=True, max_steps=100, breakpoints=mechanism.breakpoints)
+    kind = _kind(problem)
+    reverse = kind._replace(code=kind.code.for_derivatives, active=(True,) * len(kind.code.prologue.inputs), mode="reverse")
+    return [generate(k, 1, False).module for k in (kind, reverse)]
+
+
+def test_the_code_does_not_depend_on_how_many_samples_there_are():
+    """So neither do its operations nor the time that it takes to compile."""
+    assert code_of(10) == code_of(10_000)
+
+
+def test_a_hundred_thousand_samples():
+    """Each takes the same time: one step; the gradient by all of them takes a few runs."""
+    count, dt = 100_000, 1e-4
+    mechanism = udk.Mechanism({"body": udk.Body(1.0, 1.0)}, forces={"push": udk.Force("body", [0.0, 0.0])}, gravity=[0.0, 0.0])
+    values = np.sin(np.arange(count) * dt)
+
+    def distance(x):
+        push = udk.Held(jnp.stack([x, 0 * x], 1), dt)
+        run = udk.simulate(mechanism.with_parameters({NAMES[1]: push}), [0.0, count * dt], max_steps=10**6)
+        return run.q[-1, 0, 0], run.stats["steps"]
+
+    (found, steps), slope = jax.jit(jax.value_and_grad(distance, has_aux=True))(values)
+    left = dt * (count - np.arange(count))  # from the beginning of each sample to the end
+    assert steps <= 2 * count + 10
+    assert_allclose(found, np.sum(values * dt * (left - dt / 2)), rtol=1e-9)
+    assert_allclose(slope, dt * (left - dt / 2), rtol=1e-7)
+
+
+# --- step by step
+
+
+def controlled(mechanism, dt, names=NAMES):
+    """Roll out inputs (N, ...) of a mechanism: all states."""
+
+    def advance(state, now):
+        t, *values = now
+        state = udk.step(mechanism, state, dict(zip(names, values, strict=True)), dt, t, **EXACT)
+        return state, state
+
+    return lambda *inputs: jax.lax.scan(advance, udk.assemble(mechanism), (dt * np.arange(len(inputs[0])), *inputs))[1]
+
+
+def test_steps_are_the_run_of_the_same_inputs():
+    mechanism, dt = cart(0.0, [0.0, 0.0]), 0.05
+    torque, force = np.sin(np.arange(8.0)), np.cos(np.arange(16.0)).reshape(8, 2)
+    rollout, ts = jax.jit(controlled(mechanism, dt)), dt * np.arange(9)
+    run = jax.jit(lambda a, b: udk.simulate(cart(udk.Held(a, dt), udk.Held(b, dt)), ts, analysis=udk.analyse(mechanism), **EXACT))
+    found, expected = rollout(torque, force), run(torque, force)
+    assert_allclose(found.q, expected.q[1:], rtol=0, atol=1e-11)
+    by_step = jax.jit(jax.grad(lambda *x: jnp.sum(rollout(*x).v[:, 1, 2] ** 2), (0, 1)))(torque, force)
+    by_run = jax.jit(jax.grad(lambda *x: jnp.sum(run(*x).v[1:, 1, 2] ** 2), (0, 1)))(torque, force)
+    jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-8, atol=1e-10), by_step, by_run)
+    several = jax.jit(jax.vmap(rollout))(np.stack([torque, 0 * torque, -torque]), np.stack([force] * 3))
+    assert_allclose(several.q[0], found.q, rtol=0, atol=1e-12)
+    state = udk.assemble(mechanism)
+    for k in range(2):  # outside of a trace, too
+        state = udk.step(mechanism, state, dict(zip(NAMES, (torque[k], force[k]), strict=True)), dt, **EXACT)
+    assert_allclose(state.q, found.q[1], rtol=0, atol=1e-12)
+
+
+def test_steps_of_a_driven_mechanism_by_both_engines():
+    """The time goes on from step to step."""
+    drive = udk.Driver(["ground", "rod"], "angle", udk.Sine(1.0, 2.0))
+    bodies, pin = {"rod": udk.Body(1.0, 1 / 12, [0.5, 0.0])}, udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]])
+    mechanism, dt = udk.Mechanism(bodies, {"pin": pin}, {"drive": drive}), 0.1
+    state = udk.assemble(mechanism)
+    for k in range(3):
+        state = udk.step(mechanism, state, None, dt, k * dt)
+    assert_allclose(state.q[0, 2], np.sin(0.6), atol=1e-12)
+    assert_allclose(udk.step(mechanism, udk.assemble(mechanism), {}, dt, engine="diffrax").q[0, 2], np.sin(0.2), atol=1e-12)
+
+
+def test_a_step_that_fails_says_why_or_is_not_a_number():
+    mechanism = cart(0.0, [0.0, 0.0])
+    state = udk.assemble(mechanism)
+    with pytest.raises(udk.SimulationError, match="step"):
+        udk.step(mechanism, state, None, 10.0, max_steps=2)
+    assert np.isnan(jax.jit(lambda dt: udk.step(mechanism, state, None, dt, max_steps=2))(10.0).q).all()
+    for inputs, error, said in [
+        ({"force.moto.value": 1.0}, udk.SceneError, 'did you mean "force.motor.value"'),
+        ({"force.motor.value": [1.0, 2.0]}, udk.SceneError, "must have the shape"),
+        ([1.0], TypeError, "inputs must map names"),
+    ]:
+        with pytest.raises(error, match=said):
+            udk.step(mechanism, state, inputs, 0.1)
+    with pytest.raises(ValueError, match="dt must be positive"):
+        udk.step(mechanism, state, None, 0.0)

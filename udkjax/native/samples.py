@@ -1,0 +1,70 @@
+"""Numbers of a scene that have samples: between breakpoints they are constants, as all others are.
+
+A row of samples holds from one breakpoint to the next. Where a run begins anew behind a breakpoint, the constants of its lane are
+computed again, of the numbers with the row in: no step and no evaluation takes longer, however many samples there are.
+"""
+
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.module import Module
+
+ARGUMENTS = ((POINTER, "work"), (POINTER, "call"), (INT, "lane"))
+
+
+def count_breakpoints(t: Module, f: Function, member: Value, time: Value) -> Value:
+    """How many breakpoints of a member lie before a time, by bisection."""
+    call = f.given["call"]
+    breaks = t.member_address(f, call, "breaks", member)
+    low, high = f.variable(0, INT, 1), f.variable(f.load(call, t.call_fields.index("knots"), base=INT), INT, 1)
+    with f.while_(lambda: low.value < high.value):
+        middle = f.arithmetic("div", low.value + high.value, 2)
+        before = f.load(breaks, middle) < time
+        low.value, high.value = f.select(before, middle + 1, low.value), f.select(before, high.value, middle)
+    return low.value
+
+
+def write_next_breakpoint(t: Module):
+    """`next_breakpoint(work, call)`: `due` is the first breakpoint that a lane has not passed; infinite where there is none."""
+    f, s = t.function("next_breakpoint", ARGUMENTS[:2])
+    call = f.given["call"]
+    knots = f.load(call, t.call_fields.index("knots"), base=INT)
+    with f.each(f.width) as k:
+        knot, at = t.to_int(f, f.lane(s.knot, k)), f.variable(float("inf"), width=1)
+        with f.if_(knot < knots):
+            at.value = t.input_number(f, call, "breaks", f.lane(s.member, k), knot)
+        f.store(at.value, f.given["work"], k + t.places["due"] * f.width)
+
+
+def write_enter(t: Module):
+    """`enter(work, call, lane)`: the constants of a lane, of the samples that hold behind the breakpoints that it has passed."""
+    f, _ = t.function("enter", ARGUMENTS)
+    work, call, lane = (f.given[name] for _, name in ARGUMENTS)
+
+    def place(name: str) -> Value:
+        return lane + t.places[name] * f.width
+
+    knot, member = f.load(work, place("knot")), t.to_int(f, f.load(work, place("member")))
+    f.store(knot, work, place("row"))
+    numbers = numbers_of_row(t, f, member, knot) if t.plan.sampled else t.member_address(f, call, "numbers", member)
+    constants = Value(f, f.reserve(DOUBLE, max(t.constants, 1)), POINTER)
+    f.call("prologue", numbers, constants)
+    with f.each(t.constants) as i:
+        f.store(f.load(constants, i), work, i * f.width + place("constants"))
+    t.begin_row(f, lane, member, numbers, constants)
+
+
+def numbers_of_row(t: Module, f: Function, member: Value, row: Value) -> Value:
+    """The address of a copy of a member's numbers, with a row of samples in."""
+    given = t.member_address(f, f.given["call"], "numbers", member)
+    copy = f.at(f.given["work"], t.places["numbers"] * f.width)
+    with f.each(t.number_count) as i:
+        f.store(f.load(given, i), copy, i)
+    samples = row_address(t, f, "samples", member, row)
+    for k, place in enumerate(t.plan.sampled):
+        f.store(f.load(samples, k), copy, place)
+    return copy
+
+
+def row_address(t: Module, f: Function, name: str, member: Value, row: Value) -> Value:
+    """The address of a row of the samples of a member."""
+    start = t.member_address(f, f.given["call"], name, member)
+    return f.at(start, t.to_int(f, row) * len(t.plan.sampled))
