@@ -104,7 +104,7 @@ def _arguments(grid: Path) -> dict[str, Any]:
 
 def _estimate(mech: "Mechanism", arguments: dict[str, Any], memory: int, json: bool) -> None:
     from udkjax.show.sweep_summary import estimate_summary
-    from udkjax.study.sweep.cost import estimate_cost
+    from udkjax.study.sweep.chunks import estimate_cost
     from udkjax.study.sweep.plan import make_plan
 
     plan = make_plan(mech, **arguments)

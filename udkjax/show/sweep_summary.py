@@ -8,7 +8,7 @@ import numpy as np
 from udkjax.integrate import Result
 from udkjax.show.summary import table
 from udkjax.show.sweep_figures import RESULT, scalars
-from udkjax.study.sweep.cost import SweepCost
+from udkjax.study.sweep.chunks import SweepCost
 from udkjax.study.sweep.dataset import bytes_per_member, variables_of
 from udkjax.study.sweep.plan import Plan
 from udkjax.study.sweep.sweep_progress import duration

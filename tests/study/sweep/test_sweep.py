@@ -1,6 +1,5 @@
 """Sweeps: each member as a run by itself, failures as data, nothing kept that was not asked for."""
 
-import itertools
 import json
 import pickle
 from functools import partial
@@ -11,11 +10,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.sweep.cost import SECONDS, _cut, cut_chunks
-from udkjax.study.sweep.dataset import NOT_COMPUTED, assemble
-from udkjax.study.sweep.executors import program, run
-from udkjax.study.sweep.plan import make_plan
-from udkjax.study.sweep.program import lane_steps
+from udkjax.study.sweep.chunks import SECONDS, _cut, compute_members, estimate_cost
+from udkjax.study.sweep.dataset import NOT_COMPUTED, assemble, bytes_per_member
+from udkjax.study.sweep.executors import compute_on_devices, run
+from udkjax.study.sweep.plan import Chunk, make_plan
+from udkjax.study.sweep.program import group_run
 
 LINKS = ("link1", "link2", "link3")
 TS = np.linspace(0.0, 1.0, 6)
@@ -47,7 +46,7 @@ def plan(pendulum, reference):
 
 @pytest.fixture(scope="module")
 def finished(plan):
-    return [(chunk.members, run(plan, chunk)) for chunk in cut_chunks(plan)]
+    return [(chunk.members, data) for chunk, data, _ in compute_members(plan, compute_on_devices)]
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +90,6 @@ def test_the_dataset_says_what_it_is(data, pendulum):
     assert data.time.attrs["units"] == "1"  # runs of other lengths have their own times
     assert data.attrs["setting_max_steps"] == STEPS and udk.loads(data.attrs["scene"]).name == pendulum.name
     assert "position_error" in data and "rank" not in data and "q" not in data
-    assert "lane_efficiency" not in data.attrs  # machine code lets no member wait
 
 
 def test_what_is_not_finished_is_marked(plan, finished):
@@ -103,9 +101,9 @@ def test_what_is_not_finished_is_marked(plan, finished):
 
 def test_copies_of_a_plan_share_its_program(plan, finished, compilations):
     copy = pickle.loads(pickle.dumps(plan))
-    chunk = cut_chunks(plan)[0]
+    chunk = Chunk(0, 0, finished[0][0], 1.0)
     again = {}
-    assert compilations(lambda: again.update(run(copy, chunk))) == []
+    assert compilations(lambda: again.update(run(copy, chunk)[1])) == []
     for name, values in finished[0][1].items():
         assert np.array_equal(again[name], values, equal_nan=True)
 
@@ -113,7 +111,7 @@ def test_copies_of_a_plan_share_its_program(plan, finished, compilations):
 def test_a_member_does_not_depend_on_its_neighbours(plan, finished):
     members, values = finished[0]
     order = np.random.default_rng(0).permutation(len(members))
-    other = program(plan, plan.groups[0])(members[order])
+    other = group_run(plan, 0).compute(members[order])
     assert_allclose(other["q_end"], values["q_end"][order], rtol=0, atol=1e-14)
     assert np.array_equal(other["steps"], values["steps"][order])
 
@@ -126,12 +124,27 @@ def test_chunks_are_cut_by_work_and_by_memory():
     assert _cut(np.zeros(23), 8, 100) == [slice(0, 23)]
 
 
-def test_all_members_are_in_one_chunk_each(plan):
-    chunks = cut_chunks(plan, memory=1)
-    assert sorted(itertools.chain(*(chunk.members.tolist() for chunk in chunks))) == list(range(plan.size))
+@pytest.mark.parametrize(("pace", "memory", "fewest"), [(1e-9, 2**30, 1), (100.0, 2**30, 2), (1e-9, 1, 2)])
+def test_members_that_are_not_done_are_computed_once(pendulum, pace, memory, fewest):
+    """However long the first of them took, and whatever an earlier run has done, in chunks that had other members."""
+    axes = {"body.rod.mass": np.linspace(1.0, 2.0, 300), "t1": [0.1, 0.2]}
+    plan, expected, done = make_plan(pendulum, axes, [0.0, 1.0]), [], np.arange(7, 70)
+
+    def engine(plan, chunks):
+        for chunk in chunks:
+            yield chunk, {}, pace * chunk.work
+
+    chunks = [chunk for chunk, _, _ in compute_members(plan, engine, done, memory, expected.extend)]
+    assert np.sort(np.concatenate([chunk.members for chunk in chunks])).tolist() == [*range(7), *range(70, plan.size)]
     assert [chunk.index for chunk in chunks] == list(range(len(chunks)))
+    assert chunks[-len(expected) :] == expected and len(expected) >= fewest
+    later = np.concatenate([chunk.members for chunk in expected]) % 2  # whether it runs to the later end
+    assert np.all(np.diff(later) <= 0) and later[0] == 1 and later[-1] == 0
 
 
-def test_lanes_wait_for_the_slowest():
-    assert lane_steps(np.array([4, 2, 2, 1]), 2) == (9, 12)
-    assert lane_steps(np.array([4, 4, 3]), 2) == (11, 14)
+def test_what_a_sweep_will_take_is_measured_of_a_piece_of_some_groups(pendulum):
+    plan = make_plan(pendulum, {"max_steps": [100, 1000, 10_000], "body.rod.mass": MASSES}, [0.0, 0.1])
+    found = estimate_cost(plan)
+    assert (found.members, found.groups, found.tried) == (9, 3, 3) and found.chunks >= 3
+    assert found.stored == 9 * bytes_per_member(plan) and found.memory > found.stored
+    assert found.compiling > 0.0 and 0.0 < found.computing < found.compiling

@@ -14,26 +14,27 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax.integrate.assembly import close
 from udkjax.study.exact import exact_coordinates
-from udkjax.study.sweep.cost import cut_chunks
-from udkjax.study.sweep.executors import program, run
-from udkjax.study.sweep.plan import make_plan
+from udkjax.study.sweep.chunks import members_to_compute
+from udkjax.study.sweep.executors import run
+from udkjax.study.sweep.plan import Chunk, make_plan
+from udkjax.study.sweep.program import group_run
 
 LINKS = ("link1", "link2", "link3")
 DEVICES = 8
 SCRIPT = """
 import sys
 import jax, numpy as np, udkjax as udk
-from udkjax.study.sweep.cost import cut_chunks
-from udkjax.study.sweep.executors import program, run
+from udkjax.study.sweep.chunks import compute_members
+from udkjax.study.sweep.executors import compute_on_devices
 from udkjax.study.sweep.plan import make_plan
+from udkjax.study.sweep.program import group_run
 
 axes = {"mass": udk.Axis(np.linspace(1.0, 3.0, 20), of="body.rod.mass"), "rtol": np.geomspace(1e-10, 1e-4, 30)}
 plan = make_plan(udk.library.compound_pendulum(), axes, [0.0, 3.0])
-parts = [{"members": chunk.members, **run(plan, chunk)} for chunk in cut_chunks(plan)]
+parts = [{"members": chunk.members, **data} for chunk, data, _ in compute_members(plan, compute_on_devices)]
 found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 np.savez(sys.argv[1], **{name: values[np.argsort(found["members"])] for name, values in found.items()})
-own = program(plan, plan.groups[0])
-print(len(own.devices), len(jax.devices()))
+print(len(group_run(plan, 0).program.devices), len(jax.devices()))
 """
 
 
@@ -107,22 +108,12 @@ def spread():
 
 
 @pytest.mark.slow
-def test_lanes_are_busy_and_a_sweep_takes_what_a_plain_batch_takes(spread):
-    """Tolerances from 1e-3 to 1e-10: in the order of the design, less than half of the lanes are busy.
-
-    A sweep assembles each member, and so does the plain batch, which is given no states: that takes twice what the runs do.
-    """
-    own, chunks = program(spread, spread.groups[0]), cut_chunks(spread)
-    members = np.concatenate([chunk.members for chunk in chunks])
-    steps = np.concatenate([run(spread, chunk)["steps"] for chunk in chunks]).reshape(-1, 64)
-    unordered = np.empty(spread.size)
-    unordered[members] = steps.ravel()
-    unordered = unordered.reshape(-1, 64)
-    assert steps.sum() / (64 * steps.max(axis=1).sum()) > 0.85
-    assert unordered.sum() / (64 * unordered.max(axis=1).sum()) < 0.6
-
-    recipe, numbers = own.recipe, own.recipe.own(members)
-    mechanisms = jax.jit(jax.vmap(lambda own: recipe.mechanism(recipe.shared, own, {})))(numbers)
+def test_a_sweep_takes_what_a_plain_batch_takes(spread):
+    """A sweep assembles each member, and so does the plain batch, which is given no states: that takes twice what the runs do."""
+    group, members = group_run(spread, 0), members_to_compute(spread)[0]
+    chunks = [Chunk(k, 0, members[at : at + 512], 1.0) for k, at in enumerate(range(0, len(members), 512))]
+    numbers = group.own(members)
+    mechanisms = jax.jit(jax.vmap(lambda own: group.mechanism(group.shared, own, {})))(numbers)
 
     @jax.jit
     @jax.vmap
@@ -134,7 +125,7 @@ def test_lanes_are_busy_and_a_sweep_takes_what_a_plain_batch_takes(spread):
         jax.block_until_ready(function())
         return time.process_time() - start
 
-    candidates = (lambda: [run(spread, chunk) for chunk in chunks]), (lambda: plain(mechanisms, numbers[1]["tol"]))
+    candidates = (lambda: [run(spread, chunk) for chunk in chunks]), (lambda: plain(mechanisms, numbers.axes["tol"]))
     for candidate in candidates:
         candidate()
     # The least of several, in turn: waiting for a thread that another program keeps from its core counts as time of this one.
@@ -145,8 +136,7 @@ def test_lanes_are_busy_and_a_sweep_takes_what_a_plain_batch_takes(spread):
 
 @pytest.mark.slow
 def test_members_of_a_random_design_are_as_by_themselves(spread):
-    (chunk, *_) = cut_chunks(spread, memory=1)
-    found = run(spread, chunk)
+    chunk, found, _ = run(spread, Chunk(0, 0, np.arange(64), 1.0))
     mass, length, angle, tol = (column.values for column in spread.columns)
     for k, member in enumerate(chunk.members[:3].tolist()):
         mechanism = spread.mechanism.with_parameters({"body.coupler.mass": mass[member]})

@@ -33,13 +33,14 @@ def clock(monkeypatch):
 
 def test_a_sweep_is_followed(clock):
     seen: list[SweepProgress] = []
-    watch = Watch(20, CHUNKS[1:], seen.append, [0, 0, Result.drift, 0])
+    watch = Watch(20, 4, seen.append, [0, 0, Result.drift, 0])
     assert seen[-1] == SweepProgress("sweep", 4, 20, 0.0, "failed: 1 drift", failures={"drift": 1})
     clock.now += 8  # of which most went into a compilation
     watch(CHUNKS[2], {**result(Result.step_limit), "steps": np.array([3, 9, 7, 1])}, 7.5)
     state = seen[-1]
     assert (state.done, state.seconds, state.rate, state.left) == (8, 8.0, 0.5, None)
     assert (state.failures, state.slowest, state.slowest_chunk) == ({"drift": 1, "step_limit": 1}, (9, 9), (2, 7.5))
+    watch.expect([CHUNKS[1], *CHUNKS[3:]])
     clock.now += 2
     watch(CHUNKS[1], {**result(Result.drift), "steps": np.array([3, 9, 7, 1])}, 2.0)
     state = seen[-1]
@@ -60,7 +61,7 @@ def test_a_sweep_is_followed(clock):
 def test_it_is_reported_as_everything_else_is(capsys):
     for option, says in ((False, False), (True, True)):
         with report_progress(option, 20, "sweep") as report:
-            watch = Watch(20, CHUNKS, report.show)
+            watch = Watch(20, 0, report.show)
             for chunk in CHUNKS:
                 watch(chunk, result(Result.drift))
         out, err = capsys.readouterr()

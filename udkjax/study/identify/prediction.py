@@ -5,12 +5,10 @@ numbers; a mechanism, its targets, its channels and the length of a record are c
 members at once.
 """
 
-import os
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import equinox as eqx
 import jax
@@ -20,17 +18,18 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.integrate.assembly import State, close
 from udkjax.integrate.simulate import simulate
-from udkjax.integrate.solution import Solution
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure
 from udkjax.study.channels import Channel, Quantity
 from udkjax.study.identify.unknowns import Target, apply_values
-from udkjax.study.machine import CHUNKED, MEMBERS, cores
+from udkjax.study.machine import CHUNKED, MEMBERS
+from udkjax.study.members import Program
 
 # Tolerances of the integration, relative and absolute: of final estimates (parameters are known to that much where there is no
 # noise); where singular values or the continuity of pieces are all that is asked for; and on the way to a fit.
 TIGHT, MEDIUM, LOOSE = 1e-11, 1e-9, 1e-7
 LANES_FROM = 1024  # members that are computed together in vector lanes; fewer one by one, which needs no second compilation
+PROGRAMS = 64  # in memory at most
 CACHE_SIZE, CACHE_BYTES = 6, 2**24  # predictions stored, since a fit goes back to its best one, and the largest of them
 
 Numbers: TypeAlias = np.ndarray | Array
@@ -79,12 +78,10 @@ class Predictor:
         settings: Mapping[str, Any],
         ends: bool = False,
     ):
-        self.mechanism, self.targets, self.channels, self.ends = mechanism, targets, channels, ends
-        self.settings = dict(settings)
         self.evaluations = 0
         self._cache: OrderedDict[bytes, Prediction] = OrderedDict()
-        self._arrays, fixed = eqx.partition((mechanism, self.settings), eqx.is_array)
-        self._static = _Static(fixed, targets, channels, ends)
+        self._arrays, static = eqx.partition((mechanism, dict(settings)), eqx.is_array)
+        self._run = _MemberRun(static, targets, channels, ends)
 
     def __call__(self, members: Members, tol: Tolerances) -> Prediction:
         """Predict members, integrated with these tolerances."""
@@ -93,12 +90,11 @@ class Predictor:
         if key in self._cache:
             return self._cache[key]
         self.evaluations += size
-        together = size if jax.default_backend() not in CHUNKED else MEMBERS if size >= LANES_FROM else 1
-        chunks = [jax.tree.map(lambda x, k=k: _rows(x, k, together), members) for k in range(0, size, together)]
-        parts = [self._compute(chunks[0], tol)]  # compiled once, before threads ask for it
-        if len(chunks) > 1:
-            parts += _pool(os.getpid()).map(lambda chunk: self._compute(chunk, tol), chunks[1:])
-        found = Prediction(*jax.tree.map(lambda *x: np.concatenate(x)[:size], *parts))
+        piece = size if jax.default_backend() not in CHUNKED else MEMBERS if size >= LANES_FROM else 1
+        shapes = tuple((x.shape[1:], str(x.dtype)) for x in jax.tree.leaves(members))
+        program = _program(self._run, members.x.shape[1] + members.shift.shape[1], piece, shapes)
+        values, slopes = program((self._arrays, np.array(tol)), members, on_threads=True)
+        found = Prediction(values["y"], slopes["y"], values["code"], values.get("ends"), slopes.get("ends"))
         if sum(part.nbytes for part in found if part is not None) <= CACHE_BYTES:
             self._cache[key] = found
             if len(self._cache) > CACHE_SIZE:
@@ -108,92 +104,61 @@ class Predictor:
     def guess(self, members: Members, which: int) -> State:
         """Return the state from which the initial state of a member is closed."""
         member = jax.tree.map(lambda leaf: leaf[which], members)
-        return jax.tree.map(np.asarray, _guess(self._static, self._arrays, member))
-
-    def _compute(self, members: Members, tol: Tolerances) -> tuple:
-        return jax.tree.map(np.asarray, _predict(self._static, self._arrays, members, tol))
+        return jax.tree.map(np.asarray, _guess(self._run, self._arrays, member))
 
 
-class _Static:
-    """The static argument of `_predict`: for equal ones it is compiled once."""
+class _MemberRun:
+    """What is computed of one member. Equal ones have the same programs, whatever their numbers are."""
 
-    def __init__(self, fixed: PyTree, *rest: Hashable):
-        leaves, structure = jax.tree.flatten(fixed)
-        self.rest, self._key = rest, (structure, tuple(leaves), rest)
+    def __init__(self, static: PyTree, *choices: Hashable):
+        leaves, structure = jax.tree.flatten(static)
+        self._key = (structure, tuple(leaves), choices)
         self._hash = hash(self._key)  # stored: it takes as long as a short run
+        self._static = static
+        self.targets, self.channels, self.ends = cast(tuple[tuple[Target, ...], tuple[Channel | Quantity, ...], bool], choices)
 
     def __hash__(self) -> int:
         return self._hash
 
     def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, _Static) and self._key == other._key)
+        return self is other or (isinstance(other, _MemberRun) and self._key == other._key)
 
-    @property
-    def static_part(self) -> PyTree:
-        """What is not an array, in its place."""
-        structure, leaves, _ = self._key
-        return jax.tree.unflatten(structure, leaves)
+    def place(self, arrays: PyTree, member: Members) -> tuple[Mechanism, State, dict[str, Any]]:
+        """Return the mechanism of a member, the state from which its initial state is closed, and settings."""
+        run = member.runs
+        mechanism, settings = eqx.combine(arrays, self._static)
+        base = mechanism.with_parameters(run.conditions) if run.conditions else mechanism
+        found = guess = apply_values(base, self.targets, member.x)
+        if run.q is not None and run.v is not None:
+            # Lengths move the guess: that of the record, while the scene's own decides about the constants.
+            guess = apply_values(_with_state(base, run.q, run.v), self.targets, member.x)
+        q, v = (part.reshape(-1, 3) for part in jnp.einsum("iks,s->ik", run.bases, member.shift))
+        return found, State(guess.q0 + q, guess.v0 + v), settings
+
+    def __call__(self, shared: tuple[PyTree, Array], member: Members, shift: Array) -> dict[str, Array]:
+        P = member.x.shape[0]
+        member = member._replace(x=member.x + shift[:P], shift=member.shift + shift[P:])
+        arrays, (rtol, atol) = shared
+        mechanism, guess, settings = self.place(arrays, member)
+        closure = close(mechanism, member.runs.ts[0], guess, analysis=settings["analysis"])
+        solution = simulate(mechanism, member.runs.ts, closure, rtol, atol, throw=False, **settings)
+        found = {"y": measure(mechanism, solution, self.channels), "code": solution.code}
+        if self.ends:
+            ends = jnp.stack([solution.q[jnp.array([0, -1])], solution.v[jnp.array([0, -1])]], axis=1)
+            found["ends"] = ends.reshape(2, 2, -1)
+        return found
 
 
-@lru_cache(maxsize=1)
-def _pool(process: int) -> ThreadPoolExecutor:
-    """Return the threads of this process: to start them anew would take as long as a short run."""
-    return ThreadPoolExecutor(cores(), thread_name_prefix="identify")
-
-
-def _rows(x: np.ndarray, first: int, count: int) -> np.ndarray:
-    """Return some members, filled up with copies of the last."""
-    return x[np.minimum(np.arange(first, first + count), len(x) - 1)]
+@lru_cache(maxsize=PROGRAMS)
+def _program(run: _MemberRun, slopes: int, piece: int, shapes: Hashable) -> Program:
+    """Return the program of what is computed of members with numbers of these shapes."""
+    del shapes
+    return Program(run, slopes, piece)
 
 
 @partial(jax.jit, static_argnums=0)
-def _guess(static, arrays, member):
-    mechanism, _ = eqx.combine(arrays, static.static_part)
-    return _place(mechanism, member, static.rest[0])[1]
-
-
-@partial(jax.jit, static_argnums=0)
-def _predict(static, arrays, members, tol):
-    mechanism, settings = eqx.combine(arrays, static.static_part)
-    targets, channels, ends = static.rest
-    several = len(members.x) > 1
-
-    def along(e):
-        def at(x, shift):
-            return (every if several else one)(members._replace(x=x, shift=shift))
-
-        points = members.x, members.shift
-        by = jnp.split(e, [members.x.shape[1]])
-        tangents = tuple(jnp.broadcast_to(t, p.shape) for t, p in zip(by, points, strict=True))
-        return jax.jvp(at, points, tangents, has_aux=True)
-
-    def one(members):
-        member = jax.tree.map(lambda leaf: leaf[0], members)
-        mech, state = _place(mechanism, member, targets)
-        closure = close(mech, member.runs.ts[0], state, analysis=settings["analysis"])
-        return jax.tree.map(lambda leaf: leaf[None], _run(mech, member.runs.ts, closure, tol, settings, channels, ends))
-
-    def every(members):
-        mechs, states = jax.vmap(lambda member: _place(mechanism, member, targets))(members)
-        ts = members.runs.ts
-        closures = jax.vmap(lambda m, t, state: close(m, t, state, settings["analysis"]))(mechs, ts[:, 0], states)
-        return jax.vmap(lambda m, ts, c: _run(m, ts, c, tol, settings, channels, ends))(mechs, ts, closures)
-
-    size = members.x.shape[1] + members.shift.shape[1]
-    outputs, derivatives, code = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(size))
-    return outputs[0], derivatives[0], code, *outputs[1:], *derivatives[1:]
-
-
-def _place(mechanism: Mechanism, member: Members, targets: tuple[Target, ...]) -> tuple[Mechanism, State]:
-    """Return the mechanism of a member, and the state from which its initial state is closed."""
-    run = member.runs
-    base = mechanism.with_parameters(run.conditions) if run.conditions else mechanism
-    found = guess = apply_values(base, targets, member.x)
-    if run.q is not None and run.v is not None:
-        # Lengths move the guess: that of the record, while the scene's own decides about the constants.
-        guess = apply_values(_with_state(base, run.q, run.v), targets, member.x)
-    q, v = (part.reshape(-1, 3) for part in jnp.einsum("iks,s->ik", run.bases, member.shift))
-    return found, State(guess.q0 + q, guess.v0 + v)
+def _guess(run: _MemberRun, arrays: PyTree, member: Members) -> State:
+    return run.place(arrays, member)[1]
 
 
 def _with_state(mechanism: Mechanism, q: Numbers, v: Numbers) -> Mechanism:
@@ -202,12 +167,3 @@ def _with_state(mechanism: Mechanism, q: Numbers, v: Numbers) -> Mechanism:
         values |= {f"body.{body}.position": q[k, :2], f"body.{body}.angle": q[k, 2]}
         values |= {f"body.{body}.velocity": v[k, :2], f"body.{body}.angular_velocity": v[k, 2]}
     return mechanism.with_parameters(values)
-
-
-def _run(mechanism, ts, closure, tol, settings, channels, ends):
-    solution: Solution = simulate(mechanism, ts, closure, *tol, throw=False, **settings)
-    y = measure(mechanism, solution, channels)
-    if not ends:
-        return (y,), solution.code
-    ends = jnp.stack([solution.q[jnp.array([0, -1])], solution.v[jnp.array([0, -1])]], axis=1)
-    return (y, ends.reshape(2, 2, -1)), solution.code

@@ -2,8 +2,8 @@
 
 axes, layout, grid          what varies: as users write it, as dimensions, as a TOML file
 measures                    what is stored of each member
-plan, program               members and their groups; the compiled program of a group
-cost, executors             chunks of members that take alike long, computed on devices or on a cluster
+plan, program               members and their groups; what is computed of those of a group
+chunks, executors           members that take a few seconds together, computed on devices or on a cluster
 store, fingerprint          finished chunks on disk; what decides the results
 dataset                     all results, labelled
 sweep, sweep_progress       what users call, and how far it is

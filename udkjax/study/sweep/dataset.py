@@ -12,11 +12,10 @@ from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.units import units_of
 from udkjax.study.sweep.axes import Column, Dimension
-from udkjax.study.sweep.executors import program
 from udkjax.study.sweep.layout import SweepError
 from udkjax.study.sweep.measures import Label, guess_label
 from udkjax.study.sweep.plan import Group, Plan, Variable
-from udkjax.study.sweep.program import END, RESULT, STEPS, lane_steps
+from udkjax.study.sweep.program import END, RESULT, STEPS, group_run
 
 if TYPE_CHECKING:
     import xarray
@@ -36,7 +35,7 @@ def describe_group(plan: Plan, group: Group) -> dict[str, Variable]:
     """Return the variables that are stored of each member of a group."""
     bodies, found = len(plan.mechanism_of(group).body_names), {}
     known = {name: label for measure in plan.measures for name, label in measure.variables.items()} | LABELS
-    outputs = program(plan, group).outputs
+    outputs = group_run(plan, group.index).outputs
     slopes = {f"d_{of}_d_{by}": (of, by) for of in outputs for by in plan.derivatives}
     for name, info in outputs.items():
         if name in slopes:
@@ -81,22 +80,17 @@ def bytes_per_member(plan: Plan) -> int:
 def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> "xarray.Dataset":
     """Return the xarray Dataset of a plan, from (members, what was stored of them) in any order.
 
-    What is not among them is not a number, and has the result -1. `lane_efficiency`, where members are
-    computed side by side, is the part of the steps that there was room for which they took: who is done waits for the slowest.
+    What is not among them is not a number, and has the result -1.
     """
     import xarray
 
     variables = variables_of(plan)
     places = _places(plan)
     flat = {name: np.full((plan.size, *v.shape), _fill_value(name, v), v.dtype) for name, v in variables.items()}
-    taken = room = 0
     for members, data in finished:
         group = plan.groups[plan.group_of(int(members[0]))]
         for name, values in data.items():
             _put(flat[name], variables[name], members, values, places.get(group.index))
-        if (lanes := program(plan, group).lanes) is not None:
-            some = lane_steps(data[STEPS], lanes)
-            taken, room = taken + some[0], room + some[1]
     dims = tuple(dimension.name for dimension in plan.dimensions)
     found = {
         name: ((*dims, *v.dims), flat[name].reshape(*plan.shape, *v.shape), {"units": v.units, "long_name": v.long_name})
@@ -108,7 +102,7 @@ def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[
         "flag_meanings": " ".join(["not_computed", *(result.name for result in Result)]),
         "causes": json.dumps({int(result): CAUSES[result] for result in Result}),
     }
-    data.attrs = _attributes(plan) | ({"lane_efficiency": taken / room} if room else {})
+    data.attrs = _attributes(plan)
     return data
 
 

@@ -1,12 +1,11 @@
 """Compute the chunks of a sweep: on this machine's devices or cores, or by the workers of dask.distributed."""
 
-import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import jax
 import numpy as np
@@ -14,69 +13,46 @@ import numpy as np
 from udkjax.equations.analysis import analyse
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result, versions
-from udkjax.scene.mechanism import Mechanism
 from udkjax.study.machine import concurrent_chunks, cores
-from udkjax.study.sweep.plan import Chunk, Group, Plan
-from udkjax.study.sweep.program import RESULT, Program, Recipe
+from udkjax.study.sweep.plan import Chunk, Plan
+from udkjax.study.sweep.program import RESULT, GroupRun, group_run
 
 if TYPE_CHECKING:
     import distributed
 
-Done = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, what it gave, and how long it took (s)
+Done: TypeAlias = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, what it gave, and how long that took (s)
+Engine: TypeAlias = Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]  # hands over chunks as they are done
 
 RETRIES = 2  # of a chunk that raised: on another worker there may be memory, or room on the disk
 AHEAD = 2  # tasks for each thread of the cluster, so that none waits for the next; more would only fill the workers' memory
 AT_LEAST = 16  # tasks, so that a cluster that grows by what is asked of it sees that something is
 
-PROGRAMS = 64  # in memory at most: a program holds its plan
-_programs: OrderedDict[tuple[str, int, tuple[int, ...] | None], Program] = OrderedDict()
-_lock = threading.Lock()
 
-
-def program(plan: Plan, group: Group, redundant: tuple[int, ...] | None = None) -> Program:
-    """Return the program of a group, which is compiled once for each process."""
-    key = plan.token, group.index, redundant
-    with _lock:
-        if key not in _programs:
-            _programs[key] = Program(Recipe(plan, group, redundant), jax.local_devices())
-            while len(_programs) > PROGRAMS:
-                _programs.popitem(last=False)
-        _programs.move_to_end(key)
-        return _programs[key]
-
-
-def run(plan: Plan, chunk: Chunk) -> dict[str, np.ndarray]:
+def run(plan: Plan, chunk: Chunk) -> Done:
     """Compute the members of a chunk: each stored variable (members, ...), with "result". A failing member has a code, and NaN.
 
     Where a member's numbers made rows independent that the mechanism leaves out as redundant, it is run again without them.
     """
-    group = plan.groups[chunk.group]
-    mine = program(plan, group)
-    found = mine(chunk.members)
-    if mine.recipe.redundant and mine.recipe.varied:
-        for rows, which in _other_redundant_rows(mine.recipe, chunk.members, found[RESULT]).items():
-            again = program(plan, group, rows)(chunk.members[which])
-            for name, values in again.items():
+    group = group_run(plan, chunk.group)
+    group.compile()  # what that takes is not counted
+    begun = time.perf_counter()
+    found = group.compute(chunk.members)
+    if group.redundant and group.varied:
+        for rows, which in _other_redundant_rows(group, chunk.members, found[RESULT]).items():
+            for name, values in group_run(plan, chunk.group, rows).compute(chunk.members[which]).items():
                 found[name][which] = values
-    return found
+    return chunk, found, time.perf_counter() - begun
 
 
-def _other_redundant_rows(recipe: Recipe, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
+def _other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
     """Find members that drifted, although they were projected, as other rows of theirs are redundant: by these rows."""
-    drifted = np.flatnonzero(result == Result.drift)
     found: dict[tuple[int, ...], list[int]] = {}
-    if len(drifted):
-        mechanisms = _mechanisms(recipe, members[drifted])
-        for k, mechanism in zip(drifted.tolist(), mechanisms, strict=True):
-            rows = analyse(mechanism).redundant_rows
-            if rows is not None and rows != recipe.redundant:
-                found.setdefault(rows, []).append(k)
+    for k in np.flatnonzero(result == Result.drift).tolist():
+        own = jax.tree.map(lambda x: x[0], group.own(members[k : k + 1]))
+        rows = analyse(group.mechanism(group.shared, own, {})).redundant_rows
+        if rows is not None and rows != group.redundant:
+            found.setdefault(rows, []).append(k)
     return {rows: np.array(which) for rows, which in found.items()}
-
-
-def _mechanisms(recipe: Recipe, members: np.ndarray) -> list[Mechanism]:
-    own = recipe.own(members)
-    return [recipe.mechanism(recipe.shared, jax.tree.map(lambda x, k=k: x[k], own), {}) for k in range(len(members))]
 
 
 # --- where chunks are computed
@@ -90,7 +66,7 @@ def compute_on_devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, N
         try:
             while waiting or running:
                 while waiting and len(running) < width:
-                    running.add(pool.submit(_time_run, plan, waiting.popleft()))
+                    running.add(pool.submit(run, plan, waiting.popleft()))
                 done, running = wait(running, return_when=FIRST_COMPLETED)
                 for future in done:
                     yield future.result()
@@ -99,17 +75,11 @@ def compute_on_devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, N
                 future.cancel()
 
 
-def _time_run(plan: Plan, chunk: Chunk) -> Done:
-    begun = time.perf_counter()
-    data = run(plan, chunk)
-    return chunk, data, time.perf_counter() - begun
-
-
 class ClusterError(RuntimeError):
     """A cluster cannot do a sweep."""
 
 
-def dask_engine(client: "distributed.Client | None" = None) -> Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]:
+def dask_engine(client: "distributed.Client | None" = None) -> Engine:
     """Return the engine on the workers of a `distributed.Client`; without one, the client that was made last.
 
     Workers may come and go: what a lost one had not delivered is computed by another. Each result is handed over when it
@@ -191,7 +161,7 @@ def _run(plan: Plan, chunk: Chunk, wanted: dict[str, str]) -> Done:
     if (found := _deciding_versions()) != wanted:
         differing = ", ".join(f"{name} {found[name]} instead of {wanted[name]}" for name in wanted if found[name] != wanted[name])
         raise ClusterError(f"a worker has other versions of what decides the results: {differing}")
-    return _time_run(plan, chunk)
+    return run(plan, chunk)
 
 
 def _deciding_versions() -> dict[str, str]:

@@ -50,10 +50,10 @@ class Group:
 class Chunk:
     """Members of one group that are computed together: the unit of progress, of storage and of a task."""
 
-    index: int  # its place in `Plan.chunks`
+    index: int  # its place among all chunks
     group: int  # `Group.index`
     members: Int[np.ndarray, "n"]  # places in the flattened grid, in the order in which they are computed
-    work: float  # what is expected of it, beside that of other chunks
+    work: float  # that is expected of it, beside that of other chunks of its group
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +68,12 @@ class Plan:
     derivatives: tuple[str, ...] = ()
     design: Design | None = None
     token: str = field(default_factory=lambda: uuid.uuid4().hex)  # the same in every copy: what was compiled for one serves all
+
+    def __hash__(self) -> int:
+        return hash(self.token)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Plan) and self.token == other.token
 
     @property
     def shape(self) -> tuple[int, ...]:

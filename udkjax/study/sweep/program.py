@@ -1,15 +1,12 @@
-"""The program of a group: from the places of members in the sweep to what is stored of them.
+"""What is computed of the members of a group: from their places in the sweep to what is stored of them.
 
-A `Recipe` is the part of a plan that one program is compiled from. Its numbers are arguments of the program: those that all
-members share, and those of each member. A program computes pieces of a fixed size on each device: as many members as fill the
-vector units, or one, where members had better be computed one after another. The last piece is filled up with copies. So results
-do not depend on how many devices there are, nor on how a sweep is cut into chunks.
+Members of a group differ by numbers alone. These are arguments of its program: those that all members share, and those of each.
 """
 
 import dataclasses
-import threading
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar, cast
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -26,18 +23,17 @@ from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import NUMBERS
 from udkjax.study.machine import CHUNKED, MEMBERS
+from udkjax.study.members import Outputs, Program
 from udkjax.study.quantities import parameter_value
-from udkjax.study.sweep.plan import Group, Plan, stack_choices
+from udkjax.study.sweep.plan import Plan, stack_choices
 
-T = TypeVar("T")
-Outputs = dict[str, Array]
 RESULT, END, STEPS = "result", "end_time", "steps"  # stored of every member
 WIDTH = 8  # members: a piece has a multiple, of what the widest vector units hold
 WIDE = 4096  # members of a piece where a device takes them all at once
-# Times `MEMBERS` in a piece, at most: to call a program takes what ten of its members take. And pieces that a group has at least,
-# before its pieces get larger: for as many devices there is something to do.
-TOGETHER, MANY = 8, 16
+TOGETHER = 8  # times `MEMBERS` in a piece, at most: to call a program takes what ten of its members take
+MANY = 16  # pieces that a group has at least, before they get larger: so that all devices have something to do
 STRAIGHT = (type(None), Auto, Elimination)  # methods by straight-line code, which vector instructions suit
+PROGRAMS = 64  # in memory at most: a program holds its plan
 
 
 class Shared(NamedTuple):
@@ -64,11 +60,12 @@ class Choices(NamedTuple):
     places: Int[np.ndarray, "n"]
 
 
-class Recipe:
-    """How the members of a group are computed; `redundant`: the rows of Psi to leave out, where not those of the mechanism."""
+class GroupRun:
+    """The members of a group, and how they are computed; `redundant`: rows of Psi to leave out, where not the mechanism's."""
 
-    def __init__(self, plan: Plan, group: Group, redundant: tuple[int, ...] | None = None):
-        self.plan, self.group = plan, group
+    def __init__(self, plan: Plan, index: int, redundant: tuple[int, ...] | None = None):
+        group = plan.groups[index]
+        self.plan, self.members = plan, group.members
         self.names = tuple(plan.derivatives)
         self.numbers = tuple(column for column in plan.columns if not column.is_choice)
         fixed: dict[str, PyTree] = {"mechanism": plan.mechanism, **plan.settings}
@@ -98,12 +95,15 @@ class Recipe:
         self.assembled = fixed.get("state") is None
         closure = close(fixed["mechanism"], plan.ts[0]) if self.assembled and not self.varied and not moving else None
         self.shared = jax.tree.map(np.asarray, Shared(arrays, closure))
-        self.in_lanes = (
+        in_lanes = (
             is_explicit(fixed.get("solver"))
             and isinstance(fixed.get("method"), STRAIGHT)
             and self.redundant is not None
             and fixed.get("formulation") is None
         )
+        self._placed: Shared | None = None
+        devices = jax.local_devices()
+        self.program = Program(self, len(self.names), _piece(len(self.members), in_lanes, devices[0].platform), devices)
 
     def own(self, members: Int[np.ndarray, "n"]) -> Own:
         """Return the numbers of members, (n, ...) each."""
@@ -154,8 +154,9 @@ class Recipe:
                 found["method"] = _with(found.get("method") or Auto(), tol, numbers.pop(tol))
         return found | numbers | {"ts": ts}
 
-    def __call__(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> Outputs:
-        """Return what is stored of one member."""
+    def __call__(self, shared: Shared, own: Own, shifts: Array) -> Outputs:
+        """Return what is stored of one member, with `shifts` (names,) added to what derivatives are taken by."""
+        shift = dict(zip(self.names, shifts, strict=True))
         mechanism = self.mechanism(shared, own, shift)
         closure, settings = self._closure(shared, own, mechanism), self.settings(shared, own, shift)
         method, state = settings.get("method"), settings.pop("state", None)
@@ -165,6 +166,27 @@ class Recipe:
         for measure in self.plan.measures:
             stored |= measure.of(mechanism, solution, method)
         return stored
+
+    def compile(self) -> None:
+        """Compile the program, and put what members share on the devices, if that is not done yet."""
+        if self._placed is None:
+            self._placed = self.program.place(self.shared, self.own(self.members[:1]))
+
+    def compute(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
+        """Compute members, in this order: what is stored of them, (n, ...) each."""
+        self.compile()
+        stored, slopes = self.program(self._placed, self.own(members))
+        return stored | {name: slopes[of][..., k] for name, (of, k) in self._names_of_slopes(slopes).items()}
+
+    @property
+    def outputs(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """What is stored of one member: shapes and types."""
+        stored, slopes = self.program.shapes(self.shared, self.own(self.members[:1]))
+        return stored | {name: stored[of] for name, (of, _) in self._names_of_slopes(slopes).items()}
+
+    def _names_of_slopes(self, slopes: Mapping[str, object]) -> dict[str, tuple[str, int]]:
+        """Return the names of derivatives: of which variable, by which of the names."""
+        return {f"d_{of}_d_{by}": (of, k) for of in slopes if of != END for k, by in enumerate(self.names)}
 
     def _closure(self, shared: Shared, own: Own, mechanism: Mechanism) -> Closure | None:
         if shared.closure is not None or not self.assembled:
@@ -181,100 +203,15 @@ def _with(choice: PyTree, name: str, value: np.ndarray | Array) -> PyTree:
     return eqx.tree_at(lambda c: getattr(c, name), choice, value, is_leaf=lambda x: x is None)
 
 
-# --- compiled
+def _piece(members: int, in_lanes: bool, platform: str) -> int:
+    """Return how many members are computed at once on each device: in vector lanes, or one by one."""
+    full = -(-members // WIDTH) * WIDTH
+    if platform not in CHUNKED:
+        return min(WIDE, full)
+    return min(MEMBERS * max(1, min(TOGETHER, members // (MEMBERS * MANY))), full) if in_lanes else 1
 
 
-class Program:
-    """The compiled program of a group, on one or several devices of a kind."""
-
-    def __init__(self, recipe: Recipe, devices: Sequence[Any]):
-        self.recipe, self.devices = recipe, tuple(devices)
-        self.piece = self._piece(len(recipe.group.members))
-        self._lock = threading.Lock()
-        self._lowered: jax.stages.Lowered | None = None
-        self._compiled: tuple[jax.stages.Compiled, Shared] | None = None
-
-    def _piece(self, members: int) -> int:
-        full = -(-members // WIDTH) * WIDTH
-        if self.devices[0].platform not in CHUNKED:
-            return min(WIDE, full)
-        if not self.recipe.in_lanes:
-            return 1
-        return min(MEMBERS * max(1, min(TOGETHER, members // (MEMBERS * MANY))), full)
-
-    @property
-    def lanes(self) -> int | None:
-        """How many members wait for each other; None: none does."""
-        return None if self.devices[0].platform in CHUNKED else self.piece
-
-    def _compute(self, shared: Shared, own: Own) -> tuple[Outputs, Outputs]:
-        """Compute what is stored of members, and its derivatives by each name along the last axis."""
-        names = self.recipe.names
-
-        def members(shift: Mapping[str, Array]) -> Outputs:
-            return jax.vmap(lambda own: self.recipe(shared, own, shift))(own)
-
-        if not names:
-            return members({}), {}
-
-        def outputs_at(shift: Array) -> tuple[Outputs, Outputs]:
-            stored = members(dict(zip(names, shift, strict=True)))
-            return {k: x for k, x in stored.items() if jnp.issubdtype(x.dtype, jnp.floating) and k != END}, stored
-
-        slopes, stored = jax.jacfwd(outputs_at, has_aux=True)(jnp.zeros(len(names)))
-        return stored, slopes
-
-    def _lower(self) -> jax.stages.Lowered:
-        if self._lowered is None:
-            function = self._compute
-            if len(self.devices) > 1:
-                from jax.sharding import AxisType, Mesh, PartitionSpec
-
-                mesh = Mesh(np.array(self.devices), ("members",), axis_types=(AxisType.Auto,))
-                same, spread = PartitionSpec(), PartitionSpec("members")
-                function = jax.shard_map(function, mesh=mesh, in_specs=(same, spread), out_specs=spread, check_vma=False)
-            first = np.repeat(self.recipe.group.members[:1], self.piece * len(self.devices))
-            self._lowered = jax.jit(function).lower(self.recipe.shared, self.recipe.own(first))
-        return self._lowered
-
-    @property
-    def outputs(self) -> dict[str, jax.ShapeDtypeStruct]:
-        """What is stored of one member: shapes and types."""
-        with self._lock:
-            stored, slopes = self._lower().out_info
-        found = _outputs_by_name(self.recipe.names, stored, slopes, lambda x, _: jax.ShapeDtypeStruct(x.shape[:-1], x.dtype))
-        return {k: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for k, x in found.items()}
-
-    @property
-    def compiled(self) -> tuple[jax.stages.Compiled, Shared]:
-        """The executable, and the numbers that all members share, on the devices."""
-        with self._lock:
-            if self._compiled is None:
-                executable = self._lower().compile()
-                self._compiled = executable, jax.device_put(self.recipe.shared, executable.input_shardings[0][0])
-        return self._compiled
-
-    def __call__(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
-        """Compute members, in this order."""
-        size, n = self.piece * len(self.devices), len(members)
-        full = members[np.minimum(np.arange(-(-n // size) * size), n - 1)]
-        own = self.recipe.own(full)
-        compiled, shared = self.compiled
-        started = [compiled(shared, jax.tree.map(lambda x, k=k: x[k : k + size], own)) for k in range(0, len(full), size)]
-        parts = [jax.tree.map(np.asarray, part) for part in started]
-        stored, slopes = jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
-        return _outputs_by_name(self.recipe.names, stored, slopes, lambda x, k: x[..., k])
-
-
-def _outputs_by_name(
-    names: Sequence[str], stored: Mapping[str, T], slopes: Mapping[str, T], entry: Callable[[T, int], T]
-) -> dict[str, T]:
-    """Return what is stored, and derivatives under names of their own: an `entry` of a slope for each name."""
-    by_name = {f"d_{name}_d_{by}": entry(slope, k) for name, slope in slopes.items() for k, by in enumerate(names)}
-    return {**stored, **by_name}
-
-
-def lane_steps(steps: Int[np.ndarray, "n"], lanes: int) -> tuple[int, int]:
-    """Return how many steps a chunk took, and how many it had room for: each lane waits for the slowest beside it."""
-    parts = [steps[k : k + lanes] for k in range(0, len(steps), lanes)]
-    return int(steps.sum()), lanes * sum(int(part.max()) for part in parts)
+@lru_cache(maxsize=PROGRAMS)
+def group_run(plan: Plan, group: int, redundant: tuple[int, ...] | None = None) -> GroupRun:
+    """Return how the members of a group are computed: compiled once for each process."""
+    return GroupRun(plan, group, redundant)

@@ -6,7 +6,6 @@ chunks tell whether they are of the same sweep. No list says what is finished: t
 """
 
 import abc
-import dataclasses
 import hashlib
 import io
 import json
@@ -14,7 +13,7 @@ import os
 import socket
 import struct
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -180,22 +179,6 @@ class FolderStore(ChunkStore):
             valid = f"{len(self._files())} chunks in {self.folder} are finished and stay valid"
             advice = "once it can be written to, run the same sweep again: it goes on from there"
             raise StoreError(f"cannot write {name}: {error.strerror or error}; {valid}; {advice}") from error
-
-
-def unfinished_chunks(chunks: Sequence[Chunk], done: np.ndarray) -> list[Chunk]:
-    """Leave out the members that are done, and the chunks of which none is left.
-
-    By member, since the chunks are not the same with another memory or another number of devices.
-    """
-    found = []
-    for chunk in chunks:
-        members = np.asarray(chunk.members)
-        new = ~np.isin(members, done)
-        if new.all():
-            found.append(chunk)
-        elif new.any():
-            found.append(dataclasses.replace(chunk, members=members[new], work=chunk.work * float(new.mean())))
-    return found
 
 
 def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Json]) -> ChunkStore:

@@ -1,7 +1,7 @@
 """Sweep: from a mechanism and axes to a dataset with a result for every member."""
 
 import os
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from numpy.typing import ArrayLike
@@ -11,14 +11,15 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.progress import ProgressOption, report_progress
 from udkjax.study.sweep.axes import AxisValues, Design
-from udkjax.study.sweep.cost import MEMORY, cut_chunks
+from udkjax.study.sweep.chunks import MEMORY, compute_members
 from udkjax.study.sweep.dataset import assemble
-from udkjax.study.sweep.executors import Done, compute_on_devices, dask_engine
+from udkjax.study.sweep.executors import Engine as Compute
+from udkjax.study.sweep.executors import compute_on_devices, dask_engine
 from udkjax.study.sweep.fingerprint import fingerprint
 from udkjax.study.sweep.measures import MeasureChoice, Reference
-from udkjax.study.sweep.plan import Chunk, Plan, make_plan
+from udkjax.study.sweep.plan import make_plan
 from udkjax.study.sweep.program import RESULT
-from udkjax.study.sweep.store import open_store, unfinished_chunks
+from udkjax.study.sweep.store import open_store
 from udkjax.study.sweep.sweep_progress import Watch
 
 if TYPE_CHECKING:  # neither is needed before a sweep has results, or a cluster
@@ -47,7 +48,7 @@ def sweep(
 ) -> "xarray.Dataset":
     """Simulate a mechanism for all combinations of the values of some axes.
 
-    Members are computed in lanes, ordered by the steps that they are expected to take, on all devices or cores of the machine.
+    Members are computed side by side, in chunks of a few seconds, on all devices or cores of the machine.
 
     Args:
         mechanism: the scene.
@@ -90,14 +91,13 @@ def sweep(
     with open_store(out, fingerprint(plan) if out is not None else {}) as store:
         done, codes = store.read_variable(RESULT)
         with report_progress(progress, plan.size, "sweep") as report:
-            todo = unfinished_chunks(cut_chunks(plan, memory), done) if len(done) < plan.size else []
-            watch = Watch(plan.size, todo, report.show, codes)
-            for chunk, data, seconds in compute(plan, todo):
+            watch = Watch(plan.size, len(done), report.show, codes)
+            for chunk, data, seconds in compute_members(plan, compute, done, memory, watch.expect):
                 store.write(chunk, data)
                 watch(chunk, data, seconds)
         return assemble(plan, store.read_chunks())
 
 
-def _engine(engine: str, client: "distributed.Client | None") -> Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]:
+def _engine(engine: str, client: "distributed.Client | None") -> Compute:
     """Return what computes chunks: a client that is given is there to be used."""
     return dask_engine(client) if engine == "dask" or (engine == "auto" and client is not None) else compute_on_devices

@@ -47,27 +47,28 @@ class SweepProgress(Progress):
 
 
 class Watch:
-    """Follow a sweep of so many members, of which the chunks `left` are still to be computed; an earlier run ended with `codes`.
+    """Follow a sweep of so many members, of which an earlier run has `done` some, that ended with `codes`.
 
     `show` is called with the `SweepProgress` at the start and after each chunk.
     """
 
-    def __init__(self, members: int, left: Sequence[Chunk], show: Callable[[SweepProgress], object], codes: ArrayLike = ()):
-        self.show = show
-        self.work, self.work_done, self.new = sum(chunk.work for chunk in left), 0.0, 0
+    def __init__(self, members: int, done: int, show: Callable[[SweepProgress], object], codes: ArrayLike = ()):
+        self.show, self.new = show, 0
         self.begun = time.monotonic()
-        self.first: tuple[float, float] | None = None  # when the first chunk came, and its work: a compilation was part of it
+        self.since, self.work, self.work_done = self.begun, 0.0, 0.0  # of chunks whose work is known
         failures = _count_failures({}, codes)
-        done = members - sum(len(chunk.members) for chunk in left)
         self.state = SweepProgress("sweep", done, members, 0.0, _message(failures), failures=failures)
         self.show(self.state)
+
+    def expect(self, chunks: Sequence[Chunk]) -> None:
+        """Take the work that is left from these chunks, which are all that are to come."""
+        self.since, self.work = time.monotonic(), sum(chunk.work for chunk in chunks)
 
     def __call__(self, chunk: Chunk, data: Mapping[str, np.ndarray], seconds: float | None = None) -> None:
         """Note that a chunk is done, what it gave, and how long it took (s) where that is known."""
         before, now = self.state, time.monotonic()
         self.new += len(chunk.members)
-        self.work_done += chunk.work
-        self.first = self.first or (now, self.work_done)
+        self.work_done += chunk.work if self.work else 0.0
         failures = _count_failures(before.failures, data["result"])
         slowest = _find_slowest(before.slowest, chunk.members, data.get(STEPS))
         slowest_chunk = _find_slowest(before.slowest_chunk, [chunk.index], seconds)
@@ -86,10 +87,8 @@ class Watch:
         self.show(self.state)
 
     def _left(self, now: float) -> float | None:
-        """Estimate how long the rest takes (s), by the pace since the first chunk came."""
-        assert self.first is not None
-        since, work = now - self.first[0], self.work_done - self.first[1]
-        return since / work * (self.work - self.work_done) if work > 0 else None
+        """Estimate how long the rest takes (s), by the pace since its work is known."""
+        return (now - self.since) / self.work_done * (self.work - self.work_done) if self.work_done > 0 else None
 
 
 def _message(

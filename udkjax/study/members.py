@@ -1,0 +1,105 @@
+"""Functions of the members of a study, compiled: what is computed of each member, with forward derivatives.
+
+A member has numbers of its own, and shares others with all. A program computes a fixed number of members, a piece; the last piece
+is filled up with copies. So results do not depend on how many members there are, nor on how they are cut into chunks.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any, Protocol, TypeAlias, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from udkjax.study.machine import cores
+
+T = TypeVar("T")
+Outputs: TypeAlias = dict[str, Array]
+Results: TypeAlias = tuple[dict[str, np.ndarray], dict[str, np.ndarray]]  # values (members, ...); slopes (members, ..., K)
+
+
+class MemberFunction(Protocol):
+    """Computes arrays by name of one member: of numbers shared by all, its own, and a shift (K,) of what slopes are taken by."""
+
+    def __call__(self, shared: Any, own: Any, shift: Array, /) -> Outputs: ...
+
+
+class Program:
+    """A function of members, compiled for `piece` members on each of some devices of a kind, with slopes by K numbers."""
+
+    def __init__(self, function: MemberFunction, slopes: int, piece: int, devices: Sequence[Any] = ()):
+        self.function, self.slopes, self.piece, self.devices = function, slopes, piece, tuple(devices)
+        self.size = piece * max(1, len(self.devices))
+        self._lock = threading.Lock()
+        self._compiled: jax.stages.Compiled | None = None
+
+    def __call__(self, shared: PyTree, own: PyTree, on_threads: bool = False) -> Results:
+        """Compute members, the first axis of `own`, in their order; pieces one after another, or side by side on threads."""
+        count = len(jax.tree.leaves(own)[0])
+        program = self.compile(shared, own)
+
+        def compute(first: int) -> tuple[Outputs, Outputs]:
+            return jax.tree.map(np.asarray, program(shared, _rows(own, first, self.size)))
+
+        each: Callable[..., Iterable] = _threads(os.getpid()).map if on_threads and count > self.size else map
+        return jax.tree.map(lambda *x: np.concatenate(x)[:count], *each(compute, range(0, count, self.size)))
+
+    def place(self, shared: T, own: PyTree) -> T:
+        """Compile for members such as these, and put what they share on the devices: for calls that would do so each time."""
+        return jax.device_put(shared, self.compile(shared, own).input_shardings[0][0])
+
+    def compile(self, shared: PyTree, own: PyTree) -> jax.stages.Compiled:
+        """Return the executable, which is made once, for members such as these."""
+        with self._lock:
+            if self._compiled is None:
+                self._compiled = jax.jit(self._on_devices()).lower(shared, _rows(own, 0, self.size)).compile()
+        return self._compiled
+
+    def shapes(self, shared: PyTree, own: PyTree) -> tuple[dict[str, jax.ShapeDtypeStruct], dict[str, jax.ShapeDtypeStruct]]:
+        """Return shapes and types of what is computed of one such member."""
+        found = jax.eval_shape(self._compute, shared, _rows(own, 0, 1))
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), found)
+
+    def _compute(self, shared: PyTree, own: PyTree) -> tuple[Outputs, Outputs]:
+        """Compute values of members, and slopes of those that are not whole numbers."""
+        alone = len(jax.tree.leaves(own)[0]) == 1
+
+        def values(shift: Array) -> tuple[Outputs, Outputs]:
+            if alone:  # `vmap` of one member would execute all branches
+                found = self.function(shared, jax.tree.map(lambda x: x[0], own), shift)
+                found = {name: jnp.asarray(x)[None] for name, x in found.items()}
+            else:
+                found = jax.vmap(lambda own: self.function(shared, own, shift))(own)
+            return {name: x for name, x in found.items() if jnp.issubdtype(x.dtype, jnp.floating)}, found
+
+        at = jnp.zeros(self.slopes)
+        if not self.slopes:
+            return values(at)[1], {}
+        slopes, found = jax.jacfwd(values, has_aux=True)(at)
+        return found, slopes
+
+    def _on_devices(self) -> Callable[[PyTree, PyTree], tuple[Outputs, Outputs]]:
+        """Return the function of a piece for each device."""
+        if len(self.devices) < 2:
+            return self._compute
+        from jax.sharding import AxisType, Mesh, PartitionSpec
+
+        mesh = Mesh(np.array(self.devices), ("members",), axis_types=(AxisType.Auto,))
+        same, spread = PartitionSpec(), PartitionSpec("members")
+        return jax.shard_map(self._compute, mesh=mesh, in_specs=(same, spread), out_specs=spread, check_vma=False)
+
+
+def _rows(own: T, first: int, count: int) -> T:
+    """Return the numbers of some members, filled up with copies of the last."""
+    return jax.tree.map(lambda x: x[np.minimum(np.arange(first, first + count), len(x) - 1)], own)
+
+
+@lru_cache(maxsize=1)
+def _threads(process: int) -> ThreadPoolExecutor:
+    """Return the threads of this process: to start them anew would take as long as a short run."""
+    return ThreadPoolExecutor(cores(), thread_name_prefix="members")

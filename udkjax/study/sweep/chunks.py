@@ -1,0 +1,167 @@
+"""Chunks of a sweep: members of one group that take a few seconds together, by what a first chunk of the group took.
+
+Members come in the order of the steps that they are expected to take, the longest first: what is left for the end, where devices
+wait for the last chunk, is short.
+"""
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from udkjax.study.machine import concurrent_chunks
+from udkjax.study.sweep.dataset import bytes_per_member
+from udkjax.study.sweep.executors import Done, Engine, run
+from udkjax.study.sweep.plan import Chunk, Plan
+from udkjax.study.sweep.program import group_run
+
+MEMORY = 2**30  # bytes that members in computation take at most, by default
+COPIES = 4  # of what is stored of a chunk, in memory while it is computed: its parts on the device, joined, and other chunks'
+SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
+TURNS = 4  # chunks for each that computes at a time, so that all have something to do to the end
+SHORTEST = 0.05  # s of work in a chunk for that: to call a program and to store what it gave takes a few hundredths of it
+GROUPS = 3  # whose programs are compiled and tried to estimate a cost, at most; others are taken to be as fast, on average
+# Steps that a run takes grow by this power of the reciprocal of its tolerances, about: by methods of 8th order, rtol and atol.
+POWER = 1 / 16
+
+
+def compute_members(
+    plan: Plan,
+    engine: Engine,
+    done: Int[np.ndarray, "n"] | Sequence[int] = (),
+    memory: int = MEMORY,
+    expect: Callable[[Sequence[Chunk]], None] = lambda chunks: None,
+) -> Iterator[Done]:
+    """Compute the members that are not done: a piece or a few of each group, then chunks as long as these suggest.
+
+    `expect` is called with the chunks that are left after the first ones, whose `work` is in seconds.
+    """
+    orders = members_to_compute(plan, done)
+    measured = []
+    for chunk, data, seconds in engine(plan, firsts := first_chunks(plan, orders)):
+        measured.append((chunk, seconds))
+        yield chunk, data, seconds
+    computed = np.concatenate([np.zeros(0, int), *(chunk.members for chunk in firsts)])
+    rest = {index: members[~np.isin(members, computed)] for index, members in orders.items()}
+    if chunks := cut_chunks(plan, rest, measured, memory):
+        expect(chunks)
+        yield from engine(plan, chunks)
+
+
+def members_to_compute(plan: Plan, done: Int[np.ndarray, "n"] | Sequence[int] = ()) -> dict[int, np.ndarray]:
+    """Return the members of each group that are not done, the longest first; no group that has none."""
+    found = {}
+    for group in plan.groups:
+        members = group.members[~np.isin(group.members, done)]
+        if len(members):
+            found[group.index] = members[np.argsort(-expected_steps(plan, members), kind="stable")]
+    return found
+
+
+def first_chunks(plan: Plan, orders: Mapping[int, np.ndarray]) -> list[Chunk]:
+    """Return chunks of one piece that tell how long the members of each group take: as many as are computed at a time."""
+    found: list[Chunk] = []
+    for index, members in orders.items():
+        piece = group_run(plan, index).program.size
+        size = min(len(members), piece * -(-concurrent_chunks() // len(orders)))
+        some = members[np.linspace(0, len(members) - 1, size).round().astype(int)]
+        found += [_chunk(plan, len(found) + k, index, some[at : at + piece]) for k, at in enumerate(range(0, size, piece))]
+    return found
+
+
+def cut_chunks(
+    plan: Plan, orders: Mapping[int, np.ndarray], measured: Sequence[tuple[Chunk, float]], memory: int = MEMORY
+) -> list[Chunk]:
+    """Cut members of each group, in their order, into chunks of a few seconds of work and of at most `memory` bytes.
+
+    `measured` are chunks of which it is known how long they took (s); groups without one are taken to be as fast as the others.
+    """
+    most = max(1, memory // (COPIES * max(1, bytes_per_member(plan))))
+    pace = {index: [seconds / chunk.work for chunk, seconds in measured if chunk.group == index] for index in orders}
+    usual = float(np.mean([seconds / chunk.work for chunk, seconds in measured])) if measured else 0.0
+    seconds = {k: expected_steps(plan, members) * (np.mean(pace[k]) if pace[k] else usual) for k, members in orders.items()}
+    share = sum(float(each.sum()) for each in seconds.values()) / (TURNS * concurrent_chunks())
+    found: list[Chunk] = []
+    for index, members in orders.items():
+        for part in _cut(seconds[index], group_run(plan, index).program.size, most, min(SECONDS, max(SHORTEST, share))):
+            found.append(Chunk(len(measured) + len(found), index, members[part], float(seconds[index][part].sum())))
+    return found
+
+
+def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = SECONDS) -> list[slice]:
+    """Cut members into consecutive parts of whole pieces, each of at most `limit` seconds and of at most so many members."""
+    most = max(piece, most // piece * piece)
+    parts, start = [], 0
+    total = np.concatenate([[0.0], np.cumsum(seconds)])
+    while start < len(seconds):
+        enough = int(np.searchsorted(total, total[start] + limit, side="right")) - 1 - start
+        rest = len(seconds) - start
+        size = rest if rest <= min(most, enough) else min(most, max(piece, enough // piece * piece), rest)
+        parts.append(slice(start, start + size))
+        start += size
+    return parts
+
+
+def _chunk(plan: Plan, index: int, group: int, members: np.ndarray) -> Chunk:
+    return Chunk(index, group, members, float(expected_steps(plan, members).sum()))
+
+
+def expected_steps(plan: Plan, members: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Estimate the steps of members, up to a common factor: by the length of their runs, and a little by their tolerances."""
+    places, steps = plan.places(members), np.ones(len(members))
+    for column in plan.columns:
+        if not column.is_choice and not callable(column.of):
+            values = np.maximum(column.numbers, np.finfo(float).tiny)
+            if "t1" in column.of:
+                steps = steps * (values / values.max())[places[column.name]]
+            if tolerances := len({"rtol", "atol"} & set(column.of)):
+                steps = steps * ((values / values.max()) ** (-tolerances * POWER))[places[column.name]]
+    return steps
+
+
+# --- before a sweep is run
+
+
+@dataclass(frozen=True)
+class SweepCost:
+    """What a sweep will take in this process, on its devices."""
+
+    members: int
+    groups: int  # programs, each compiled once
+    tried: int  # of these, of which a first chunk was run
+    chunks: int
+    stored: int  # bytes of the dataset, and roughly of the files
+    memory: int  # bytes of this process, at most
+    compiling: float  # s; less where programs are in the cache
+    computing: float  # s
+
+
+def estimate_cost(plan: Plan, memory: int = MEMORY) -> SweepCost:
+    """Compile and run a piece of some groups of a plan, and say what all of it will take."""
+    orders, compiling, measured = members_to_compute(plan), [], []
+    count = len(plan.groups)
+    for k in np.unique(np.linspace(0, count - 1, min(count, GROUPS)).astype(int)).tolist():
+        begun = time.perf_counter()
+        group_run(plan, k).compile()
+        compiling.append(time.perf_counter() - begun)
+        chunk, _, seconds = run(plan, first_chunks(plan, {k: orders[k]})[0])
+        measured.append((chunk, seconds))
+    chunks = cut_chunks(plan, orders, measured, memory)
+    stored = plan.size * bytes_per_member(plan)
+    used = _resident() + min(memory, stored) + stored
+    computing = sum(chunk.work for chunk in chunks) / concurrent_chunks()
+    all_compiling = count * float(np.mean(compiling))
+    return SweepCost(plan.size, count, len(measured), len(chunks), stored, used, all_compiling, computing)
+
+
+def _resident() -> int:
+    """Return the most memory that this process has used so far, in bytes; 0 where it cannot be known."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024
