@@ -12,7 +12,7 @@ import pytest
 
 from udkjax.study.sweep import store
 from udkjax.study.sweep.plan import Chunk
-from udkjax.study.sweep.store import FolderStore, MemoryStore, StoreError, open_store
+from udkjax.study.sweep.store import FolderStore, MemoryStore, StoreError, open_store, read_variable, write_whole
 
 FINGERPRINT = {"settings": {"rtol": 1e-8}, "scene": "format = 1\nmass = 1.0\n", "axes": [1.0, 2.0, float("nan")]}
 
@@ -29,7 +29,7 @@ def data(chunk):
 
 
 def not_done(stored):
-    return [c for c in CHUNKS if not np.isin(c.members, stored.read_variable("result")[0]).all()]
+    return [c for c in CHUNKS if not np.isin(c.members, read_variable(stored, "result")[0]).all()]
 
 
 def collected(stored):
@@ -48,7 +48,7 @@ def test_what_is_finished_is_left_out_and_given_back(tmp_path, place):
         assert not_done(stored) == CHUNKS
         stored.write(CHUNKS[1], data(CHUNKS[1]))
         assert not_done(stored) == [CHUNKS[0], CHUNKS[2]]
-        done, codes = stored.read_variable("result")
+        done, codes = read_variable(stored, "result")
         np.testing.assert_array_equal(done, [0, 5])
         np.testing.assert_array_equal(codes, [0, 0])
         ((members, found),) = stored.read_chunks()
@@ -68,7 +68,7 @@ def test_what_is_kept_may_have_any_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "damage", [lambda content: content[: len(content) // 2], lambda content: b"", lambda content: b"\0" * len(content)]
+    "damage", [lambda content: content[:-1], lambda content: b"", lambda content: content[:40] + b"\1" + content[41:]]
 )
 def test_a_damaged_chunk_is_computed_again_and_no_other(tmp_path, damage):
     with FolderStore(tmp_path, FINGERPRINT) as stored:
@@ -135,9 +135,9 @@ def test_what_is_no_file_is_named(tmp_path):
     with pytest.raises(StoreError, match="cannot write to the folder"):
         FolderStore(tmp_path, FINGERPRINT)
     (tmp_path / "sweep.json").rmdir()
-    (tmp_path / "chunks" / "0.npz").mkdir()
-    with pytest.raises(StoreError, match=r"0\.npz.*remove it"):
-        FolderStore(tmp_path, FINGERPRINT)
+    with FolderStore(tmp_path, FINGERPRINT) as stored, pytest.raises(StoreError, match=r"0\.npz.*remove it"):
+        (tmp_path / "chunks" / "0.npz").mkdir()
+        list(stored.read_chunks())
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot write to the folder"):
         FolderStore(tmp_path / "file", FINGERPRINT)
@@ -192,3 +192,16 @@ def test_the_manifest_says_what_the_sweep_is(tmp_path):
         pass
     said = json.loads((tmp_path / "sweep.json").read_text())
     assert said["settings"] == {"rtol": 1e-8} and said["scene"] == FINGERPRINT["scene"]
+
+
+def test_a_file_that_cannot_be_written_to_its_end_is_not_there(tmp_path):
+    """With a limit on the size of files, which the system enforces in the middle of a write."""
+    write_whole(tmp_path / "a", b"before")
+    code = (
+        "import resource, signal, sys; from pathlib import Path; from udkjax.study.sweep.store import write_whole\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        "write_whole(Path(sys.argv[1]), b'x' * 5000)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a")], capture_output=True, text=True, check=False)
+    assert "File too large" in ran.stderr
+    assert [f.name for f in tmp_path.iterdir()] == ["a"] and (tmp_path / "a").read_bytes() == b"before"

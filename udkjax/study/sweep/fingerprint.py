@@ -2,6 +2,7 @@
 
 import difflib
 import hashlib
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TypeAlias
@@ -19,7 +20,7 @@ from udkjax.study.sweep.measures import Measure
 from udkjax.study.sweep.plan import Plan
 
 Json: TypeAlias = "str | int | float | bool | Sequence[Json] | Mapping[str, Json] | None"
-MOST_LINES = 12  # lines of a text, and entries of a list, that are spelled out
+MOST_LINES = 24  # on differences; more are counted
 SHORT = 64  # numbers that are spelled out; of more, how many, the first, the last, and a digest
 STATS = ("steps", "accepted", "rejected", "right_hand_sides", "projections")
 
@@ -111,51 +112,33 @@ def _digest(data: bytes) -> str:
 # --- differences
 
 
-def differences(before: Json, now: Json, path: str = "") -> list[str]:
-    """Return one line for each difference between two JSON values: its path, what was there, what is there now.
+def differences(before: Json, now: Json) -> list[str]:
+    """Return lines on what differs between two JSON values: the path, what was there, what is there now.
 
     Of texts of several lines, such as scenes, the lines that differ are shown.
     """
-    return list(_compare(before, now, path))
+    old, new, found = dict(_leaves(before)), dict(_leaves(now)), []
+    for path in {**old, **new}:
+        a, b = old.get(path), new.get(path)
+        if path not in new:
+            found.append(f"{path}: was {abbreviate(a)}, is no longer there")
+        elif path not in old:
+            found.append(f"{path}: was not there, is {abbreviate(b)}")
+        elif isinstance(a, str) and isinstance(b, str) and "\n" in a + b:
+            compared = list(difflib.unified_diff(a.splitlines(), b.splitlines(), lineterm="", n=0))[2:]  # the first name files
+            found += [f"{path}: {'was' if line[0] == '-' else 'is'} {line[1:]}" for line in compared if line[0] != "@"]
+        elif json.dumps(a) != json.dumps(b):  # nan is equal to nan, and true is not 1
+            found.append(f"{path}: was {abbreviate(a)}, is {abbreviate(b)}")
+    return found if len(found) <= MOST_LINES else [*found[:MOST_LINES], f"and {len(found) - MOST_LINES} more"]
 
 
-def _compare(before: Json, now: Json, path: str) -> Iterator[str]:
-    if isinstance(before, dict) and isinstance(now, dict):
-        for key in {**before, **now}:
-            place = f"{path}.{key}" if path else key
-            if key not in now:
-                yield f"{place}: was {abbreviate(before[key])}, is no longer there"
-            elif key not in before:
-                yield f"{place}: was not there, is {abbreviate(now[key])}"
-            else:
-                yield from _compare(before[key], now[key], place)
-    elif isinstance(before, list) and isinstance(now, list):
-        yield from _lists(before, now, path)
-    elif isinstance(before, str) and isinstance(now, str) and "\n" in before + now:
-        yield from _texts(before, now, path)
-    elif not _same(before, now):
-        yield f"{path}: was {abbreviate(before)}, is {abbreviate(now)}"
-
-
-def _lists(before: Sequence[Json], now: Sequence[Json], path: str) -> Iterator[str]:
-    if len(before) != len(now):
-        yield f"{path}: was {abbreviate(before)} ({len(before)} entries), is {abbreviate(now)} ({len(now)} entries)"
-        return
-    found = [line for k, pair in enumerate(zip(before, now, strict=True)) for line in _compare(*pair, f"{path}[{k}]")]
-    yield from found[:MOST_LINES]
-    if len(found) > MOST_LINES:
-        yield f"{path}: and {len(found) - MOST_LINES} more"
-
-
-def _texts(before: str, now: str, path: str) -> Iterator[str]:
-    compared = list(difflib.unified_diff(before.splitlines(), now.splitlines(), lineterm="", n=0))
-    lines = [line for line in compared[2:] if not line.startswith("@@")]  # the first two name files
-    for line in lines[:MOST_LINES]:
-        yield f"{path}: {'was' if line[0] == '-' else 'is'} {line[1:]}"
-    if len(lines) > MOST_LINES:
-        yield f"{path}: and {len(lines) - MOST_LINES} more lines"
-
-
-def _same(a: Json, b: Json) -> bool:
-    """Return whether two are equal; nan equals nan, and truth values are no numbers."""
-    return isinstance(a, bool) == isinstance(b, bool) and (a == b or (a != a and b != b))
+def _leaves(value: Json, path: str = "") -> Iterator[tuple[str, Json]]:
+    """Iterate over the paths and values of what is neither a list nor a mapping in a JSON value, nor an empty one."""
+    if isinstance(value, dict) and value:
+        for key, part in value.items():
+            yield from _leaves(part, f"{path}.{key}" if path else key)
+    elif isinstance(value, list) and value:
+        for k, part in enumerate(value):
+            yield from _leaves(part, f"{path}[{k}]")
+    else:
+        yield path, value

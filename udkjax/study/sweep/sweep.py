@@ -19,7 +19,7 @@ from udkjax.study.sweep.fingerprint import fingerprint
 from udkjax.study.sweep.measures import MeasureChoice, Reference
 from udkjax.study.sweep.plan import make_plan
 from udkjax.study.sweep.program import RESULT
-from udkjax.study.sweep.store import open_store
+from udkjax.study.sweep.store import open_store, read_variable
 from udkjax.study.sweep.sweep_progress import Watch
 
 if TYPE_CHECKING:  # neither is needed before a sweep has results, or a cluster
@@ -89,7 +89,7 @@ def sweep(
     plan = make_plan(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
     compute = _engine(engine, client)
     with open_store(out, fingerprint(plan) if out is not None else {}) as store:
-        done, codes = store.read_variable(RESULT)
+        done, codes = read_variable(store, RESULT)
         with report_progress(progress, plan.size, "sweep") as report:
             watch = Watch(plan.size, len(done), report.show, codes)
             for chunk, data, seconds in compute_members(plan, compute, done, memory, watch.expect):
