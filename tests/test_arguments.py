@@ -198,21 +198,18 @@ def test_what_turns_out_to_be_of_no_use_is_the_result_of_a_member(events):
     listed = udk.Event(lambda t, at: at["rod"].angle - 10.0, udk.Log()) if events else None
     state = udk.assemble(OTHER)
 
-    def run(ts, rtol, q, drift_tol):
+    def run(ts, rtol, q, drift_tol, mass, lower):
         given = udk.State(q, state.v)
-        found = udk.simulate(OTHER, ts, given, rtol=rtol, drift_tol=drift_tol, events=listed, throw=False)
+        known = [listed, udk.JointLimit("pin", lower, 9.0)] if events else None
+        scene = OTHER.with_parameters({"body.rod.mass": mass})
+        found = udk.simulate(scene, ts, given, rtol=rtol, drift_tol=drift_tol, events=known, throw=False)
         return found.code, found.q, found.ts
 
-    rows = [
-        (TS, 1e-8, state.q, 1e-6),
-        (TS[::-1], 1e-8, state.q, 1e-6),
-        (TS * np.nan, 1e-8, state.q, 1e-6),
-        (TS, -1e-8, state.q, 1e-6),
-        (TS, np.nan, state.q, 1e-6),
-        (TS, 1e-8, state.q * np.nan, 1e-6),
-        (TS, 1e-8, state.q, -1e-6),
-    ]
-    code, q, ts = jax.jit(jax.vmap(run))(*(np.stack([np.asarray(row[k]) for row in rows]) for k in range(4)))
+    right = (TS, 1e-8, state.q, 1e-6, 2.0, -9.0)
+    wrong = [(0, TS[::-1]), (0, TS * np.nan), (1, -1e-8), (1, np.nan), (2, state.q * np.nan), (3, -1e-6), (4, -1.0), (4, np.nan)]
+    wrong += [(5, 10.0)] * events
+    rows = [right, *((*right[:k], x, *right[k + 1 :]) for k, x in wrong)]
+    code, q, ts = jax.jit(jax.vmap(run))(*(np.stack([np.asarray(row[k]) for row in rows]) for k in range(len(right))))
     assert code.tolist() == [udk.Result.successful, *[udk.Result.invalid_argument] * (len(rows) - 1)]
     np.testing.assert_allclose(q[0], udk.simulate(OTHER, TS, state).q, rtol=1e-12)
     assert np.isnan(q[1:, 1:]).all()

@@ -61,7 +61,7 @@ def test_no_crossing_is_lost_at_any_frequency():
         count = int(sol.events.count)
         assert sol.code == udk.Result.successful and count == len(expected), numbers
         assert np.abs(positions(sol)[:count] - expected).max(initial=0) < 1e-9
-        assert np.isnan(sol.events.unresolved).all()
+        assert np.isinf(sol.events.unresolved).all()
 
 
 @pytest.mark.slow

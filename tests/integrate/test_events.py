@@ -248,7 +248,7 @@ def test_pendulums_of_a_batch_have_events_of_their_own():
         assert np.array_equal(getattr(again, name), np.asarray(getattr(all_of_them, name))[chosen], equal_nan=True), name
     assert np.array_equal(again.events.time, np.asarray(all_of_them.events.time)[chosen], equal_nan=True)
     for k in chosen[:3]:
-        assert np.isnan(all_of_them.events.time[k, counts[k] :]).all()
+        assert np.isinf(all_of_them.events.time[k, counts[k] :]).all()
     # Those that turn over do so where energy and an elliptic integral say.
     fast = np.flatnonzero(codes == udk.Result.event_stop)
     assert np.abs(all_of_them.events.q_before[fast, counts[fast] - 1, 0, 2] - 1.0).max() < 1e-11
@@ -392,6 +392,7 @@ def test_both_engines_find_the_same():
         (udk.Contact("lnik"), 'no body named "lnik"; did you mean "link"'),
         (udk.Event(lambda t, at: at["lnik"].x), 'event "event1": no body named "lnik"; did you mean "link"'),
         (udk.Event(lambda t, at: at["link"].omega, udk.Impact(0.5)), "must depend on positions alone"),
+        (udk.Event(lambda t, at: at["link"].x, udk.Impact(0.5), 1), "its condition falls to zero, and not where direction=1"),
         (udk.Event(lambda t, at: at["link"].x, udk.Impact(1.5)), "restitution must be from 0 to 1, is 1.5"),
         (udk.Event(lambda t, at: at["link"].x, udk.Release("C")), 'no joint or driver named "C"'),
         (udk.Event(lambda t, at: jnp.ones(2)), r"must return one number, not an array of shape \(2,\)"),

@@ -217,12 +217,6 @@ def test_a_full_disk_leaves_nothing_behind(folder, monkeypatch):
     assert list(folder.iterdir()) == []
 
 
-def test_derivatives_pass_where_jax_looks_for_values_that_are_not_numbers():
-    with jax.debug_nans(True):
-        for derivative in (jax.grad, jax.jacfwd):
-            assert abs(float(derivative(lambda inertia: angles(inertia)[-1])(0.3))) > 0.0
-
-
 MANY = """
 from test_composition import TEXT, answer
 for k in range(20):

@@ -1,3 +1,4 @@
+import dataclasses
 import pickle
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
 from tests.elements import P
+from udkjax.scene.checks import traced_numbers_hold
 
 
 def test_the_order_is_the_users(everything):
@@ -219,3 +221,32 @@ def test_it_can_be_sent_to_another_process(everything, same):
     error = pickle.loads(pickle.dumps(udk.SceneError(["one", "two"], "scene.toml")))
     assert error.problems == ["one", "two"]
     assert str(error) == str(udk.SceneError(["one", "two"], "scene.toml"))
+
+
+def test_a_rod_of_no_length_is_refused_where_rounding_gives_it_one():
+    """0.1 + 0.2 - 0.3 is 5.6e-17: its direction is that of the error. A rod that is small beside nothing is a rod."""
+    for x, place in ((0.1 + 0.2, 0.3), (1.0, 1.0 + 1e-15), (0.0, 0.0)):
+        with pytest.raises(udk.SceneError, match=r"joint\[0\]\).length: must be > 0, and is 0.0 in the initial guess"):
+            udk.Mechanism({"b": udk.Body(1.0, 0.1, [x, 0.0])}, {"rod": udk.Distance(["ground", "b"], [[place, 0.0], [0.0, 0.0]])})
+    small = udk.Mechanism({"b": udk.Body(1.0, 0.1, [1e-17, 0.0])}, {"rod": udk.Distance(["ground", "b"], [[0.0, 0.0]] * 2)})
+    assert float(small.joints["rod"].length) == 1e-17
+
+
+def _requiring(element):
+    """Iterate over the numbers of an element that must be positive or in order: the element that owns each, and the name."""
+    for field in dataclasses.fields(element):
+        value = getattr(element, field.name)
+        if isinstance(value, eqx.Module):
+            yield from _requiring(value)
+        elif value is not None and any(need.strict for need in field.metadata.get("require", ())):
+            yield element, field.name
+
+
+def test_traced_numbers_are_looked_at_as_known_ones_are(everything):
+    """One that must be positive is not; what must increase does not."""
+    hold = jax.jit(lambda element: traced_numbers_hold([element]))
+    found = [one for element in everything.elements for one in _requiring(element)]
+    assert len({(type(owner), name) for owner, name in found}) == 9
+    for owner, name in {(type(owner), name): (owner, name) for owner, name in found}.values():
+        assert hold(owner)
+        assert not hold(eqx.tree_at(lambda x, name=name: getattr(x, name), owner, -getattr(owner, name)))

@@ -73,7 +73,7 @@ def kinematics(
         "travel": "no limits" if free else f"{float(travel.lower):.15g} to {float(travel.upper):.15g} {travel.unit}",
         "reached": f"{reached} of {count} values from {first:g} to {last:g}",
     }
-    if not math.isnan(float(found.limit)):
+    if math.isfinite(float(found.limit)):
         lines["toggle"] = f"{float(found.limit):.15g}"
     for name, words in (("singular", "singular at"), ("not_determined", "velocities open at")):
         if name in names:

@@ -10,10 +10,11 @@ import numpy as np
 
 from udkjax.equations.abstract_system import Time
 from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed, try_to_close
-from udkjax.equations.scales import ROUNDING, Scales, known_scales, rank_tolerance
+from udkjax.equations.scales import Scales, known_scales, rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_scalars
 from udkjax.expressions import ScalarProgram
+from udkjax.scene.fields import ROUNDING
 from udkjax.scene.mechanism import Mechanism
 
 # Singular values of D with rows of length one at a closed position, relative to the largest. Up to half of the digits a singular

@@ -17,16 +17,13 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, is_large, numbers_as_scalars, numbers_as_vector
 from udkjax.expressions import ScalarProgram
 from udkjax.printing import PrintsTable, units
-from udkjax.scene.fields import number
+from udkjax.scene.fields import ROUNDING, number
 from udkjax.scene.mechanism import Mechanism
 
 # Relative to the largest singular value of D: far above rounding and drift, far below the singular values of a mechanism in
 # ordinary positions. With the states returned to the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
 RANK_TOL = 1e-4
 ORDINARY_MASS_RATIO = 100.0  # up to which that holds: see `rank_tolerance`
-
-# Of the largest of its kind: what a number that is zero in theory may be as it is computed, some hundred units of rounding.
-ROUNDING = 256 * float(np.finfo(float).eps)
 
 
 class GuessTerms(NamedTuple):

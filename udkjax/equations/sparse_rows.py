@@ -21,10 +21,11 @@ from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE
 from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed, try_to_close
-from udkjax.equations.scales import RANK_TOL, ROUNDING, known_scales, mass_of
+from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
+from udkjax.scene.fields import ROUNDING
 from udkjax.scene.mechanism import Mechanism
 
 # Pivots of rows of length one, which are squares of lengths: at or below it a row depends on those before it.

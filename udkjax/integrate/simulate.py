@@ -31,6 +31,7 @@ from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.arguments import checked
+from udkjax.scene.checks import traced_numbers_hold
 from udkjax.scene.fields import number, optional_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
@@ -248,6 +249,8 @@ def _simulate(
     good, given_ts = xp.array(True), ts
     if xp is jnp:  # what is known has passed the door
         good = usable(*stop_gradients((q, v, rtol, atol, drift_tol, dt0))) | ~closed  # pyright: ignore[reportArgumentType]
+        if isinstance(mechanism, Mechanism):
+            good = good & stop_gradients(traced_numbers_hold(mechanism.elements))
     if isinstance(ts, Tracer):
         in_order = increases(stop_gradients(ts))
         good, ts = good & in_order, jnp.where(in_order, ts, jnp.arange(len(ts)))

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array, Bool
 
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import FieldMetadata, Requirement, Table
@@ -106,6 +107,19 @@ def completion_mistakes(where: str, before: eqx.Module, after: eqx.Module) -> It
         if unmet:
             given = f"{where}.{field.name}: {unmet}, and is {abbreviate(known)} in the initial guess"
             yield f"{given}, from which it is taken: give it, or other positions of the bodies"
+
+
+def traced_numbers_hold(elements: Iterable[eqx.Module]) -> Bool[Array, ""]:
+    """Tell whether the traced numbers of elements are what their fields require: known ones were checked as they were given."""
+    found = [jnp.array(True)]
+    for element in elements:
+        for field in dataclasses.fields(element):
+            value = getattr(element, field.name)
+            if isinstance(value, eqx.Module):
+                found.append(traced_numbers_hold([value]))
+            elif isinstance(value, Tracer):
+                found += [jnp.all(need.holds(value)) for need in field.metadata.get("require", ()) if need.strict]
+    return jnp.all(jnp.stack(found))
 
 
 def gravity_mistakes(gravity: object) -> list[str]:

@@ -19,6 +19,9 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.annotations import Number as Number
 from udkjax.annotations import Numbers as Numbers
 
+# Of the largest of its kind: what a number that is zero in theory may be as it is computed, some hundred units of rounding.
+ROUNDING = 256 * float(np.finfo(float).eps)
+
 Table: TypeAlias = Mapping[str, object]  # {key: value} of one element, as in a scene file
 
 
@@ -143,10 +146,15 @@ class StaticValue:
 
 
 class Requirement(NamedTuple):
-    """A condition on each entry of a number: `holds` maps the array to a boolean array of the same shape."""
+    """A condition on each entry of a number: `holds` maps the array, of NumPy or of JAX, to a boolean array of the same shape.
+
+    Where it is `strict`, numbers that break it mean nothing, and a run whose traced numbers do ends by `Result.invalid_argument`.
+    Where it is not, as of a damping below zero, they still have a meaning, and differences around zero need them.
+    """
 
     text: str
-    holds: Callable[[np.ndarray], np.ndarray]
+    holds: Callable[[Any], Any]
+    strict: bool = True
 
 
 class FieldMetadata(TypedDict, total=False):
@@ -158,8 +166,8 @@ class FieldMetadata(TypedDict, total=False):
 
 
 _POSITIVE = Requirement("must be > 0", lambda v: v > 0)
-_NOT_NEGATIVE = Requirement("must be >= 0", lambda v: v >= 0)
-_INCREASING = Requirement("must be greater than the entry before", lambda v: np.diff(v, prepend=-np.inf) > 0)
+_NOT_NEGATIVE = Requirement("must be >= 0", lambda v: v >= 0, strict=False)
+_INCREASING = Requirement("must be greater than the entry before", lambda v: array_namespace(v).diff(v, prepend=-np.inf) > 0)
 _ONE_TURN = Requirement("must be less than a turn after the first (the profile closes by itself)", lambda v: v - v[0] < 2 * np.pi)
 
 POSITIVE: FieldMetadata = {"require": (_POSITIVE,)}

@@ -133,7 +133,7 @@ class Force(ForceElement):
     frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")
 
     def __post_init__(self):
-        self.bodies = (self.body,)
+        self.bodies = (self.body,) if isinstance(self.body, str) else ()  # anything else is refused by its own name
 
     def loads(self, t, *frames):
         (body,) = frames

@@ -21,8 +21,10 @@ from udkjax.scene.fields import (
     POSITIVE,
     PROFILE_ANGLES,
     PROFILE_RADII,
+    ROUNDING,
     Number,
     Numbers,
+    array_namespace,
     given_direction,
     given_names,
     given_number,
@@ -177,7 +179,10 @@ class Distance(Joint):
         return [0.5 * (d.dot(d) / self.length - self.length)]
 
     def complete(self, *frames):
-        return fill(self, "length", between(self.points, *frames).norm())
+        length = between(self.points, *frames).norm()
+        reach = sum(abs(x) for frame, point in zip(frames, self.points, strict=True) for x in (frame.x, frame.y, *point))
+        # What rounding leaves of points that coincide has no direction: a length of zero, which the mechanism refuses.
+        return fill(self, "length", array_namespace(length).where(length > ROUNDING * reach, length, 0.0))
 
 
 class Angle(Joint):

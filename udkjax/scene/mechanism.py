@@ -233,6 +233,11 @@ class Mechanism(PrintsTable):
     def _own_numbers(self) -> tuple[Any, ...]:
         return self.gravity, self._bodies, self._joints, self._drivers, self._forces
 
+    @property
+    def elements(self) -> tuple[Any, ...]:
+        """All bodies, joints, drivers and force elements."""
+        return self._bodies + self._joints + self._drivers + self._forces
+
     def _table(self) -> PrintedTable:
         return mechanism_table(self, self.frames_of)
 

@@ -59,7 +59,7 @@ class Points(NamedTuple):
     dq: Float[Array, "T n"]
     ddq: Float[Array, "T n"]
     status: Int[Array, "T"]
-    limit: Float[Array, ""]  # the value at the toggle; not a number where none was met
+    limit: Float[Array, ""]  # the value at the toggle; infinite where none was met
     limit_q: Float[Array, "n"]
 
 
@@ -245,6 +245,6 @@ def _root(f: Callable[[Array], Array], end: Float[Array, ""]) -> Float[Array, ""
 
 def no_points(count: int, n: int) -> Points:
     """Return points of which none is known yet."""
-    nothing = jnp.full((count, n), jnp.nan)
+    nothing = jnp.zeros((count, n))
     status = jnp.full(count, int(Reached.lost))
-    return Points(nothing, nothing, nothing, status, jnp.asarray(np.nan), jnp.full(n, jnp.nan))
+    return Points(nothing, nothing, nothing, status, jnp.asarray(np.inf), jnp.full(n, np.inf))

@@ -97,6 +97,9 @@ def drive(mechanism: Mechanism, driver: Drive, t: Scalar = 0.0, held: Mapping[st
 
 def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Scalar] | None) -> Driven:
     if driver is None:
+        if held:
+            problem = "held is given with driver=None, where all drivers go along time: name the one that drives"
+            raise SceneError([problem], mechanism.name)
         analysis = analyse(mechanism)
         _require_determinate(mechanism, analysis, "all drivers")
         rate = analysis.scales.rate

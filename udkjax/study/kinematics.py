@@ -19,6 +19,7 @@ from udkjax.integrate.march import can_march, march, march_at_once, psi_at_once
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame, frame_over_time
+from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
@@ -36,15 +37,15 @@ class Kinematics(PrintsTable):
     """Positions over the values of a driver, and velocities and accelerations there; not a number where it does not get.
 
     `status` is a `Reached` for each value; where velocities do not follow from the driver's (`not_determined`), they are not
-    numbers. `limit` is the value at the toggle that ended it (not a number where none did), and `limit_q` the position there,
-    which has no derivative.
+    numbers. `limit` is the value at the toggle that ended it, and `limit_q` the position there, which has no derivative; both are
+    infinite where none did.
 
     Attributes:
         q: x, y (m) and angle (rad) of each body.
         v: their rates (m/s, rad/s).
         a: the rates of these (m/s^2, rad/s^2).
         status: the number of a `Reached` for each value.
-        limit: the value at the toggle that ended it; not a number where none did.
+        limit: the value at the toggle that ended it; infinite where none did.
         limit_q: the position at that toggle.
         bodies: the names of the bodies, in the order of q.
     """
@@ -99,7 +100,7 @@ class Kinematics(PrintsTable):
 class Travel(PrintsTable):
     """Between which values (rad, m) a coordinate can be driven; infinite where nothing ends it.
 
-    `lower_q` and `upper_q` are the positions at the toggles; not a number where there is none.
+    `lower_q` and `upper_q` are the positions at the toggles; infinite as well where there is none.
 
     Attributes:
         lower: the lower end (rad, m); -inf where nothing ends it.
@@ -197,6 +198,8 @@ def travel(mechanism: Mechanism, driver: Drive, state: State | None = None, held
     Args and errors are those of `kinematics`. An angle that makes a whole turn has no limits. `lower` and `upper` have exact
     derivatives by every number of the mechanism.
     """
+    if driver is None:
+        raise SceneError(["driver is None: travel is that of a coordinate; name it, or one of the drivers"], mechanism.name)
     driven, q = _start(mechanism, driver, 0.0, state, held)
     return _travel(driven, q, TURN if driven.is_angle else FAR * driven.unit)
 
@@ -214,8 +217,8 @@ def _at_once(
     at, dq, ddq = (np.asarray(x).reshape(shape) for x in found[:3])
     per = rate[:, None, None]
     a = ddq * per**2 + dq * np.broadcast_to(acceleration, values.shape)[:, None, None]
-    status, nowhere = np.zeros(len(values), int), np.full((len(bodies), 3), np.nan)
-    arrays = values, at, dq * per, a, rate, status, np.nan, nowhere
+    status, nowhere = np.zeros(len(values), int), np.full((len(bodies), 3), np.inf)
+    arrays = values, at, dq * per, a, rate, status, np.inf, nowhere
     return Kinematics(*[jnp.asarray(x) for x in arrays], bodies=bodies, unit=driven.value_unit)
 
 
@@ -288,8 +291,8 @@ def _solve(driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Fl
     found = _with_derivatives(curve, values, safe, points.dq, points.ddq, regular)
     q, dq, ddq = (jnp.where(there[:, None], x, jnp.nan) for x in found)
     limited = jnp.isfinite(points.limit)
-    X = jnp.append(jnp.where(limited, points.limit_q, jax.lax.stop_gradient(safe[0])), points.limit)
-    limit = jnp.where(limited, _limit(curve, jnp.where(jnp.isfinite(X), X, 0.0)), jnp.nan)
+    X = jnp.where(limited, jnp.append(points.limit_q, points.limit), jax.lax.stop_gradient(jnp.append(safe[0], values[0])))
+    limit = jnp.where(limited, _limit(curve, X), jnp.inf)
     return points._replace(q=q, dq=dq, ddq=ddq, limit=limit)
 
 

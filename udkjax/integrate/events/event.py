@@ -33,7 +33,7 @@ from udkjax.integrate.events.checks import (
 from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_of, joint_coordinate, require_name
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import quote, suggestion
+from udkjax.scene.checks import Mistakes, quote, suggestion
 from udkjax.scene.fields import Number, number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import describe
@@ -43,9 +43,9 @@ class Event(PrintsLine):
     """Where `condition(t, frames)`, a scalar, crosses zero, `action` happens.
 
     `frames` maps the name of each body, and "ground", to its frame: x, y, angle, cos, sin, vx, vy, omega, `point`, `velocity`.
-    `direction` is 1 for rising, -1 for falling, 0 for either; of an `Impact`, before whose zero the condition is positive, always
-    -1. Only crossings count: a run that starts at a zero, or that touches one and turns back, does not cross it. But an `Impact`
-    whose condition is zero at the start, and falling, happens at once.
+    `direction` is 1 for rising, -1 for falling, 0 for either; of an `Impact`, before whose zero the condition is positive, 0 or
+    -1, which mean the same. Only crossings count: a run that starts at a zero, or that touches one and turns back, does not cross
+    it. But an `Impact` whose condition is zero at the start, and falling, happens at once.
 
     Args:
         condition: (t, frames) -> a number.
@@ -147,7 +147,7 @@ class Contact(PrintsLine):
 class Events(PrintsTable):
     """The events of a run in their order: times (s), states before and after, and which each was.
 
-    Where numbers are traced, or in a batch, there are `max_events` of each, padded with NaN, and -1 for `index`.
+    Where numbers are traced, or in a batch, there are `max_events` of each, padded with infinity, and -1 for `index`.
 
     Attributes:
         time: of each event (s).
@@ -166,7 +166,7 @@ class Events(PrintsTable):
     q_after: Float[Array, "events bodies 3"]
     v_after: Float[Array, "events bodies 3"]
     count: Int[Array, ""]
-    unresolved: Float[Array, "conditions"]  # the time (s) from which on crossings may be missed: a condition varies too quickly
+    unresolved: Float[Array, "conditions"]  # from when on (s) crossings may be missed, as it varies too quickly; else inf
     undefined: Bool[Array, "conditions"]  # whether a condition is not a number, where the run ends by that
     names: tuple[str, ...] = eqx.field(static=True)
 
@@ -208,19 +208,27 @@ def expand_events(events: Sequence[ExpandsToEvents], mechanism: Mechanism) -> tu
     """Return all events, each with a name of its own. Raises `ValueError` where one cannot be."""
     found: list[Event] = []
     for k, event in enumerate(events):
-        if not hasattr(event, "expand"):
-            raise ValueError(f"events[{k}]: must be an Event, a JointLimit or a Contact, is a {type(event).__name__}")
-        for one in event.expand(mechanism):
-            require_name_text(f"events[{k}]: name", one.name, may_be_empty=True)
-            name = one.name or f"event{k + 1}"
-            if any(name == other.name for other in found):
-                raise ValueError(f"event {quote(name)}: two events have this name; give one of them another (`name=`)")
-            found.append(_with_name(one, name))
-    for event in found:
-        _check(event, mechanism)
+        try:
+            _expand(event, k, mechanism, found)
+        except Mistakes:
+            raise
+        except ValueError as error:
+            raise type(error)(f"events[{k}]: {error}") from error
     if not found:
         raise ValueError("events: the list is empty; leave it out for a run without events")
     return tuple(found)
+
+
+def _expand(event: ExpandsToEvents, k: int, mechanism: Mechanism, found: list[Event]) -> None:
+    if not hasattr(event, "expand"):
+        raise ValueError(f"must be an Event, a JointLimit or a Contact, is a {type(event).__name__}")
+    for one in event.expand(mechanism):
+        require_name_text("name", one.name, may_be_empty=True)
+        name = one.name or f"event{k + 1}"
+        if any(name == other.name for other in found):
+            raise ValueError(f"event {quote(name)}: two events have this name; give one of them another (`name=`)")
+        found.append(_with_name(one, name))
+        _check(found[-1], mechanism)
 
 
 def sees_velocity(event: Event, mechanism: Mechanism) -> bool:
@@ -232,7 +240,8 @@ def sees_velocity(event: Event, mechanism: Mechanism) -> bool:
 
 
 def _with_name(event: Event, name: str) -> Event:
-    return Event(event.condition, event.action, -1 if isinstance(event.action, Impact) else event.direction, name)
+    falls = isinstance(event.action, Impact) and event.direction in (0, -1)  # from above zero, which it does not pass
+    return Event(event.condition, event.action, -1 if falls else event.direction, name)
 
 
 def _check(event: Event, mechanism: Mechanism) -> None:
@@ -258,11 +267,14 @@ def _check(event: Event, mechanism: Mechanism) -> None:
     if value.shape:
         raise ValueError(f"{where}: the condition must return one number, not an array of shape {value.shape}")
     if isinstance(action, Impact):
+        if event.direction == 1:
+            cure = "turn the condition's sign, and leave the direction out"
+            raise ValueError(f"{where}: an Impact is where its condition falls to zero, and not where direction=1: {cure}")
         if sees_velocity(event, mechanism):
             raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
         require_restitution(f"{where}: the restitution", action.restitution)
         if not isinstance(action.at_rest, str) or action.at_rest not in ("hold", "stop"):
-            raise ValueError(f'{where}: at_rest must be "hold" or "stop", is {action.at_rest!r}')
+            raise ValueError(f'{where}: at_rest must be "hold" or "stop", {describe(action.at_rest)}')
     elif isinstance(action, Lock):
         require_name_text(f"{where}: the joint of Lock", action.joint)
         joint_coordinate(mechanism, action.joint, where)

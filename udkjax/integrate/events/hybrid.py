@@ -1,6 +1,7 @@
 """A mechanism with events as a hybrid system: a flow in each phase, and conditions along it. `jumps` leads between phases."""
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -23,6 +24,7 @@ from udkjax.integrate.events.phases import Phases
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.checks import traced_numbers_hold
 from udkjax.scene.joints import Joint
 
 if TYPE_CHECKING:
@@ -91,16 +93,22 @@ class Hybrid(eqx.Module):
 
     @property
     def has_usable_numbers(self) -> Bool[Array, ""]:
-        """Whether restitutions are from 0 to 1, and limits and contacts finite, where they were traced when they were checked."""
-        found = jnp.array(True)
+        """Whether the scene's numbers are what they must be, restitutions from 0 to 1, limits in order, contacts finite.
+
+        Those that are known were checked before; those that were traced then are looked at here.
+        """
+        found, limits = traced_numbers_hold(self.phases.mechanisms[0].elements), {}
         for e in self.events:
+            if isinstance(e.condition, WithinLimit):
+                limits[e.name] = e.condition.limit
             if isinstance(e.action, Impact):
                 found &= (e.action.restitution >= 0) & (e.action.restitution <= 1)
             if isinstance(e.condition, WithinLimit | Gap):
                 found &= jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(e.condition)]))
             if isinstance(e.condition, Gap):
                 found &= jnp.any(e.condition.normal != 0)
-        return found
+        both = (name[: -len(".lower")] for name in limits if name.endswith(".lower"))
+        return reduce(jnp.logical_and, (limits[f"{n}.lower"] <= limits.get(f"{n}.upper", jnp.inf) for n in both), found)
 
     def mask(self, *actions: type[Action]) -> Bool[np.ndarray, "E"]:
         """Tell which events have an action of these kinds."""

@@ -56,7 +56,7 @@ class LoopState(NamedTuple):
     search: Search
     reach: Float[Array, ""]  # how far the next window goes (s)
     quiet: Float[Array, "2E"]  # the time up to which each condition has no crossings in pairs
-    unresolved: Float[Array, "2E"]  # the time from which on a condition varies too quickly to be sure of its crossings, or NaN
+    unresolved: Float[Array, "2E"]  # the time from which on a condition varies too quickly to be sure of its crossings, or inf
     undefined: Bool[Array, "E"]  # the conditions that are not a number where the run ends by that
     q: Float[Array, "T n"]  # outputs
     v: Float[Array, "T n"]
@@ -89,7 +89,7 @@ def run_loop(
 
     def integrate(loop: LoopState) -> WindowResult:
         window = plan_window(hybrid, ts, loop.state, loop.search, loop.reach, loop.quiet, loop.written)
-        held, known = hybrid.is_held(loop.state.phase), ~jnp.isnan(loop.unresolved)
+        held, known = hybrid.is_held(loop.state.phase), jnp.isfinite(loop.unresolved)
         watched = jnp.append(~held & ~loop.carried, held)
         looked_at = loop.sides, loop.values.scale, watched, loop.search, loop.quiet, known
         return integrate_window(hybrid, window, loop.state, *looked_at, drift_tol)
@@ -115,9 +115,9 @@ def run_loop(
 
 def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, code: Int[Array, ""], max_events: int) -> LoopState:
     E, n, T = hybrid.count, len(state.q), len(ts)
-    nothing = jnp.full((T, n), jnp.nan, float)
+    nothing = jnp.full((T, n), jnp.inf, float)
     none, zeros = jnp.full(max_events, -1, int), jnp.zeros(2 * E)
-    states, times = jnp.full((max_events, 2, n), jnp.nan, float), jnp.full(max_events, jnp.nan, float)
+    states, times = jnp.full((max_events, 2, n), jnp.inf, float), jnp.full(max_events, jnp.inf, float)
     open_ = jnp.full((max_events, E), OPEN, int)
     return LoopState(
         state=state,
@@ -128,7 +128,7 @@ def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, co
         search=no_search(ts[0]),
         reach=ts[-1] - ts[0],
         quiet=jnp.full(2 * E, ts[0]),
-        unresolved=jnp.full(2 * E, jnp.nan),
+        unresolved=jnp.full(2 * E, jnp.inf),
         undefined=jnp.zeros(E, bool),
         q=nothing,
         v=nothing,
@@ -193,7 +193,7 @@ def _after_window(hybrid: Hybrid, loop: LoopState, result: WindowResult, values:
         search=search,
         reach=reach,
         quiet=loop.quiet.at[k].set(jnp.where(step.is_lost, result.search.until, loop.quiet[k])),
-        unresolved=jnp.where(result.unresolved & jnp.isnan(loop.unresolved), state.t, loop.unresolved),
+        unresolved=jnp.where(result.unresolved & jnp.isinf(loop.unresolved), state.t, loop.unresolved),
         undefined=result.undefined,
         q=loop.q.at[rows].set(result.q, mode="drop"),
         v=loop.v.at[rows].set(result.v, mode="drop"),

@@ -21,7 +21,7 @@ OUTPUTS = 32  # of one piece
 
 
 class EventRun(NamedTuple):
-    """The outputs and events of a run, NaN where it did not get. In derivatives a field is None that has none."""
+    """The outputs and events of a run, infinite where it did not get. In derivatives a field is None that has none."""
 
     q: Float[Array, "T n"]
     v: Float[Array, "T n"]
@@ -77,7 +77,7 @@ def _run(fixed: FixedPart, xs: list[Array]) -> EventRun:
     record, smooth = loop.record, (loop.q, loop.v, loop.state.t)
     events = record.t, record.q, record.v, record.index, record.phase, record.together, record.closed, record.count
     # Before it is no number, a condition may vary quickly: that is told by how the run ended.
-    faults = jnp.where(loop.undefined, jnp.nan, loop.unresolved[: hybrid.count]), loop.undefined
+    faults = jnp.where(loop.undefined, jnp.inf, loop.unresolved[: hybrid.count]), loop.undefined
     return EventRun(*smooth, *events, *faults, loop.code, loop.totals)
 
 
@@ -162,13 +162,13 @@ def replay(hybrid: Hybrid, given: RunInput, found: EventRun) -> tuple[Array, ...
     state = RunState(ts[0], given.q, given.v, jnp.array(0), hybrid.phases.first_added())
     end, out = jax.lax.scan(piece, PieceStart(state, jnp.array(0), jnp.array(0), jnp.zeros(())), None, length=pieces)
     rows = out.rows.ravel()
-    q, v = (jnp.full((T, n), jnp.nan).at[rows].set(x.reshape(-1, n), mode="drop") for x in (out.q, out.v))
+    q, v = (jnp.full((T, n), jnp.inf).at[rows].set(x.reshape(-1, n), mode="drop") for x in (out.q, out.v))
     last = (ts == found.time)[:, None]
     q, v = jnp.where(last, end.state.q, q), jnp.where(last, end.state.v, v)
     first = jnp.cumsum(~found.together) - 1  # the number of the event that each happens with, and of itself if it is the first
     first = jnp.flatnonzero(~found.together, size=K, fill_value=0)[first]
-    times = jnp.full(K, jnp.nan).at[out.event].set(out.event_time, mode="drop")[first]
-    qs, vs = (jnp.full((K, 2, n), jnp.nan).at[out.event].set(x, mode="drop")[first] for x in (out.event_q, out.event_v))
+    times = jnp.full(K, jnp.inf).at[out.event].set(out.event_time, mode="drop")[first]
+    qs, vs = (jnp.full((K, 2, n), jnp.inf).at[out.event].set(x, mode="drop")[first] for x in (out.event_q, out.event_v))
     stopped = (found.code == Result.event_stop) | (found.code == Result.at_rest)
     time = jnp.where(stopped, times[jnp.maximum(found.count - 1, 0)], found.time)
     return q, v, time, times, qs, vs

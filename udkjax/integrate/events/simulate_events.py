@@ -94,8 +94,8 @@ def simulate_events(
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(given))
     found, reasons = _run(*eqx.partition(given, eqx.is_array))
     count = None if traced else int(found.count)
-    if count is not None and not np.isnan(found.unresolved).all():
-        fast = [f"{quote(e.name)} from {t:.6g} s on" for e, t in zip(listed, found.unresolved, strict=True) if not np.isnan(t)]
+    if count is not None and np.isfinite(found.unresolved).any():
+        fast = [f"{quote(e.name)} from {t:.6g} s on" for e, t in zip(listed, found.unresolved, strict=True) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
     return _solution(mechanism, tuple(e.name for e in listed), ts, choices, found, reasons, count)
 
@@ -185,7 +185,7 @@ def _solution(
     """Return the solution; its events are `count`, or padded to the most that there may be where that is None."""
     bodies = (-1, len(mechanism.body_names), 3)
 
-    def trim(x: Array, padding: float = np.nan) -> Array:
+    def trim(x: Array, padding: float = np.inf) -> Array:
         if count is not None:
             return x[:count]
         is_event = (jnp.arange(choices.max_events) < found.count).reshape(-1, *[1] * (x.ndim - 1))
@@ -223,7 +223,8 @@ def _solution(
         ("first_step", "chosen" if choices.dt0 is None else "given"),
         ("engine", f"diffrax: {why}" if all(reasons) else f"native, in some phases diffrax: {why}" if why else "native"),
     )
-    q, v = (x.reshape(len(x), *bodies[1:]) for x in (found.q, found.v))
+    with jax.debug_nans(False):  # they stand for outputs behind the end of a run, and alarm nobody
+        q, v = (jnp.where(jnp.isinf(x), jnp.nan, x).reshape(len(x), *bodies[1:]) for x in (found.q, found.v))
     return Solution(
         ts=ts,
         q=q,

@@ -97,7 +97,7 @@ def _entries(mechanism: Mechanism, item: OneAsked, problems: list[str]) -> list[
     try:
         parts = _parts(mechanism, p)
     except (SceneError, ValueError) as problem:
-        problems.append(str(problem) if not p.name else f"{quote(p.name)}: {problem}")
+        problems.append(f"parameters: {f'{quote(p.name)}: ' * bool(p.name)}{problem}")
         return []
     found = []
     for part in parts:
@@ -107,7 +107,7 @@ def _entries(mechanism: Mechanism, item: OneAsked, problems: list[str]) -> list[
         try:
             found.append(_unknown(mechanism, p, name, part))
         except (TypeError, ValueError) as problem:
-            problems.append(f"{quote(name)}: {problem}")
+            problems.append(f"parameters: {quote(name)}: {problem}")
     return found
 
 
@@ -132,6 +132,8 @@ def _unknown(mechanism: Mechanism, p: Parameter, name: str, part: _Part) -> Unkn
     low, high = p.bounds if p.bounds is not None else (np.nan, np.nan)
     if p.bounds is not None and not np.isfinite(p.bounds).all():
         raise ValueError(f'bounds must be two finite numbers, are ({low}, {high}); what has no upper one can be "positive"')
+    if low >= high:
+        raise ValueError(f"bounds must be (low, high), the lower one first, are ({low}, {high})")
     if kind == "bounded" and not low < guess < high:
         raise ValueError(f"the first guess {guess:g} must be between the bounds ({low}, {high}): move the one or the others")
     if kind == "positive" and not guess > 0:

@@ -12,6 +12,7 @@ from typing_extensions import TypeAliasType
 from udkjax.extras import OptionalImport
 from udkjax.integrate.assembly import State
 from udkjax.scene.checks import Mistakes, quote
+from udkjax.scene.requirements import describe
 from udkjax.study.channels import Channel, Quantity
 
 if TYPE_CHECKING:
@@ -55,7 +56,9 @@ class Start:
 
     def __post_init__(self):
         if self.estimate not in get_args(Estimated):
-            raise IdentificationError([f"Start: estimate must be one of {', '.join(get_args(Estimated))}, is {self.estimate!r}"])
+            raise IdentificationError(
+                [f"initial_state: estimate must be one of {', '.join(get_args(Estimated))}, {describe(self.estimate)}"]
+            )
 
 
 class Record:
