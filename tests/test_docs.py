@@ -232,18 +232,21 @@ def test_its_names_and_files_exist(page):
     assert list(missing(BLOCK.sub("", page.read_text()))) == []
 
 
-def docstrings() -> Iterator[tuple[str, str]]:
-    """Each docstring of the package, and where it is."""
+def prose() -> Iterator[tuple[str, str]]:
+    """Each docstring and each comment of the package and its studies, and where it is."""
     for path, tree in SOURCES.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
                 yield f"{name_of(path)}: {getattr(node, 'name', 'module')}", text
+        for line, text in enumerate(path.read_text().splitlines(), 1):
+            if "# " in text and "`" in text:
+                yield f"{name_of(path)}:{line}", text.partition("# ")[2]
 
 
-def test_names_in_docstrings_exist():
-    assert [(where, name) for where, text in docstrings() for name in missing(text)] == []
+def test_names_in_docstrings_and_comments_exist():
+    assert [(where, name) for where, text in prose() for name in missing(text)] == []
     files = {path.name for path in [*SOURCES, *(ROOT / "tests").rglob("*.py")]}
-    assert [(where, file) for where, text in docstrings() for file in re.findall(r"\w+\.py\b", text) if file not in files] == []
+    assert [(where, file) for where, text in prose() for file in re.findall(r"\w+\.py\b", text) if file not in files] == []
 
 
 def test_a_name_that_does_not_exist_is_noticed():

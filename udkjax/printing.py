@@ -1,4 +1,4 @@
-"""What the package's classes print: short tables of numbers with their units, as text and, in notebooks, as HTML."""
+"""Printing of the package's classes: short tables of numbers with their units, as text and, in notebooks, as HTML."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields

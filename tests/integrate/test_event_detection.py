@@ -3,6 +3,7 @@
 # pyright: reportOptionalMemberAccess=false
 # All of these runs have events.
 import warnings
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -131,7 +132,7 @@ def quarter(t, at):
     return at["b"].x - 0.25
 
 
-def rooted(x, engine="native"):
+def rooted(x, engine: Any = "native"):
     """A run with a condition that is a number up to x."""
     events = [udk.Event(RootOf(x), udk.Log(), name="root"), udk.Event(quarter, udk.Log(), name="quarter")]
     return udk.simulate(POINT, [0, 0.3, 1.0], events=events, max_events=4, throw=False, engine=engine)

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     import numpy as np
 
     from udkjax import Mechanism
-    from udkjax.show.player.measures import Trajectory
+    from udkjax.show.player.measures import ShownMotion
 
-    ShownRun = tuple[Mechanism, Trajectory, dict[str, np.ndarray]]  # and further measures by name
+    ShownRun = tuple[Mechanism, ShownMotion, dict[str, np.ndarray]]  # and further measures by name
 
-KINDS = (".html", ".gif", ".mp4", ".svg", ".png", ".dxf")
+ANIMATION_SUFFIXES = (".html", ".gif", ".mp4", ".svg", ".png", ".dxf")
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN.nc|SCENE.toml")]
 
 
@@ -61,7 +61,7 @@ def animate(
         width: of a film or a picture (px).
         json: write the results as JSON.
     """
-    check_target(out, KINDS)
+    check_target(out, ANIMATION_SUFFIXES)
     kind = out.suffix.lower()
     if not files:
         refuse("give a run (.nc) or a scene (.toml)")

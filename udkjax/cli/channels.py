@@ -1,4 +1,4 @@
-"""What the commands share that measure a motion: channels by their names, and the driver that is meant."""
+"""Options of commands that measure a motion: channels by their names, and the driver that is meant."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING

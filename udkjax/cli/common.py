@@ -1,4 +1,4 @@
-"""What the commands share: options that are spelled alike, how a scene is read, and how results are shown.
+"""Parts of all commands: options that are spelled alike, reading a scene, and showing results.
 
 A command is a function of its options that imports what it needs when it runs:
 

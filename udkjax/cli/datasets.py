@@ -1,4 +1,4 @@
-"""How commands write arrays to a file of the kind that its name ends with, with what a reader needs to trust them."""
+"""Files of commands: arrays in the kind that the name ends with, with what a reader needs to trust them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -11,15 +11,15 @@ if TYPE_CHECKING:
     import xarray
     from numpy.typing import ArrayLike
 
-KINDS = (".nc", ".h5", ".csv", ".npz")  # of datasets; .h5 is NetCDF too, which is HDF5 within
-PICTURES = (".png", ".svg", ".pdf", ".jpg")
-FILES = (*KINDS, *PICTURES, ".html", ".json", ".toml")  # what no folder is called
+DATASET_SUFFIXES = (".nc", ".h5", ".csv", ".npz")  # of datasets; .h5 is NetCDF too, which is HDF5 within
+PICTURE_SUFFIXES = (".png", ".svg", ".pdf", ".jpg")
+FILE_SUFFIXES = (*DATASET_SUFFIXES, *PICTURE_SUFFIXES, ".html", ".json", ".toml")  # what no folder is called
 
 # What the columns of a .csv are called, as measurements are: `body.crank.vx [m/s]`.
-CHANNELS = {"q": ("x", "y", "angle"), "v": ("vx", "vy", "omega"), "a": ("ax", "ay", "alpha")}
+COLUMN_NAMES = {"q": ("x", "y", "angle"), "v": ("vx", "vy", "omega"), "a": ("ax", "ay", "alpha")}
 
 
-def check_target(out: Path | None, kinds: Sequence[str] = KINDS, option: str = "--out") -> None:
+def check_target(out: Path | None, kinds: Sequence[str] = DATASET_SUFFIXES, option: str = "--out") -> None:
     """Refuse a file of no known kind, or one that has no folder."""
     if out is None:
         return
@@ -33,7 +33,7 @@ def check_folder(out: Path) -> None:
     """Refuse a folder that cannot be made, or that is called as a file is."""
     if out.exists() and not out.is_dir():
         refuse(f"--out {out} is no folder")
-    if not out.exists() and out.suffix.lower() in FILES:
+    if not out.exists() and out.suffix.lower() in FILE_SUFFIXES:
         refuse(f"--out {out}: a folder is written, of several files; give a name without {out.suffix}")
     if not out.parent.is_dir():
         refuse(f"there is no folder {out.parent} to make {out.name} in")
@@ -117,8 +117,8 @@ def _columns(data: "xarray.Dataset") -> "Iterator[tuple[str, np.ndarray]]":
         units = str(variable.attrs.get("units", "")).split(", ", 2)
         for k, place in enumerate(np.ndindex(*(variable.sizes[dim] for dim in others))):
             words = [str(i) if known is None else known[i] for known, i in zip(labels, place, strict=True)]
-            if name in CHANNELS and others == ["body", "coordinate"]:
-                words = ["body", words[0], CHANNELS[str(name)][place[1]]]
+            if name in COLUMN_NAMES and others == ["body", "coordinate"]:
+                words = ["body", words[0], COLUMN_NAMES[str(name)][place[1]]]
             else:
                 words = [str(name), *words]
             unit = units[place[-1]] if others and others[-1] == "coordinate" and len(units) == 3 else ", ".join(units)

@@ -1,4 +1,4 @@
-"""How commands end: the exit codes, and what is said on stderr."""
+"""Ends of commands: the exit codes, and what is said on stderr."""
 
 import sys
 from collections.abc import Iterator

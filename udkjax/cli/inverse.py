@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
-from udkjax.cli.datasets import PICTURES, check_target, write
+from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, write
 
 
 def inverse(
@@ -33,7 +33,7 @@ def inverse(
     """
     ts = output_times(t0, t1, dt)
     check_target(out)
-    check_target(plot, PICTURES, "--plot")
+    check_target(plot, PICTURE_SUFFIXES, "--plot")
     mech, text = load(scene)
     if not mech.drivers:
         refuse("the scene has no driver that prescribes a motion")

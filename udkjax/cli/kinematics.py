@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from udkjax.cli.channels import channels_of, choose_driver, measure_channels
 from udkjax.cli.common import Json, Scene, fail, load, refuse, show
-from udkjax.cli.datasets import PICTURES, check_target, write
+from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, write
 from udkjax.extras import OptionalImport
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def kinematics(
     if count < 1:
         refuse(f"--count {count}: must be positive")
     check_target(out)
-    check_target(plot, PICTURES, "--plot")
+    check_target(plot, PICTURE_SUFFIXES, "--plot")
     mech, text = load(scene)
     driver, measured = choose_driver(mech, driver), channels_of(mech, channels)
     import numpy as np

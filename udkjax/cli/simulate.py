@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from udkjax.cli.channels import channels_of, measure_channels
 from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
-from udkjax.cli.datasets import PICTURES, check_target, save
+from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, save
 from udkjax.extras import require
 
 # The names of udkjax.study.choices, which cannot be imported before a command is known: it imports JAX.
@@ -75,7 +75,7 @@ def simulate(
         refuse("--formulation partitioning keeps the constraints itself: take --stabilization projection or none")
     if plot == out:
         refuse(f"--out {out} and --plot {plot} are the same file")
-    check_target(plot, PICTURES, "--plot")
+    check_target(plot, PICTURE_SUFFIXES, "--plot")
     require("xarray", "h5netcdf")
     mech, text = load(scene)
     measured = channels_of(mech, channels)

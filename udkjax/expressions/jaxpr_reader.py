@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from udkjax.expressions.graph import BoundPrimitive, Graph, Scalar
 
 ClosedJaxpr: TypeAlias = Any  # JAX exports the class, but not to type checkers
-Equation: TypeAlias = Any  # a `JaxprEqn`, whose annotations leave the shapes of its variables out
+Equation: TypeAlias = Any  # its annotations leave the shapes of its variables out
 Dimensions = tuple[Sequence[int], Sequence[int]]
 DimensionNumbers = tuple[Dimensions, Dimensions]  # of `dot_general`: those contracted, those of the batch, of each operand
 

@@ -19,7 +19,7 @@ from udkjax.scene.held import Held
 from udkjax.scene.joints import Revolute
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 
-LONGEST = 60  # characters of a value or a name in a message
+LONGEST_QUOTE = 60  # characters of a value or a name in a message
 KnownNames = Mapping[str, Mapping[str, type | None]]  # the classes of elements, by kind (body, revolute) and by name
 
 
@@ -132,7 +132,7 @@ def check_table(where: str, cls: type, table: Table, known: KnownNames) -> Itera
     expected, sizes = keys(cls), {}
     for name in table:
         if name not in expected:
-            yield f"{where}.{name if len(name) <= LONGEST else abbreviate(name)}: unknown key{suggestion(name, expected)}"
+            yield f"{where}.{name if len(name) <= LONGEST_QUOTE else abbreviate(name)}: unknown key{suggestion(name, expected)}"
     for name, key in expected.items():
         if name in table:
             yield from _check_value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes)
@@ -303,16 +303,16 @@ def quote(name: str) -> str:
 
 
 def abbreviate(value: object) -> str:
-    """Return a value as the text of a message: as in a TOML file, and not longer than `LONGEST`."""
+    """Return a value as the text of a message: as in a TOML file, and not longer than `LONGEST_QUOTE`."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return quote(value if len(value) <= LONGEST else value[: LONGEST - 3] + "...")
+        return quote(value if len(value) <= LONGEST_QUOTE else value[: LONGEST_QUOTE - 3] + "...")
     if isinstance(value, list | tuple):
         text = f"[{', '.join(map(abbreviate, value))}]"
     else:
         text = f"shape {value.shape}" if isinstance(value, Tracer) else str(getattr(value, "tolist", lambda: value)())
-    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
+    return text if len(text) <= LONGEST_QUOTE else text[: LONGEST_QUOTE - 3] + "..."
 
 
 def check_hashable(element: eqx.Module) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""How the classes of a scene declare their fields: converters, and the requirements that values must satisfy.
+"""Fields of the classes of a scene: converters, and the requirements that values must satisfy.
 
 A class of this folder is its own schema: its fields are the keys of the scene format, the annotation of a number states its
 shape, and the metadata below state what else must hold. Files and Python are checked by the same declarations (`checks.py`).

@@ -54,7 +54,7 @@ class Origin:
 
 
 class AbstractDrawing(PrintsTable):
-    """What a mechanism was made from, with numbers of its own that decide on those of the bodies: pins, widths, densities."""
+    """Source that a mechanism was made from, whose own numbers decide on those of the bodies: pins, widths, densities."""
 
     @property
     @abstractmethod
@@ -218,7 +218,7 @@ class Mechanism(PrintsTable):
 
     @property
     def is_concrete(self) -> bool:
-        """Whether no number is traced."""
+        """True if no number is traced."""
         return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self._own_numbers))
 
     @property

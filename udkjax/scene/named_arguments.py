@@ -1,4 +1,4 @@
-"""What arguments of these names must be in every public function, whatever their annotations say."""
+"""Requirements on arguments by their names, the same in every public function, whatever the annotations say."""
 
 import dataclasses
 import os
@@ -144,7 +144,7 @@ def _require_optimizer(name: str, value: Any, given: Given) -> None:
 
 
 def _require_parameters(name: str, value: Any, given: Given) -> None:
-    """What is to be identified: a name, an object that stands for one, or a list of these."""
+    """Require parameters to identify: a name, an object that stands for one, or a list of these."""
     if not isinstance(value, str | list | tuple) and not callable(value) and not dataclasses.is_dataclass(value):
         raise ArgumentTypeError(f"{name} must be the name of a parameter, a Parameter, or a list of these, {describe(value)}")
 

@@ -17,7 +17,7 @@ Groups = dict[str, dict[str, Any]]  # elements by section and name
 
 
 class Drawn(Protocol):
-    """What a drawing holds: its elements, by section (pin, link, motor, ...) and name."""
+    """Elements of a drawing, by section (pin, link, motor, ...) and name."""
 
     @property
     def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]: ...

@@ -1,4 +1,4 @@
-"""What arguments must be: real, finite, of a shape and a sign; and the errors that say which was not, with what was given."""
+"""Requirements on arguments: real, finite, of a shape and a sign; the errors say which was not, with what was given."""
 
 from collections.abc import Callable, Mapping, Sequence
 from inspect import isclass

@@ -1,4 +1,4 @@
-"""What in a scene is likely a mistake, although it can be computed: points in another unit, degrees for radians, loose bodies."""
+"""Likely mistakes in a scene that can be computed all the same: points in another unit, degrees for radians, loose bodies."""
 
 from collections.abc import Iterator
 from typing import Any

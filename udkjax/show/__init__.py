@@ -1,1 +1,1 @@
-"""What people see: pictures and tables."""
+"""Pictures and tables, for people."""

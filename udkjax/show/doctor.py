@@ -1,4 +1,4 @@
-"""What this machine and this environment are, ready to paste into a bug report."""
+"""Facts about this machine and this environment, ready to paste into a bug report."""
 
 import os
 import platform

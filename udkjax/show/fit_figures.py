@@ -83,7 +83,7 @@ def draw_series(axes: Axes, one: Series) -> None:
 
 
 def _panels(data: "xarray.Dataset", every: list[Series]) -> tuple[int, dict[int, Series]]:
-    """How many columns of panels there are, and the place of each series that is shown: a few records stand side by side."""
+    """Return the number of columns of panels, and the place of each series that is shown: a few records stand side by side."""
     records, channels = list(data["record"].values), list(data["channel"].values)
     columns, places = min(MOST_COLUMNS, -(-len(every) // 4)), list(range(len(every)))
     if 1 < len(records) <= MOST_COLUMNS:
@@ -158,7 +158,7 @@ def _distribution(axes: Axes, own: list[Series]) -> None:
 
 
 def _autocorrelation(axes: Axes, own: list[Series]) -> None:
-    """That of the residuals divided by the noise, of all records, and the band in which 19 of 20 values of white noise are."""
+    """Draw the autocorrelation of the residuals over the noise, and the band that holds 19 of 20 values of white noise."""
     parts = [one.residual / np.where(one.noise > 0, one.noise, 1.0) for one in own]
     parts = [part for part in parts if np.isfinite(part).all()]
     count = min(MOST_LAGS, max((len(part) for part in parts), default=0) // SAMPLES_PER_LAG)

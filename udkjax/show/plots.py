@@ -42,11 +42,11 @@ __all__ = [
     "to_ground",
     "trajectory",
 ]  # and every function that draws
-WIDE = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
-ROUNDING = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
-SMALLEST = 1e-18  # singular values below it are drawn as it
+WIDE_SCENE_RATIO = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
+SMALLEST_VIOLATION = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
+SMALLEST_SINGULAR_VALUE = 1e-18  # singular values below it are drawn as it
 RANK_SHIFT = 0.06  # between the ranks of several runs
-LINEAR = 1e-6  # m, rad: a displacement of a mode at which its points move as its derivative says
+SMALL_DISPLACEMENT = 1e-6  # m, rad: a displacement of a mode at which its points move as its derivative says
 SAME_ANGLE = 1e-6  # rad: curves closer than the width of a line share it
 
 
@@ -57,7 +57,7 @@ def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
     """
     ts, q = np.asarray(sol.ts), np.asarray(sol.q)
     alive = q[np.isfinite(q).all((1, 2))]  # a run that failed has no values after its end
-    if np.ptp(alive[..., 0]) > WIDE * np.ptp(alive[..., 1]):
+    if np.ptp(alive[..., 0]) > WIDE_SCENE_RATIO * np.ptp(alive[..., 1]):
         figure = Figure(figsize=(10, 6.2), layout="constrained")
         panels = figure.subplot_mosaic([["scene"] * 3, ["angles", "constraints", "energy"]], height_ratios=(1.5, 1))
         lowest = ("angles", "constraints", "energy")
@@ -118,8 +118,8 @@ def draw_angles(axes: Axes, mech: Mechanism, ts: ArrayLike, q: Float[np.ndarray,
 def draw_violation(axes: Axes, ts: ArrayLike, violated: ArrayLike) -> Axes:
     """Draw the largest violation of any constraint over time, in metres or radians."""
     size = largest_violation(violated)
-    axes.semilogy(ts, np.maximum(size, ROUNDING), color=COLOURS[1], lw=1)
-    axes.set_ylim(ROUNDING, 1e3 * np.nanmax(size, initial=ROUNDING))
+    axes.semilogy(ts, np.maximum(size, SMALLEST_VIOLATION), color=COLOURS[1], lw=1)
+    axes.set_ylim(SMALLEST_VIOLATION, 1e3 * np.nanmax(size, initial=SMALLEST_VIOLATION))
     axes.set(xlabel="time (s)", ylabel="violation (m, rad)")
     return axes
 
@@ -142,7 +142,7 @@ def draw_singular_values(
 
     `unit`: that of D is kg$^{-1/2}$; those of `udk.singular_values` have none.
     """
-    values = np.maximum(np.asarray(values, float), SMALLEST)
+    values = np.maximum(np.asarray(values, float), SMALLEST_SINGULAR_VALUE)
     count = values.shape[1]
     first = max(count - least, 0)
     for k in range(first):
@@ -197,7 +197,7 @@ def draw_sweep(axes: Axes, data: "xarray.Dataset", name: str) -> Axes:
 
 def draw_failures(axes: Axes, data: "xarray.Dataset") -> Axes:
     """Draw how each member of a sweep ended, over its axes: a colour for each `Result`, successes in grey."""
-    drawn = sweep_figures.draw_panel(axes, data, sweep_figures.RESULT)
+    drawn = sweep_figures.draw_panel(axes, data, sweep_figures.RESULT_VARIABLE)
     if drawn is not None:
         sweep_figures.name_results(axes.figure.colorbar(drawn, ax=axes))
     return axes
@@ -244,7 +244,7 @@ def draw_mode(
     """
     q, shape, held = np.asarray(q, float), np.asarray(shape, float), attachments(mech)
     rest = np.concatenate([to_ground(held[body], q[k]) for k, body in enumerate(mech.bodies)] + [held[GROUND], q[:, :2]])
-    tiny = LINEAR * shape / np.abs(shape).max()
+    tiny = SMALL_DISPLACEMENT * shape / np.abs(shape).max()
     moved = [to_ground(held[body], q[k] + tiny[k]) - to_ground(held[body], q[k]) for k, body in enumerate(mech.bodies)]
     scale = swing * np.ptp(rest, axis=0).max() / np.abs(np.concatenate([*moved, tiny[:, :2]])).max()
     for sign, colour, style in ((0, "0.6", "-"), (1, COLOURS[0], "-"), (-1, COLOURS[1], "--")):

@@ -15,7 +15,7 @@ with OptionalImport():
 if TYPE_CHECKING:
     import xarray
 
-HIGHEST = 3.0  # times the limit: what is higher is not drawn
+HIGHEST_COST = 3.0  # times the limit: what is higher is not drawn
 
 
 def profiles(data: "xarray.Dataset") -> Figure:
@@ -50,7 +50,7 @@ def _profile(axes: Axes, data: "xarray.Dataset", name: str) -> None:
         line = np.linspace(left, right, 101)
         axes.plot(line, ((line - value) / error) ** 2, "--", lw=1, color=COLOURS[1], label="from the standard error")
     axes.axhline(limit, color="0.5", lw=0.8)
-    axes.set_ylim(min(0.0, 1.1 * rise.min()) - 0.03 * limit, max(1.25 * limit, min(1.1 * rise.max(), HIGHEST * limit)))
+    axes.set_ylim(min(0.0, 1.1 * rise.min()) - 0.03 * limit, max(1.25 * limit, min(1.1 * rise.max(), HIGHEST_COST * limit)))
     axes.set_title(name, fontsize="small", loc="left")
     units = str(known["parameter_units"].values)
     axes.set_xlabel("" if units == "1" else units)

@@ -1,4 +1,4 @@
-"""What all plots share: colours and marks that everyone tells apart, in print too, and how axes look."""
+"""Style of all plots: colours and marks that everyone tells apart, in print too, and the look of axes."""
 
 from udkjax.extras import OptionalImport
 

@@ -1,4 +1,4 @@
-"""What the command line says about a mechanism and about a run."""
+"""Texts of the command line about a mechanism and about a run."""
 
 from collections.abc import Sequence
 

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 Colours = tuple[Colormap | str, Normalize]
 
-RESULT, MEMBER = "result", "member"  # the variable of the codes, and the dimension of a design
-OTHER = "not computed"  # what has a code of no `Result`
-SHADES = ("#d9d9d9", *COLOURS[1:6], "white")  # of the results in their order, successes in grey, and of the others
-FAILED = "0.75"  # where there is no value
-DECADES = 1e2  # from this ratio of the largest to the smallest value on, colours and axes are logarithmic
+RESULT_VARIABLE, MEMBER_DIMENSION = "result", "member"  # the variable of the codes, and the dimension of a design
+OTHER_RESULT = "not computed"  # what has a code of no `Result`
+RESULT_COLOURS = ("#d9d9d9", *COLOURS[1:6], "white")  # of the results in their order, successes in grey, and of the others
+MISSING_COLOUR = "0.75"  # where there is no value
+LOGARITHMIC_RATIO = 1e2  # from this ratio of the largest to the smallest value on, colours and axes are logarithmic
 COLUMNS = 4  # of panels
 PANELS = 12  # of one picture; of the dimensions that these cannot show, the first values are drawn
 
@@ -40,16 +40,20 @@ def pictures(data: "xarray.Dataset") -> dict[str, Figure]:
     line. Members of a design, which has no grid, are points over its first two axes.
     """
     differing = [name for name in scalars(data) if len(np.unique(data[name])) > 1]
-    return {name: _picture(data, name) for name in (RESULT, *differing)}
+    return {name: _picture(data, name) for name in (RESULT_VARIABLE, *differing)}
 
 
 def scalars(data: "xarray.Dataset") -> list[str]:
     """Return the variables with one number for each member."""
-    return [str(n) for n in data.data_vars if n != RESULT and data[n].dims == data[RESULT].dims and data[n].dtype.kind in "iuf"]
+    return [
+        str(n)
+        for n in data.data_vars
+        if n != RESULT_VARIABLE and data[n].dims == data[RESULT_VARIABLE].dims and data[n].dtype.kind in "iuf"
+    ]
 
 
 def _dims(data: "xarray.Dataset") -> tuple[str, ...]:
-    return tuple(map(str, data[RESULT].dims))
+    return tuple(map(str, data[RESULT_VARIABLE].dims))
 
 
 def _picture(data: "xarray.Dataset", name: str) -> Figure:
@@ -59,7 +63,7 @@ def _picture(data: "xarray.Dataset", name: str) -> Figure:
     rows = -(-count // columns)
     figure = Figure(figsize=(1.2 + 3.4 * columns, 0.8 + 2.9 * rows), layout="constrained")
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)).ravel()
-    colours = _codes() if name == RESULT else _scale(data[name].values)
+    colours = _codes() if name == RESULT_VARIABLE else _scale(data[name].values)
     drawn = None
     for axes, (chosen, said) in zip(grid, panels, strict=False):
         drawn = _panel(axes, data.isel(chosen), name, across, colours)
@@ -82,12 +86,14 @@ def draw_panel(axes: Axes, data: "xarray.Dataset", name: str) -> ScalarMappable 
     """Draw `result` or another variable with one number a member; return what a colour bar needs, None of a line."""
     across, panels = _layout(data)
     if len(panels) > 1:
-        raise ValueError(f"a sweep over {', '.join(map(str, data[RESULT].dims))} needs several panels: choose values by data.sel")
-    return _panel(axes, data.isel(panels[0][0]), name, across, _codes() if name == RESULT else _scale(data[name].values))
+        raise ValueError(
+            f"a sweep over {', '.join(map(str, data[RESULT_VARIABLE].dims))} needs several panels: choose values by data.sel"
+        )
+    return _panel(axes, data.isel(panels[0][0]), name, across, _codes() if name == RESULT_VARIABLE else _scale(data[name].values))
 
 
 def _panel(axes: Axes, part: "xarray.Dataset", name: str, across: Sequence[str], colours: Colours) -> ScalarMappable | None:
-    if MEMBER in across:
+    if MEMBER_DIMENSION in across:
         return _points(axes, part, name, *colours)
     if len(across) == 1:
         return _line(axes, part, name, across[0])
@@ -98,7 +104,7 @@ def _layout(data: "xarray.Dataset") -> tuple[tuple[str, ...], list[tuple[dict[st
     """The dimensions that are drawn across, and for each panel which values of the others it has, and what is said of them."""
     dims = _dims(data)
     longest = sorted(dims, key=lambda d: (_numeric(data, d), data.sizes[d]), reverse=True)[:2]
-    across = (MEMBER,) if MEMBER in dims else tuple(d for d in dims if d in longest)
+    across = (MEMBER_DIMENSION,) if MEMBER_DIMENSION in dims else tuple(d for d in dims if d in longest)
     others = [d for d in dims if d not in across]
     indices = islice(product(*(range(data.sizes[d]) for d in others)), PANELS)
     return across, [
@@ -112,7 +118,7 @@ def _map(
     """A heatmap: the first dimension upwards, the second to the right."""
     up, right = across
     values = np.ma.masked_invalid(_drawable(part[name], name).transpose(up, right).values)
-    axes.set_facecolor(FAILED)
+    axes.set_facecolor(MISSING_COLOUR)
     drawn = axes.pcolormesh(_edges(part, right, axes.set_xscale), _edges(part, up, axes.set_yscale), values, cmap=cmap, norm=norm)
     for dim, ticks in ((right, axes.set_xticks), (up, axes.set_yticks)):
         if not _numeric(part, dim):
@@ -125,10 +131,10 @@ def _map(
 
 def _line(axes: Axes, part: "xarray.Dataset", name: str, dim: str) -> None:
     """A value over one axis; where a member failed, a cross at the lower edge."""
-    codes, values = part[RESULT].values, _drawable(part[name], name).values
+    codes, values = part[RESULT_VARIABLE].values, _drawable(part[name], name).values
     numeric = _numeric(part, dim)
     x = part[dim].values if numeric else np.arange(part.sizes[dim])
-    if name == RESULT:
+    if name == RESULT_VARIABLE:
         for code in np.unique(codes):
             axes.plot(x[codes == code], values[codes == code], "o", color=COLOURS[int(code) % len(COLOURS)])
         shown = sorted({int(v) for v in values})
@@ -148,30 +154,34 @@ def _line(axes: Axes, part: "xarray.Dataset", name: str, dim: str) -> None:
         axes.set_xscale("log")
     elif not numeric:
         axes.set_xticks(x, [str(v) for v in part[dim].values], rotation=30)
-    _label(axes, words(part, dim), "" if name == RESULT else words(part, name))
+    _label(axes, words(part, dim), "" if name == RESULT_VARIABLE else words(part, name))
 
 
 def _points(axes: Axes, part: "xarray.Dataset", name: str, cmap: Colormap | str, norm: Normalize) -> ScalarMappable:
     """Members of a design over its first two axes, or its only one."""
-    names = [str(c) for c in part.coords if part[c].dims == (MEMBER,) and part[c].dtype.kind in "iuf" and c != MEMBER][:2]
+    names = [
+        str(c)
+        for c in part.coords
+        if part[c].dims == (MEMBER_DIMENSION,) and part[c].dtype.kind in "iuf" and c != MEMBER_DIMENSION
+    ][:2]
     values = _drawable(part[name], name).values
     x = part[names[0]].values if names else np.arange(len(values))
     y = part[names[1]].values if len(names) > 1 else values
     missing = ~np.isfinite(values)
     if len(names) > 1:
-        axes.plot(x[missing], y[missing], "x", color=FAILED, ms=3)
+        axes.plot(x[missing], y[missing], "x", color=MISSING_COLOUR, ms=3)
     drawn = axes.scatter(x[~missing], y[~missing], c=values[~missing], s=9, cmap=cmap, norm=norm, lw=0)
     for values_, scale in ((x, axes.set_xscale), (y, axes.set_yscale)):
         if _decades(values_):
             scale("log")
-    _label(axes, words(part, names[0]) if names else MEMBER, words(part, names[1] if len(names) > 1 else name))
+    _label(axes, words(part, names[0]) if names else MEMBER_DIMENSION, words(part, names[1] if len(names) > 1 else name))
     return drawn
 
 
 def _key(figure: Figure, drawn: ScalarMappable, data: "xarray.Dataset", name: str) -> None:
-    """What the colours mean."""
+    """Draw the key to the colours."""
     bar = figure.colorbar(drawn, ax=figure.axes, aspect=30)
-    if name == RESULT:
+    if name == RESULT_VARIABLE:
         name_results(bar)
 
 
@@ -184,7 +194,7 @@ def name_results(bar: Colorbar) -> None:
 def _codes() -> Colours:
     """A colour for each result, and one for what is none."""
     count = len(Result) + 1
-    return ListedColormap(SHADES[:count]), BoundaryNorm(np.arange(count + 1) - 0.5, count)
+    return ListedColormap(RESULT_COLOURS[:count]), BoundaryNorm(np.arange(count + 1) - 0.5, count)
 
 
 def _scale(values: np.ndarray) -> Colours:
@@ -196,11 +206,11 @@ def _scale(values: np.ndarray) -> Colours:
 
 def _drawable(values: "xarray.DataArray", name: str) -> "xarray.DataArray":
     """Codes of no `Result` are drawn as one."""
-    return values.where(values.isin([int(r) for r in Result]), len(Result)) if name == RESULT else values
+    return values.where(values.isin([int(r) for r in Result]), len(Result)) if name == RESULT_VARIABLE else values
 
 
 def _edges(part: "xarray.Dataset", dim: str, scale: Callable[[str], object]) -> np.ndarray:
-    """Where the cells of a map begin and end: half way between the values, of labels between their places."""
+    """Return the edges of a map's cells: half way between the values, of labels between their places."""
     if not _numeric(part, dim):
         return np.arange(part.sizes[dim] + 1) - 0.5
     values = part[dim].values.astype(float)
@@ -220,11 +230,11 @@ def _between(values: np.ndarray) -> np.ndarray:
 def _decades(values: np.ndarray) -> bool:
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
-    return values.size > 0 and values.min() > 0 and values.max() >= DECADES * values.min()
+    return values.size > 0 and values.min() > 0 and values.max() >= LOGARITHMIC_RATIO * values.min()
 
 
 def _numeric(data: "xarray.Dataset", dim: str) -> bool:
-    """Whether a dimension has numbers on it that are apart, in order."""
+    """Return True if a dimension has distinct numbers on it, in order."""
     values = data[dim].values
     return values.dtype.kind in "iuf" and (len(values) < 2 or bool(np.all(np.diff(values) > 0) or np.all(np.diff(values) < 0)))
 
@@ -248,7 +258,7 @@ def _label(axes: Axes, right: str, up: str) -> None:
 
 
 def _result(code: int) -> str:
-    return Result(code).name.replace("_", " ") if code in list(Result) else OTHER
+    return Result(code).name.replace("_", " ") if code in list(Result) else OTHER_RESULT
 
 
 def save_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""What the command line says about a sweep, before it and after it."""
+"""Texts of the command line about a sweep, before it and after it."""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -7,7 +7,7 @@ import numpy as np
 
 from udkjax.integrate import Result
 from udkjax.show.summary import table
-from udkjax.show.sweep_figures import RESULT, scalars
+from udkjax.show.sweep_figures import RESULT_VARIABLE, scalars
 from udkjax.study.sweep.chunks import SweepCost
 from udkjax.study.sweep.dataset import bytes_per_member, variables_of
 from udkjax.study.sweep.plan import Plan
@@ -37,7 +37,7 @@ def estimate_summary(plan: Plan, cost: SweepCost) -> str:
 
 def sweep_results(data: "xarray.Dataset") -> dict[str, Any]:
     """Return how many members of a sweep ended in which way, and the range of each number that was kept."""
-    codes, counts = np.unique(data[RESULT].values, return_counts=True)
+    codes, counts = np.unique(data[RESULT_VARIABLE].values, return_counts=True)
     known = {int(result): result.name for result in Result}
     ranges = {}
     for name in scalars(data):
@@ -46,7 +46,7 @@ def sweep_results(data: "xarray.Dataset") -> dict[str, Any]:
             numbers = {"least": values.min(), "largest": values.max(), "median": np.median(values)}
             ranges[name] = {"units": data[name].attrs.get("units", ""), **numbers}
     ended = {known.get(int(code), "not_computed"): int(count) for code, count in zip(codes, counts, strict=True)}
-    return {"members": int(data[RESULT].size), "results": ended, "ranges": ranges}
+    return {"members": int(data[RESULT_VARIABLE].size), "results": ended, "ranges": ranges}
 
 
 def sweep_summary(data: "xarray.Dataset", seconds: float) -> str:

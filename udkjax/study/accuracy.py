@@ -1,4 +1,4 @@
-"""How far a run can be trusted: what its constraints, its energy and, where one is known, the exact solution say."""
+"""Accuracy of a run, by its constraints, its energy and, where one is known, the exact solution."""
 
 from typing import NamedTuple
 
@@ -13,11 +13,11 @@ from udkjax.integrate.events.conditions import frames_of
 from udkjax.scene import Mechanism
 from udkjax.study.exact import exact_coordinates
 
-SAMPLES = 5  # times at which it is asked whether drivers move and potentials change
+N_SAMPLES = 5  # times at which it is asked whether drivers move and potentials change
 
 
 class Accuracy(NamedTuple):
-    """What `accuracy` finds, each the largest over all output times that a run reached."""
+    """Errors of a run, each the largest over all output times that it reached."""
 
     violation: float  # of any constraint, m or rad
     energy_change: float  # of the total energy since the start, J
@@ -56,7 +56,7 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
 def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
     """Return whether nothing but errors changes the total energy: no driver moves, and all forces have potentials at rest."""
     frames = frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())
-    times = np.linspace(np.min(ts), np.max(ts), SAMPLES)
+    times = np.linspace(np.min(ts), np.max(ts), N_SAMPLES)
     for element in mechanism.forces.values():
         seen = [frames[name] for name in mechanism.frames_of(element)]
         if element.loads(times[0], *seen) is not None:

@@ -1,4 +1,4 @@
-"""What channels show of a motion, and the paths of points: positions, rates, accelerations, reactions, functions of one's own."""
+"""Values of channels along a motion, and paths of points: positions, rates, accelerations, reactions, functions of one's own."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

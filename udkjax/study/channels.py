@@ -37,7 +37,7 @@ _ACCELERATIONS = ("ax", "ay", "alpha")
 
 
 class Trajectory(Protocol):
-    """What is measured: a pytree with output times ts (T,) and states q and v (T, bodies, 3), such as a `Solution`."""
+    """A motion to measure: a pytree with output times ts (T,) and states q and v (T, bodies, 3), such as a `Solution`."""
 
     @property
     def ts(self) -> Array: ...

@@ -24,20 +24,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.printing import PrintsWords
-from udkjax.study.crossing import CLOSE, NEAR, UNRESOLVED, across
+from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, across
 from udkjax.study.curve import Curve, derivatives
 from udkjax.study.sequential import sequential
 
 FIRST, LONGEST, SHORTEST = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
-STRAIGHT = 0.95  # cosine of the angle by which the tangent may turn in a step: 18 degrees; branches that cross differ by more
-SLACK = 0.3  # of a step: how far its end may lie from the prediction
-SECANTS = 60  # until a root is rounding; ten are usual
-TRIALS = 2000  # steps besides those to the values asked for: some hundred turns
-SAME = 8.0  # units of rounding within which a value is that of a toggle
+LARGEST_BEND = 0.95  # cosine of the angle by which the tangent may turn in a step: 18 degrees; branches that cross differ by more
+PREDICTION_TOL = 0.3  # of a step: how far its end may lie from the prediction
+MAX_SECANTS = 60  # until a root is rounding; ten are usual
+MAX_TRIALS = 2000  # steps besides those to the values asked for: some hundred turns
+SAME_VALUE = 8.0  # units of rounding within which a value is that of a toggle
 
 
 class Reached(PrintsWords):
-    """What became of one value of a driver."""
+    """Outcome for one value of a driver."""
 
     closed = 0
     singular = 1  # closed; branches meet here, and velocities are those of the one that is followed, from both of its sides
@@ -110,7 +110,7 @@ def _follow(
         return _record(curve, state)
 
     def goes_on(state: _State) -> Bool[Array, ""]:
-        return (is_unfinished(state) | (state.event == _LANDS)) & (state.trials < TRIALS + 4 * len(values))
+        return (is_unfinished(state) | (state.event == _LANDS)) & (state.trials < MAX_TRIALS + 4 * len(values))
 
     state = jax.lax.while_loop(goes_on, body, state)
     event = jnp.where(is_unfinished(state), Reached.lost, state.event)
@@ -132,15 +132,16 @@ def _step(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
     ahead = ahead.at[-1].set(jnp.where(lands, target, ahead[-1]))
     at, closed = curve.correct(ahead, fixed=lands)
     turned = curve.tangent(at, tau)
-    near = jnp.linalg.norm(at - ahead) <= SLACK * eta + 64 * jnp.finfo(X.dtype).eps * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
-    good = near & (turned @ tau >= STRAIGHT) & closed
-    good = good & ~(lands & (eta > CLOSE) & (curve.clearance(at) < NEAR))  # the tangent that leads across has to be a close one
+    rounding = 64 * jnp.finfo(X.dtype).eps * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
+    near = jnp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding
+    good = near & (turned @ tau >= LARGEST_BEND) & closed
+    good = good & ~(lands & (eta > CLOSE_DISTANCE) & (curve.clearance(at) < NEAR_LOSS))  # only a close tangent leads across
     folds = good & (turned[-1] * tau[-1] < 0) & (eta > 0)
     passed = good & ~lands & ~folds & ((target - at[-1]) * way < 0)  # too far: the next one is shorter
     counts = good & ~folds & ~passed
     lands = lands & counts
     shorter = jnp.where(passed, 0.5 * eta, jnp.where(good, h, 0.5 * eta))
-    longer = jnp.where(turned @ tau > 1 - 0.25 * (1 - STRAIGHT), jnp.minimum(1.5 * h, LONGEST), h)
+    longer = jnp.where(turned @ tau > 1 - 0.25 * (1 - LARGEST_BEND), jnp.minimum(1.5 * h, LONGEST), h)
     lost = ~good & (0.5 * eta < SHORTEST)
     return _State(
         X=jnp.where(counts, at, X),
@@ -151,7 +152,7 @@ def _step(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
         event=jnp.where(
             folds,
             _FOLD,
-            jnp.where(lands, _LANDS, jnp.where(lost | (trials > TRIALS + 4 * len(targets)), Reached.lost, event)),
+            jnp.where(lands, _LANDS, jnp.where(lost | (trials > MAX_TRIALS + 4 * len(targets)), Reached.lost, event)),
         ),
         points=points,
     )
@@ -172,9 +173,9 @@ def _record(curve: Curve, state: _State) -> _State:
         other = at, slope, dq, ddq, here[4]
         return (*(jnp.where(is_known, x, y) for x, y in zip(other, here, strict=True)), is_known)
 
-    X, tau, dq, ddq, rank, is_known = jax.lax.cond(lands & (clearance < NEAR), beside, lambda: (*here, jnp.asarray(False)))
+    X, tau, dq, ddq, rank, is_known = jax.lax.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (*here, jnp.asarray(False)))
     deficient = rank < len(X) - 1
-    doubtful = ~is_known & (deficient | (clearance < UNRESOLVED))
+    doubtful = ~is_known & (deficient | (clearance < LOST_RANK))
     status = jnp.where(doubtful, Reached.not_determined, jnp.where(deficient, Reached.singular, Reached.closed))
     dq, ddq = (jnp.where(doubtful, jnp.nan, x) for x in (dq, ddq))
     new = X[:-1] * curve.units[:-1], dq, ddq, status
@@ -204,7 +205,7 @@ def _find_fold(curve: Curve, targets: Float[Array, "T"], state: _State) -> _Stat
         return sigma, (sigma, *point_at(sigma))
 
     _, (sigma, (fold, landed), (_, turned)) = jax.lax.scan(find, h, jnp.array([False, True]))
-    room = SAME * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.abs(fold[-1]))
+    room = SAME_VALUE * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.abs(fold[-1]))
     before = (target - fold[-1]) * way <= room
     x = fold * curve.units
     landed = jnp.where(jnp.abs(target - fold[-1]) <= room, fold, landed)  # which is known to rounding, and not to its root
@@ -240,7 +241,7 @@ def _root(f: Callable[[Array], Array], end: Float[Array, ""]) -> Float[Array, ""
     # One evaluation for both ends: what is traced once compiles in half the time.
     at_start, at_end = jax.lax.map(f, jnp.stack([jnp.zeros_like(end), end]))
     state = jnp.zeros_like(end), at_start, end, at_end, jnp.asarray(0), at_end >= 0
-    return jax.lax.while_loop(lambda s: (s[4] < SECANTS) & ~s[5], halve, state)[2]
+    return jax.lax.while_loop(lambda s: (s[4] < MAX_SECANTS) & ~s[5], halve, state)[2]
 
 
 def no_points(count: int, n: int) -> Points:

@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.study.curve import Curve, derivatives, plus
 
-NEAR = 1e-2  # of the largest singular value of E: nearer to a loss of rank, q'' has lost more than its sixth digit
-UNRESOLVED = 1e-5  # of it: q'' has no digit left
-CLOSE = 0.02  # scaled: how far the point before may lie, whose tangent leads across; it turns by a degree or so
+NEAR_LOSS = 1e-2  # of the largest singular value of E: nearer to a loss of rank, q'' has lost more than its sixth digit
+LOST_RANK = 1e-5  # of it: q'' has no digit left
+CLOSE_DISTANCE = 0.02  # scaled: how far the point before may lie, whose tangent leads across; it turns by a degree or so
 SPACINGS = (0.04, 0.015, 0.005)  # h, scaled values
 FIRST, LAST = 2, 7  # steps from the point to the nearest and to the farthest of the others
 # How far the polynomials through twelve and through ten values may differ in q, q' and q'', scaled: a hundred times their error.
@@ -88,7 +88,7 @@ def _interpolated(curve: Curve, X: Array, tau: Array, h: Array) -> tuple[Array, 
     doubts = [jnp.max(jnp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED, strict=True)]
     at = jnp.append(q, X[-1])
     E = curve.slopes(at).at[:, -1].set(0.0)
-    at = at - plus(E, NEAR) @ curve.residual(at)  # what E sees well is closed to rounding
+    at = at - plus(E, NEAR_LOSS) @ curve.residual(at)  # what E sees well is closed to rounding
     known = jnp.all(closed) & jnp.all(good) & curve.is_closed(at) & (tau[-1] != 0)
     doubt = jnp.where(known, jnp.max(jnp.stack(doubts)), jnp.inf)
     doubt = jnp.where(jnp.isfinite(doubt), doubt, jnp.inf)

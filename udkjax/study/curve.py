@@ -12,7 +12,7 @@ from udkjax.pinv import SVD, Plus
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.drive import Driven
 
-NEWTON = 8  # corrections; three are usual
+NEWTON_STEPS = 8  # corrections; three are usual
 _Correction = tuple[Array, Array, Array]  # X, corrections so far, whether it is closed
 
 
@@ -38,7 +38,7 @@ class Curve(eqx.Module):
         return jax.jacfwd(self.residual)(X)
 
     def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
-        """Whether the residual is what rounding leaves of it."""
+        """Return True if the residual is what rounding leaves of it."""
         size = jnp.max(jnp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
         return size <= ROUNDING_UNITS * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
 
@@ -55,7 +55,7 @@ class Curve(eqx.Module):
 
         def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last correction is that of a closed point, to rounding
             _, k, closed = state
-            return (k < NEWTON) & ~closed
+            return (k < NEWTON_STEPS) & ~closed
 
         X, _, closed = jax.lax.while_loop(is_unfinished, body, (X, jnp.asarray(0), jnp.asarray(False)))
         return X, closed

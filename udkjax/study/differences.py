@@ -10,7 +10,7 @@ STEP_RATIO = 4.0  # from one step of differences to the next
 DIFFERENCE_STEPS = 0.1 * STEP_RATIO ** -np.arange(10.0)  # of dimensionless unknowns: 0.1 to 4e-7
 RICHARDSON = STEP_RATIO**2
 NEXT_STEPS = 2  # smaller steps whose truncation does not count beside that of one; two, since one may be near by chance
-MOTION = 1e-2  # of what is seen: the least change that is more than that of a small step
+LEAST_CHANGE = 1e-2  # of what is seen: the least change that is more than that of a small step
 TOO_LARGE = 0.5  # of a difference: where smaller steps say otherwise by more, a step is too large
 
 
@@ -82,7 +82,7 @@ def _truncation(R: np.ndarray, noise: np.ndarray, series: Sequence[np.ndarray]) 
 def leave_out_far_steps(found: Differences, size: Float[np.ndarray, "S"], series: Sequence[np.ndarray]) -> Differences:
     """Leave out the differences whose steps lead to quite another motion; `size` is that of the derivative in each series."""
     h = found.steps[:, None]
-    far = (h * size > found.largest) & (h * sizes(found.values, series) > MOTION * found.largest)
+    far = (h * size > found.largest) & (h * sizes(found.values, series) > LEAST_CHANGE * found.largest)
     return found._replace(truncation=np.where(far, np.nan, found.truncation))
 
 

@@ -1,4 +1,4 @@
-"""What drives a mechanism through its positions: one coordinate, whose value takes the place of time.
+"""Coordinate that drives a mechanism through its positions: its value takes the place of time.
 
 A mechanism whose driver prescribes `coordinate = t` has the coordinate's value s for its time: Psi(s, q) = 0 are its positions,
 Psi_dot = 0 gives dq/ds, and Psi_q a = gamma gives d2q/ds2, by the equations that serve every other mechanism.
@@ -29,7 +29,7 @@ from udkjax.study.holding import require_free
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)
-STILL = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # the ground
+FRAME_AT_REST = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # the ground
 
 
 class Coordinate(PrintsLine):
@@ -51,7 +51,7 @@ class Coordinate(PrintsLine):
 Drive = str | Coordinate | None  # a driver's name, the name of a coordinate, a coordinate; or all drivers along time
 
 
-class Value(Motion):
+class ValueMotion(Motion):
     """The value of a coordinate, in place of time, from an `origin` on (rad, m)."""
 
     origin: Float[Array, ""] = eqx.field(converter=number_called("origin"), default=0.0)
@@ -71,7 +71,7 @@ class Driven(NamedTuple):
 
     @property
     def is_angle(self) -> bool:
-        """Whether s is an angle."""
+        """True if s is an angle."""
         return bool(self.name) and self.mechanism.drivers[self.name].coordinate == "angle"
 
     @property
@@ -128,7 +128,7 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Ar
     places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
 
     def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
-        return coordinate_value(element, *(STILL if k is None else _frame(q[k]) for k in places))
+        return coordinate_value(element, *(FRAME_AT_REST if k is None else _frame(q[k]) for k in places))
 
     return value
 
@@ -200,7 +200,7 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Scalar)
     with jax.ensure_compile_time_eval():
         origin = known and Origin(_add_driver(known, name, _known_element(known, name, element), _value_or(t, 0.0)))
     held = {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
-    held[name] = Driver(element.bodies, element.coordinate, Value(), element.points)
+    held[name] = Driver(element.bodies, element.coordinate, ValueMotion(), element.points)
     return with_drivers(mechanism, held, origin=origin)
 
 

@@ -29,11 +29,11 @@ from udkjax.study.linearization import Linearization, linearize
 from udkjax.study.positions import distinct, random_positions
 from udkjax.study.sequential import sequential
 
-STEPS = 100
-BALANCED = 1e-9  # of the scale of forces: what may be left of the loads along free directions; rounding leaves 1e-15
-SETTLED = 32 * float(np.finfo(float).eps)  # of it: what is left is rounding, which no step makes less
-NEUTRAL = 1e-10  # of the largest stiffness: one below it resists nothing
-ROUNDING = 1e-12  # of the scale of stiffnesses: one below it is rounding; rounding leaves 1e-15
+MAX_STEPS = 100
+FORCE_TOL = 1e-9  # of the scale of forces: what may be left of the loads along free directions; rounding leaves 1e-15
+FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # of it: what is left is rounding, which no step makes less
+NEUTRAL_STIFFNESS = 1e-10  # of the largest stiffness: one below it resists nothing
+SMALLEST_STIFFNESS = 1e-12  # of the scale of stiffnesses: one below it is rounding; rounding leaves 1e-15
 
 Trial: TypeAlias = tuple[Array, Array, Array, Array]  # the part of a step, how many were tried, whether it is better, q
 
@@ -78,18 +78,18 @@ class Equilibrium(PrintsTable):
 
     @property
     def stable(self) -> Bool[Array, ""]:
-        """Whether the potential energy has a minimum there, as all stiffnesses are positive."""
+        """True if the potential energy has a minimum there, as all stiffnesses are positive."""
         return self.balanced & jnp.all(self.omega2 > self.neutral[..., None], axis=-1)
 
     @property
     def indifferent(self) -> Bool[Array, ""]:
-        """Whether nothing moves it away, though not all stiffnesses are positive: some vanish."""
+        """True if nothing moves it away, though not all stiffnesses are positive: some vanish."""
         least = jnp.min(self.omega2, axis=-1, initial=jnp.inf)
         return self.balanced & (jnp.abs(least) <= self.neutral)
 
     @property
     def kind(self) -> str:
-        """Of one position: "stable", "indifferent" or "unstable", or that it is none of rest."""
+        """Kind of one position: "stable", "indifferent" or "unstable", or that it is none of rest."""
         if not self.balanced:
             return "not at rest: loads are left over"
         return "stable" if self.stable else "indifferent" if self.indifferent else "unstable"
@@ -183,8 +183,8 @@ def _equilibrium(
     at, scale = linearize(curve.mechanism, analysis, free, t, q), load_scale(curve.mechanism, analysis.scales, t, q)
     left = jnp.linalg.norm(at.force) / jnp.where(scale.force > 0, scale.force, 1.0)
     closed = curve.is_closed(jnp.append(q, t) / curve.units)
-    balanced, bodies = closed & (left <= BALANCED), curve.mechanism.body_names
-    return Equilibrium(q.reshape(-1, 3), at.multipliers, omega2(at), left, balanced, ROUNDING * scale.stiffness, bodies)
+    balanced, bodies = closed & (left <= FORCE_TOL), curve.mechanism.body_names
+    return Equilibrium(q.reshape(-1, 3), at.multipliers, omega2(at), left, balanced, SMALLEST_STIFFNESS * scale.stiffness, bodies)
 
 
 def _settle(
@@ -220,21 +220,21 @@ def _settle(
             return (state[1] < STEP_HALVINGS) & ~state[2]
 
         _, _, better, new = jax.lax.while_loop(worse, trial, (jnp.ones(()), jnp.asarray(0), jnp.asarray(False), q))
-        better &= size > SETTLED * scale.force
+        better &= size > FORCE_ROUNDING * scale.force
         return jnp.where(better, new, q), k + 1, better
 
-    return jax.lax.while_loop(lambda s: (s[1] < STEPS) & s[2], body, (q, jnp.asarray(0), jnp.asarray(True)))[0]
+    return jax.lax.while_loop(lambda s: (s[1] < MAX_STEPS) & s[2], body, (q, jnp.asarray(0), jnp.asarray(True)))[0]
 
 
 def _towards_rest(here: Linearization, scale: LoadScale, stable: bool) -> Float[Array, "f"]:
     """Return the step eta of the linearization; only downhill, where the equilibrium is to be stable."""
-    rounding = ROUNDING * scale.stiffness
+    rounding = SMALLEST_STIFFNESS * scale.stiffness
     if not stable:
         resists = jnp.max(jnp.abs(here.stiffness)) > rounding
-        return SVD(NEUTRAL).plus(jnp.where(resists, here.stiffness, 0.0)) @ here.force
+        return SVD(NEUTRAL_STIFFNESS).plus(jnp.where(resists, here.stiffness, 0.0)) @ here.force
     values, vectors = jnp.linalg.eigh(0.5 * (here.stiffness + here.stiffness.T))
     values = jnp.abs(values)
-    values = jnp.maximum(values, jnp.maximum(NEUTRAL * jnp.max(values), rounding))
+    values = jnp.maximum(values, jnp.maximum(NEUTRAL_STIFFNESS * jnp.max(values), rounding))
     return vectors @ (vectors.T @ here.force / jnp.where(values > 0, values, 1.0))
 
 

@@ -21,7 +21,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.explanation import Explanation, Gauss
 
-RIVALS = 200  # feasible accelerations that a is compared with
+N_RIVALS = 200  # feasible accelerations that a is compared with
 
 
 @checked
@@ -115,7 +115,7 @@ def _gauss(s: dict[str, np.ndarray], rank: int) -> Gauss:
     size = float(np.linalg.norm(deviation))
     slope = float(np.abs(free.T @ deviation).max(initial=0.0)) / (size if size > 0 else 1.0)
     spread = max(size, float(np.linalg.norm(root * s["a_F"])), np.finfo(float).tiny) / 10
-    steps = np.random.default_rng(0).standard_normal((RIVALS if free.shape[1] else 0, free.shape[1])) * spread
+    steps = np.random.default_rng(0).standard_normal((N_RIVALS if free.shape[1] else 0, free.shape[1])) * spread
     rivals = 0.5 * np.sum((deviation + steps @ free.T) ** 2, axis=1)
     return Gauss(0.5 * size**2, free.shape[1], slope, float(rivals.min(initial=np.inf)), len(rivals))
 

@@ -12,8 +12,8 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.row_labels import row_label
 from udkjax.study.wording import plural
 
-WIDE = 18  # columns of a matrix that fit beside each other
-TINY = 1e-12  # relative to the largest of an array: printed as 0
+MOST_MATRIX_COLUMNS = 18  # columns of a matrix that fit beside each other
+SMALLEST_PRINTED = 1e-12  # relative to the largest of an array: printed as 0
 SYMBOLS = ("psi", "psi_dot", "psi_q", "gamma", "mass", "force", "weights", "D", "singular_values", "D_plus", "a_F", "b", "a")
 
 
@@ -153,7 +153,8 @@ def _state(e: Explanation, columns: list[str]) -> str:
 
 def _constraints(e: Explanation, rows: list[str], columns: list[str]) -> str:
     pattern = [
-        f"  {name:<{_width(rows)}}  " + " ".join("x" if abs(entry) > TINY * np.abs(e.psi_q).max() else "." for entry in row)
+        f"  {name:<{_width(rows)}}  "
+        + " ".join("x" if abs(entry) > SMALLEST_PRINTED * np.abs(e.psi_q).max() else "." for entry in row)
         for name, row in zip(rows, e.psi_q, strict=True)
     ]
     values = np.stack([e.psi, e.psi_dot, e.gamma], axis=1)
@@ -286,8 +287,8 @@ def _width(names: list[str]) -> int:
 def _table(rows: list[str], columns: list[str], values: np.ndarray) -> str:
     """Lay out a matrix with its names; wide ones in pieces below each other."""
     width, pieces = _width(rows), []
-    for start in range(0, len(columns), WIDE):
-        part = slice(start, start + WIDE)
+    for start in range(0, len(columns), MOST_MATRIX_COLUMNS):
+        part = slice(start, start + MOST_MATRIX_COLUMNS)
         sizes = np.abs(values).max(axis=0 if values.shape[1] <= 3 else None, initial=0.0)
         cells = [
             [_number(x, size) for x, size in zip(row[part], np.broadcast_to(sizes, row.shape)[part], strict=True)]
@@ -305,4 +306,4 @@ def _table(rows: list[str], columns: list[str], values: np.ndarray) -> str:
 
 def _number(x: float, size: float) -> str:
     """Write a number with four digits; as zero where it is rounding beside the largest."""
-    return "0" if abs(x) <= TINY * size else f"{x:.4g}"
+    return "0" if abs(x) <= SMALLEST_PRINTED * size else f"{x:.4g}"

@@ -1,4 +1,4 @@
-"""Whether a coordinate can be driven, or what holds it."""
+"""Finding out whether a coordinate can be driven, or what holds it."""
 
 from collections.abc import Mapping
 

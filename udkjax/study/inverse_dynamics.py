@@ -42,7 +42,7 @@ from udkjax.study.kinematics import Kinematics, kinematics
 
 
 class InverseDynamics(PrintsTable):
-    """What each driver exerts along its coordinate on a prescribed motion; not a number where that is not determined.
+    """Efforts of drivers along their coordinates on a prescribed motion; not a number where they are not determined.
 
     It is not where the motion does not get, nor in a position where its velocities do not follow, nor where branches meet and
     there is more than one degree of freedom.

@@ -27,8 +27,8 @@ from udkjax.study.continuation import Points, Reached, follow, no_points
 from udkjax.study.curve import Curve, derivatives, plus
 from udkjax.study.drive import Drive, Driven, drive
 
-FAR = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
-TURN = 2.0 * np.pi  # rad
+UNLIMITED_TRAVEL = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
+FULL_TURN = 2.0 * np.pi  # rad
 
 Rows: TypeAlias = Float[Array, "T n"]
 
@@ -80,7 +80,7 @@ class Kinematics(PrintsTable):
 
     @property
     def reached(self) -> Bool[Array, "T"]:
-        """Which values were reached."""
+        """True for each value that was reached."""
         return Reached.has_position(self.status)
 
     @property
@@ -201,7 +201,7 @@ def travel(mechanism: Mechanism, driver: Drive, state: State | None = None, held
     if driver is None:
         raise SceneError(["driver is None: travel is that of a coordinate; name it, or one of the drivers"], mechanism.name)
     driven, q = _start(mechanism, driver, 0.0, state, held)
-    return _travel(driven, q, TURN if driven.is_angle else FAR * driven.unit)
+    return _travel(driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
 
 
 def _at_once(

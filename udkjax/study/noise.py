@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import ndtri
 
-from udkjax.study.whiteness import IMPROBABLE
+from udkjax.study.whiteness import SIGNIFICANCE
 
-GAUSSIAN = 1.4826  # standard deviation over median of absolute values, of Gaussian noise
+GAUSSIAN_RATIO = 1.4826  # standard deviation over median of absolute values, of Gaussian noise
 MOST_TOGETHER = 5  # wrong numbers one after another: more are no slips of a sensor
 
 
@@ -29,7 +29,7 @@ def noise_of_differences(times: Float[np.ndarray, "N"], values: Float[np.ndarray
 
 def robust_deviation(values: Float[np.ndarray, "N"]) -> float:
     """Return the standard deviation of Gaussian noise whose absolute values have the median of these: outliers do not move it."""
-    return float(GAUSSIAN * np.median(np.abs(values)))
+    return float(GAUSSIAN_RATIO * np.median(np.abs(values)))
 
 
 def outlier_rows(values: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
@@ -37,7 +37,7 @@ def outlier_rows(values: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
 
     More than `MOST_TOGETHER` in a row are none: there the signal is another one.
     """
-    limit = ndtri(1.0 - 0.5 * IMPROBABLE / max(len(values), 1)) * robust_deviation(values) if len(values) else np.inf
+    limit = ndtri(1.0 - 0.5 * SIGNIFICANCE / max(len(values), 1)) * robust_deviation(values) if len(values) else np.inf
     found = np.abs(values) > limit if limit > 0.0 else np.zeros(len(values), bool)
     ends = np.flatnonzero(np.diff(np.concatenate([[False], found, [False]])))
     for first, end in ends.reshape(-1, 2).tolist():

@@ -9,7 +9,7 @@ from udkjax.equations.scales import Scales
 from udkjax.integrate.assembly import State
 from udkjax.scene.mechanism import Mechanism
 
-SAME = 1e-5  # of the characteristic length, or rad: positions nearer to each other are one
+SAME_POSITION = 1e-5  # of the characteristic length, or rad: positions nearer to each other are one
 
 
 def random_positions(mechanism: Mechanism, count: int, seed: int, state: State | None = None) -> Float[Array, "count bodies 3"]:
@@ -31,6 +31,6 @@ def distinct(q: Float[Array, "count bodies 3"], counts: Bool[Array, "count"], sc
         d = points[k] - points[different]
         d[..., 2] = 2 * np.abs(np.sin(d[..., 2] / 2))
         d[..., :2] /= length
-        if not different or np.min(np.max(np.abs(d), axis=(1, 2))) > SAME:
+        if not different or np.min(np.max(np.abs(d), axis=(1, 2))) > SAME_POSITION:
             different.append(int(k))
     return different

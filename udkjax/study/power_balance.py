@@ -1,4 +1,4 @@
-"""Where the power of a motion comes from and where it goes: the check of accelerations, multipliers and velocities together.
+"""Balance of power along a motion: a check of accelerations, multipliers and velocities together.
 
 With M a + Psi_q^T lambda = F and Psi_q v = -Psi_t the energies T and V change by
 

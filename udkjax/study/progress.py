@@ -1,4 +1,4 @@
-"""How far a long computation is, reported the same way by every function that has a `progress` argument."""
+"""Progress of a long computation, reported the same way by every function that has a `progress` argument."""
 
 import sys
 import threading
@@ -18,7 +18,7 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a computation is: what a callable given as `progress=` receives, once at least for everything that is done.
+    """Progress of a computation, as a callable given as `progress=` receives it, once at least for everything that is done.
 
     Attributes:
         what: what is being computed, such as "identify".
@@ -49,7 +49,7 @@ ProgressOption = TypeAliasType("ProgressOption", Callable[[Progress], object] | 
 
 
 class Report:
-    """What a computation calls: `report(done, message)`; with None for `done`, as much is done as before."""
+    """Function that a computation calls: `report(done, message)`; with None for `done`, as much is done as before."""
 
     def __init__(self, show: Callable[[Progress], object], what: str, total: float | None):
         self.show, self.begun = show, time.monotonic()

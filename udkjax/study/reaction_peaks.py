@@ -28,7 +28,7 @@ UNITS = units(force="N", rms_force="N", torque="N m", rms_torque="N m", force_ti
 
 @prints_table
 class Peak(NamedTuple):
-    """Of one joint and body over a run: the largest force and torque, when they occur, and the roots of mean squares."""
+    """Largest force and torque of one joint on one body over a run, their times, and the roots of mean squares."""
 
     force: Float[Array, ""]  # N, of |(fx, fy)|
     force_time: Float[Array, ""]  # s
@@ -42,7 +42,7 @@ class Peak(NamedTuple):
 
 @prints_table
 class Envelope(NamedTuple):
-    """Of one joint and body over load cases: the largest peaks, and in which case they occur."""
+    """Largest peaks of one joint on one body over load cases, and the case in which each occurs."""
 
     force: Float[Array, ""]  # N
     force_case: Int[Array, ""]

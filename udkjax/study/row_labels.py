@@ -1,4 +1,4 @@
-"""What rows of constraints, coordinates and directions are called in texts."""
+"""Names of rows of constraints, coordinates and directions in texts."""
 
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
 
-COEFFICIENT = 1e-5  # of the largest coefficient: zero, in directions found from differences that are good to 1e-8
+SMALLEST_COEFFICIENT = 1e-5  # of the largest coefficient: zero, in directions found from differences that are good to 1e-8
 
 
 def null_space(matrix: Float[np.ndarray, "R K"], tol: float) -> Float[np.ndarray, "D K"]:
@@ -19,7 +19,7 @@ def row_space(matrix: Float[np.ndarray, "R K"], tol: float) -> Float[np.ndarray,
     return echelon(vt[: int(np.sum(sigma > tol))])
 
 
-def echelon(rows: Float[np.ndarray, "R K"], tol: float = COEFFICIENT) -> Float[np.ndarray, "D K"]:
+def echelon(rows: Float[np.ndarray, "R K"], tol: float = SMALLEST_COEFFICIENT) -> Float[np.ndarray, "D K"]:
     """Return independent rows in reduced echelon form; what is below `tol`, relative to a row's largest entry, is made zero."""
     rows, done = np.array(rows, float), 0
     for column in range(rows.shape[1]):

@@ -1,4 +1,4 @@
-"""How well a linkage passes on motion and force: transmission angle, mechanical advantage; and where its points can get."""
+"""Transmission of motion and force through a linkage: transmission angle, mechanical advantage; and reachable points."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from udkjax.study.kinematics import Kinematics, kinematics
 
 @prints_table
 class Workspace(NamedTuple):
-    """Where a point gets, (S, T, 2) in m, over the values of a first driver (S,) and a second one (T,).
+    """Places of a point, (S, T, 2) in m, over the values of a first driver (S,) and a second one (T,).
 
     Attributes:
         points: where the point gets (m).

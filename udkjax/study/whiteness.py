@@ -1,4 +1,4 @@
-"""Whether residuals are white noise: a test for correlation in time that allows for gaps, and for what a fit has removed."""
+"""Test of residuals for white noise: for correlation in time, with gaps, and with what a fit has removed."""
 
 from typing import NamedTuple
 
@@ -6,14 +6,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtrc
 
-IMPROBABLE = 1e-3  # probability of what was seen if noise is white: below it, it is said not to be so
-LAGS = 5  # at most; a model that lacks something leaves long waves, which show at the first of them
+SIGNIFICANCE = 1e-3  # probability of what was seen if noise is white: below it, it is said not to be so
+MAX_LAGS = 5  # at most; a model that lacks something leaves long waves, which show at the first of them
 PAIRS_PER_LAG = 4  # at least: with fewer there is nothing to be said
 NO_GAP = 1.5  # times the usual distance in time of k samples: pairs farther apart have a gap between them
 
 
 class Whiteness(NamedTuple):
-    """Whether the residuals of a channel are white noise."""
+    """Test of a channel's residuals for white noise."""
 
     lag1: float  # correlation of neighbours
     statistic: float  # Q
@@ -23,8 +23,8 @@ class Whiteness(NamedTuple):
 
     @property
     def white(self) -> bool:
-        """Whether nothing speaks against white noise."""
-        return not self.p < IMPROBABLE
+        """True if nothing speaks against white noise."""
+        return not self.p < SIGNIFICANCE
 
     def text(self, channel: str) -> str:
         """Return a sentence about the residuals; nothing where they are white."""
@@ -65,9 +65,9 @@ def whiteness_of(
         return Whiteness(np.nan, np.nan, 0, np.nan, len(e))
     variance, usual = square / left, float(np.median(np.diff(t)))
     z, lag1 = [], np.nan
-    for k in range(1, LAGS + 1):
+    for k in range(1, MAX_LAGS + 1):
         pairs = np.flatnonzero(t[k:] - t[:-k] <= NO_GAP * k * usual)
-        if len(pairs) < PAIRS_PER_LAG * LAGS:
+        if len(pairs) < PAIRS_PER_LAG * MAX_LAGS:
             break
         products = e[pairs] * e[pairs + k]
         expected = -variance * np.sum(U[pairs] * U[pairs + k])

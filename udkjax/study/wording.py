@@ -1,4 +1,4 @@
-"""How counts, lists and tables are worded in texts for people."""
+"""Wording of counts, lists and tables in texts for people."""
 
 import math
 from collections.abc import Sequence

@@ -37,7 +37,7 @@ BY_HAND = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement
 
 
 class DrawingElements(NamedTuple):
-    """What was read of a drawing, and what is wrong with it."""
+    """Elements that were read of a drawing, and its mistakes."""
 
     groups: dict[str, dict[str, Any]]
     gravity: Any

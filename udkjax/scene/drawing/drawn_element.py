@@ -20,7 +20,7 @@ from udkjax.scene.joints import Joint
 
 
 class Parts(NamedTuple):
-    """What an element of a drawing becomes in the mechanism, under its own name."""
+    """Parts of the mechanism that an element of a drawing becomes, under its own name."""
 
     joint: Joint | None = None
     driver: Driver | None = None

@@ -1,4 +1,4 @@
-"""What moves the links of a drawing, and pulls at them: motors, springs, dampers, loads."""
+"""Elements of a drawing that move its links or pull at them: motors, springs, dampers, loads."""
 
 from collections.abc import Iterator
 from dataclasses import replace

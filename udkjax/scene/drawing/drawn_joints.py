@@ -1,4 +1,4 @@
-"""What joins the links of a drawing besides its pins: slides, slots, gears, cams."""
+"""Joints of a drawing besides its pins: slides, slots, gears, cams."""
 
 import equinox as eqx
 from jaxtyping import Array, Float

@@ -55,7 +55,7 @@ class Link(PrintsLine):
 
     @property
     def kind(self) -> str:
-        """What it is drawn as: an outline, a disc, a bar, or a plate."""
+        """Shape it is drawn as: an outline, a disc, a bar, or a plate."""
         if self.outline is not None:
             return "outline"
         if len(self.pins) == 1:

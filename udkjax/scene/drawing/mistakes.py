@@ -1,4 +1,4 @@
-"""What is wrong with a drawing as a whole: names that are taken, pins and links that hang on nothing, shapes that are none."""
+"""Mistakes of a drawing as a whole: names that are taken, pins and links that hang on nothing, shapes that are none."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, pairwise
@@ -20,7 +20,7 @@ Groups = Mapping[str, Mapping[str, Any]]
 SAME_PLACE = 1e-9
 # Of the distances among the other pins: farther away, a pin is in another unit. Usual units of length differ by ten (cm and mm),
 # which no drawing shows, or by 25 (mm and inches) to 1,000; pins of a mechanism by less.
-FAR = 100.0
+FAR_POINT_RATIO = 100.0
 # Of the largest distance between two pins: a gap that assembly closes as drawing to scale would leave it.
 DRAWN_GAP = 0.01
 
@@ -141,7 +141,7 @@ def _far_pins(places: Mapping[str, Points]) -> Iterator[str]:
     for name, place in places.items():
         rest = [other for key, other in places.items() if key != name]
         away, size = min(np.linalg.norm(place - other) for other in rest), extent(rest)
-        if away > FAR * size > 0:
+        if away > FAR_POINT_RATIO * size > 0:
             yield (
                 f"pins.{name}: is {away:.3g} m away from the other pins, which are within {size:.3g} m of each other: "
                 "is its unit the one that is meant?"

@@ -1,4 +1,4 @@
-"""Which links meet at which pins, and where they are: what elements of a drawing are attached to."""
+"""Pins of a drawing, their places, and the links that meet at them: other elements are attached to these."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -21,7 +21,7 @@ class SlidingLink(Protocol):
 
 
 class PinLayout:
-    """Which links meet at which pins: names alone."""
+    """Names of the links that meet at each pin."""
 
     def __init__(self, links: Mapping[str, Link], ground: Sequence[str], slides: Mapping[str, SlidingLink]):
         self.links, self.ground, self.slides = links, ground, slides

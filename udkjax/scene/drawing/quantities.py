@@ -15,7 +15,7 @@ from udkjax.scene.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.scene.units import FOLLOWS, conversion_factor, field_unit, read_quantity
 
 # Quantities that a file may choose a unit of, and their SI units, which are the choice where it says nothing.
-KINDS = {
+QUANTITY_KINDS = {
     "length": "m",
     "angle": "rad",
     "mass": "kg",
@@ -32,7 +32,7 @@ KINDS = {
     "torsional_stiffness": "N m/rad",
     "torsional_damping": "N m s/rad",
 }
-_KIND_OF = {unit: kind for kind, unit in KINDS.items()}
+_KIND_OF = {unit: kind for kind, unit in QUANTITY_KINDS.items()}
 VECTORS = ("axis", "direction")  # angles that may be given as vectors
 
 
@@ -50,14 +50,16 @@ class Units:
             self.problems.append(f'units: must be a table such as {{length = "mm"}}, is {abbreviate(chosen)}')
             return
         for kind, unit in (chosen or {}).items():
-            if kind not in KINDS:
-                known = suggestion(kind, KINDS) or "; there are " + ", ".join(KINDS)
+            if kind not in QUANTITY_KINDS:
+                known = suggestion(kind, QUANTITY_KINDS) or "; there are " + ", ".join(QUANTITY_KINDS)
                 self.problems.append(f"units.{kind}: unknown quantity{known}")
             elif not isinstance(unit, str):
-                self.problems.append(f"units.{kind}: must be a unit, such as {quote(KINDS[kind])}, is {abbreviate(unit)}")
+                self.problems.append(
+                    f"units.{kind}: must be a unit, such as {quote(QUANTITY_KINDS[kind])}, is {abbreviate(unit)}"
+                )
             else:
                 try:
-                    conversion_factor(unit, KINDS[kind])
+                    conversion_factor(unit, QUANTITY_KINDS[kind])
                     self.chosen[kind] = unit
                 except ValueError as problem:
                     self.problems.append(f"units.{kind}: {problem}")
@@ -97,7 +99,9 @@ class Units:
     def _changed(self, unit: str) -> dict[str, str]:
         """Return the units of this file for parts of an SI unit, where they are others."""
         parts = [_KIND_OF.get(part, "") for part in re.findall(r"[A-Za-z]+", unit)]
-        return {k: self.chosen[k] for k in parts if k in self.chosen and conversion_factor(self.chosen[k], KINDS[k]) != 1.0}
+        return {
+            k: self.chosen[k] for k in parts if k in self.chosen and conversion_factor(self.chosen[k], QUANTITY_KINDS[k]) != 1.0
+        }
 
     def write(self, value: float, unit: str) -> float | str:
         """Return what to write for a number in SI units, so that it is read as the same number, bit by bit."""

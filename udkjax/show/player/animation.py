@@ -14,7 +14,7 @@ from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.requirements import require_history
 from udkjax.show.player import pictures
 from udkjax.show.player.marks import Shapes
-from udkjax.show.player.measures import Measures, Trajectory
+from udkjax.show.player.measures import Measures, ShownMotion
 from udkjax.show.player.packing import Json
 from udkjax.show.player.page import frame, page
 from udkjax.show.player.records import Traces, failure_of, mode_record, motion_of, player_data, run_record
@@ -30,7 +30,7 @@ class FailedRunWarning(UserWarning):
 
 
 class Animation:
-    """What `animate` returns. In a notebook it shows itself, as a page in a frame.
+    """An animation, as `animate` returns it. In a notebook it shows itself, as a page in a frame.
 
     So it is still there when the notebook is opened without Python, and in what nbconvert exports. `widget` returns one that
     Python can steer.
@@ -107,7 +107,7 @@ class Animation:
 
 def animate(
     mechanism: Mechanism | Mapping[str, Mechanism],
-    solution: Trajectory | Mapping[str, Trajectory] | None = None,
+    solution: ShownMotion | Mapping[str, ShownMotion] | None = None,
     *,
     measures: Measures = ("violation", "energy", "rank"),
     reactions: bool = False,
@@ -136,7 +136,7 @@ def animate(
     Raises:
         ValueError: a batch, a name that is not known, or a run without any state.
     """
-    runs: dict[str, Trajectory | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
+    runs: dict[str, ShownMotion | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
     if not runs:
         raise ValueError("there is no run to show")
     found, failures = [], {}

@@ -1,4 +1,4 @@
-"""What is drawn of a mechanism: a list of marks, plain data that the player in the browser and the writers of pictures share.
+"""Marks of a mechanism's picture: a list of plain data that the player in the browser and the writers of pictures share.
 
 A mark is a dict with a `kind`. Places are in metres in the frame of a body, which is a number: the body's place in the
 mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How large a pin or an arrow is drawn is for who draws it.
@@ -268,14 +268,14 @@ class _Drawing:
         return [[self.number[body], x, y] for body, (x, y) in zip(bodies, np.asarray(points, float).tolist(), strict=True)]
 
     def _held_by(self, body: str, other: str) -> Mark:
-        """Where a revolute joint holds `body` to `other`, in the frame of `body`; its origin, if none does."""
+        """Return the point where a revolute joint holds `body` to `other`, in the frame of `body`; its origin, if none does."""
         for joint in self.mechanism.joints.values():
             if isinstance(joint, Revolute) and set(joint.bodies) == {body, other}:
                 return self._at(body, joint.points[joint.bodies.index(body)])
         return self._at(body, (0.0, 0.0))
 
     def _axle(self, bodies: Sequence[str]) -> Mark:
-        """Where two bodies turn on each other: at their revolute joint, else at the second one's centre of mass."""
+        """Return the point about which two bodies turn: at their revolute joint, else at the second one's centre of mass."""
         one, two = bodies
         return self._held_by(one if two == GROUND else two, two if two == GROUND else one)
 
@@ -302,7 +302,7 @@ def _local(frame: Float[np.ndarray, "3"], place: Float[np.ndarray, "2"]) -> Floa
 
 
 def _size(drawing: _Drawing) -> float:
-    """How far the points of a mechanism are apart (m)."""
+    """Return the extent of a mechanism's points (m)."""
     every = [to_ground(point, drawing._frames(body)[:1])[0] for body, points in drawing.points.items() for point in points]
     every += [frame[:2] for frame in drawing.poses[0]]
     return float(np.ptp(np.array(every), axis=0).max()) or 1.0

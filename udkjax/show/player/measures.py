@@ -15,7 +15,7 @@ from udkjax.equations.determinacy import STATIC_RANK_TOL
 from udkjax.scene import GROUND, Mechanism
 from udkjax.study.accuracy import conserves_energy
 
-ROUNDING = 1e-17  # below any violation (m, rad) or singular value but zero; drawn in place of zero, which has no logarithm
+SMALLEST_POSITIVE = 1e-17  # below any violation (m, rad) or singular value but zero, which has no logarithm: drawn in its place
 
 
 # Names of measures, or values over time by name; of several runs, by name and then by the run's label.
@@ -25,7 +25,7 @@ Measures = Sequence[str] | Mapping[str, ArrayLike | Mapping[str, ArrayLike] | No
 ReactionArrows = tuple[list[list[float]], Float[np.ndarray, "T joints 2"], list[bool]]  # anchors, forces (N), uniqueness
 
 
-class Trajectory(Protocol):
+class ShownMotion(Protocol):
     """A motion: times ts (T,) in s, coordinates q and velocities v (T, bodies, 3)."""
 
     @property
@@ -38,7 +38,7 @@ class Trajectory(Protocol):
     def v(self) -> Array | np.ndarray: ...
 
 
-class Measure(NamedTuple):
+class MeasureCurve(NamedTuple):
     """A number over time: its name, unit, values at the output times, and whether they are drawn over a logarithm."""
 
     name: str
@@ -47,7 +47,7 @@ class Measure(NamedTuple):
     log: bool = False
 
 
-def measures_of(mechanism: Mechanism, solution: Trajectory, wanted: Measures, label: str) -> list[Measure]:
+def measures_of(mechanism: Mechanism, solution: ShownMotion, wanted: Measures, label: str) -> list[MeasureCurve]:
     """Return the measures of a run: those of `MEASURES` by their names, or others as {"name" or "name (unit)": values}.
 
     Values may be under the labels of the runs that have them.
@@ -55,7 +55,7 @@ def measures_of(mechanism: Mechanism, solution: Trajectory, wanted: Measures, la
     Raises:
         ValueError: a name that is not known, or values that are not one number for each output time.
     """
-    found: list[Measure] = []
+    found: list[MeasureCurve] = []
     given = wanted if isinstance(wanted, Mapping) else dict.fromkeys(wanted)
     for name, values in given.items():
         if values is None:
@@ -68,11 +68,11 @@ def measures_of(mechanism: Mechanism, solution: Trajectory, wanted: Measures, la
             values = np.asarray(values, float)
             if values.shape != np.shape(solution.ts):
                 raise ValueError(f"measure {name!r} has shape {values.shape}; the run has {len(solution.ts)} output times")
-            found.append(Measure(words, unit.removesuffix(")"), values))
+            found.append(MeasureCurve(words, unit.removesuffix(")"), values))
     return found
 
 
-def singular_values_over_time(mechanism: Mechanism, solution: Trajectory) -> Float[np.ndarray, "T k"]:
+def singular_values_over_time(mechanism: Mechanism, solution: ShownMotion) -> Float[np.ndarray, "T k"]:
     """Return the singular values of the scaled Jacobian (`udkjax.singular_values`) at each output time, the largest first."""
     values = np.array(_singular_values(mechanism, analyse(mechanism), solution.ts, solution.q))
     values[~np.isfinite(np.asarray(solution.q)).all((1, 2))] = np.nan
@@ -92,37 +92,37 @@ def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q:
     return jax.vmap(lambda t, q: singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
 
 
-def _violation(mechanism: Mechanism, solution: Trajectory) -> list[Measure]:
+def _violation(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     psi = np.asarray(violation(mechanism, solution))
     values = np.abs(psi) * np.asarray(analyse(mechanism).scales.weights)  # radians as an arc of the characteristic length
-    return [Measure("violation", "m", np.maximum(values.max(axis=1, initial=0.0), ROUNDING), log=True)]
+    return [MeasureCurve("violation", "m", np.maximum(values.max(axis=1, initial=0.0), SMALLEST_POSITIVE), log=True)]
 
 
-def _energy(mechanism: Mechanism, solution: Trajectory) -> list[Measure]:
+def _energy(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     parts = energy(mechanism, solution)
     total = np.asarray(parts.total)
     changed_by = "energy change" if conserves_energy(mechanism, solution.ts) else "work of drivers and loads"
     return [
-        Measure(changed_by, "J", total - total[0]),
-        Measure("kinetic energy", "J", np.asarray(parts.kinetic)),
-        Measure("potential energy", "J", np.asarray(parts.potential)),
+        MeasureCurve(changed_by, "J", total - total[0]),
+        MeasureCurve("kinetic energy", "J", np.asarray(parts.kinetic)),
+        MeasureCurve("potential energy", "J", np.asarray(parts.potential)),
     ]
 
 
-def _rank(mechanism: Mechanism, solution: Trajectory) -> list[Measure]:
+def _rank(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     values = singular_values_over_time(mechanism, solution)
     count = rank_of(values)
-    found = [Measure("rank", "", count)]
+    found = [MeasureCurve("rank", "", count)]
     usual = int(np.nanmax(count, initial=0))
     if usual:
-        found.append(Measure(f"singular value {usual}", "", np.maximum(values[:, usual - 1], ROUNDING), log=True))
+        found.append(MeasureCurve(f"singular value {usual}", "", np.maximum(values[:, usual - 1], SMALLEST_POSITIVE), log=True))
     return found
 
 
 MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank}
 
 
-def reaction_arrows(mechanism: Mechanism, solution: Trajectory) -> ReactionArrows:
+def reaction_arrows(mechanism: Mechanism, solution: ShownMotion) -> ReactionArrows:
     """Return what the arrows of reactions need, for each joint and driver that puts a force on a body.
 
     Returns:

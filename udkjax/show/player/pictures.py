@@ -22,7 +22,7 @@ DXF_LAYERS = {
 
 
 class Posed(Protocol):
-    """What is drawn: the data of the player, and the coordinates of each run at any time."""
+    """Animation as the writers of pictures need it: the data of the player, and the coordinates of each run at any time."""
 
     data: Json
 

@@ -29,7 +29,7 @@ from udkjax.equations import analyse
 from udkjax.integrate.solution import Result
 from udkjax.scene import Mechanism
 from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
-from udkjax.show.player.measures import Measures, Trajectory, measures_of, reaction_arrows
+from udkjax.show.player.measures import Measures, ShownMotion, measures_of, reaction_arrows
 from udkjax.show.player.packing import Json, floats, pack, unpack
 from udkjax.study.channels import locate
 
@@ -40,19 +40,19 @@ PRECISION = (
 )
 TIME_PRECISION = 1e-9  # of the timeline
 FORCE_PRECISION = 1e-3  # of the usual force
-USUAL = 0.95  # of the instants: the largest force of any joint, which decides how long arrows are, is below the usual one
+USUAL_FORCE_QUANTILE = 0.95  # of the instants: at these no joint's force is larger than the usual one, which sets arrows' length
 MOST_INSTANTS = 2400  # of one run; a longer one is thinned out evenly, and interpolated by its velocities
 MOST_TRACES = 8
-COMFORTABLE = (4.0, 40.0)  # s: how long it takes to play something at the speed that is chosen for it
+COMFORTABLE_DURATIONS = (4.0, 40.0)  # s: how long it takes to play something at the speed that is chosen for it
 SPEEDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-CYCLE = 2.0  # s: how long one cycle of a mode takes
-SWING = 0.12  # of the characteristic length, or rad: how far a mode is shown to move
-STILL = 1e-6  # characteristic lengths: what moves less has no path
+MODE_PERIOD = 2.0  # s: how long one cycle of a mode takes
+MODE_AMPLITUDE = 0.12  # of the characteristic length, or rad: how far a mode is shown to move
+SMALLEST_PATH = 1e-6  # characteristic lengths: what moves less has no path
 
 
 def run_record(
     mechanism: Mechanism,
-    solution: Trajectory,
+    solution: ShownMotion,
     label: str,
     measures: Measures,
     with_reactions: bool,
@@ -92,7 +92,7 @@ def run_record(
         anchors, forces, unique = reaction_arrows(mechanism, solution)
         forces = np.nan_to_num(forces[shown])
         largest = np.linalg.norm(forces, axis=2).max(axis=1, initial=0.0)
-        usual = float(np.quantile(largest, USUAL)) or float(largest.max(initial=0.0))
+        usual = float(np.quantile(largest, USUAL_FORCE_QUANTILE)) or float(largest.max(initial=0.0))
         if usual > 0:
             table = pack(forces.reshape(len(shown), -1), FORCE_PRECISION * usual)
             record["reactions"] = {"anchors": anchors, "usual": usual, "unique": unique, "force": table}
@@ -108,7 +108,7 @@ def mode_record(
     largest = np.max(np.abs(shape) / [length, length, 1.0])
     if not (np.isfinite(largest) and largest > 0):
         raise ValueError(f"mode {label!r} does not move anything")
-    shape = SWING / largest * shape
+    shape = MODE_AMPLITUDE / largest * shape
     poses = q + np.sin(np.linspace(0, 2 * np.pi, 33))[:, None, None] * shape
     record = {
         "label": label,
@@ -156,7 +156,7 @@ def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.nda
         "unit": "" if is_mode else "s",
         "start": start,
         "end": end,
-        "speed": 1 / CYCLE if is_mode else _speed(end - start),
+        "speed": 1 / MODE_PERIOD if is_mode else _speed(end - start),
         "length": float(analyse(runs[0][0]).length),
         "bounds": [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()],
         "runs": [record for _, record, _ in runs],
@@ -181,8 +181,8 @@ def trace_anchors(
         k = bodies.index(body)
         for point in points.tolist() or [[0.0, 0.0]]:
             path = to_ground(point, poses[:, k])
-            moves = np.ptp(path, axis=0).max() > STILL * length
-            if moves and all(np.abs(path - other).max() > STILL * length for other, _ in found):
+            moves = np.ptp(path, axis=0).max() > SMALLEST_PATH * length
+            if moves and all(np.abs(path - other).max() > SMALLEST_PATH * length for other, _ in found):
                 found.append((path, [k, *point]))
     found.sort(key=lambda item: -float(np.ptp(item[0], axis=0).max()))
     return [anchor for _, anchor in found[:MOST_TRACES]]
@@ -233,7 +233,7 @@ def _ends(record: Record) -> tuple[float, float]:
 
 def _speed(duration: float) -> float:
     """The natural speed where that is comfortable, else the nearest that is."""
-    shortest, longest = COMFORTABLE
+    shortest, longest = COMFORTABLE_DURATIONS
     if duration <= 0 or shortest <= duration <= longest:
         return 1.0
     if duration < shortest:
@@ -241,7 +241,7 @@ def _speed(duration: float) -> float:
     return min((s for s in SPEEDS if s >= 1 and duration / s <= longest), default=SPEEDS[-1])
 
 
-def failure_of(solution: Trajectory) -> str:
+def failure_of(solution: ShownMotion) -> str:
     """Say how a run failed, whatever of it can be shown; an empty text where it did not."""
     result, cause = getattr(solution, "result", None), getattr(solution, "cause", "")
     if isinstance(result, Result):

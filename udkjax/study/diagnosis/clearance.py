@@ -1,4 +1,4 @@
-"""How far a configuration is from the next one where the rank of the constraints changes.
+"""Distance of a configuration from the next one where the rank of the constraints changes.
 
 The smallest singular value that counts, sigma, is the distance of J to the nearest matrix of lower rank. Within the mechanism's
 own motion its slope along the displacements V that the constraints allow says how far that is, to first order: sigma / |sigma_V|,
@@ -15,11 +15,11 @@ import numpy as np
 from scipy.interpolate import BarycentricInterpolator
 from scipy.optimize import brentq
 
-from udkjax.study.diagnosis.configuration import STEP, Configuration, Positions
+from udkjax.study.diagnosis.configuration import NEIGHBOUR_STEP, Configuration, Positions
 
 SLOPE_STEP = 1e-5  # of the characteristic length, and rad: the third root of rounding, for central differences
-WALK = 160  # steps along the path in each direction: about a turn of everything, or more
-BESIDE = 4  # positions on each side of a root that the polynomial goes through: what it misses is a step to the eighth
+WALK_STEPS = 160  # steps along the path in each direction: about a turn of everything, or more
+POINTS_BESIDE = 4  # positions on each side of a root that the polynomial goes through: what it misses is a step to the eighth
 
 
 class RankChange(NamedTuple):
@@ -33,7 +33,7 @@ class RankChange(NamedTuple):
 
 
 class Clearance(NamedTuple):
-    """How far the next rank change is."""
+    """Distance of the next rank change."""
 
     smallest: float  # the smallest singular value that counts, relative to the largest
     estimate: float  # the distance by its slope, as in `RankChange`; infinite where it does not change
@@ -76,26 +76,26 @@ def _search(positions: Positions, start: Configuration, rank: int) -> tuple[Rank
 
 def _walk(positions: Positions, start: Configuration, rank: int, side: float) -> tuple[list[Configuration], bool]:
     """Follow closed positions along the path to beyond the first minimum of sigma; say whether they came back to the start."""
-    path, more = [start], WALK
+    path, more = [start], WALK_STEPS
     heading = side * start.right[:, 0] if start.right.shape[1] else np.zeros(len(start.q))
     while more:
         last, more = path[-1], more - 1
-        moved = _step(positions, last, heading, STEP, side) or _step(positions, last, heading, 0.7 * STEP, side)
-        if moved is None or moved.rank > rank or (heading.any() and positions.distance(last, moved) < STEP / 4):
+        moved = next(filter(None, (_step(positions, last, heading, part * NEIGHBOUR_STEP, side) for part in (1.0, 0.7))), None)
+        if moved is None or moved.rank > rank or (heading.any() and positions.distance(last, moved) < NEIGHBOUR_STEP / 4):
             break
         path.append(moved)
         if moved.right.shape[1]:
             onward = moved.right @ (moved.right.T @ heading)
             heading = onward / np.linalg.norm(onward)
-        if len(path) > 3 and positions.distance(start, moved, turns=False) < STEP:
+        if len(path) > 3 and positions.distance(start, moved, turns=False) < NEIGHBOUR_STEP:
             return path[1:], True
-        if len(path) > 2 and more > BESIDE and _has_kink([c.sigma[rank - 1] for c in path[-3:]]):
-            more = BESIDE
+        if len(path) > 2 and more > POINTS_BESIDE and _has_kink([c.sigma[rank - 1] for c in path[-3:]]):
+            more = POINTS_BESIDE
     return path[1:], False
 
 
 def _has_kink(sigma: list[float]) -> bool:
-    """Whether three values have a minimum that may be one of zero: not above the rise on either side."""
+    """Return True if three values have a minimum that may be one of zero: not above the rise on either side."""
     return sigma[1] <= min(sigma[0], sigma[2]) and sigma[1] <= max(sigma[0], sigma[2]) - sigma[1]
 
 
@@ -108,7 +108,7 @@ def _root(positions: Positions, path: list, way: np.ndarray, sigma: np.ndarray, 
     """Return the configuration beside the k-th position where sigma vanishes, if it does."""
     if not _has_kink(sigma[k - 1 : k + 2].tolist()):
         return None
-    near = slice(max(0, k - BESIDE), k + BESIDE + 1)
+    near = slice(max(0, k - POINTS_BESIDE), k + POINTS_BESIDE + 1)
     for turned in (k, k + 1):  # from where on sigma has the other sign
         signed = np.where(np.arange(len(sigma)) < turned, sigma, -sigma)
         smooth = BarycentricInterpolator(way[near], signed[near])

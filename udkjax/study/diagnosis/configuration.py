@@ -10,9 +10,9 @@ import numpy as np
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import LONGEST_STEP
 
-STEP = 0.1  # of the characteristic length, and rad: from one position to the next of a neighbourhood
-POSITIONS = 12  # of a neighbourhood
-MOVED = 0.01  # of a step: positions nearer than that to each other are the same
+NEIGHBOUR_STEP = 0.1  # of the characteristic length, and rad: from one position to the next of a neighbourhood
+N_NEIGHBOURS = 12  # of a neighbourhood
+SMALLEST_MOVE = 0.01  # of a step: positions nearer than that to each other are the same
 
 
 class Configuration(NamedTuple):
@@ -38,7 +38,7 @@ class Configuration(NamedTuple):
 
     @property
     def redundancy(self) -> int:
-        """How many rows depend on others."""
+        """Number of rows that depend on others."""
         return len(self.J) - self.rank
 
     @property
@@ -83,14 +83,14 @@ class Positions:
         """Return closed positions along a random motion from one, while drivers go on; none where it cannot move."""
         random, found, last = np.random.default_rng(0), [], start
         heading, t = random.standard_normal(len(start.q)), start.t
-        for _ in range(POSITIONS if self.rows.count else 0):
+        for _ in range(N_NEIGHBOURS if self.rows.count else 0):
             heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(len(heading)) / np.sqrt(len(heading))
             allowed = last.right @ (last.right.T @ heading)
             size = np.linalg.norm(allowed)
-            t += self.rows.driver_time_step * STEP / LONGEST_STEP
+            t += self.rows.driver_time_step * NEIGHBOUR_STEP / LONGEST_STEP
             direction = allowed / size if size > 0.0 else allowed
-            moved = self.displace(last, direction, STEP, t) or self.displace(last, direction, STEP, last.t)
-            if moved is None or self.distance(moved, last) < MOVED * STEP:
+            moved = self.displace(last, direction, NEIGHBOUR_STEP, t) or self.displace(last, direction, NEIGHBOUR_STEP, last.t)
+            if moved is None or self.distance(moved, last) < SMALLEST_MOVE * NEIGHBOUR_STEP:
                 heading = random.standard_normal(len(heading))
                 continue
             heading, last = (allowed if size > 0.0 else heading), moved
@@ -99,7 +99,7 @@ class Positions:
 
 
 class JointForces(NamedTuple):
-    """Which multipliers of a constraint equilibrium decides."""
+    """Multipliers of a constraint that equilibrium decides."""
 
     unique: tuple[bool, ...]  # row by row
     share: tuple[float, ...]  # the length of each row of N: 0 unique, 1 arbitrary

@@ -1,4 +1,4 @@
-"""What `diagnose` finds, as numbers and as text."""
+"""Result of `diagnose`, as numbers and as text."""
 
 import html
 from typing import Any, NamedTuple
@@ -14,9 +14,9 @@ from udkjax.study.diagnosis.timeline import Timeline
 from udkjax.study.row_labels import row_label
 from udkjax.study.wording import plural
 
-WIDTH = 14
-MOST = 8  # fixes of one set that are printed
-ROUNDED = 1e-9  # rad, and of the length: smaller numbers of a pose are rounding
+LABEL_WIDTH = 14
+MOST_FIXES = 8  # fixes of one set that are printed
+SMALLEST_POSE_NUMBER = 1e-9  # rad, and of the length: smaller numbers of a pose are rounding
 
 
 class Diagnosis(NamedTuple):
@@ -76,12 +76,12 @@ class Diagnosis(NamedTuple):
 
     @property
     def is_singular(self) -> bool:
-        """Whether the rank here is lower than around it, or it moves to first order only."""
+        """True if the rank here is lower than around it, or it moves to first order only."""
         return self.rank < self.ordinary_rank or (self.mobility > 0 and not any(branch.followed for branch in self.branches))
 
     @property
     def redundant(self) -> int:
-        """How many rows are redundant in this configuration."""
+        """Number of rows that are redundant in this configuration."""
         return self.rows - self.rank
 
     @property
@@ -116,7 +116,7 @@ def as_text(found: Diagnosis) -> str:
     lines = [found.mechanism.name or "mechanism"]
     for title, entries in sections(found):
         for k, entry in enumerate(entries):
-            lines.append(f"  {title if k == 0 else '':<{WIDTH}}  {entry}")
+            lines.append(f"  {title if k == 0 else '':<{LABEL_WIDTH}}  {entry}")
     return "\n".join(lines)
 
 
@@ -168,10 +168,10 @@ def _freedoms(found: Diagnosis) -> list[str]:
 def _redundancy(r: Redundancy) -> list[str]:
     when = "everywhere along the motion" if r.permanent else "in this configuration only"
     lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant row')}, {when}"]
-    for fix in r.fixes[:MOST]:
+    for fix in r.fixes[:MOST_FIXES]:
         more = f", takes {fix.removes} redundant rows" if fix.removes > 1 and fix.removes > r.count else ""
         lines.append(f"  fix {fix.constraint}: {fix.change} (condition {1 / fix.conditioning:.3g}{more})")
-    lines += [f"  ... {len(r.fixes) - MOST} more"] if len(r.fixes) > MOST else []
+    lines += [f"  ... {len(r.fixes) - MOST_FIXES} more"] if len(r.fixes) > MOST_FIXES else []
     if r.permanent and not r.fixes:
         lines.append("  no single change of a joint was found that takes redundancy away and leaves the mobility")
     return lines
@@ -197,9 +197,9 @@ def _branches(found: Diagnosis) -> list[str]:
     lines = [f"{len(found.branches)} meet" if len(found.branches) != 1 else "one goes through"]
     for k, branch in enumerate(found.branches):
         moving = [
-            f"{name} ({', '.join(f'{x:.3g}' if abs(x) > ROUNDED else '0' for x in row)})"
+            f"{name} ({', '.join(f'{x:.3g}' if abs(x) > SMALLEST_POSE_NUMBER else '0' for x in row)})"
             for name, row in zip(found.mechanism.body_names, branch.tangent, strict=True)
-            if np.abs(row).max() > ROUNDED
+            if np.abs(row).max() > SMALLEST_POSE_NUMBER
         ]
         state = f"rank {branch.rank}" if branch.followed else "not followed: it may end here"
         lines.append(f"  {k + 1}: {state}; dx, dy, dangle of {'; '.join(moving)}")
@@ -234,7 +234,7 @@ def _conditioning(found: Diagnosis) -> list[str]:
 
 
 def _pose(found: Diagnosis, change: RankChange) -> str:
-    angles = np.rad2deg(np.where(np.abs(change.q[:, 2]) > ROUNDED, change.q[:, 2], 0.0))
+    angles = np.rad2deg(np.where(np.abs(change.q[:, 2]) > SMALLEST_POSE_NUMBER, change.q[:, 2], 0.0))
     return ", ".join(f"{name} {angle:.4g}" for name, angle in zip(found.mechanism.body_names, angles, strict=True)) + " degrees"
 
 

@@ -1,4 +1,4 @@
-"""What to change about a redundant constraint: each way is tried on the Jacobian, and the best on the mechanism itself.
+"""Changes that cure a redundant constraint: each is tried on the Jacobian, and the best on the mechanism itself.
 
 A constraint is relaxed by what its kind can give up: a revolute one direction (it becomes a slot, in either of its bodies), a
 weld or a prismatic joint one of its freedoms, anything all of its rows. That helps where the rows that are given up carry the
@@ -18,10 +18,10 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, Positions, decompose
 from udkjax.study.diagnosis.dependence import Dependency, stress_of
 
-STEEP = 1e-3  # the smallest singular value relative to the largest: a fix that leaves less is as good as none
+SMALLEST_PIVOT = 1e-3  # the smallest singular value relative to the largest: a fix that leaves less is as good as none
 
 
-class Change(NamedTuple):
+class JointChange(NamedTuple):
     """One way to relax a constraint: what takes its place, and which of its rows stay."""
 
     text: str
@@ -82,7 +82,7 @@ def fixes_of(
         forces = [stress[own] / positions.row_unit[own, None] for stress in stresses]
         for change in _changes(mechanism, name, at[0], forces[0]):
             removes, conditioning = _effect(mechanism, name, change, at, owners, positions.rank_tol)
-            if removes > 0 and conditioning > STEEP * min(c.smallest for c in at):
+            if removes > 0 and conditioning > SMALLEST_PIVOT * min(c.smallest for c in at):
                 aligned = min(change.alignment(force, c.q, _places(mechanism, name)) for force, c in zip(forces, at, strict=True))
                 options.append((removes, round(aligned, 6), round(conditioning, 12), change))
         for removes, _, conditioning, change in sorted(options, key=lambda option: option[:3], reverse=True):
@@ -93,7 +93,7 @@ def fixes_of(
     return sorted(found, key=lambda fix: (-fix.removes, -fix.conditioning))
 
 
-def apply_change(mechanism: Mechanism, name: str, change: Change) -> Mechanism | None:
+def apply_change(mechanism: Mechanism, name: str, change: JointChange) -> Mechanism | None:
     """Return the mechanism with a constraint changed, or None where something else needs it as it is: friction in a revolute."""
     joints, drivers = dict(mechanism.joints), dict(mechanism.drivers)
     if change.element is not None:
@@ -117,10 +117,10 @@ def _places(mechanism: Mechanism, name: str) -> list[int | None]:
     return [None if body == GROUND else mechanism.body_names.index(body) for body in bodies]
 
 
-def _changes(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarray) -> Iterator[Change]:
+def _changes(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarray) -> Iterator[JointChange]:
     """Iterate over the ways to relax a constraint that carries the multipliers `force` (rows, redundancy) of the stress."""
     element = mechanism.constraints[name]
-    yield Change("remove it", None)
+    yield JointChange("remove it", None)
     if isinstance(element, Revolute):
         most = np.linalg.svd(force)[0][:, 0]  # the direction that carries most
         along = np.arctan2(most[1], most[0])
@@ -130,13 +130,13 @@ def _changes(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarr
             other = element.bodies[1 - k]
             slot = Slot((body, other), (element.points[k], element.points[1 - k]), axis=axis)
             text = f'make it a slot along {np.rad2deg(axis):.4g} degrees of "{body}" for the pin of "{other}"'
-            yield Change(text, slot, (k, axis))
+            yield JointChange(text, slot, (k, axis))
     if isinstance(element, Weld):
-        yield Change("make it a revolute", Revolute(element.bodies, element.points), None, (0, 1))
+        yield JointChange("make it a revolute", Revolute(element.bodies, element.points), None, (0, 1))
     if isinstance(element, Prismatic):
         slot = Slot(element.bodies, element.points, element.axis)
-        yield Change("make it a slot: free to turn", slot, None, (0,))
-        yield Change("hold the angle alone", Angle(element.bodies, element.angle), None, (1,))
+        yield JointChange("make it a slot: free to turn", slot, None, (0,))
+        yield JointChange("hold the angle alone", Angle(element.bodies, element.angle), None, (1,))
 
 
 def _half_turn(angle: float) -> float:
@@ -148,7 +148,7 @@ def _half_turn(angle: float) -> float:
 
 
 def _effect(
-    mechanism: Mechanism, name: str, change: Change, at: list[Configuration], owners: list[str], rank_tol: float
+    mechanism: Mechanism, name: str, change: JointChange, at: list[Configuration], owners: list[str], rank_tol: float
 ) -> tuple[int, float]:
     """Return by how much the redundancy falls (-1: the mobility changes, or it falls unevenly), and the conditioning then."""
     own, places, falls, conditioning = _own(owners, name), _places(mechanism, name), set(), np.inf
@@ -162,7 +162,7 @@ def _effect(
 
 
 def _removes_redundancy(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
-    """Whether the changed mechanism itself is closed in all positions, has the same mobility there, and fewer redundant rows."""
+    """Return True if the changed mechanism is closed in all positions, has the same mobility there, and fewer redundant rows."""
     positions = Positions(KinematicRows(after), rank_tol)
     seen = [positions.at(position.t, position.q) for position in at]
     closed = all(

@@ -16,14 +16,14 @@ from udkjax.equations import constraints
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, Positions
 
-STARTS = 400  # directions to look from
+N_STARTS = 400  # directions to look from
 ITERATIONS = 60
-ZERO = 1e-10  # of the forms, whose coefficients are at most one
-DOUBLE = 1e-7  # of a tangent: a double zero is known to the root of rounding
-SAME = 1e-4  # rad: directions nearer than that are one
-ASIDE = 0.1  # rad: how far from a zero to look for others
-STEP = 0.02  # of the characteristic length, and rad: how far a branch is walked along
-ASTRAY = 0.2  # of the step: how far its end may be from the tangent; it bends by the step's square
+ZERO_FORM = 1e-10  # of the forms, whose coefficients are at most one
+DOUBLE_ZERO = 1e-7  # of a tangent: a double zero is known to the root of rounding
+SAME_DIRECTION = 1e-4  # rad: directions nearer than that are one
+SEARCH_ANGLE = 0.1  # rad: how far from a zero to look for others
+STEP_LENGTH = 0.02  # of the characteristic length, and rad: how far a branch is walked along
+TANGENT_TOL = 0.2  # of the step: how far its end may be from the tangent; it bends by the step's square
 
 
 class Branch(NamedTuple):
@@ -72,13 +72,13 @@ class Zeros(NamedTuple):
 def zeros_of(A: np.ndarray) -> list[Zeros]:
     """Return the directions x where all forms x^T A_i x vanish: isolated lines, linear spaces, and one line of each cone."""
     d, size = A.shape[1], np.abs(A).max(initial=0.0)
-    if size < ZERO:
+    if size < ZERO_FORM:
         return [Zeros(np.eye(d), d)]
     A, random = A / size, np.random.default_rng(0)
-    x = _solve(A, np.concatenate([np.eye(d), random.standard_normal((STARTS, d))]))
+    x = _solve(A, np.concatenate([np.eye(d), random.standard_normal((N_STARTS, d))]))
     found: list[Zeros] = []
     for direction in x:
-        if any(np.linalg.norm(direction - z.space @ (z.space.T @ direction)) < SAME for z in found):
+        if any(np.linalg.norm(direction - z.space @ (z.space.T @ direction)) < SAME_DIRECTION for z in found):
             continue
         zeros = _around(A, direction)
         if zeros.is_cone and any(z.is_cone and z.dimension == zeros.dimension for z in found):  # one line is enough
@@ -95,36 +95,38 @@ def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
         matrix = np.concatenate([2 * np.einsum("kij,sj->ski", A, x), x[:, None, :]], axis=1)  # and a step across x
         x = x - np.einsum("sij,sj->si", np.linalg.pinv(matrix, rcond=1e-9), np.pad(residual, ((0, 0), (0, 1))))
         x = x / np.linalg.norm(x, axis=1, keepdims=True)
-    return x[np.abs(np.einsum("kij,si,sj->sk", A, x, x)).max(axis=1) < ZERO]
+    return x[np.abs(np.einsum("kij,si,sj->sk", A, x, x)).max(axis=1) < ZERO_FORM]
 
 
 def _around(A: np.ndarray, x: np.ndarray) -> Zeros:
     """Return the zeros around x: the kernel of all A_i x if all forms vanish on it; a cone if others are near; or x alone."""
     sigma, vt = np.linalg.svd(2 * np.einsum("kij,j->ki", A, x))[1:]
-    kernel = vt[int(np.sum(sigma > SAME)) :].T
+    kernel = vt[int(np.sum(sigma > SAME_DIRECTION)) :].T
     if kernel.shape[1] > 1:
-        if np.abs(np.einsum("ia,kij,jb->kab", kernel, A, kernel)).max(initial=0.0) < SAME**2:
+        if np.abs(np.einsum("ia,kij,jb->kab", kernel, A, kernel)).max(initial=0.0) < SAME_DIRECTION**2:
             return Zeros(kernel, kernel.shape[1])
-        near = _solve(A, x + ASIDE * kernel.T)
-        if np.any(np.linalg.norm(near - (near @ x)[:, None] * x, axis=1) > ASIDE / 2):
+        near = _solve(A, x + SEARCH_ANGLE * kernel.T)
+        if np.any(np.linalg.norm(near - (near @ x)[:, None] * x, axis=1) > SEARCH_ANGLE / 2):
             return Zeros(x[:, None], kernel.shape[1])
     return Zeros(x[:, None], 1)
 
 
 def _inside(one: np.ndarray, two: np.ndarray) -> bool:
-    return one.shape[1] < two.shape[1] and bool(np.linalg.norm(one - two @ (two.T @ one)) < SAME)
+    return one.shape[1] < two.shape[1] and bool(np.linalg.norm(one - two @ (two.T @ one)) < SAME_DIRECTION)
 
 
 def _follow(positions: Positions, at: Configuration, tangents: np.ndarray, dimension: int) -> Branch:
     tangent = tangents @ np.ones(tangents.shape[1]) / np.sqrt(tangents.shape[1])
     size = positions.rows.scales.size(positions.unit * tangent, np)
     tangent = tangent / size * np.sign(tangent[np.argmax(np.abs(tangent))])
-    tangent[np.abs(tangent) < DOUBLE] = 0.0
-    ends = [positions.displace(at, tangent, side * STEP) for side in (1.0, -1.0)]
-    reached = [end for end, side in zip(ends, (1.0, -1.0), strict=True) if _reaches(positions, at, end, side * STEP * tangent)]
+    tangent[np.abs(tangent) < DOUBLE_ZERO] = 0.0
+    ends = [positions.displace(at, tangent, side * STEP_LENGTH) for side in (1.0, -1.0)]
+    reached = [
+        end for end, side in zip(ends, (1.0, -1.0), strict=True) if _reaches(positions, at, end, side * STEP_LENGTH * tangent)
+    ]
     rank = max((end.rank for end in reached if end is not None), default=at.rank)
     return Branch((positions.unit * tangent).reshape(-1, 3), dimension, rank, len(reached) == 2)
 
 
 def _reaches(positions: Positions, at: Configuration, end: Configuration | None, way: np.ndarray) -> bool:
-    return end is not None and float(np.linalg.norm((end.q - at.q) / positions.unit - way)) < ASTRAY * float(np.linalg.norm(way))
+    return end is not None and bool(np.linalg.norm((end.q - at.q) / positions.unit - way) < TANGENT_TOL * np.linalg.norm(way))

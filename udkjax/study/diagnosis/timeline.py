@@ -23,14 +23,14 @@ from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Trajectory
 
-BETWEEN = 4  # samples from one output to the next, to look for minima
-FINER = 8  # parts of an interval that is integrated anew
-GRID = 16  # parts of a bracket, of which two are left by each refinement
-KINKED = 2.0  # a minimum is one of zero where it is at most so many times the rise to its neighbours
-TIGHT = 1e-12  # rtol and atol of an interval that is integrated anew
+SAMPLES_PER_OUTPUT = 4  # samples from one output to the next, to look for minima
+PARTS_OF_INTERVAL = 8  # parts of an interval that is integrated anew
+PARTS_OF_BRACKET = 16  # parts of a bracket, of which two are left by each refinement
+KINK_RATIO = 2.0  # a minimum is one of zero where it is at most so many times the rise to its neighbours
+TIGHT_TOL = 1e-12  # rtol and atol of an interval that is integrated anew
 
 
-class Change(NamedTuple):
+class RankChange(NamedTuple):
     """An instant at which the rank is another one than before and after."""
 
     time: float  # s
@@ -46,7 +46,7 @@ class Timeline(NamedTuple):
     ts: Float[np.ndarray, "T"]
     singular_values: Float[np.ndarray, "T k"]
     rank: Int[np.ndarray, "T"]
-    changes: tuple[Change, ...]
+    changes: tuple[RankChange, ...]
     closest: tuple[float, float]  # the time (s), and the smallest relative singular value that counts, over all samples
 
     @property
@@ -73,7 +73,7 @@ def timeline(mechanism: Mechanism, solution: Trajectory, rank_tol: float, tol: f
     ts, q, v = ts[alive], q[alive].reshape(alive.sum(), -1), v[alive].reshape(alive.sum(), -1)
     tol = _tolerance(analysis, ts) if tol is None else tol
     path = _Path(mechanism, analysis, ts, q, v)
-    fine = np.unique(np.concatenate([np.linspace(a, b, BETWEEN + 1) for a, b in pairwise(ts)] or [ts]))
+    fine = np.unique(np.concatenate([np.linspace(a, b, SAMPLES_PER_OUTPUT + 1) for a, b in pairwise(ts)] or [ts]))
     sampled = path.singular_values(fine)
     own = np.searchsorted(fine, ts)
     rank = np.sum(sampled > rank_tol * sampled[:, :1], axis=1)
@@ -100,24 +100,26 @@ def _kinks(sigma: np.ndarray) -> list[int]:
     """Return samples at which a singular value has a minimum that may be zero."""
     before, after = np.append(np.inf, sigma[:-1]), np.append(sigma[1:], np.inf)
     rise = np.where(np.isfinite(before), before - sigma, 0.0) + np.where(np.isfinite(after), after - sigma, 0.0)
-    return np.flatnonzero((sigma < before) & (sigma <= after) & (sigma <= KINKED * rise)).tolist()
+    return np.flatnonzero((sigma < before) & (sigma <= after) & (sigma <= KINK_RATIO * rise)).tolist()
 
 
-def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> Change | None:
+def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> RankChange | None:
     """Return the minimum of a singular value in a bracket, if the rank is lower there."""
     start, end, at, values = low, high, low, np.zeros(0)
     while True:
-        grid = np.linspace(low, high, GRID + 1)
+        grid = np.linspace(low, high, PARTS_OF_BRACKET + 1)
         values = path.singular_values(grid)
         k = int(np.argmin(values[:, rank - 1]))
         at, values = grid[k], values[k]
         if high - low <= 2 * tol or np.max(np.diff(grid)) <= 4 * np.spacing(abs(at)):
             break
-        low, high = grid[max(k - 1, 0)], grid[min(k + 1, GRID)]
+        low, high = grid[max(k - 1, 0)], grid[min(k + 1, PARTS_OF_BRACKET)]
     found = int(np.sum(values > rank_tol * values[0]))
     if found >= rank:
         return None
-    return Change(float(at), float(max(start, at - tol)), float(min(end, at + tol)), found, float(values[rank - 1] / values[0]))
+    return RankChange(
+        float(at), float(max(start, at - tol)), float(min(end, at + tol)), found, float(values[rank - 1] / values[0])
+    )
 
 
 def _renew(
@@ -127,10 +129,10 @@ def _renew(
     if not isinstance(solution, Solution):
         return None
     first = int(np.searchsorted(ts, low, side="right")) - 1
-    later = np.linspace(low, high, 2 * FINER + 1)
+    later = np.linspace(low, high, 2 * PARTS_OF_INTERVAL + 1)
     times = np.unique(np.append(ts[first], later))
     state = State(solution.q[first], solution.v[first])
-    again = simulate(mechanism, times, state, rtol=TIGHT, atol=TIGHT, throw=False)
+    again = simulate(mechanism, times, state, rtol=TIGHT_TOL, atol=TIGHT_TOL, throw=False)
     q, v = (np.asarray(x).reshape(len(times), -1) for x in (again.q, again.v))
     return _Path(mechanism, analysis, times, q, v) if np.all(np.isfinite(q)) else None
 

@@ -28,7 +28,7 @@ from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.unknowns import Unknowns, apply_values, sample_guesses
-from udkjax.study.row_spaces import COEFFICIENT, connected_columns, echelon, null_space, row_space
+from udkjax.study.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
 from udkjax.study.wording import join_names, ratio
 
 # Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions
@@ -170,7 +170,7 @@ class RedundantLoops:
         free = sorted(set(range(len(self.x))) - {i for members in sets for i in members})
         if free and not self._closes(np.eye(len(self.x))[free]):
             ties = self._ties(free, np.eye(len(free)))
-            for part in connected_columns(row_space(null_space(ties, COEFFICIENT), COEFFICIENT)):
+            for part in connected_columns(row_space(null_space(ties, SMALLEST_COEFFICIENT), SMALLEST_COEFFICIENT)):
                 members = [free[i] for i in part]
                 inside = [i for i in range(len(ties)) if np.any(ties[i, part])]
                 found.append(self._message(names, members, ties[np.ix_(inside, part)]))
@@ -200,10 +200,10 @@ class RedundantLoops:
         for candidate in self._candidates(members, closed):
             size = np.linalg.norm(candidate)
             outside = candidate - closed.T @ (closed @ candidate)
-            if np.linalg.norm(outside) > COEFFICIENT * size:
+            if np.linalg.norm(outside) > SMALLEST_COEFFICIENT * size:
                 continue
             trial = np.vstack([chosen, candidate / size])
-            if np.linalg.svd(trial)[1][-1] < COEFFICIENT:
+            if np.linalg.svd(trial)[1][-1] < SMALLEST_COEFFICIENT:
                 continue
             every = np.zeros((len(trial), len(self.x)))
             every[:, members] = trial
@@ -225,7 +225,7 @@ class RedundantLoops:
         yield from echelon(closed)
 
     def _message(self, names: Sequence[str], members: Sequence[int], ties: np.ndarray) -> str:
-        ties = np.where(np.abs(ties) > COEFFICIENT, ties, 0.0)
+        ties = np.where(np.abs(ties) > SMALLEST_COEFFICIENT, ties, 0.0)
         ties = ties[np.count_nonzero(ties, axis=1) > 1] * self._unit[members]
         own, x = [names[i] for i in members], self.x[members]
         who = join_names(own)
@@ -249,7 +249,7 @@ class RedundantLoops:
         opened = np.einsum("srk,srm->skm", self._circuits, self._effect[:, :, members])
         part_of = np.abs(opened).max((0, 2)) > DEPENDENT
         circuits = self._circuits[:, :, part_of if part_of.any() else slice(None)]
-        involved = np.abs(circuits).max((0, 2)) > COEFFICIENT
+        involved = np.abs(circuits).max((0, 2)) > SMALLEST_COEFFICIENT
         constraints = list(dict.fromkeys(name for name, there in zip(self._names, involved, strict=True) if there))
         what = "constraints" if set(constraints) & set(self._drivers) else "joints"
         return f"{what} {join_names([quote(name) for name in constraints])} close a loop"

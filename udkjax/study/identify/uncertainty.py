@@ -20,7 +20,7 @@ from scipy.special import chdtr, chdtrc
 
 from udkjax.study.identify.problem import INVISIBLE
 from udkjax.study.row_spaces import echelon, null_space
-from udkjax.study.whiteness import IMPROBABLE
+from udkjax.study.whiteness import SIGNIFICANCE
 from udkjax.study.wording import join_names
 
 POOR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
@@ -268,9 +268,9 @@ def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
     """Say so where residuals are not as large as the noise that was given."""
     ratio = np.sqrt(chi2 / freedom)
     numbers = f"chi^2 = {chi2:.4g} with {freedom} degrees of freedom"
-    if chdtrc(freedom, chi2) < IMPROBABLE:
+    if chdtrc(freedom, chi2) < SIGNIFICANCE:
         size, why = f"{ratio:.3g}", "the model leaves something out, or the noise is larger"
-    elif chdtr(freedom, chi2) < IMPROBABLE:
+    elif chdtr(freedom, chi2) < SIGNIFICANCE:
         size, why = f"only {ratio:.3g}", "the noise is smaller, or its samples are not independent"
     else:
         return
