@@ -91,7 +91,7 @@ class BodyTree:
         """Return the masses of a body and of those that are fixed to it."""
         chosen, (low, high) = self.settings.mass_from_geoms, self.settings.mass_groups
         found: list[SpaceMass] = []
-        for body in (body for k, body in enumerate(self.bodies) if self.hosts[k] == host):
+        for body in (body for k, body in enumerate(self.bodies) if k and self.hosts[k] == host):
             if chosen == "false" or (chosen == "auto" and body.given):
                 found += body.given
             else:

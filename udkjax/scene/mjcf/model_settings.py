@@ -27,6 +27,7 @@ class ModelSettings:
             self.sequence = "xyz"
         self.autolimits = read.choice("autolimits", ("true", "false"), "true") == "true"
         self.mass_from_geoms = read.choice("inertiafromgeom", ("true", "false", "auto"), "auto")
+        self.total_mass = read.number("settotalmass", -1.0)  # kg; not positive: as it is
         self.mass_groups = read.numbers("inertiagrouprange", (0, 5))
         read = AttributeReader(flags, flags.attributes, problems)
         off = {name for name in _STANDARD if read.choice(name, ("enable", "disable"), "enable") == "disable"}

@@ -41,8 +41,12 @@ class PlaneModel:
     def __init__(self, tree: BodyTree, plane: MotionPlane):
         self.tree, self.plane = tree, plane
         self.bodies = {0: PlaneBody(GROUND, 0j, 0.0, np.inf, np.inf)}
+        wanted = tree.settings.total_mass
+        everything = sum(mass.mass for host in set(tree.hosts) for mass in tree.masses_of(host))
+        scale = wanted / everything if wanted > 0 and everything else 1.0
         for k, body in tree.moving():
             mass, centre, inertia = sum_masses(tree.masses_of(k), plane.normal)
+            mass, inertia = scale * mass, scale * inertia
             if not (mass > 0 and inertia > 0):
                 tree.settings.problems.append(f"{body.where}: must have mass and inertia, by its geoms or an <inertial>")
             side = plane.flat(body.frame.axes[:, 0])

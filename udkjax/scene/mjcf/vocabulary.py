@@ -39,10 +39,10 @@ _TENDON = _Attributes(
 )
 _KNOWN: dict[str, _Attributes] = {
     "compiler": _Attributes(
-        "angle eulerseq autolimits inertiafromgeom inertiagrouprange",
+        "angle eulerseq autolimits inertiafromgeom inertiagrouprange settotalmass",
         "meshdir texturedir assetdir strippath discardvisual usethread fusestatic saveinertial savecompiled savecanonical "
         "conflict passthrough fitaabb alignfree convexhull exactmeshinertia",
-        {"coordinate": "local", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0", "balanceinertia": "false"},
+        {"coordinate": "local", "boundmass": "0", "boundinertia": "0", "balanceinertia": "false"},
     ),
     "option": _Attributes(
         "gravity",
