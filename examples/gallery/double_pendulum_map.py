@@ -1,4 +1,4 @@
-"""A map of chaos: how far the lower rod of a double pendulum has turned after a few seconds, for 2,500 ways to let it go.
+"""A map of chaos: how far the lower rod of a double pendulum has turned after a few seconds, from 2,500 starts.
 
 One call of `sweep`: its members run side by side in lanes of machine code.
 """

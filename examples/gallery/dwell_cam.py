@@ -1,6 +1,6 @@
 """A cam that lets its follower rest for a third of each turn, as a Geneva drive does.
 
-The profile is a closed cubic spline; a motor turns the cam, and a spring holds the follower to nothing: the joint does.
+The profile is a closed cubic spline; a motor turns the cam, and the joint holds the follower on it: no spring is needed.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Peaucellier's linkage turns a rotation into an exact straight line, of 1864.
+"""Peaucellier's linkage of 1864 turns a rotation into an exact straight line.
 
 Its far corner D moves on x = (arm^2 - side^2) / (2 crank), to rounding.
 """

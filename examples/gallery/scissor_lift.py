@@ -1,6 +1,6 @@
 """A scissor lift comes down under its platform, with two constraints more than it needs.
 
-Its platform's guide is overconstrained; the motion is that of a single freedom, and the energy stays what it was.
+Its platform's guide is overconstrained; it moves with one degree of freedom, and its energy is constant.
 """
 
 import numpy as np
