@@ -11,10 +11,11 @@ import xarray
 
 import udkjax as udk
 from tests.command_line import udkjax
-from udkjax.cli import COMMANDS, common
+from udkjax.cli import COMMANDS
 from udkjax.cli.datasets import save
 from udkjax.extras import MissingExtraError
 from udkjax.integrate import Result
+from udkjax.study.report import plain
 from udkjax.study.sweep.executors import ClusterError
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -256,7 +257,7 @@ def test_what_json_cannot_hold_is_written_as_what_it_can():
         "numbers": (np.float32(0.5), float("nan"), np.inf, 3, True, None),
         "names": {"result": Result.step_limit, "file": Path("a"), 7: np.array("text")},
     }
-    assert common.plain(given) == {
+    assert plain(given) == {
         "arrays": [[0, 1, 2], [[1.0], [1.0]]],
         "numbers": [0.5, None, None, 3, True, None],
         "names": {"result": "step_limit", "file": "a", "7": "text"},

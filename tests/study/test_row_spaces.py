@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from udkjax.study.report import join_names, ratio
 from udkjax.study.row_spaces import connected_columns, echelon, null_space, row_space
-from udkjax.study.wording import join_names, ratio
 
 
 def test_spaces_of_rows():

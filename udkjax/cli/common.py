@@ -26,7 +26,6 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -96,22 +95,9 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
         json: whether JSON was asked for.
     """
     if json:
+        from udkjax.study.report import plain
+
         print(text, file=sys.stderr)
         print(json_text.dumps(plain(results), ensure_ascii=False, allow_nan=False))
     else:
         print(text)
-
-
-def plain(value: object) -> JsonValue:
-    """Return a value as JSON knows it: arrays and tuples as lists, enumerations by name, paths as text, NaN and inf as None."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, Enum):
-        return value.name
-    if (tolist := getattr(value, "tolist", None)) is not None:  # of an array or a number of NumPy or JAX
-        return plain(tolist())
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else str(value)

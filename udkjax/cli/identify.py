@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from udkjax.cli.common import Json, Quiet, Scene, fail, load, plain, refuse, show
+from udkjax.cli.common import Json, Quiet, Scene, fail, load, refuse, show
 from udkjax.cli.datasets import check_folder
 
 if TYPE_CHECKING:
@@ -121,6 +121,7 @@ def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], result
     import udkjax as udk
     from udkjax.show.identify_figures import save_pictures
     from udkjax.study.identify.estimate import Row
+    from udkjax.study.report import plain
 
     out.mkdir(exist_ok=True)
     udk.save(estimate.mechanism, out / "identified.toml")

@@ -12,8 +12,7 @@ from udkjax.integrate.solution import format_work
 from udkjax.printing import align_columns, format_number
 from udkjax.scene import Mechanism
 from udkjax.study.accuracy import Accuracy
-from udkjax.study.row_labels import row_label
-from udkjax.study.wording import plural
+from udkjax.study.report import plural, row_label
 
 
 def check_summary(mech: Mechanism, found: Check) -> str:

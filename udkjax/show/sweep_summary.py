@@ -8,11 +8,11 @@ import numpy as np
 from udkjax.integrate import Result
 from udkjax.show.summary import table
 from udkjax.show.sweep_figures import RESULT_VARIABLE, scalars
+from udkjax.study.report import plural
 from udkjax.study.sweep.chunks import SweepCost
 from udkjax.study.sweep.dataset import bytes_per_member, variables_of
 from udkjax.study.sweep.plan import Plan
 from udkjax.study.sweep.sweep_progress import duration
-from udkjax.study.wording import plural
 
 if TYPE_CHECKING:
     import xarray

@@ -9,12 +9,11 @@ from jaxtyping import Bool, Float
 from udkjax.equations.determinacy import unique_direction
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.row_labels import row_label
-from udkjax.study.wording import plural
+from udkjax.study.report import plain, plural, row_label
 
 MOST_MATRIX_COLUMNS = 18  # columns of a matrix that fit beside each other
 SMALLEST_PRINTED = 1e-12  # relative to the largest of an array: printed as 0
-SYMBOLS = ("psi", "psi_dot", "psi_q", "gamma", "mass", "force", "weights", "D", "singular_values", "D_plus", "a_F", "b", "a")
+SMALLEST_TERM = 1e-9  # of the largest coefficient of a combination of rows: smaller ones are rounding
 
 
 class Gauss(NamedTuple):
@@ -82,166 +81,115 @@ class Explanation(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain numbers, lists and texts, for JSON."""
-        return as_dict(self)
+        found = plain(self) | {"bodies": list(self.mechanism.body_names), "rows": self.row_labels()}
+        return found | {"lambda": found.pop("multipliers")}
+
+    def row_labels(self) -> list[str]:
+        """Return what texts call the rows."""
+        return [row_label(self.mechanism, *name) for name in self.row_names]
 
     def __str__(self) -> str:
-        return as_text(self)
+        """Lay out the derivation for a terminal."""
+        rows, columns = self.row_labels(), _columns(self.mechanism)
+        parts = [_state(self, columns)]
+        parts += [_constraints(self, rows, columns), _rank(self, rows)] if rows else []
+        parts += [_masses(self, columns)]
+        parts += [_right_hand_side(self, rows), _pseudoinverse(self, rows, columns)] if rows else []
+        parts += [_accelerations(self, columns)]
+        parts += [_multipliers(self, rows)] if rows else []
+        return "\n\n".join("\n".join(lines) for lines in [*parts, _gauss(self), _checks(self)])
 
     def __repr__(self) -> str:
         return f"Explanation({self.mechanism.name!r}, t = {self.t:g}, rank {self.rank} of {len(self.psi)} rows)"
 
     def _repr_html_(self) -> str:
-        return as_html(self)
+        return f"<pre>{html.escape(str(self))}</pre>"
+
+
+# --- as text: the lines of each section
 
 
 # --- as text
-
-
-def as_text(e: Explanation) -> str:
-    """Lay out the derivation for a terminal."""
-    rows, columns = [row_label(e.mechanism, *name) for name in e.row_names], _columns(e.mechanism)
-    parts = [_state(e, columns)]
-    if rows:
-        parts += [_constraints(e, rows, columns), _rank(e, rows)]
-    parts += [_masses(e, columns)]
-    if rows:
-        parts += [_right_hand_side(e, rows), _pseudoinverse(e, rows, columns)]
-    parts += [_accelerations(e, columns)]
-    if rows:
-        parts += [_multipliers(e, rows)]
-    parts += [_gauss(e), _checks(e)]
-    return "\n\n".join(parts)
-
-
-def as_html(e: Explanation) -> str:
-    """Return the same text for a notebook, as it stands."""
-    return f"<pre>{html.escape(as_text(e))}</pre>"
-
-
-def as_dict(e: Explanation) -> dict[str, Any]:
-    """Return an explanation as plain numbers, lists and texts."""
-    return {
-        "mechanism": e.mechanism.name,
-        "t": e.t,
-        "bodies": list(e.mechanism.body_names),
-        "rows": [row_label(e.mechanism, *name) for name in e.row_names],
-        "q": e.q.tolist(),
-        "v": e.v.tolist(),
-        **{name: getattr(e, name).tolist() for name in SYMBOLS},
-        "rank": e.rank,
-        "lambda": e.multipliers.tolist(),
-        "unique": e.unique.tolist(),
-        "constraint_force": e.constraint_force.tolist(),
-        "gauss": {**e.gauss._asdict(), "least_rival": e.gauss.least_rival if e.gauss.rivals else None},
-        "checks": e.checks,
-    }
 
 
 def _columns(mechanism: Mechanism) -> list[str]:
     return [f"{letter}{k + 1}" for k in range(len(mechanism.body_names)) for letter in ("x", "y", "th")]
 
 
-def _title(number: int, text: str) -> str:
-    return f"{number}. {text}"
-
-
-def _state(e: Explanation, columns: list[str]) -> str:
+def _state(e: Explanation, columns: list[str]) -> list[str]:
     bodies = ", ".join(f"{k + 1} {name}" for k, name in enumerate(e.mechanism.body_names))
     head = f"{e.mechanism.name or 'mechanism'} at t = {e.t:g} s. Bodies: {bodies}; x, y (m) and th (rad) of each."
-    return "\n".join([head, "", _table(["q", "v"], columns, np.stack([e.q, e.v]))])
+    return [head, "", *_table(["q", "v"], columns, np.stack([e.q, e.v]))]
 
 
-def _constraints(e: Explanation, rows: list[str], columns: list[str]) -> str:
-    pattern = [
-        f"  {name:<{_width(rows)}}  "
-        + " ".join("x" if abs(entry) > SMALLEST_PRINTED * np.abs(e.psi_q).max() else "." for entry in row)
-        for name, row in zip(rows, e.psi_q, strict=True)
+def _constraints(e: Explanation, rows: list[str], columns: list[str]) -> list[str]:
+    there = np.abs(e.psi_q) > SMALLEST_PRINTED * np.abs(e.psi_q).max()
+    return [
+        "1. Constraints Psi(t, q) = 0; along a motion Psi_dot = Psi_q v + Psi_t = 0, and Psi_q a = gamma",
+        *_table(rows, ["Psi", "Psi_dot", "gamma"], np.stack([e.psi, e.psi_dot, e.gamma], axis=1)),
+        "",
+        f"  The Jacobian Psi_q ({len(rows)} x {len(columns)}), which entries are there, and their values:",
+        *(
+            f"  {name:<{_width(rows)}}  " + " ".join("x" if entry else "." for entry in row)
+            for name, row in zip(rows, there, strict=True)
+        ),
+        "",
+        *_table(rows, columns, e.psi_q),
     ]
-    values = np.stack([e.psi, e.psi_dot, e.gamma], axis=1)
-    return "\n".join(
-        [
-            _title(1, "Constraints Psi(t, q) = 0; along a motion Psi_dot = Psi_q v + Psi_t = 0, and Psi_q a = gamma"),
-            _table(rows, ["Psi", "Psi_dot", "gamma"], values),
-            "",
-            f"  The Jacobian Psi_q ({len(rows)} x {len(columns)}), which entries are there, and their values:",
-            *pattern,
-            "",
-            _table(rows, columns, e.psi_q),
-        ]
-    )
 
 
-def _rank(e: Explanation, rows: list[str]) -> str:
+def _rank(e: Explanation, rows: list[str]) -> list[str]:
     n = len(e.a)
     free = f"{n} coordinates - {e.rank} = {plural(n - e.rank, 'degree')} of freedom"
-    lines = [_title(2, f"Rank of Psi_q: {e.rank} of {len(rows)} rows; {free}")]
-    if e.null_rows.shape[1]:
-        lines.append("  These combinations of rows vanish, so that lambda may be changed by any of them without an effect:")
-        for column in e.null_rows.T:
-            column = column / column[np.argmax(np.abs(column))]
-            terms = [f"{x:+.3g} {name}" for x, name in zip(column, rows, strict=True) if abs(x) > 1e-9]
-            lines.append("    " + " ".join(terms))
-    else:
-        lines.append("  All rows are independent.")
-    return "\n".join(lines)
+    lines = [f"2. Rank of Psi_q: {e.rank} of {len(rows)} rows; {free}"]
+    if not e.null_rows.shape[1]:
+        return [*lines, "  All rows are independent."]
+    lines.append("  These combinations of rows vanish, so that lambda may be changed by any of them without an effect:")
+    for column in e.null_rows.T:
+        column = column / column[np.argmax(np.abs(column))]
+        terms = [f"{x:+.3g} {name}" for x, name in zip(column, rows, strict=True) if abs(x) > SMALLEST_TERM]
+        lines.append("    " + " ".join(terms))
+    return lines
 
 
-def _masses(e: Explanation, columns: list[str]) -> str:
-    return "\n".join(
-        [
-            _title(3, "Masses M (diagonal), loads F, and a_F = M^(-1) F: what the loads would do without the constraints"),
-            _table(["M", "F", "a_F"], columns, np.stack([e.mass, e.force, e.a_F])),
-        ]
-    )
+def _masses(e: Explanation, columns: list[str]) -> list[str]:
+    title = "3. Masses M (diagonal), loads F, and a_F = M^(-1) F: what the loads would do without the constraints"
+    return [title, *_table(["M", "F", "a_F"], columns, np.stack([e.mass, e.force, e.a_F]))]
 
 
-def _right_hand_side(e: Explanation, rows: list[str]) -> str:
-    done = e.psi_q @ e.a_F
-    lines = [
-        _title(4, "What the constraints still ask: b = gamma - Psi_q a_F"),
-        _table(rows, ["gamma", "Psi_q a_F", "b"], np.stack([e.gamma, done, e.b / e.weights], axis=1)),
-    ]
-    return "\n".join(lines)
+def _right_hand_side(e: Explanation, rows: list[str]) -> list[str]:
+    values = np.stack([e.gamma, e.psi_q @ e.a_F, e.b / e.weights], axis=1)
+    return ["4. What the constraints still ask: b = gamma - Psi_q a_F", *_table(rows, ["gamma", "Psi_q a_F", "b"], values)]
 
 
-def _pseudoinverse(e: Explanation, rows: list[str], columns: list[str]) -> str:
-    sigma = " ".join(_number(x, np.abs(e.singular_values).max(initial=0.0)) for x in e.singular_values)
+def _pseudoinverse(e: Explanation, rows: list[str], columns: list[str]) -> list[str]:
     weighted = not np.allclose(e.weights, 1.0)
-    note = "; rows in radians are multiplied by the characteristic length, b too" if weighted else ""
-    return "\n".join(
-        [
-            _title(5, f"D = Psi_q M^(-1/2){note}"),
-            _table(rows, columns, e.D),
-            f"  Singular values: {sigma}",
-            "",
-            f"  D^+, transposed (a row of it for each row of D), of rank {e.rank}:",
-            _table(rows, columns, e.D_plus.T),
-        ]
-    )
+    return [
+        f"5. D = Psi_q M^(-1/2){'; rows in radians are multiplied by the characteristic length, b too' if weighted else ''}",
+        *_table(rows, columns, e.D),
+        f"  Singular values: {' '.join(_number(x, e.singular_values.max(initial=0.0)) for x in e.singular_values)}",
+        "",
+        f"  D^+, transposed (a row of it for each row of D), of rank {e.rank}:",
+        *_table(rows, columns, e.D_plus.T),
+    ]
 
 
-def _accelerations(e: Explanation, columns: list[str]) -> str:
-    return "\n".join(
-        [
-            _title(6, "a = a_F + M^(-1/2) D^+ b: what the loads would do, and what the constraints add"),
-            _table(["a_F", "added", "a"], columns, np.stack([e.a_F, e.a - e.a_F, e.a])),
-        ]
-    )
+def _accelerations(e: Explanation, columns: list[str]) -> list[str]:
+    title = "6. a = a_F + M^(-1/2) D^+ b: what the loads would do, and what the constraints add"
+    return [title, *_table(["a_F", "added", "a"], columns, np.stack([e.a_F, e.a - e.a_F, e.a]))]
 
 
-def _multipliers(e: Explanation, rows: list[str]) -> str:
-    shown = _table(rows, ["lambda"], e.multipliers[:, None]).split("\n")
+def _multipliers(e: Explanation, rows: list[str]) -> list[str]:
     marks = ["", *("unique" if unique else "not unique: the share of least norm" for unique in e.unique)]
-    return "\n".join(
-        [
-            _title(7, "lambda = -(D^+)^T D^+ b (N, N m), with which M a + Psi_q^T lambda = F"),
-            *(f"{line}   {mark}".rstrip() for line, mark in zip(shown, marks, strict=True)),
-            *(f"  {name}: its force is unique only along {np.rad2deg(angle):.4g} degrees" for name, angle in _directions(e)),
-            "",
-            "  The constraints' forces on the bodies, -Psi_q^T lambda = M (a - a_F), are unique:",
-            _table(["force"], _columns(e.mechanism), e.constraint_force[None]),
-        ]
-    )
+    shown = zip(_table(rows, ["lambda"], e.multipliers[:, None]), marks, strict=True)
+    return [
+        "7. lambda = -(D^+)^T D^+ b (N, N m), with which M a + Psi_q^T lambda = F",
+        *(f"{line}   {mark}".rstrip() for line, mark in shown),
+        *(f"  {name}: its force is unique only along {np.rad2deg(angle):.4g} degrees" for name, angle in _directions(e)),
+        "",
+        "  The constraints' forces on the bodies, -Psi_q^T lambda = M (a - a_F), are unique:",
+        *_table(["force"], _columns(e.mechanism), e.constraint_force[None]),
+    ]
 
 
 def _directions(e: Explanation) -> list[tuple[str, float]]:
@@ -254,54 +202,45 @@ def _directions(e: Explanation) -> list[tuple[str, float]]:
     return found
 
 
-def _gauss(e: Explanation) -> str:
+def _gauss(e: Explanation) -> list[str]:
     g = e.gauss
     lines = [
-        _title(8, "Gauss's principle: of all accelerations that the constraints allow, a has the least"),
+        "8. Gauss's principle: of all accelerations that the constraints allow, a has the least",
         "     G(x) = (x - a_F)^T M (x - a_F) / 2",
         f"  G(a) = {g.at_a:.10g}",
     ]
-    if g.free:
-        free = f"  {plural(g.free, 'direction')} {'is' if g.free == 1 else 'are'} left free"
-        lines += [
-            f"{free}. The slope of G there is {g.slope:.1e} of its size: zero, to rounding.",
-            f"  The least G of {g.rivals} other feasible accelerations is {g.least_rival:.10g}: "
-            + ("more." if g.least_rival >= g.at_a else "LESS, which must not be."),
-        ]
-    else:
-        lines.append("  The constraints leave nothing free: a is the only one.")
-    return "\n".join(lines)
+    if not g.free:
+        return [*lines, "  The constraints leave nothing free: a is the only one."]
+    free = f"  {plural(g.free, 'direction')} {'is' if g.free == 1 else 'are'} left free"
+    verdict = "more." if g.least_rival >= g.at_a else "LESS, which must not be."
+    return [
+        *lines,
+        f"{free}. The slope of G there is {g.slope:.1e} of its size: zero, to rounding.",
+        f"  The least G of {g.rivals} other feasible accelerations is {g.least_rival:.10g}: {verdict}",
+    ]
 
 
-def _checks(e: Explanation) -> str:
-    width = max(map(len, e.checks))
-    return "\n".join(
-        [_title(9, "Checks, relative: all vanish"), *(f"  {name:<{width}}  {x:.1e}" for name, x in e.checks.items())]
-    )
+def _checks(e: Explanation) -> list[str]:
+    width = _width(list(e.checks))
+    return ["9. Checks, relative: all vanish", *(f"  {name:<{width}}  {x:.1e}" for name, x in e.checks.items())]
 
 
 def _width(names: list[str]) -> int:
     return max(map(len, names))
 
 
-def _table(rows: list[str], columns: list[str], values: np.ndarray) -> str:
+def _table(rows: list[str], columns: list[str], values: np.ndarray) -> list[str]:
     """Lay out a matrix with its names; wide ones in pieces below each other."""
-    width, pieces = _width(rows), []
+    width, lines = _width(rows), []
+    sizes = np.abs(values).max(axis=0 if values.shape[1] <= 3 else None, initial=0.0)
+    cells = [[_number(x, size) for x, size in zip(row, np.broadcast_to(sizes, row.shape), strict=True)] for row in values]
     for start in range(0, len(columns), MOST_MATRIX_COLUMNS):
         part = slice(start, start + MOST_MATRIX_COLUMNS)
-        sizes = np.abs(values).max(axis=0 if values.shape[1] <= 3 else None, initial=0.0)
-        cells = [
-            [_number(x, size) for x, size in zip(row[part], np.broadcast_to(sizes, row.shape)[part], strict=True)]
-            for row in values
-        ]
-        widths = [max(len(name), *(len(line[k]) for line in cells)) for k, name in enumerate(columns[part])]
-        lines = ["  " + " " * width + "  " + " ".join(f"{name:>{w}}" for name, w in zip(columns[part], widths, strict=True))]
-        lines += [
-            f"  {name:<{width}}  " + " ".join(f"{cell:>{w}}" for cell, w in zip(line, widths, strict=True))
-            for name, line in zip(rows, cells, strict=True)
-        ]
-        pieces.append("\n".join(lines))
-    return "\n\n".join(pieces)
+        widths = [max(map(len, column)) for column in zip(columns[part], *(line[part] for line in cells), strict=True)]
+        lines += [""] if start else []
+        for name, line in zip(["", *rows], [columns[part], *(line[part] for line in cells)], strict=True):
+            lines.append(f"  {name:<{width}}  " + " ".join(f"{cell:>{w}}" for cell, w in zip(line, widths, strict=True)))
+    return lines
 
 
 def _number(x: float, size: float) -> str:

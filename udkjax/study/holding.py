@@ -8,7 +8,7 @@ from udkjax.equations.dense_rows import NEGLIGIBLE_SHARE
 from udkjax.equations.redundancy import kinematic_rows, ordinary_position
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.wording import join_names
+from udkjax.study.report import join_names
 
 
 def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, names: Mapping[str, str]) -> None:

@@ -12,7 +12,7 @@ from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.optimizer import squares
 from udkjax.study.identify.records import Record, labels
 from udkjax.study.identify.uncertainty import Uncertainty
-from udkjax.study.wording import format_value
+from udkjax.study.report import format_value
 
 
 @pytest.mark.parametrize(

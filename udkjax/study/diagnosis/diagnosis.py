@@ -11,8 +11,7 @@ from udkjax.study.diagnosis.configuration import JointForces
 from udkjax.study.diagnosis.fixes import Fix, Redundancy
 from udkjax.study.diagnosis.second_order import Branch
 from udkjax.study.diagnosis.timeline import Timeline
-from udkjax.study.row_labels import row_label
-from udkjax.study.wording import plural
+from udkjax.study.report import plain, plural, row_label
 
 LABEL_WIDTH = 14
 MOST_FIXES = 8  # fixes of one set that are printed
@@ -96,41 +95,41 @@ class Diagnosis(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain numbers, lists and texts, for JSON; angles in rad."""
-        return as_dict(self)
+        found, names, line = plain(self), self.mechanism.body_names, self.timeline
+        for branch in found["branches"]:
+            branch["tangent"] = dict(zip(names, branch["tangent"], strict=True))
+        if line is not None:
+            closest = dict(zip(("time", "smallest"), line.closest, strict=True))
+            found["timeline"] |= plain({"smallest": line.smallest, "closest": closest})
+        further = ("gruebler", "degrees_of_freedom", "mobility", "joint_mobility", "conditioning")
+        return (
+            found
+            | {name: plain(getattr(self, name)) for name in further}
+            | {"q": dict(zip(names, self.q.tolist(), strict=True)), "singular": self.is_singular}
+        )
 
     def __str__(self) -> str:
-        return as_text(self)
+        lines = [self.mechanism.name or "mechanism"]
+        for title, entries in _sections(self):
+            lines += [f"  {title if k == 0 else '':<{LABEL_WIDTH}}  {entry}" for k, entry in enumerate(entries)]
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.mechanism.name!r}, rank {self.rank}, {self.degrees_of_freedom} degrees of freedom)"
 
     def _repr_html_(self) -> str:
-        return as_html(self)
+        rows = "".join(
+            f"<tr><th style='text-align:left;vertical-align:top'>{html.escape(title)}</th>"
+            f"<td style='text-align:left'>{'<br>'.join(html.escape(entry) for entry in entries)}</td></tr>"
+            for title, entries in _sections(self)
+        )
+        return f"<table><caption>{html.escape(self.mechanism.name or 'mechanism')}</caption>{rows}</table>"
 
 
 # --- as text
 
 
-def as_text(found: Diagnosis) -> str:
-    """Lay out a diagnosis for a terminal."""
-    lines = [found.mechanism.name or "mechanism"]
-    for title, entries in sections(found):
-        for k, entry in enumerate(entries):
-            lines.append(f"  {title if k == 0 else '':<{LABEL_WIDTH}}  {entry}")
-    return "\n".join(lines)
-
-
-def as_html(found: Diagnosis) -> str:
-    """Lay out a diagnosis as a table."""
-    rows = "".join(
-        f"<tr><th style='text-align:left;vertical-align:top'>{html.escape(title)}</th>"
-        f"<td style='text-align:left'>{'<br>'.join(html.escape(entry) for entry in entries)}</td></tr>"
-        for title, entries in sections(found)
-    )
-    return f"<table><caption>{html.escape(found.mechanism.name or 'mechanism')}</caption>{rows}</table>"
-
-
-def sections(found: Diagnosis) -> list[tuple[str, list[str]]]:
+def _sections(found: Diagnosis) -> list[tuple[str, list[str]]]:
     """Say everything, title by title, in lines."""
     parts = [
         ("freedoms", _freedoms(found)),
@@ -246,65 +245,3 @@ def _timeline(line: Timeline) -> list[str]:
         half = (change.latest - change.earliest) / 2
         lines.append(f"  rank {change.rank} at {change.time:.10g} s (+- {half:.1g} s)")
     return lines
-
-
-def as_dict(found: Diagnosis) -> dict[str, Any]:
-    """Return a diagnosis as plain numbers, lists and texts."""
-    line, nearest = found.timeline, found.clearance.nearest
-    return {
-        "mechanism": found.mechanism.name,
-        "t": found.t,
-        "q": dict(zip(found.mechanism.body_names, found.q.tolist(), strict=True)),
-        "coordinates": found.coordinates,
-        "rows": found.rows,
-        "rank": found.rank,
-        "ordinary_rank": found.ordinary_rank,
-        "gruebler": found.gruebler,
-        "degrees_of_freedom": found.degrees_of_freedom,
-        "mobility": found.mobility,
-        "joint_mobility": found.joint_mobility,
-        "singular": found.is_singular,
-        "redundancies": [
-            {
-                "constraints": list(r.constraints),
-                "count": r.count,
-                "permanent": r.permanent,
-                "fixes": [_fix(fix) for fix in r.fixes],
-            }
-            for r in found.redundancies
-        ],
-        "cure": [_fix(fix) for fix in found.cure],
-        "branches": [
-            {
-                "tangent": dict(zip(found.mechanism.body_names, branch.tangent.tolist(), strict=True)),
-                "degrees_of_freedom": branch.degrees_of_freedom,
-                "rank": branch.rank,
-                "followed": branch.followed,
-            }
-            for branch in found.branches
-        ],
-        "forces": {
-            name: {"unique": list(f.unique), "share": list(f.share), "direction": f.direction} for name, f in found.forces.items()
-        },
-        "singular_values": found.singular_values.tolist(),
-        "conditioning": found.conditioning,
-        "clearance": {
-            "smallest": found.clearance.smallest,
-            "estimate": found.clearance.estimate if np.isfinite(found.clearance.estimate) else None,
-            "searched": found.clearance.searched,
-            "nearest": None if nearest is None else {**nearest._asdict(), "q": nearest.q.tolist()},
-        },
-        "timeline": None
-        if line is None
-        else {
-            "ts": line.ts.tolist(),
-            "rank": line.rank.tolist(),
-            "smallest": line.smallest.tolist(),
-            "changes": [change._asdict() for change in line.changes],
-            "closest": {"time": line.closest[0], "smallest": line.closest[1]},
-        },
-    }
-
-
-def _fix(fix: Fix) -> dict[str, Any]:
-    return {"constraint": fix.constraint, "change": fix.change, "removes": fix.removes, "conditioning": fix.conditioning}

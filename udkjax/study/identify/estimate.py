@@ -27,8 +27,8 @@ from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikeliho
 from udkjax.study.identify.records import IdentificationError, dataset_of_fit, label_prefixes
 from udkjax.study.identify.uncertainty import Uncertainty
 from udkjax.study.identify.unknowns import apply_values
+from udkjax.study.report import format_value, join_names, plain, plural
 from udkjax.study.whiteness import Whiteness
-from udkjax.study.wording import format_value, join_names, plural
 
 if TYPE_CHECKING:
     import xarray
@@ -261,36 +261,24 @@ class Estimate:
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as plain numbers and texts, as a JSON file has them."""
         known, rows, P = self.uncertainty, self.rows(), len(self.names)
-        return {
-            "success": self.success,
-            "converged": self.converged,
-            "message": self.message,
+        same = ("success", "converged", "message", "at_bounds", "guesses", "agreeing", "ways", "evaluations", "seconds")
+        found = {
             "parameters": {
-                row.parameter: {"value": row.value, "standard_error": _finite(row.standard_error), "units": row.units}
-                for row in rows[:P]
+                r.parameter: {"value": r.value, "standard_error": r.standard_error, "units": r.units} for r in rows[:P]
             },
-            "correlation": [[_finite(x) for x in row] for row in known.correlation],
-            "unknown": {"dead": list(known.dead), "flat": [direction.text for direction in known.flat]},
-            "at_bounds": list(self.at_bounds),
-            "starts": {r.parameter: {"change": _finite(r.value), "standard_error": _finite(r.standard_error)} for r in rows[P:]},
+            "correlation": known.correlation,
+            "unknown": {"dead": known.dead, "flat": [direction.text for direction in known.flat]},
+            "starts": {r.parameter: {"change": r.value, "standard_error": r.standard_error} for r in rows[P:]},
             "chi2": known.chi2,
             "degrees_of_freedom": known.degrees_of_freedom,
-            "noise": [{channel: _finite(np.nanmedian(sigma)) for channel, sigma in table.items()} for table in self.noise],
-            "outliers": [one._asdict() for one in self.outliers],
-            "whiteness": [{"record": k, "channel": c, "p": _finite(w.p)} for (k, c), w in self.whiteness.items()],
-            "guesses": self.guesses,
-            "agreeing": self.agreeing,
-            "ways": list(self.ways),
-            "evaluations": self.evaluations,
-            "seconds": self.seconds,
+            "noise": [{channel: np.nanmedian(sigma) for channel, sigma in table.items()} for table in self.noise],
+            "outliers": self.outliers,
+            "whiteness": [{"record": k, "channel": c, "p": w.p} for (k, c), w in self.whiteness.items()],
             "tolerance": self.tol[0],
             "versions": versions(),
         }
+        return plain({name: getattr(self, name) for name in same} | found)
 
     def to_json(self) -> str:
         """Return the same as text."""
         return json.dumps(self.to_dict(), indent=1)
-
-
-def _finite(x: float) -> float | None:  # as JSON knows it
-    return float(x) if np.isfinite(x) else None

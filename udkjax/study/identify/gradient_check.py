@@ -29,7 +29,7 @@ from udkjax.study.identify.prediction import TIGHT, Tolerances
 from udkjax.study.identify.problem import Problem, Residuals, build_problem
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
-from udkjax.study.wording import join_names
+from udkjax.study.report import join_names
 
 AGREEMENT = 3.0  # floors: a floor is a sum of sizes, each of which was measured once
 USEFUL = 0.1  # of the derivative's size: where the floor is higher, agreement says little

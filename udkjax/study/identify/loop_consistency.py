@@ -28,8 +28,8 @@ from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.unknowns import Unknowns, apply_values, sample_guesses
+from udkjax.study.report import join_names, ratio
 from udkjax.study.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
-from udkjax.study.wording import join_names, ratio
 
 # Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions
 # that are closed to 1e-11 leave 5e-12 of it; a parameter that opens a loop leaves a tenth or more.

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import label_prefixes, output_times
 from udkjax.study.noise import outlier_rows
-from udkjax.study.wording import plural
+from udkjax.study.report import plural
 
 NOISE_FLOOR = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike
 MOST_NAMED = 5  # of a channel, the largest; the others are counted

@@ -19,9 +19,9 @@ from jaxtyping import Float, Int
 from scipy.special import chdtr, chdtrc
 
 from udkjax.study.identify.problem import INVISIBLE
+from udkjax.study.report import join_names
 from udkjax.study.row_spaces import echelon, null_space
 from udkjax.study.whiteness import SIGNIFICANCE
-from udkjax.study.wording import join_names
 
 POOR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
 CORRELATED = 0.98  # of two parameters: their difference is known ten times worse than their sum

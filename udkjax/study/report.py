@@ -1,0 +1,62 @@
+"""What studies say: counts, lists, numbers and rows of constraints in texts for people, and everything as plain data for JSON."""
+
+import math
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from udkjax.scene.mechanism import Mechanism
+
+MOST_LISTED = 8  # names in one sentence
+MOST_DIGITS = 12  # of a number in a table
+_ROWS = {"Revolute": ("x", "y"), "Weld": ("x", "y", "angle"), "Prismatic": ("across", "angle")}
+
+
+def plural(count: int, noun: str) -> str:
+    """Say how many there are."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Return names as they stand in a sentence: "a, b and c"."""
+    if len(names) > MOST_LISTED:
+        return f"{', '.join(names[:MOST_LISTED])} and {len(names) - MOST_LISTED} more"
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def ratio(values: Sequence[float] | np.ndarray) -> str:
+    """Return numbers relative to the first, such as "1 : 2 : 0.5"."""
+    return " : ".join(f"{v / values[0]:.4g}" for v in values)
+
+
+def format_value(value: float, error: float) -> str:
+    """Return a value with as many digits as its standard error allows, and one more."""
+    if not (math.isfinite(error) and error > 0 and value):
+        return f"{value:.6g}"
+    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(error)) + 2
+    return f"{value:#.{min(max(digits, 2), MOST_DIGITS)}g}".rstrip(".")
+
+
+def row_label(mechanism: Mechanism, constraint: str, row: int) -> str:
+    """Name one row of a constraint, such as `B2 (y)`."""
+    kind = type(mechanism.constraints[constraint]).__name__
+    return f"{constraint} ({_ROWS[kind][row] if kind in _ROWS else f'row {row + 1}'})"
+
+
+def plain(value: object) -> Any:
+    """Return a value as JSON knows it: what is not finite as None, named fields as a mapping, a mechanism by its name."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Enum | Mechanism):
+        return value.name
+    if (fields := getattr(value, "_asdict", None)) is not None:  # of a NamedTuple
+        return plain(fields())
+    if (tolist := getattr(value, "tolist", None)) is not None:  # of an array or a number of NumPy or JAX
+        return plain(tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
