@@ -153,7 +153,8 @@ LONG = {"jnp": "jax.numpy", "np": "numpy", "eqx": "equinox", "eqxi": "equinox.in
 def identifiers() -> set[str]:
     """All names that the package and its studies know: of modules, of Python, keys of dictionaries and of scenes."""
     found = {*dir(builtins), "udk", "udkjax", "pytest", "Args", "Returns", "Raises", "Source"}
-    found |= set(re.findall(r"\w+", (ROOT / "udkjax/show/player/player.js").read_text()))
+    for script in (ROOT / "udkjax/show/player").glob("*.js"):
+        found |= set(re.findall(r"\w+", script.read_text()))
     tests = {
         path: ast.parse(path.read_text()) for path in [ROOT / "tests" / "elements.py", *(ROOT / "tests").glob("*/methods.py")]
     }

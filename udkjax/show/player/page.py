@@ -2,18 +2,20 @@
 
 import html
 import json
+import re
 from functools import cache
 from importlib.resources import files
 from string import Template
 
 from udkjax.show.player.packing import Json
 
+MODULES = ("motion", "painter", "marks", "strip", "style", "elements", "pointers", "player", "mount")  # after those they import
 # Within <script> no character of a text may end it, begin markup or break a line of JavaScript.
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
 def page(data: Json, options: Json | None = None) -> str:
-    """Return the player of `data` (records.py) as one HTML page; `options` are those of `mount` in player.js."""
+    """Return the player of `data` (records.py) as one HTML page; `options` are those of `mount` in mount.js."""
     template = Template(files("udkjax.show.player").joinpath("page.html").read_text(encoding="utf-8"))
     return template.substitute(
         title=html.escape(data["title"]),
@@ -37,5 +39,8 @@ def as_json(data: object) -> str:
 
 @cache
 def module() -> str:
-    """Return the source of the player."""
-    return files("udkjax.show.player").joinpath("player.js").read_text(encoding="utf-8")
+    """Return the source of the player: its modules, joined to one."""
+    *parts, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES)
+    return re.sub(
+        r"^import .*\n", "", "\n".join([*(re.sub(r"^export ", "", part, flags=re.M) for part in parts), last]), flags=re.M
+    )

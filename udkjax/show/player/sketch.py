@@ -1,6 +1,6 @@
 """Marks at a pose as lines and circles, in pixels, y downwards: what an SVG, a DXF or the frame of a film is made of.
 
-It draws what `Painter` in player.js draws, in the same colours and proportions.
+It draws what `MarkPainter` in marks.js draws, in the same colours and proportions.
 """
 
 from collections.abc import Sequence

@@ -1,0 +1,109 @@
+// Motions: packed tables, and where the bodies of a run are at any time.
+
+const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
+const floats = text => new Float32Array(bytesOf(text).buffer);
+
+/** A packed table (udkjax/show/player/packing.py), row by row. Sums stay below 2^53: no bit operations, which have 32 bits. */
+function unpack({rows, steps, bytes}) {
+  const table = new Float64Array(rows * steps.length), source = bytesOf(bytes);
+  let at = 0;
+  for (let column = 0; column < steps.length; column++) {
+    let value = 0, slope = 0;
+    for (let row = 0; row < rows; row++) {
+      let unsigned = 0, weight = 1, byte;
+      do {
+        byte = source[at++];
+        unsigned += (byte & 127) * weight;
+        weight *= 128;
+      } while (byte > 127);
+      slope += unsigned % 2 ? -(unsigned + 1) / 2 : unsigned / 2;
+      value += slope;
+      table[row * steps.length + column] = value * steps[column];
+    }
+  }
+  return table;
+}
+
+/** 1, 2 or 5 times a power of ten, at least x. */
+export function nice(x) {
+  const power = 10 ** Math.floor(Math.log10(x));
+  return power * [1, 2, 5, 10].find(k => k * power >= x * (1 - 1e-9));
+}
+
+export const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+export const short = x => (x === 0 ? "0" : Math.abs(x) >= 1e5 || Math.abs(x) < 1e-3 ? x.toExponential(2) : String(+x.toPrecision(4))).replace("-", "−");
+
+/** Where the bodies of one run are at any time: cubic between its instants, whose rates are known; a mode is a sine. */
+export class Run {
+  constructor(record) {
+    Object.assign(this, record);
+    this.size = 3 * record.bodies.length;
+    if (!record.mode) {
+      this.ts = unpack(record.time);
+      this.q = unpack(record.q);
+      this.v = unpack(record.v);
+    }
+    this.measures = record.measures.map(m => ({...m, values: floats(m.values)}));
+    this.forces = record.reactions && unpack(record.reactions.force);
+    this.paths = null;
+    this.now = new Float64Array(this.size);
+  }
+
+  /** The interval that holds t, and where in it t is, from 0 to 1. */
+  find(t) {
+    const ts = this.ts;
+    let low = 0, high = ts.length - 1;
+    while (high - low > 1) {
+      const middle = (low + high) >> 1;
+      if (ts[middle] <= t) low = middle; else high = middle;
+    }
+    const h = ts[high] - ts[low];
+    return [low, high, h, h > 0 ? clamp((t - ts[low]) / h, 0, 1) : 0];
+  }
+
+  /** The coordinates x, y, angle of each body in turn; the array is used again by the next call. */
+  pose(t, amplitude = 1) {
+    const out = this.now;
+    if (this.mode) {
+      const s = amplitude * Math.sin(2 * Math.PI * t);
+      for (let k = 0; k < this.size; k++) out[k] = this.mode.q[k] + s * this.mode.shape[k];
+      return out;
+    }
+    const [i, j, h, s] = this.find(t), n = this.size, {q, v} = this;
+    const scale = h / this.frame, r = 1 - s;
+    for (let k = 0; k < n; k++) {
+      const a = q[i * n + k], b = q[j * n + k];
+      out[k] = a * r * r * (1 + 2 * s) + b * s * s * (3 - 2 * s) + scale * s * r * (v[i * n + k] * r - v[j * n + k] * s);
+    }
+    return out;
+  }
+
+  /** Forces x, y of each anchor of reactions. */
+  force(t) {
+    const [i, j, , s] = this.find(t), n = 2 * this.reactions.anchors.length;
+    return Array.from({length: n}, (_, k) => this.forces[i * n + k] * (1 - s) + this.forces[j * n + k] * s);
+  }
+
+  /** The paths of its traces: for each, its points at times that are evenly spaced. */
+  trace() {
+    if (!this.paths) {
+      const first = this.ts[0], last = this.ts[this.ts.length - 1];
+      const count = clamp(4 * this.ts.length, 2, 3000);
+      this.paths = {first, last, count, lines: this.traces.map(() => new Float64Array(2 * count))};
+      for (let i = 0; i < count; i++) {
+        const pose = this.pose(first + (last - first) * i / (count - 1));
+        this.traces.forEach((anchor, k) => this.paths.lines[k].set(place(pose, anchor), 2 * i));
+      }
+    }
+    return this.paths;
+  }
+}
+
+/** Where the anchor [body, x, y] is; body -1 is the ground. */
+export function place(pose, [body, x, y]) {
+  if (body < 0) return [x, y];
+  const cos = Math.cos(pose[3 * body + 2]), sin = Math.sin(pose[3 * body + 2]);
+  return [pose[3 * body] + cos * x - sin * y, pose[3 * body + 1] + sin * x + cos * y];
+}
+
+export const angleOf = (pose, body) => (body < 0 ? 0 : pose[3 * body + 2]);

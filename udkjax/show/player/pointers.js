@@ -1,0 +1,41 @@
+// Fingers, mouse and wheel on a canvas.
+
+/** Drag moves the view, two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
+export function followPointers(player, canvas) {
+  const down = new Map();
+  let moved = 0;
+  const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+  canvas.addEventListener("pointerdown", event => {
+    canvas.setPointerCapture(event.pointerId);
+    down.set(event.pointerId, point(event));
+    moved = 0;
+  });
+  canvas.addEventListener("pointermove", event => {
+    if (!down.has(event.pointerId)) return;
+    const before = [...down.values()], old = down.get(event.pointerId), now = point(event);
+    down.set(event.pointerId, now);
+    moved += Math.hypot(now[0] - old[0], now[1] - old[1]);
+    if (moved < 4) return;
+    const after = [...down.values()], centre = list => [0, 1].map(k => list.reduce((sum, p) => sum + p[k], 0) / list.length);
+    const [cx, cy] = centre(before), [nx, ny] = centre(after);
+    if (down.size === 2) {
+      const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]);
+      player.zoomAt(canvas, cx, cy, apart(after) / (apart(before) || 1));
+    }
+    player.zoom.x += nx - cx;
+    player.zoom.y += ny - cy;
+    player.draw();
+  });
+  const up = event => {
+    if (down.delete(event.pointerId) && event.type === "pointerup" && moved < 4) player.toggle("playing");
+  };
+  canvas.addEventListener("pointerup", up);
+  canvas.addEventListener("pointercancel", up);
+  canvas.addEventListener("dblclick", () => player.whole());
+  canvas.addEventListener("wheel", event => {
+    if (!player.options.fill && !event.ctrlKey && document.activeElement?.shadowRoot !== player.root.getRootNode()) return;
+    event.preventDefault();
+    player.zoomAt(canvas, ...point(event), Math.exp(-0.0015 * event.deltaY));
+    player.draw();
+  }, {passive: false});
+}
