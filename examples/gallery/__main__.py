@@ -1,4 +1,4 @@
-"""Make the gallery: for each example its player (.html), a picture of its motion and its plots (.png), and a page of them all.
+"""Make the gallery: players (.html, with one player.js), pictures of motions and plots (.png), and a page of them all.
 
     python -m examples.gallery [NAME ...] [--out docs/gallery]
 
@@ -8,6 +8,7 @@ files of at most 25 lines: `udkjax animate examples/drawings/door_closer.toml`.
 
 import argparse
 import html
+import re
 import time
 from importlib import import_module
 from pathlib import Path
@@ -25,6 +26,7 @@ NAMES = (
     "neural_friction",
 )
 DRAWINGS = {"toggle_press": 1.0, "quick_return": 2.0, "cam_follower": 0.5, "door_closer": 6.0, "scissor_lift_spring": 2.0}  # s
+PLAYER = "player.js"  # what moves their pages
 FRAMES = 121  # of their players
 WIDTH = 720  # px, of pictures
 DPI = 96  # of plots
@@ -42,7 +44,7 @@ def make(name: str, out: Path) -> dict:
     files = []
     for what, thing in shown.items():
         if what == "motion":
-            thing.save(out / f"{name}.html")
+            share_player(thing.save(out / f"{name}.html"))
             span = thing.data["end"] - thing.data["start"]
             moment = getattr(module, "MOMENT", MOMENT)
             picture = thing.save(out / f"{name}.png", thing.data["start"] + moment * span, width=WIDTH)
@@ -79,6 +81,20 @@ def make_drawing(name: str) -> tuple[str, tuple[dict, dict]]:
         "largest violation of a constraint (m or rad)": float(np.abs(udk.violation(mech, sol)).max()),
     }
     return "\n".join(words), (facts, {"motion": udk.animate(mech, sol)})
+
+
+def share_player(player: Path) -> None:
+    """Put the program of a page, which all of them have in common, into `player.js` beside it.
+
+    It is a script, since browsers read no modules from a disk, and the page loses its policy, which allows no scripts beside it.
+    """
+    text = player.read_text(encoding="utf-8")
+    start, module, end = re.fullmatch(r'(.*)<script type="module">\n(.*)\n(mount\(.*)', text, re.DOTALL).groups()
+    start = re.sub(r'<meta http-equiv="Content-Security-Policy"[^\n]*\n', "", start)
+    player.write_text(f'{start}<script src="{PLAYER}"></script>\n<script>\n{end}', encoding="utf-8")
+    program = re.sub(r"^export (default .*|)", "", module, flags=re.MULTILINE)
+    shared = f'const mount = (() => {{\n"use strict";\n{program}\nreturn mount;\n}})();\n'
+    (player.parent / PLAYER).write_text(shared, encoding="utf-8")
 
 
 def _shrink(picture: Path) -> None:

@@ -56,6 +56,8 @@ def test_an_example_shows_what_it_says(name, tmp_path):
     example = gallery.make(name, tmp_path)
     assert FACTS[name](*example["facts"].values()), example["facts"]
     assert (tmp_path / f"{name}.html").stat().st_size < 300_000
+    assert '<script src="player.js"></script>' in (tmp_path / f"{name}.html").read_text(encoding="utf-8")
+    assert (tmp_path / "player.js").read_bytes() == (ROOT / "docs" / "gallery" / "player.js").read_bytes()  # else make one anew
     for file in example["files"]:
         assert (tmp_path / file).read_bytes().startswith(b"\x89PNG")
     assert example["title"] in gallery.page([example]) and import_module(f"examples.gallery.{name}").__doc__

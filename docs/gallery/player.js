@@ -1,0 +1,1054 @@
+const mount = (() => {
+"use strict";
+// The player: shows the motion of planar mechanisms. One module without dependencies, for a page, a notebook and documentation.
+//
+//   mount(element, data, {fill, theme, autoplay}) -> {time, playing, play(), pause(), seek(t), ...}     (see `mount`)
+//   default export: {render} for anywidget
+//
+// `data` is what udkjax/show/player/records.py describes. All texts go through `textContent` or a canvas: none is markup.
+
+// ---------------------------------------------------------------------------------------------------------------- numbers
+
+const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
+const floats = text => new Float32Array(bytesOf(text).buffer);
+
+/** A packed table (udkjax/show/player/packing.py), row by row. Sums stay below 2^53: no bit operations, which have 32 bits. */
+function unpack({rows, steps, bytes}) {
+  const table = new Float64Array(rows * steps.length), source = bytesOf(bytes);
+  let at = 0;
+  for (let column = 0; column < steps.length; column++) {
+    let value = 0, slope = 0;
+    for (let row = 0; row < rows; row++) {
+      let unsigned = 0, weight = 1, byte;
+      do {
+        byte = source[at++];
+        unsigned += (byte & 127) * weight;
+        weight *= 128;
+      } while (byte > 127);
+      slope += unsigned % 2 ? -(unsigned + 1) / 2 : unsigned / 2;
+      value += slope;
+      table[row * steps.length + column] = value * steps[column];
+    }
+  }
+  return table;
+}
+
+/** 1, 2 or 5 times a power of ten, at least x. */
+function nice(x) {
+  const power = 10 ** Math.floor(Math.log10(x));
+  return power * [1, 2, 5, 10].find(k => k * power >= x * (1 - 1e-9));
+}
+
+const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+const short = x => (x === 0 ? "0" : Math.abs(x) >= 1e5 || Math.abs(x) < 1e-3 ? x.toExponential(2) : String(+x.toPrecision(4))).replace("-", "−");
+
+// ------------------------------------------------------------------------------------------------------------------- runs
+
+/** Where the bodies of one run are at any time: cubic between its instants, whose rates are known; a mode is a sine. */
+class Run {
+  constructor(record) {
+    Object.assign(this, record);
+    this.size = 3 * record.bodies.length;
+    if (!record.mode) {
+      this.ts = unpack(record.time);
+      this.q = unpack(record.q);
+      this.v = unpack(record.v);
+    }
+    this.measures = record.measures.map(m => ({...m, values: floats(m.values)}));
+    this.forces = record.reactions && unpack(record.reactions.force);
+    this.paths = null;
+    this.now = new Float64Array(this.size);
+  }
+
+  /** The interval that holds t, and where in it t is, from 0 to 1. */
+  find(t) {
+    const ts = this.ts;
+    let low = 0, high = ts.length - 1;
+    while (high - low > 1) {
+      const middle = (low + high) >> 1;
+      if (ts[middle] <= t) low = middle; else high = middle;
+    }
+    const h = ts[high] - ts[low];
+    return [low, high, h, h > 0 ? clamp((t - ts[low]) / h, 0, 1) : 0];
+  }
+
+  /** The coordinates x, y, angle of each body in turn; the array is used again by the next call. */
+  pose(t, amplitude = 1) {
+    const out = this.now;
+    if (this.mode) {
+      const s = amplitude * Math.sin(2 * Math.PI * t);
+      for (let k = 0; k < this.size; k++) out[k] = this.mode.q[k] + s * this.mode.shape[k];
+      return out;
+    }
+    const [i, j, h, s] = this.find(t), n = this.size, {q, v} = this;
+    const scale = h / this.frame, r = 1 - s;
+    for (let k = 0; k < n; k++) {
+      const a = q[i * n + k], b = q[j * n + k];
+      out[k] = a * r * r * (1 + 2 * s) + b * s * s * (3 - 2 * s) + scale * s * r * (v[i * n + k] * r - v[j * n + k] * s);
+    }
+    return out;
+  }
+
+  /** Forces x, y of each anchor of reactions. */
+  force(t) {
+    const [i, j, , s] = this.find(t), n = 2 * this.reactions.anchors.length;
+    return Array.from({length: n}, (_, k) => this.forces[i * n + k] * (1 - s) + this.forces[j * n + k] * s);
+  }
+
+  /** The paths of its traces: for each, its points at times that are evenly spaced. */
+  trace() {
+    if (!this.paths) {
+      const first = this.ts[0], last = this.ts[this.ts.length - 1];
+      const count = clamp(4 * this.ts.length, 2, 3000);
+      this.paths = {first, last, count, lines: this.traces.map(() => new Float64Array(2 * count))};
+      for (let i = 0; i < count; i++) {
+        const pose = this.pose(first + (last - first) * i / (count - 1));
+        this.traces.forEach((anchor, k) => this.paths.lines[k].set(place(pose, anchor), 2 * i));
+      }
+    }
+    return this.paths;
+  }
+}
+
+/** Where the anchor [body, x, y] is; body -1 is the ground. */
+function place(pose, [body, x, y]) {
+  if (body < 0) return [x, y];
+  const cos = Math.cos(pose[3 * body + 2]), sin = Math.sin(pose[3 * body + 2]);
+  return [pose[3 * body] + cos * x - sin * y, pose[3 * body + 1] + sin * x + cos * y];
+}
+
+const angleOf = (pose, body) => (body < 0 ? 0 : pose[3 * body + 2]);
+
+// ----------------------------------------------------------------------------------------------------------------- themes
+
+// Okabe and Ito's colours, which everyone tells apart, and one more; on dark grounds, lighter.
+const THEMES = {
+  light: {
+    back: "#ffffff", panel: "#f5f7f9", ink: "#1b2430", soft: "#5a6676", line: "#d5dbe3", grid: "#edf0f4", accent: "#0067b0",
+    onAccent: "#ffffff", force: "#b3261e", tint: 0.74,
+    bodies: ["#0072b2", "#d55e00", "#009e73", "#c2559a", "#3a9bdc", "#b87a00", "#6b5bb5"],
+  },
+  dark: {
+    back: "#11161d", panel: "#191f28", ink: "#e7ecf3", soft: "#9aa7b8", line: "#303a48", grid: "#1c232d", accent: "#5cb3f2",
+    onAccent: "#0c1219", force: "#ff8a80", tint: 0.68,
+    bodies: ["#4fb0ec", "#ff9055", "#3fcfa4", "#ea9fcb", "#93d2f6", "#f0bb4a", "#ab9cf2"],
+  },
+};
+
+const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
+
+/** A colour on the way to another one: t from 0 to 1. */
+function mix(one, two, t) {
+  const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
+  return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
+}
+
+// ---------------------------------------------------------------------------------------------------------------- drawing
+
+/** Draws marks (udkjax/show/player/marks.py) at a pose. Lengths of what is a symbol are in `pt`, which grow with the panel. */
+class Painter {
+  constructor(context, view, theme, pt, pose) {
+    Object.assign(this, {context, view, theme, pt, pose});
+  }
+
+  /** Pixels of a place in metres. */
+  px([x, y]) {
+    return [this.view.x + this.view.scale * x, this.view.y - this.view.scale * y];
+  }
+
+  anchor(anchor) {
+    return this.px(place(this.pose, anchor));
+  }
+
+  at(mark) {
+    return this.anchor([mark.body, ...mark.at]);
+  }
+
+  colour(body) {
+    return body < 0 ? this.theme.soft : this.theme.bodies[body % this.theme.bodies.length];
+  }
+
+  fillOf(body) {
+    return mix(this.colour(body), this.theme.back, this.theme.tint);
+  }
+
+  line(points, width, colour, {closed = false, fill = null, dash = []} = {}) {
+    const c = this.context;
+    c.beginPath();
+    points.forEach(([x, y], k) => (k ? c.lineTo(x, y) : c.moveTo(x, y)));
+    if (closed) c.closePath();
+    if (fill) { c.fillStyle = fill; c.fill(); }
+    if (width) {
+      c.setLineDash(dash.map(d => d * this.pt));
+      c.lineWidth = width * this.pt;
+      c.strokeStyle = colour;
+      c.stroke();
+      c.setLineDash([]);
+    }
+  }
+
+  circle([x, y], radius, {fill = null, stroke = null, width = 1.5, from = 0, to = 2 * Math.PI} = {}) {
+    const c = this.context;
+    c.beginPath();
+    c.arc(x, y, radius, from, to);
+    if (fill) { c.fillStyle = fill; c.fill(); }
+    if (stroke) { c.lineWidth = width * this.pt; c.strokeStyle = stroke; c.stroke(); }
+  }
+
+  /** Draw in a frame of pixels with its origin at a place and its x axis turned anticlockwise by an angle. */
+  inFrame([x, y], angle, draw) {
+    const c = this.context;
+    c.save();
+    c.translate(x, y);
+    c.rotate(-angle);
+    draw(c);
+    c.restore();
+  }
+
+  draw(marks) {
+    for (const mark of marks) this[mark.kind]?.(mark);
+  }
+
+  /** Short strokes to the lower left of a line from x0 to x1 at height y of the frame: what does not move. */
+  hatch(x0, x1, y) {
+    const c = this.context, pt = this.pt, step = 5 * pt;
+    c.beginPath();
+    for (let x = x0 + step; x <= x1 + 0.01 * pt; x += step) { c.moveTo(x, y); c.lineTo(x - step, y + step); }
+    c.lineWidth = pt;
+    c.strokeStyle = this.theme.soft;
+    c.stroke();
+  }
+
+  link({body, points, closed}) {
+    const corners = points.map(([x, y]) => this.anchor([body, x, y]));
+    const edge = this.colour(body), fill = this.fillOf(body);
+    this.line(corners, 11, edge, {closed, fill: closed ? edge : null});
+    this.line(corners, 8, fill, {closed, fill: closed ? fill : null});
+  }
+
+  disc(mark) {
+    const radius = Math.max(this.view.scale * mark.radius, 7 * this.pt);
+    this.circle(this.at(mark), radius, {fill: this.fillOf(mark.body), stroke: this.colour(mark.body)});
+    this.centre(mark);
+  }
+
+  /** The sign of a centre of mass: a circle in quarters, which shows how a body turns. */
+  centre(mark) {
+    const r = 4.5 * this.pt, {ink, back} = this.theme;
+    this.inFrame(this.at(mark), angleOf(this.pose, mark.body), c => {
+      this.circle([0, 0], r, {fill: back, stroke: ink, width: 1});
+      c.fillStyle = ink;
+      for (const start of [0, Math.PI]) { c.beginPath(); c.moveTo(0, 0); c.arc(0, 0, r, start, start + Math.PI / 2); c.fill(); }
+    });
+  }
+
+  wheel(mark) {
+    const radius = this.view.scale * mark.radius, pt = this.pt, edge = this.colour(mark.body);
+    const depth = Math.min(4 * pt, 0.12 * radius), teeth = clamp(Math.round(2 * Math.PI * radius / (9 * pt) / 4) * 4, 12, 96);
+    this.inFrame(this.at(mark), angleOf(this.pose, mark.body), c => {
+      const rim = [];
+      for (let k = 0; k < teeth; k++) {
+        for (const [part, r] of [[0, -1], [0.25, -1], [0.35, 1], [0.65, 1], [0.75, -1]]) {
+          const angle = 2 * Math.PI * (k + part) / teeth, reach = radius + r * depth / 2;
+          rim.push([reach * Math.cos(angle), reach * Math.sin(angle)]);
+        }
+      }
+      if (mark.internal) {
+        this.circle([0, 0], radius + depth + 5 * pt, {fill: this.fillOf(mark.body), stroke: edge});
+        this.line(rim, 1.3, edge, {closed: true, fill: this.theme.back});
+        return;
+      }
+      this.line(rim, 1.3, edge, {closed: true, fill: this.fillOf(mark.body)});
+      c.globalAlpha = 0.75;
+      for (let k = 0; k < 3; k++) {
+        const angle = 2 * Math.PI * k / 3, inner = Math.min(9 * pt, 0.3 * radius), outer = 0.8 * radius;
+        this.line([[inner * Math.cos(angle), inner * Math.sin(angle)], [outer * Math.cos(angle), outer * Math.sin(angle)]], 2.2, edge);
+      }
+    });
+  }
+
+  outline({body, points}) {
+    this.line(points.map(([x, y]) => this.anchor([body, x, y])), 1.6, this.colour(body), {closed: true, fill: this.fillOf(body)});
+  }
+
+  /** The ends of a rail in its frame (px), and its place and angle. */
+  railFrame({body, at, axis, span}, draw) {
+    const [a, b] = span.map(s => s * this.view.scale);
+    this.inFrame(this.anchor([body, ...at]), angleOf(this.pose, body) + axis, c => draw(c, a, b));
+  }
+
+  rail(mark) {
+    const pt = this.pt, {soft, back} = this.theme;
+    this.railFrame(mark, (c, a, b) => {
+      if (mark.slot) {
+        c.beginPath();
+        c.roundRect(a, -6.5 * pt, b - a, 13 * pt, 6.5 * pt);
+        c.fillStyle = back;
+        c.fill();
+        c.lineWidth = 1.3 * pt;
+        c.strokeStyle = this.colour(mark.body);
+        c.stroke();
+        return;
+      }
+      if (mark.body >= 0) { this.line([[a, 0], [b, 0]], 3, this.colour(mark.body)); return; }
+      this.line([[a, 9 * pt], [b, 9 * pt]], 1.5, soft);
+      this.hatch(a, b, 9 * pt);
+    });
+  }
+
+  rack(mark) {
+    const pt = this.pt, colour = this.colour(mark.body), step = 9 * pt;
+    this.railFrame(mark, (c, a, b) => {
+      const teeth = [];
+      for (let x = a; x < b; x += step) teeth.push([x, 2 * pt], [x + 0.3 * step, -2 * pt], [x + 0.7 * step, -2 * pt], [x + step, 2 * pt]);
+      this.line(teeth, 1.4, colour);
+      this.line([[a, 7 * pt], [b, 7 * pt]], 1.4, colour);
+      if (mark.body < 0) this.hatch(a, b, 7 * pt);
+    });
+  }
+
+  block(mark) {
+    const pt = this.pt;
+    this.inFrame(this.at(mark), angleOf(this.pose, mark.body) + mark.axis, c => {
+      c.beginPath();
+      c.roundRect(-15 * pt, -9 * pt, 30 * pt, 18 * pt, 3 * pt);
+      c.fillStyle = this.fillOf(mark.body);
+      c.fill();
+      c.lineWidth = 1.5 * pt;
+      c.strokeStyle = this.colour(mark.body);
+      c.stroke();
+    });
+  }
+
+  support(mark) {
+    const [x, y] = this.at(mark), pt = this.pt, {back, soft} = this.theme, foot = y + 17 * pt;
+    this.line([[x, y], [x - 10 * pt, foot], [x + 10 * pt, foot]], 1.4, soft, {closed: true, fill: back});
+    this.line([[x - 15 * pt, foot], [x + 15 * pt, foot]], 1.4, soft);
+    this.hatch(x - 15 * pt, x + 15 * pt, foot);
+  }
+
+  pin(mark) {
+    this.circle(this.at(mark), 4.2 * this.pt, {fill: this.theme.back, stroke: this.theme.ink, width: 1.7});
+  }
+
+  roller(mark) {
+    this.circle(this.at(mark), 4.8 * this.pt, {fill: this.fillOf(mark.body), stroke: this.theme.ink, width: 1.7});
+    this.circle(this.at(mark), 1.2 * this.pt, {fill: this.theme.ink});
+  }
+
+  weld(mark) {
+    const r = 4.5 * this.pt;
+    this.inFrame(this.at(mark), angleOf(this.pose, mark.body), c => {
+      c.fillStyle = this.theme.ink;
+      c.fillRect(-r, -r, 2 * r, 2 * r);
+    });
+  }
+
+  rod({a, b}) {
+    this.line([this.anchor(a), this.anchor(b)], 2.4, this.theme.ink);
+  }
+
+  /** Draw between two anchors, in a frame along them: draw(length). */
+  between({a, b}, draw) {
+    const [x0, y0] = this.anchor(a), [x1, y1] = this.anchor(b);
+    this.inFrame([x0, y0], -Math.atan2(y1 - y0, x1 - x0), () => draw(Math.hypot(x1 - x0, y1 - y0)));
+    for (const end of [a, b]) this.circle(this.anchor(end), 2.6 * this.pt, {fill: this.theme.ink});
+  }
+
+  spring(mark) {
+    const pt = this.pt, {ink} = this.theme;
+    this.between(mark, length => {
+      const end = Math.min(10 * pt, 0.15 * length), coils = clamp(Math.round(length / (11 * pt)), 6, 24), line = [[0, 0], [end, 0]];
+      const high = (mark.damper ? 5 : 7) * pt, shift = mark.damper ? -5 * pt : 0;
+      if (mark.damper) line.push([end, shift]);
+      for (let k = 0; k < 2 * coils; k++) line.push([end + (length - 2 * end) * (k + 0.5) / (2 * coils), shift + (k % 2 ? high : -high)]);
+      if (mark.damper) line.push([length - end, shift]);
+      line.push([length - end, 0], [length, 0]);
+      this.line(line, 1.5, ink);
+      if (mark.damper) {
+        const y = 9 * pt, box = 0.38 * length, right = 0.62 * length, piston = 0.5 * length;
+        this.line([[end, 0], [end, y], [piston, y]], 1.5, ink);
+        this.line([[piston, y - 3 * pt], [piston, y + 3 * pt]], 1.8, ink);
+        this.line([[box, y - 5 * pt], [right, y - 5 * pt], [right, y + 5 * pt], [box, y + 5 * pt]], 1.5, ink);
+        this.line([[right, y], [length - end, y], [length - end, 0]], 1.5, ink);
+      }
+    });
+  }
+
+  spiral(mark) {
+    const line = [];
+    for (let k = 0; k <= 60; k++) {
+      const r = (5 + 8 * k / 60) * this.pt, angle = 0.25 * k;
+      line.push([r * Math.cos(angle), r * Math.sin(angle)]);
+    }
+    this.inFrame(this.at(mark), angleOf(this.pose, mark.body), () => this.line(line, 1.3, this.theme.ink));
+  }
+
+  piston(mark) {
+    const {ink, back} = this.theme;
+    this.between(mark, length => {
+      this.line([[0, 0], [length, 0]], 3, ink);
+      this.line([[0, 0], [0.55 * length, 0]], 9, ink);
+      this.line([[0, 0], [0.55 * length, 0]], 6, back);
+    });
+  }
+
+  motor(mark) {
+    this.turn(this.at(mark), 11, 1, this.theme.accent);
+  }
+
+  friction(mark) {
+    const place = this.at(mark), pt = this.pt;
+    this.circle(place, 8 * pt, {stroke: this.theme.soft, width: 1.2});
+    for (let k = 0; k < 8; k++) {
+      const angle = Math.PI * k / 4, c = Math.cos(angle), s = Math.sin(angle);
+      this.line([[place[0] + 8 * pt * c, place[1] + 8 * pt * s], [place[0] + 11 * pt * c, place[1] + 11 * pt * s]], 1.2, this.theme.soft);
+    }
+  }
+
+  force(mark) {
+    const angle = Math.atan2(mark.vector[1], mark.vector[0]) + (mark.turns ? angleOf(this.pose, mark.body) : 0);
+    const [x, y] = this.at(mark), length = 42 * this.pt;
+    this.arrow([x, y], [x + length * Math.cos(angle), y - length * Math.sin(angle)], this.theme.accent);
+  }
+
+  torque(mark) {
+    this.turn(this.at(mark), 16, mark.sign, this.theme.accent);
+  }
+
+  /** A round arrow: sign 1 is anticlockwise. */
+  turn(place, radius, sign, colour) {
+    const c = this.context, pt = this.pt, r = radius * pt;
+    c.save();
+    c.translate(...place);
+    c.scale(1, -sign);
+    this.circle([0, 0], r, {stroke: colour, width: 1.8, from: -0.5, to: 3.5});
+    const tip = 3.5, x = r * Math.cos(tip), y = r * Math.sin(tip), dx = -Math.sin(tip), dy = Math.cos(tip);
+    this.head([x + 4 * pt * dx, y + 4 * pt * dy], Math.atan2(dy, dx), colour);
+    c.restore();
+  }
+
+  head([x, y], angle, colour) {
+    const size = 7.5 * this.pt, wide = 0.42;
+    const corner = turn => [x - size * Math.cos(angle + turn), y - size * Math.sin(angle + turn)];
+    this.line([[x, y], corner(wide), corner(-wide)], 0, colour, {closed: true, fill: colour});
+  }
+
+  arrow([x0, y0], [x1, y1], colour, dash = []) {
+    const angle = Math.atan2(y1 - y0, x1 - x0), length = Math.hypot(x1 - x0, y1 - y0), back = Math.min(5 * this.pt, length);
+    this.line([[x0, y0], [x1 - back * Math.cos(angle), y1 - back * Math.sin(angle)]], 2.2, colour, {dash});
+    if (length > 2 * this.pt) this.head([x1, y1], angle, colour);
+  }
+
+  text(words, [x, y], colour, {align = "left", size = 12, weight = 400, halo = true, back = this.theme.back} = {}) {
+    const c = this.context;
+    c.font = `${weight} ${size * Math.max(1, this.pt)}px system-ui, -apple-system, "Segoe UI", Roboto, sans-serif`;
+    c.textAlign = align;
+    c.textBaseline = "middle";
+    if (halo) {
+      c.lineWidth = 4;
+      c.strokeStyle = back;
+      c.strokeText(words, x, y);
+    }
+    c.fillStyle = colour;
+    c.fillText(words, x, y);
+  }
+
+  grid(width, height) {
+    const step = nice(80 / this.view.scale), c = this.context;
+    c.beginPath();
+    for (let k = Math.ceil(-this.view.x / this.view.scale / step); k * step * this.view.scale + this.view.x < width; k++) {
+      const x = Math.round(this.view.x + k * step * this.view.scale) + 0.5;
+      c.moveTo(x, 0);
+      c.lineTo(x, height);
+    }
+    for (let k = Math.ceil((this.view.y - height) / this.view.scale / step); this.view.y - k * step * this.view.scale > 0; k++) {
+      const y = Math.round(this.view.y - k * step * this.view.scale) + 0.5;
+      c.moveTo(0, y);
+      c.lineTo(width, y);
+    }
+    c.lineWidth = 1;
+    c.strokeStyle = this.theme.grid;
+    c.stroke();
+    return step;
+  }
+
+  /** How long one step of the grid is. */
+  bar(step, height) {
+    const {soft} = this.theme, length = step * this.view.scale, x = 14, y = height - 14;
+    this.line([[x, y - 3], [x, y + 3], [x, y], [x + length, y], [x + length, y - 3], [x + length, y + 3]], 1.2 / this.pt, soft);
+    const [value, unit] = step >= 1e3 ? [step / 1e3, "km"] : step >= 1 ? [step, "m"] : step >= 1e-2 ? [step * 100, "cm"]
+      : step >= 1e-3 ? [step * 1e3, "mm"] : [step * 1e6, "µm"];
+    this.text(`${+value.toPrecision(3)} ${unit}`, [x + length + 7, y], soft, {size: 11 / Math.max(1, this.pt)});
+  }
+
+  traces(run, t) {
+    const c = this.context, {first, last, count, lines} = run.trace();
+    const now = clamp((t - first) / (last - first || 1) * (count - 1), 0, count - 1), tail = Math.max(2, 0.06 * count);
+    lines.forEach((line, k) => {
+      const colour = this.colour(run.traces[k][0]);
+      const stroke = (from, to, width, alpha) => {
+        c.beginPath();
+        for (let i = from; i <= to; i++) {
+          const [x, y] = this.px([line[2 * i], line[2 * i + 1]]);
+          if (i === from) c.moveTo(x, y); else c.lineTo(x, y);
+        }
+        c.globalAlpha = alpha;
+        c.lineWidth = width * this.pt;
+        c.strokeStyle = colour;
+        c.stroke();
+        c.globalAlpha = 1;
+      };
+      stroke(0, count - 1, 1, 0.4);
+      stroke(Math.max(0, Math.ceil(now - tail)), Math.floor(now), 2.4, 0.8);
+    });
+  }
+
+  /** Arrows of forces, and one whose force is told. An arrow that would be longer than three times the usual one is cut. */
+  reactions(run, t, width, height) {
+    const forces = run.force(t), {anchors, usual, unique} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
+    anchors.forEach((anchor, k) => {
+      const [x, y] = this.anchor(anchor), fx = forces[2 * k] / usual, fy = forces[2 * k + 1] / usual;
+      const size = length * Math.min(1, 3 / Math.hypot(fx, fy));
+      if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour, unique[k] ? [] : NOT_UNIQUE);
+    });
+    const told = nice(usual / 2), y = height - 14, words = `${short(told)} N${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
+    this.text(words, [width - 14, y], colour, {align: "right", size: 11 / Math.max(1, this.pt)});
+    const end = width - 14 - this.context.measureText(words).width - 7;
+    this.arrow([end - length * told / usual, y], [end, y], colour);
+  }
+
+  names(run) {
+    run.bodies.forEach((name, body) => this.text(name, this.anchor([body, 0, 0]), this.colour(body), {align: "center", weight: 600}));
+    for (const mark of run.marks) {
+      if (mark.kind !== "pin") continue;
+      const [x, y] = this.at(mark);
+      this.text(mark.name, [x + 8 * this.pt, y - 10 * this.pt], this.theme.ink, {size: 11});
+    }
+  }
+}
+
+// ------------------------------------------------------------------------------------------------------------------ strip
+
+/** Curves of one measure of all runs over the timeline, and a line at the time that is shown. */
+function drawStrip(context, width, height, runs, name, start, end, t, theme, taken) {
+  const left = 12, right = width - 12, top = 34, bottom = height - 10;
+  const found = runs.map(run => run.measures.find(m => m.name === name));
+  const log = found.some(m => m?.log);
+  const scaled = y => (log ? Math.log10(Math.max(Math.abs(y), 1e-300)) : y);
+  let low = Infinity, high = -Infinity;
+  for (const m of found) for (const y of m?.values ?? []) {
+    if (Number.isFinite(y)) { low = Math.min(low, scaled(y)); high = Math.max(high, scaled(y)); }
+  }
+  const painter = new Painter(context, {x: 0, y: 0, scale: 1}, theme, 1, null);
+  if (!(high >= low)) return painter.text("no values", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
+  const least = log ? 3 : 1e-12 * Math.max(Math.abs(low), Math.abs(high)) || 1;
+  if (high - low < least) { low -= least / 2; high += least / 2; }
+  const x = time => left + (right - left) * (time - start) / (end - start || 1);
+  const y = value => bottom - (bottom - top) * (scaled(value) - low) / (high - low);
+  painter.line([[left, bottom + 0.5], [right, bottom + 0.5]], 1, theme.line);
+  found.forEach((m, k) => {
+    if (!m) return;
+    context.beginPath();
+    let pen = false;
+    runs[k].ts.forEach((time, i) => {
+      if (!Number.isFinite(m.values[i])) { pen = false; return; }
+      if (pen) context.lineTo(x(time), y(m.values[i])); else context.moveTo(x(time), y(m.values[i]));
+      pen = true;
+    });
+    context.lineWidth = 1.6;
+    context.lineJoin = "round";
+    context.strokeStyle = theme.bodies[k % theme.bodies.length];
+    context.stroke();
+  });
+  painter.line([[x(t), top - 4], [x(t), bottom]], 1.2, theme.ink);
+  const ends = {back: theme.panel, align: "right", size: 10.5}, back = value => (log ? 10 ** value : value);
+  painter.text(short(back(high)), [right, top + 3], theme.soft, ends);
+  painter.text(short(back(low)), [right, bottom - 7], theme.soft, ends);
+  // Values at this time, from the right: one for each run, in its colour; without the runs' names where there is no room.
+  const now = runs.map((run, k) => {
+    const [i, j, , s] = run.find(t), value = found[k]?.values[s < 0.5 ? i : j];
+    return {value, words: found[k] ? `${Number.isFinite(value) ? short(value) : "–"}${found[k].unit && " " + found[k].unit}` : ""};
+  });
+  context.font = "600 12px system-ui";
+  const whole = now.map(({words}, k) => `${runs[k].label}  ${words}`);
+  const room = whole.reduce((sum, words) => sum + context.measureText(words).width + 18, taken) < width;
+  let edge = right;
+  for (let k = runs.length - 1; k >= 0; k--) {
+    const colour = theme.bodies[k % theme.bodies.length], {value} = now[k], words = room && runs.length > 1 ? whole[k] : now[k].words;
+    if (!now[k].words) continue;
+    painter.text(words, [edge, 17], colour, {align: "right", weight: 600, halo: false});
+    if (Number.isFinite(value)) painter.circle([x(t), y(value)], 3.4, {fill: colour, stroke: theme.panel});
+    edge -= context.measureText(words).width + 18;
+  }
+}
+
+// ----------------------------------------------------------------------------------------------------------------- player
+
+const SPEEDS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100];
+const ICONS = {
+  play: "M7 4.5v15l13-7.5z",
+  pause: "M6 4.5h4.2v15H6zM13.8 4.5H18v15h-4.2z",
+  loop: "M17 3l4 4-4 4V8H8a3 3 0 0 0-3 3v1H3v-1a5 5 0 0 1 5-5h9zM7 21l-4-4 4-4v3h9a3 3 0 0 0 3-3v-1h2v1a5 5 0 0 1-5 5H7z",
+  theme: "M12 3a9 9 0 1 0 0 18zM12 3a9 9 0 0 1 0 18v-2a7 7 0 0 0 0-14z",
+};
+const HELP = [
+  ["Space", "play, pause"], ["← →", "one frame back, ahead"], ["Shift ← →", "a twentieth back, ahead"], ["Home End", "start, end"],
+  ["+ −", "faster, slower"], ["T", "traces"], ["N", "names"], ["R", "reactions"], ["L", "repeat"], ["D", "dark or light"],
+  ["0", "whole view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
+];
+
+const STYLE = `
+:host { display: block; }
+.player { --radius: 8px; box-sizing: border-box; display: flex; flex-direction: column; font: 14px/1.4 system-ui, -apple-system, "Segoe UI",
+  Roboto, "Helvetica Neue", Arial, sans-serif; color: var(--ink); background: var(--back); border: 1px solid var(--line);
+  border-radius: var(--radius); overflow: hidden; position: relative; }
+.player.fill { height: 100vh; height: 100dvh; border: 0; border-radius: 0; }
+.player *, .player *::before { box-sizing: border-box; }
+header { display: flex; align-items: center; gap: 8px; padding: 10px 10px 10px 16px; border-bottom: 1px solid var(--line); }
+h1 { font-size: 15px; font-weight: 600; margin: 0; flex: 1; min-width: 0; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; }
+.stage { display: grid; grid-auto-columns: minmax(0, 1fr); grid-auto-flow: column; min-height: 0; }
+.fill .stage { flex: 1; }
+.panel { position: relative; min-width: 0; min-height: 0; margin: 0; }
+.panel + .panel { border-left: 1px solid var(--line); }
+.narrow .stage { grid-auto-flow: row; grid-auto-rows: minmax(0, 1fr); }
+.narrow .panel + .panel { border-left: 0; border-top: 1px solid var(--line); }
+.panel canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: grab; outline-offset: -2px; }
+.panel canvas:active { cursor: grabbing; }
+figcaption { position: absolute; left: 16px; top: 10px; right: 16px; pointer-events: none; font-size: 13px; color: var(--soft);
+  overflow-wrap: anywhere; }
+figcaption b { color: var(--ink); font-weight: 600; }
+.strip { position: relative; height: 104px; background: var(--panel); border-top: 1px solid var(--line); flex: none; }
+.strip canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: ew-resize; }
+.strip select { position: absolute; left: 8px; top: 3px; max-width: 46%; }
+.controls { display: flex; flex-wrap: wrap; align-items: center; gap: 6px 8px; padding: 8px 10px; background: var(--panel);
+  border-top: 1px solid var(--line); flex: none; }
+.group { display: flex; flex-wrap: wrap; gap: 6px; align-items: center; }
+.time { font-variant-numeric: tabular-nums; white-space: nowrap; min-width: 11ch; color: var(--soft); }
+.time b { color: var(--ink); font-weight: 600; }
+button, select { font: inherit; font-size: 13px; color: var(--ink); background: transparent; border: 1px solid transparent; border-radius: 6px;
+  height: 32px; padding: 0 8px; margin: 0; cursor: pointer; }
+button:hover, select:hover { background: color-mix(in srgb, var(--ink) 8%, transparent); }
+button[aria-pressed="true"] { color: var(--accent); background: color-mix(in srgb, var(--accent) 14%, transparent); }
+option { color: #111; background: #fff; }
+:focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
+button svg { display: block; width: 18px; height: 18px; fill: currentColor; }
+button.icon { width: 34px; padding: 0; display: grid; place-items: center; flex: none; }
+button.primary { background: var(--accent); color: var(--on-accent); width: 40px; height: 40px; border-radius: 50%; }
+button.primary:hover { background: color-mix(in srgb, var(--accent) 86%, var(--ink)); }
+input[type="range"] { accent-color: var(--accent); height: 32px; margin: 0; cursor: pointer; }
+.scrub { flex: 1 1 140px; min-width: 100px; }
+.amplitude { display: flex; align-items: center; gap: 6px; font-size: 13px; color: var(--soft); }
+.amplitude input { width: 96px; }
+.help { position: absolute; inset: 0; display: grid; place-items: center; background: color-mix(in srgb, var(--back) 72%, transparent); z-index: 2; }
+.help[hidden] { display: none; }
+.help dl { display: grid; grid-template-columns: auto auto; gap: 5px 18px; margin: 0; padding: 18px 22px; background: var(--panel); max-height: 96%;
+  overflow: auto; border: 1px solid var(--line); border-radius: var(--radius); box-shadow: 0 8px 30px rgb(0 0 0 / 22%); font-size: 13px; }
+.help dt { font-weight: 600; text-align: right; white-space: nowrap; }
+.help dd { margin: 0; color: var(--soft); }
+@media (pointer: coarse) { button, select { height: 38px; } button.icon { width: 40px; } button.primary { width: 44px; height: 44px; } }
+`;
+
+/** An element with properties and children; texts are texts. */
+function make(tag, properties = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [key, value] of Object.entries(properties)) {
+    if (key === "class") element.className = value;
+    else if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else element.setAttribute(key, value);
+  }
+  element.append(...children);
+  return element;
+}
+
+function icon(name) {
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), path = document.createElementNS(svg.namespaceURI, "path");
+  svg.setAttribute("viewBox", "0 0 24 24");
+  svg.setAttribute("aria-hidden", "true");
+  path.setAttribute("d", ICONS[name]);
+  svg.append(path);
+  return svg;
+}
+
+class Player {
+  constructor(element, data, options) {
+    if (data.format !== 1) throw new Error(`this player reads format 1, not ${data.format}`);
+    this.data = data;
+    this.options = options;
+    this.runs = data.runs.map(record => new Run(record));
+    this.modes = this.runs.some(run => run.mode);
+    this.t = data.start;
+    this.playing = false;
+    this.speed = data.speed;
+    this.amplitude = 1;
+    this.show = {traces: !this.modes, names: false, reactions: this.runs.some(run => run.reactions), loop: true};
+    this.zoom = {factor: 1, x: 0, y: 0};
+    this.measures = [...new Set(this.runs.flatMap(run => run.measures.map(m => m.name)))];
+    this.measure = this.measures[0];
+    this.listeners = [];
+    this.media = matchMedia("(prefers-color-scheme: dark)");
+    this.chosen = options.theme ?? null;
+    this.build(element);
+    this.onMedia = () => this.retheme();
+    this.media.addEventListener("change", this.onMedia);
+    this.resize = new ResizeObserver(() => this.layout());
+    this.resize.observe(this.root);
+    this.retheme();
+    this.layout();
+    if (options.autoplay && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.play();
+  }
+
+  build(element) {
+    const {data} = this, shadow = element.shadowRoot ?? element.attachShadow({mode: "open"});
+    const toggle = (name, words, key) => this.button(words, `${words} (${key})`, () => this.toggle(name));
+    this.playButton = make("button", {class: "icon primary", type: "button", onclick: () => this.toggle("playing")});
+    this.timeLabel = make("span", {class: "time"});
+    this.scrub = make("input", {class: "scrub", type: "range", min: 0, max: 10000, step: 1, "aria-label": "time",
+      oninput: () => this.seek(data.start + (data.end - data.start) * this.scrub.value / 10000)});
+    this.speedSelect = make("select", {"aria-label": "speed", title: "speed (+ −)", onchange: () => this.setSpeed(+this.speedSelect.value)});
+    const near = SPEEDS.filter(s => s >= 0.009 * this.speed && s <= 21 * this.speed);
+    for (const s of [...new Set([...near, this.speed])].sort((a, b) => a - b)) {
+      this.speedSelect.append(make("option", {value: s}, `${s} ×`));
+    }
+    this.speedSelect.value = this.speed;
+    this.buttons = {loop: this.button(icon("loop"), "repeat (L)", () => this.toggle("loop"), "icon")};
+    if (this.runs.some(run => run.traces.length)) this.buttons.traces = toggle("traces", "Traces", "T");
+    if (this.runs.some(run => run.reactions)) this.buttons.reactions = toggle("reactions", "Reactions", "R");
+    this.buttons.names = toggle("names", "Names", "N");
+    this.panels = this.runs.map((run, k) => this.panel(run, k));
+    this.stage = make("div", {class: "stage"}, ...this.panels.map(p => p.figure));
+    this.help = make("div", {class: "help", hidden: "", onclick: () => this.toggleHelp()},
+      make("dl", {}, ...HELP.flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
+    const groups = [this.playButton, this.timeLabel, this.scrub, make("div", {class: "group"}, ...(this.modes ? [] : [this.speedSelect]),
+      ...Object.values(this.buttons))];
+    if (this.modes) {
+      const range = make("input", {type: "range", min: 0, max: 3, step: 0.01, value: 1, "aria-label": "amplitude",
+        oninput: () => { this.amplitude = +range.value; this.draw(); }});
+      groups.push(make("label", {class: "amplitude"}, "amplitude", range));
+    }
+    this.root = make("div", {class: "player", tabindex: -1, onkeydown: event => this.key(event)},
+      make("header", {}, make("h1", {title: data.title}, data.title),
+        this.button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
+        this.button("?", "keys", () => this.toggleHelp(), "icon")),
+      this.stage, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
+    this.root.classList.toggle("fill", Boolean(this.options.fill));
+    shadow.replaceChildren(make("style", {}, STYLE), this.root);
+    for (const name of Object.keys(this.buttons)) this.press(name);
+    this.setPlaying(false);
+  }
+
+  button(content, title, action, kind = "") {
+    return make("button", {type: "button", class: kind, title, "aria-label": title, onclick: action}, content);
+  }
+
+  panel(run, k) {
+    const canvas = make("canvas", {role: "img", tabindex: 0, "aria-label": `${this.data.title} ${run.label}: motion`});
+    const caption = make("figcaption");
+    if (this.runs.length > 1 || this.modes) caption.append(make("b", {}, run.label));
+    if (run.note) caption.append(" ", run.note);
+    const panel = {run, canvas, figure: make("figure", {class: "panel"}, canvas, caption)};
+    this.pointers(panel);
+    return panel;
+  }
+
+  strip() {
+    this.stripCanvas = make("canvas", {"aria-hidden": "true"});
+    const select = this.measureSelect = make("select", {"aria-label": "measure", onchange: () => { this.measure = select.value; this.draw(); }});
+    for (const name of this.measures) select.append(make("option", {value: name}, name));
+    const seek = event => {
+      const box = this.stripCanvas.getBoundingClientRect();
+      this.seek(this.data.start + (this.data.end - this.data.start) * clamp((event.clientX - box.left - 12) / (box.width - 24), 0, 1));
+    };
+    this.stripCanvas.addEventListener("pointerdown", event => { this.stripCanvas.setPointerCapture(event.pointerId); seek(event); });
+    this.stripCanvas.addEventListener("pointermove", event => { if (event.buttons) seek(event); });
+    return make("div", {class: "strip"}, this.stripCanvas, select);
+  }
+
+  /** Drag moves the view, two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
+  pointers({canvas}) {
+    const down = new Map();
+    let moved = 0;
+    const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+    canvas.addEventListener("pointerdown", event => {
+      canvas.setPointerCapture(event.pointerId);
+      down.set(event.pointerId, point(event));
+      moved = 0;
+    });
+    canvas.addEventListener("pointermove", event => {
+      if (!down.has(event.pointerId)) return;
+      const before = [...down.values()], old = down.get(event.pointerId), now = point(event);
+      down.set(event.pointerId, now);
+      moved += Math.hypot(now[0] - old[0], now[1] - old[1]);
+      if (moved < 4) return;
+      const after = [...down.values()], centre = list => [0, 1].map(k => list.reduce((sum, p) => sum + p[k], 0) / list.length);
+      const [cx, cy] = centre(before), [nx, ny] = centre(after);
+      if (down.size === 2) {
+        const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]);
+        this.zoomAt(canvas, cx, cy, apart(after) / (apart(before) || 1));
+      }
+      this.zoom.x += nx - cx;
+      this.zoom.y += ny - cy;
+      this.draw();
+    });
+    const up = event => {
+      if (down.delete(event.pointerId) && event.type === "pointerup" && moved < 4) this.toggle("playing");
+    };
+    canvas.addEventListener("pointerup", up);
+    canvas.addEventListener("pointercancel", up);
+    canvas.addEventListener("dblclick", () => this.whole());
+    canvas.addEventListener("wheel", event => {
+      if (!this.options.fill && !event.ctrlKey && document.activeElement?.shadowRoot !== this.root.getRootNode()) return;
+      event.preventDefault();
+      this.zoomAt(canvas, ...point(event), Math.exp(-0.0015 * event.deltaY));
+      this.draw();
+    }, {passive: false});
+  }
+
+  zoomAt(canvas, x, y, factor) {
+    const next = clamp(this.zoom.factor * factor, 0.2, 100), ratio = next / this.zoom.factor;
+    const cx = canvas.clientWidth / 2, cy = canvas.clientHeight / 2;
+    this.zoom.x = (this.zoom.x + cx - x) * ratio + x - cx;
+    this.zoom.y = (this.zoom.y + cy - y) * ratio + y - cy;
+    this.zoom.factor = next;
+  }
+
+  whole() {
+    this.zoom = {factor: 1, x: 0, y: 0};
+    this.draw();
+  }
+
+  // What happens
+
+  on(listener) {
+    this.listeners.push(listener);
+  }
+
+  tell() {
+    for (const listener of this.listeners) listener(this);
+  }
+
+  toggle(name) {
+    if (name === "playing") return this.playing ? this.pause() : this.play();
+    this.show[name] = !this.show[name];
+    this.press(name);
+    this.draw();
+  }
+
+  press(name) {
+    this.buttons[name]?.setAttribute("aria-pressed", this.show[name]);
+  }
+
+  setPlaying(playing) {
+    this.playing = playing;
+    const words = playing ? "pause (space)" : "play (space)";
+    this.playButton.replaceChildren(icon(playing ? "pause" : "play"));
+    this.playButton.title = words;
+    this.playButton.setAttribute("aria-label", words);
+  }
+
+  setSpeed(speed) {
+    this.speed = speed;
+    this.speedSelect.value = speed;
+  }
+
+  play() {
+    if (this.playing) return;
+    if (this.t >= this.data.end) this.t = this.data.start;
+    this.setPlaying(true);
+    let before = null;
+    const frame = now => {
+      if (!this.playing) return;
+      this.advance(before === null ? 0 : Math.min(now - before, 250) / 1000);
+      before = now;
+      this.request = requestAnimationFrame(frame);
+    };
+    this.request = requestAnimationFrame(frame);
+    this.tell();
+  }
+
+  advance(seconds) {
+    const {start, end} = this.data;
+    let t = this.t + seconds * this.speed;
+    if (t >= end && this.show.loop && end > start) t = start + (t - start) % (end - start);
+    this.t = Math.min(t, end);
+    this.draw();
+    if (this.t >= end) this.pause();
+  }
+
+  pause() {
+    if (!this.playing) return;
+    cancelAnimationFrame(this.request);
+    this.setPlaying(false);
+    this.tell();
+  }
+
+  seek(t) {
+    this.t = clamp(t, this.data.start, this.data.end);
+    this.draw();
+    this.tell();
+  }
+
+  switchTheme() {
+    this.chosen = this.themeName() === "dark" ? "light" : "dark";
+    this.retheme();
+  }
+
+  themeName() {
+    return this.chosen ?? (this.media.matches ? "dark" : "light");
+  }
+
+  retheme() {
+    this.theme = THEMES[this.themeName()];
+    const {back, panel, ink, soft, line, accent, onAccent, force} = this.theme;
+    const colours = {back, panel, ink, soft, line, accent, force, "on-accent": onAccent};
+    for (const [name, value] of Object.entries(colours)) this.root.style.setProperty(`--${name}`, value);
+    this.root.style.colorScheme = this.themeName();
+    if (this.options.fill) document.body.style.background = back;
+    this.draw();
+  }
+
+  toggleHelp() {
+    this.help.hidden = !this.help.hidden;
+  }
+
+  key(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+    const {start, end} = this.data, step = event.shiftKey ? (end - start) / 20 : this.speed / 30;
+    const speeds = [...this.speedSelect.options].map(o => +o.value), at = speeds.indexOf(this.speed);
+    const actions = {
+      " ": () => this.toggle("playing"), ArrowLeft: () => this.seek(this.t - step), ArrowRight: () => this.seek(this.t + step),
+      Home: () => this.seek(start), End: () => this.seek(end), 0: () => this.whole(), "?": () => this.toggleHelp(),
+      "+": () => this.setSpeed(speeds[Math.min(at + 1, speeds.length - 1)]), "-": () => this.setSpeed(speeds[Math.max(at - 1, 0)]),
+      t: () => this.toggle("traces"), n: () => this.toggle("names"), r: () => this.toggle("reactions"), l: () => this.toggle("loop"),
+      d: () => this.switchTheme(), Escape: () => { this.help.hidden = true; },
+    };
+    const action = actions[event.key] ?? actions[event.key.toLowerCase()];
+    if (!action || (event.key === " " && event.target.tagName === "BUTTON")) return;  // a button takes the space bar itself
+    event.preventDefault();
+    action();
+  }
+
+  // How it looks
+
+  layout() {
+    const width = this.root.clientWidth;
+    if (!width) return;
+    this.root.classList.toggle("narrow", width < 640);
+    if (!this.options.fill) {
+      const [left, bottom, right, top] = this.data.bounds, narrow = width < 640;
+      const each = narrow ? width : width / this.runs.length, aspect = (top - bottom) / (right - left);
+      const height = clamp(each * aspect + 60, 220, narrow ? 320 : 480);
+      this.stage.style.height = `${Math.round(narrow ? height * this.runs.length : height)}px`;
+    }
+    this.draw();
+  }
+
+  /** A canvas's context, in CSS pixels, cleared, at the resolution of the screen. */
+  context(canvas) {
+    const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
+    const wide = Math.round(width * ratio), high = Math.round(height * ratio);
+    if (canvas.width !== wide || canvas.height !== high) { canvas.width = wide; canvas.height = high; }
+    const context = canvas.getContext("2d");
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, width, height);
+    context.lineCap = context.lineJoin = "round";
+    return {context, width, height};
+  }
+
+  /** Pixels of a place in metres in a panel: x + scale X, y - scale Y. */
+  view(width, height) {
+    const [left, bottom, right, top] = this.data.bounds;
+    const margin = Math.min(44, 0.12 * Math.min(width, height));
+    const fit = Math.min((width - 2 * margin) / (right - left), (height - 2 * margin) / (top - bottom));
+    const scale = fit * this.zoom.factor;
+    return {scale, x: width / 2 - scale * (left + right) / 2 + this.zoom.x, y: height / 2 + scale * (bottom + top) / 2 + this.zoom.y};
+  }
+
+  draw() {
+    if (!this.theme) return;
+    const {data, t, theme, show} = this;
+    for (const {run, canvas} of this.panels) {
+      const {context, width, height} = this.context(canvas);
+      if (!width || !height) continue;
+      const view = this.view(width, height), pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
+      const painter = new Painter(context, view, theme, pt, null);
+      const step = painter.grid(width, height);
+      if (show.traces && !run.mode) painter.traces(run, t);
+      painter.pose = run.pose(t, this.amplitude);
+      painter.draw(run.marks);
+      if (show.reactions && run.reactions) painter.reactions(run, t, width, height);
+      if (show.names) painter.names(run);
+      painter.bar(step, height);
+    }
+    if (this.stripCanvas) {
+      const {context, width, height} = this.context(this.stripCanvas);
+      drawStrip(context, width, height, this.runs, this.measure, data.start, data.end, t, theme, this.measureSelect.offsetWidth + 24);
+    }
+    const span = data.end - data.start;
+    this.scrub.value = span > 0 ? Math.round(10000 * (t - data.start) / span) : 0;
+    const digits = clamp(3 - Math.floor(Math.log10(span || 1)), 0, 9), of = x => x.toFixed(digits);
+    const [now, rest] = this.modes ? [`${Math.round(360 * t)}°`, ""] : [of(t), ` / ${of(data.end)} ${data.unit}`];
+    this.timeLabel.replaceChildren(make("b", {}, now), rest);
+    this.scrub.setAttribute("aria-valuetext", now + rest);
+  }
+
+  destroy() {
+    this.pause();
+    this.resize.disconnect();
+    this.media.removeEventListener("change", this.onMedia);
+    this.root.remove();
+  }
+}
+
+/** Show `data` in an element.
+ *
+ *  options: fill (the whole window), theme ("light", "dark"; by default what the system prefers), autoplay.
+ *  Returns time, playing, play(), pause(), seek(t), speed, pixel(panel, x, y) -> [x, y] in the panel's canvas (CSS px),
+ *  on(listener) and destroy(). The same object is the element's property `player`.
+ */
+function mount(element, data, options = {}) {
+  const player = new Player(element, data, options);
+  const handle = {
+    get time() { return player.t; },
+    get playing() { return player.playing; },
+    get speed() { return player.speed; },
+    set speed(speed) { player.setSpeed(speed); },
+    play: () => player.play(),
+    pause: () => player.pause(),
+    seek: t => player.seek(t),
+    pixel: (panel, x, y) => {
+      const {clientWidth, clientHeight} = player.panels[panel].canvas, view = player.view(clientWidth, clientHeight);
+      return [view.x + view.scale * x, view.y - view.scale * y];
+    },
+    on: listener => player.on(() => listener(handle)),
+    destroy: () => player.destroy(),
+  };
+  element.player = handle;
+  return handle;
+}
+
+/** anywidget: the model has `data`, and `time` (s) and `playing`, which follow the player and move it. */
+function render({model, el}) {
+  const player = mount(el, model.get("data"), {theme: model.get("theme") || null});
+  const seek = () => { if (Math.abs(model.get("time") - player.time) > 1e-9) player.seek(model.get("time")); };
+  const play = () => (model.get("playing") ? player.play() : player.pause());
+  player.on(({time, playing}) => {
+    model.set("time", time);
+    model.set("playing", playing);
+    model.save_changes();
+  });
+  model.on("change:time", seek);
+  model.on("change:playing", play);
+  if (model.get("time") > player.time) seek();
+  if (model.get("playing")) play();
+  return () => {
+    model.off("change:time", seek);
+    model.off("change:playing", play);
+    player.destroy();
+  };
+}
+
+
+
+return mount;
+})();
