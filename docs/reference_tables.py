@@ -42,12 +42,14 @@ def command(name: str) -> str:
         "|---|---|---|---|",
     ]
     for option, parameter in inspect.signature(function).parameters.items():
-        spelled = next((n for m in getattr(parameter.annotation, "__metadata__", ()) if (n := getattr(m, "name", None))), option)
+        told = [(getattr(m, "name", None), getattr(m, "help", None)) for m in getattr(parameter.annotation, "__metadata__", ())]
+        spelled = next((name for name, _ in told if name), option)
+        meaning = next((text for _, text in told if text), said.get(option, ""))  # an option of many commands says it once
         words = f"`{option}`" if parameter.kind is parameter.POSITIONAL_ONLY else f"`--{spelled.replace('_', '-')}`"
         kind = type_text(
             get_args(parameter.annotation)[0] if get_origin(parameter.annotation) is Annotated else parameter.annotation
         )
-        lines.append(f"| {words} | {kind} | {default_text(type, option, parameter)} | {said.get(option, '')} |")
+        lines.append(f"| {words} | {kind} | {default_text(type, option, parameter)} | {meaning} |")
     return "\n".join([*lines, ""])
 
 

@@ -59,7 +59,6 @@ def animate(
         fps: frames of a film in one second.
         speed: seconds of motion in one second of a film; by default what is comfortable to watch.
         width: of a film or a picture (px).
-        json: write the results as JSON.
     """
     check_target(out, ANIMATION_SUFFIXES)
     kind = out.suffix.lower()

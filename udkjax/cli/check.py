@@ -10,7 +10,6 @@ def check(scene: Scene, /, json: Json = False) -> None:
 
     Args:
         scene: the mechanism.
-        json: write the results as JSON.
     """
     mech, _ = load(scene)
     from udkjax.integrate.assembly import check as checked

@@ -8,7 +8,6 @@ A command is a function of its options that imports what it needs when it runs:
         Args:
             scene: the mechanism.
             count: how many.
-            json: write the results as JSON.
         '''
         mech, _ = load(scene)
         from udkjax.show.summary import table
@@ -45,9 +44,9 @@ __all__ += ["fail", "load", "output_times", "refuse", "say", "show"]
 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml|MODEL.xml")]
 JsonValue = dict[str, "JsonValue"] | list["JsonValue"] | str | float | bool | None
-Json = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Json = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="write the results as JSON.")]
 MOST_TIMES = 10**7  # that a command writes: some gigabytes for a few bodies
-Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="do not show how far it is.")]
 
 
 def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[str] | None) -> None:

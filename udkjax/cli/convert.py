@@ -24,7 +24,6 @@ def convert(
         target: what to write: .toml, a scene file; .xml, an MJCF model.
         leave_out: of an MJCF model, what may be passed over.
         key: the keyframe of an MJCF model from which the initial state is taken.
-        json: write the results as JSON.
     """
     check_target(target, (".toml", ".xml"))
     mechanism, _ = load(scene, leave_out, key)

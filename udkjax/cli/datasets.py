@@ -4,12 +4,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from udkjax.cli.common import refuse
+from udkjax.cli.common import load, refuse
 
 if TYPE_CHECKING:
     import numpy as np
     import xarray
     from numpy.typing import ArrayLike
+
+    from udkjax import Mechanism
 
 DATASET_SUFFIXES = (".nc", ".h5", ".csv", ".npz")  # of datasets; .h5 is NetCDF too, which is HDF5 within
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf", ".jpg")
@@ -27,6 +29,13 @@ def check_target(out: Path | None, kinds: Sequence[str] = DATASET_SUFFIXES, opti
         refuse(f"{option} {out} ends with none of {', '.join(kinds)}")
     if not out.parent.is_dir():
         refuse(f"there is no folder {out.parent} to write {out.name} to")
+
+
+def load_to_write(scene: Path, out: Path | None, plot: Path | None = None) -> tuple["Mechanism", str]:
+    """Return a scene and its text, once the files that are to be written from it can be."""
+    check_target(out)
+    check_target(plot, PICTURE_SUFFIXES, "--plot")
+    return load(scene)
 
 
 def check_folder(out: Path) -> None:

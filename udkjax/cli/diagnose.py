@@ -14,7 +14,6 @@ def diagnose(
         t1: end of a run from `t` along which the rank is followed (s); by default none.
         dt: time between two instants of the run (s); changes of the rank are located between them.
         fixes: look for changes of joints that take redundancy away, and verify them.
-        json: write the results as JSON.
     """
     ts = None if t1 is None else output_times(t, t1, dt)
     mech, _ = load(scene)

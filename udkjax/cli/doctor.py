@@ -4,11 +4,7 @@ from udkjax.cli.common import Json, show
 
 
 def doctor(json: Json = False) -> None:
-    """Tell versions, devices, precision and which engine is used and why, ready to paste into a bug report.
-
-    Args:
-        json: write the results as JSON.
-    """
+    """Tell versions, devices, precision and which engine is used and why, ready to paste into a bug report."""
     from udkjax.show.doctor import facts, summary
 
     found = facts()

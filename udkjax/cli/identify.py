@@ -76,7 +76,6 @@ def identify(
         tol: tolerance of the integration.
         seed: of the first guesses.
         profile: parameters whose confidence intervals are to be found by profile likelihood, which needs no linear model.
-        quiet: do not show how far it is.
         json: write the results as JSON, as in estimate.json.
     """
     check_folder(out)

@@ -4,8 +4,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
-from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, write
+from udkjax.cli.common import Json, Scene, fail, output_times, refuse, show
+from udkjax.cli.datasets import load_to_write, write
 
 
 def inverse(
@@ -29,12 +29,9 @@ def inverse(
         drivers: who exerts: drivers or coordinates, such as body.crank.angle; by default the scene's drivers.
         out: file to write (.nc, .h5, .csv or .npz): effort and power (time, driver).
         plot: picture to write (.png, .svg, .pdf or .jpg): efforts and powers over time.
-        json: write the results as JSON.
     """
     ts = output_times(t0, t1, dt)
-    check_target(out)
-    check_target(plot, PICTURE_SUFFIXES, "--plot")
-    mech, text = load(scene)
+    mech, text = load_to_write(scene, out, plot)
     if not mech.drivers:
         refuse("the scene has no driver that prescribes a motion")
     import numpy as np

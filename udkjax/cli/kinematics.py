@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from udkjax.cli.channels import channels_of, choose_driver, measure_channels
-from udkjax.cli.common import Json, Scene, fail, load, refuse, show
-from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, write
+from udkjax.cli.common import Json, Scene, fail, refuse, show
+from udkjax.cli.datasets import load_to_write, write
 from udkjax.extras import OptionalImport
 
 if TYPE_CHECKING:
@@ -45,13 +45,10 @@ def kinematics(
         channels: what else is written, such as pin.C.x, pin.C.vy or body.coupler(0.1, 0).ay.
         out: file to write (.nc, .h5, .csv or .npz): value, q, v and a (value, body, coordinate), status.
         plot: picture to write (.png, .svg, .pdf or .jpg): poses and angles, or the channels.
-        json: write the results as JSON.
     """
     if count < 1:
         refuse(f"--count {count}: must be positive")
-    check_target(out)
-    check_target(plot, PICTURE_SUFFIXES, "--plot")
-    mech, text = load(scene)
+    mech, text = load_to_write(scene, out, plot)
     driver, measured = choose_driver(mech, driver), channels_of(mech, channels)
     import numpy as np
 

@@ -3,8 +3,8 @@
 import math
 from pathlib import Path
 
-from udkjax.cli.common import Json, Scene, fail, load, show
-from udkjax.cli.datasets import check_target, write
+from udkjax.cli.common import Json, Scene, fail, show
+from udkjax.cli.datasets import load_to_write, write
 
 
 def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None = None, json: Json = False) -> None:
@@ -16,10 +16,8 @@ def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None
         t: time of drivers and loads (s).
         out: file to write (.nc, .h5, .csv or .npz): omega2 (mode), shape (mode, body, coordinate), and the position q (body,
             coordinate).
-        json: write the results as JSON.
     """
-    check_target(out)
-    mech, text = load(scene)
+    mech, text = load_to_write(scene, out)
     import numpy as np
 
     import udkjax as udk

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
-from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, write
+from udkjax.cli.common import Json, Scene, fail, output_times, refuse, show
+from udkjax.cli.datasets import load_to_write, write
 
 
 def reactions(
@@ -26,12 +26,9 @@ def reactions(
         dt: time between two instants (s).
         out: file to write (.nc, .h5, .csv or .npz): fx, fy and torque (time) at each pin on each body.
         plot: picture to write (.png, .svg, .pdf or .jpg): the size of the force at each pin over time.
-        json: write the results as JSON.
     """
     ts = output_times(t0, t1, dt)
-    check_target(out)
-    check_target(plot, PICTURE_SUFFIXES, "--plot")
-    mech, text = load(scene)
+    mech, text = load_to_write(scene, out, plot)
     import numpy as np
 
     import udkjax as udk

@@ -46,8 +46,6 @@ def report(
         start: angle of the links (degrees) from which they are released at rest.
         seed: of the starts that differ by rounding errors.
         from_file: draw the page from this file instead of running anything.
-        quiet: do not show how far it is.
-        json: write the results as JSON.
     """
     target = out if out.suffix == ".html" else out / "report.html"
     if seed < 0:

@@ -64,7 +64,6 @@ def simulate(
         max_steps: give up after so many steps.
         channels: what else is written, such as pin.C.x, joint.A.fx or driver.motor.load; they have a picture of their own.
         plot: picture to write (.png, .svg, .pdf or .jpg); by default a .png beside the file.
-        json: write the results as JSON.
     """
     ts = output_times(t0, t1, dt)
     check_target(out)

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from udkjax.cli.common import Json, Scene, fail, load, refuse, show
-from udkjax.cli.datasets import check_target, write
+from udkjax.cli.common import Json, Scene, fail, refuse, show
+from udkjax.cli.datasets import load_to_write, write
 
 
 def statics(
@@ -26,12 +26,10 @@ def statics(
         t: time of drivers and loads (s).
         out: file to write (.nc, .h5, .csv or .npz): q (equilibrium, body, coordinate), omega2 (equilibrium, mode), multiplier
             (equilibrium, row).
-        json: write the results as JSON.
     """
     if starts < 1:
         refuse(f"--starts {starts}: must be positive")
-    check_target(out)
-    mech, text = load(scene)
+    mech, text = load_to_write(scene, out)
     import numpy as np
 
     import udkjax as udk

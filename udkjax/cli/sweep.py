@@ -45,8 +45,6 @@ def sweep(
         scheduler: address of a scheduler of dask, such as tcp://host:8786; without one, workers are processes of this machine.
         memory: what the members that are computed at a time may take (MiB).
         dry_run: say how many members there are, and what they will take, from a sample; compute nothing else.
-        quiet: do not show how far it is.
-        json: write the results as JSON.
     """
     if out is None and not dry_run:
         refuse("--out FOLDER is missing (or --dry-run)")
