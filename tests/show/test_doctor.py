@@ -1,4 +1,7 @@
+from functools import partial
+
 import jax
+import pytest
 
 import udkjax as udk
 from udkjax.show import doctor
@@ -19,7 +22,6 @@ def test_single_precision_is_said():
 
 
 def test_where_machine_code_is_cached_is_said(monkeypatch, tmp_path):
-    monkeypatch.setattr(doctor, "engine_here", lambda: ("native", "by default"))
     monkeypatch.setenv("UDKJAX_CACHE", str(tmp_path))
     (tmp_path / "0123").write_bytes(bytes(3 * 2**20))
     assert f"1 in {tmp_path}, 3.0 MiB" in doctor.summary(doctor.facts())
@@ -27,16 +29,15 @@ def test_where_machine_code_is_cached_is_said(monkeypatch, tmp_path):
     assert "nothing, as UDKJAX_CACHE=0 says" in doctor.summary(doctor.facts())
 
 
-def test_an_engine_that_does_not_work_is_said(monkeypatch):
+def test_an_engine_that_does_not_work_is_said():
     def broken(*_, **__):
         raise OSError("no executable memory")
 
-    monkeypatch.setattr(doctor, "simulate", broken)
-    found = doctor.facts()
+    found = doctor.facts(broken)
     assert found["engine"] == "none" and "no executable memory" in found["engine_reason"]
     assert any("machine code is not used" in line for line in found["advice"])
 
 
-def test_the_reason_is_that_of_the_run(monkeypatch):
-    monkeypatch.setattr(doctor, "simulate", lambda *given: udk.simulate(*given, engine="diffrax"))
-    assert doctor.engine_here() == ("diffrax", "it was asked for")
+@pytest.mark.slow
+def test_the_reason_is_that_of_the_run():
+    assert doctor.engine_here(partial(udk.simulate, engine="diffrax")) == ("diffrax", "it was asked for")

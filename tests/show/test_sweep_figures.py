@@ -8,7 +8,6 @@ import xarray
 from matplotlib.colors import LogNorm
 
 from udkjax.integrate import Result
-from udkjax.show import sweep_figures
 from udkjax.show.sweep_figures import pictures, save_pictures
 
 TOLS, MASSES = 10.0 ** np.arange(-10, -6), np.array([1.0, 2.0, 4.0])
@@ -68,7 +67,7 @@ def test_failures_have_a_colour_for_each_code():
     assert mesh.get_array()[0, 0] == len(Result)
 
 
-def test_other_axes_have_panels(monkeypatch):
+def test_other_axes_have_panels():
     data = made("start", "rtol", "method", "mass")
     figure = pictures(data)["violation"]
     assert [axes.get_title() for axes in panels(figure)] == [
@@ -76,8 +75,7 @@ def test_other_axes_have_panels(monkeypatch):
     ]
     (mesh,) = panels(figure)[2].collections
     np.testing.assert_array_equal(mesh.get_array(), data["violation"].isel(start=1, method=0).values)
-    monkeypatch.setattr(sweep_figures, "PANELS", 3)
-    figure = pictures(data)["violation"]
+    figure = pictures(data, most_panels=3)["violation"]
     assert len(panels(figure)) == 3 and "the first 3 of 4 panels" in figure.get_suptitle()
 
 

@@ -6,12 +6,11 @@ from itertools import pairwise
 
 import pytest
 
-from udkjax.study import progress as module
 from udkjax.study.progress import Progress, report_progress
 
 
-def work(progress, steps=4, pause=0.0):
-    with report_progress(progress, steps, "count") as report:
+def work(progress, steps=4, pause=0.0, **choices):
+    with report_progress(progress, steps, "count", **choices) as report:
         for k in range(steps):
             report(message=f"number {k}")
             time.sleep(pause)
@@ -44,18 +43,15 @@ def test_false_is_silent_and_true_is_not(capsys):
 
 
 @pytest.mark.parametrize("progress", [None, "auto"])
-def test_by_default_there_is_a_line_only_after_the_time_of_patience(capsys, monkeypatch, progress):
+def test_by_default_there_is_a_line_only_after_the_time_of_patience(capsys, progress):
     work(progress)
     assert capsys.readouterr() == ("", "")
-    monkeypatch.setattr(module, "PATIENCE", 0.02)
-    monkeypatch.setattr(module, "FILE_INTERVAL", 0.0)
-    work(progress, pause=0.05)
+    work(progress, pause=0.05, patience=0.02, interval=0.0)
     assert "100%" in capsys.readouterr().err
 
 
-def test_the_line_appears_while_the_first_piece_takes_long(capsys, monkeypatch):
-    monkeypatch.setattr(module, "PATIENCE", 0.02)
-    with report_progress(None, None, "compile"):
+def test_the_line_appears_while_the_first_piece_takes_long(capsys):
+    with report_progress(None, None, "compile", patience=0.02):
         for _ in range(100):
             time.sleep(0.02)
             if "compile: 00:0" in capsys.readouterr().err:
@@ -63,10 +59,9 @@ def test_the_line_appears_while_the_first_piece_takes_long(capsys, monkeypatch):
     pytest.fail("there was no line")
 
 
-def test_nothing_remains_of_it(monkeypatch):
-    monkeypatch.setattr(module, "PATIENCE", 60.0)
+def test_nothing_remains_of_it():
     before = threading.active_count()
-    with pytest.raises(ZeroDivisionError), report_progress(None, 1, "fail"):
+    with pytest.raises(ZeroDivisionError), report_progress(None, 1, "fail", patience=60.0):
         raise ZeroDivisionError
     for _ in range(100):
         if threading.active_count() == before:

@@ -2,7 +2,7 @@
 
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from typing import Any
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.extras import EXTRAS
-from udkjax.integrate import simulate
+from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
 from udkjax.native import code_cache, machine
 from udkjax.scene.library import double_pendulum
@@ -20,10 +20,10 @@ from udkjax.study.machine import cores, processor
 FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 
 
-def facts() -> dict[str, Any]:
+def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
     """Return versions, devices, precision, engine, cache and what could be better, by names that scripts can rely on."""
     folder, sizes = code_cache.cache_folder(), [size for _, size, _ in code_cache.cached_files()]
-    engine, reason = engine_here()
+    engine, reason = engine_here(run)
     return {
         "versions": versions(),
         "missing_extras": sorted({extra for package, extra in EXTRAS.items() if find_spec(package) is None}),
@@ -44,10 +44,10 @@ def facts() -> dict[str, Any]:
     }
 
 
-def engine_here() -> tuple[str, str]:
+def engine_here(run: Callable[..., Solution] = simulate) -> tuple[str, str]:
     """Return which engine a small simulation runs on here, "native", "diffrax" or "none", and why."""
     try:
-        solution = simulate(double_pendulum(), np.array([0.0, 0.1]))
+        solution = run(double_pendulum(), np.array([0.0, 0.1]))
     except Exception as error:
         return "none", f"a small simulation fails: {type(error).__name__}: {error}"
     engine, _, reason = solution.settings["engine"].partition(": ")

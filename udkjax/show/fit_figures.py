@@ -52,10 +52,10 @@ def series(data: "xarray.Dataset") -> list[Series]:
     return found
 
 
-def fit(data: "xarray.Dataset") -> Figure:
+def fit(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> Figure:
     """Draw what was measured as points, and what the mechanism shows as lines."""
     every, records = series(data), data.sizes["record"]
-    columns, panels = _panels(data, every)
+    columns, panels = _panels(data, every, most_panels)
     rows = 1 + max(panels) // columns
     figure = Figure(figsize=(1.0 + (6.5 if columns == 1 else 4.2) * columns, 1.1 + 1.9 * rows), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
@@ -82,20 +82,20 @@ def draw_series(axes: Axes, one: Series) -> None:
     plain(axes)
 
 
-def _panels(data: "xarray.Dataset", every: list[Series]) -> tuple[int, dict[int, Series]]:
+def _panels(data: "xarray.Dataset", every: list[Series], most_panels: int) -> tuple[int, dict[int, Series]]:
     """Return the number of columns of panels, and the place of each series that is shown: a few records stand side by side."""
     records, channels = list(data["record"].values), list(data["channel"].values)
     columns, places = min(MOST_COLUMNS, -(-len(every) // 4)), list(range(len(every)))
     if 1 < len(records) <= MOST_COLUMNS:
         columns, places = len(records), [channels.index(one.channel) * len(records) + records.index(one.record) for one in every]
-    return columns, {place: one for place, one in zip(places, every, strict=True) if place < MOST_PANELS}
+    return columns, {place: one for place, one in zip(places, every, strict=True) if place < most_panels}
 
 
-def residuals(data: "xarray.Dataset") -> Figure:
+def residuals(data: "xarray.Dataset", most_channels: int = MOST_CHANNELS) -> Figure:
     """Draw what is left of each channel: over time, its distribution beside that of the noise, and its correlation in time."""
     every = series(data)
-    channels = _least_white(data)
-    shown = channels[:MOST_CHANNELS]
+    channels = _least_white(data, most_channels)
+    shown = channels[:most_channels]
     records = {str(name): k for k, name in enumerate(data["record"].values)}
     figure = Figure(figsize=(11, 1.1 + 2.0 * len(shown)), layout="constrained")
     grid = figure.subplots(len(shown), 3, squeeze=False, width_ratios=(3, 1, 1.2))
@@ -116,18 +116,18 @@ def residuals(data: "xarray.Dataset") -> Figure:
         axes.set_title(words, fontsize="small", loc="left")
     if 1 < len(records) <= MOST_COLOURS:
         _key(figure, grid[0, 0])
-    few = f"the {MOST_CHANNELS} of {len(channels)} channels that look least like noise" if len(channels) > MOST_CHANNELS else ""
+    few = f"the {most_channels} of {len(channels)} channels that look least like noise" if len(channels) > most_channels else ""
     title(figure, data, "measured minus predicted; grey: two standard deviations of the noise", few)
     return figure
 
 
-def _least_white(data: "xarray.Dataset") -> list[str]:
+def _least_white(data: "xarray.Dataset", most_channels: int) -> list[str]:
     """The channels: as they are, or, where there are too many, those that look least like noise."""
     names = [str(name) for name in data["channel"].values]
-    if len(names) <= MOST_CHANNELS:
+    if len(names) <= most_channels:
         return names
     doubt = np.nan_to_num(data["correlated"].transpose("record", "channel").values, nan=1.0).min(0)
-    kept = set(np.argsort(doubt, kind="stable")[:MOST_CHANNELS])
+    kept = set(np.argsort(doubt, kind="stable")[:most_channels])
     return [name for k, name in enumerate(names) if k in kept] + [name for k, name in enumerate(names) if k not in kept]
 
 

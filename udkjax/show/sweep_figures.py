@@ -30,17 +30,17 @@ RESULT_COLOURS = ("#d9d9d9", *COLOURS[1:6], "white")  # of the results in their 
 MISSING_COLOUR = "0.75"  # where there is no value
 LOGARITHMIC_RATIO = 1e2  # from this ratio of the largest to the smallest value on, colours and axes are logarithmic
 COLUMNS = 4  # of panels
-PANELS = 12  # of one picture; of the dimensions that these cannot show, the first values are drawn
+MOST_PANELS = 12  # of one picture; of the dimensions that these cannot show, the first values are drawn
 
 
-def pictures(data: "xarray.Dataset") -> dict[str, Figure]:
+def pictures(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> dict[str, Figure]:
     """Draw the dataset of a sweep: `result`, and every variable with one number a member, not the same for all of them.
 
     Two dimensions are the axes of a map, those with most values; each combination of the others has a panel. One dimension is a
     line. Members of a design, which has no grid, are points over its first two axes.
     """
     differing = [name for name in scalars(data) if len(np.unique(data[name])) > 1]
-    return {name: _picture(data, name) for name in (RESULT_VARIABLE, *differing)}
+    return {name: _picture(data, name, most_panels) for name in (RESULT_VARIABLE, *differing)}
 
 
 def scalars(data: "xarray.Dataset") -> list[str]:
@@ -56,8 +56,8 @@ def _dims(data: "xarray.Dataset") -> tuple[str, ...]:
     return tuple(map(str, data[RESULT_VARIABLE].dims))
 
 
-def _picture(data: "xarray.Dataset", name: str) -> Figure:
-    across, panels = _layout(data)
+def _picture(data: "xarray.Dataset", name: str, most_panels: int) -> Figure:
+    across, panels = _layout(data, most_panels)
     count, others = len(panels), [d for d in _dims(data) if d not in across]
     columns = min(count, COLUMNS, data.sizes[others[-1]] if others else 1)
     rows = -(-count // columns)
@@ -100,13 +100,13 @@ def _panel(axes: Axes, part: "xarray.Dataset", name: str, across: Sequence[str],
     return _map(axes, part, name, across, *colours)
 
 
-def _layout(data: "xarray.Dataset") -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
+def _layout(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
     """The dimensions that are drawn across, and for each panel which values of the others it has, and what is said of them."""
     dims = _dims(data)
     longest = sorted(dims, key=lambda d: (_numeric(data, d), data.sizes[d]), reverse=True)[:2]
     across = (MEMBER_DIMENSION,) if MEMBER_DIMENSION in dims else tuple(d for d in dims if d in longest)
     others = [d for d in dims if d not in across]
-    indices = islice(product(*(range(data.sizes[d]) for d in others)), PANELS)
+    indices = islice(product(*(range(data.sizes[d]) for d in others)), most_panels)
     return across, [
         (dict(zip(others, k, strict=True)), ", ".join(_value(data, d, i) for d, i in zip(others, k))) for k in indices
     ]

@@ -63,7 +63,9 @@ class Report:
 
 
 @contextmanager
-def report_progress(progress: ProgressOption, total: float | None, what: str) -> Iterator[Report]:
+def report_progress(
+    progress: ProgressOption, total: float | None, what: str, patience: float = PATIENCE, interval: float | None = None
+) -> Iterator[Report]:
     """Report the progress of the computation in the body of a `with` statement.
 
     Args:
@@ -71,6 +73,8 @@ def report_progress(progress: ProgressOption, total: float | None, what: str) ->
             never; a callable gets a `Progress` at each report. What it raises ends the computation.
         total: how much there is to do, in any unit; None where that is not known.
         what: what is being computed, as it stands before the line.
+        patience: time (s) after which there is a line by default.
+        interval: time (s) between two states of the line; by default what suits a terminal, or a file.
 
     Returns:
         The function `report(done, message="")` to call whenever some of it is done.
@@ -83,7 +87,7 @@ def report_progress(progress: ProgressOption, total: float | None, what: str) ->
     elif progress is False:
         yield Report(lambda state: None, what, total)
     elif progress is None or progress is True or progress == "auto":
-        line = _Line(what, total, 0.0 if progress is True else PATIENCE)
+        line = _Line(what, total, 0.0 if progress is True else patience, interval)
         try:
             yield Report(line.show, what, total)
         finally:
@@ -95,8 +99,10 @@ def report_progress(progress: ProgressOption, total: float | None, what: str) ->
 class _Line:
     """A bar of tqdm on stderr, made by a timer: so it appears too while the first piece of work compiles."""
 
-    def __init__(self, what: str, total: float | None, patience: float):
+    def __init__(self, what: str, total: float | None, patience: float, interval: float | None):
         self.what, self.total, self.begun = what, total, time.time()
+        usual = TERMINAL_INTERVAL if sys.stderr.isatty() or "ipykernel" in sys.modules else FILE_INTERVAL
+        self.interval = usual if interval is None else interval
         self.bar: Any = None
         self.state: Progress | None = None
         self.lock = threading.Lock()
@@ -110,10 +116,11 @@ class _Line:
     def _open(self) -> None:
         from tqdm.auto import tqdm
 
-        interval = TERMINAL_INTERVAL if sys.stderr.isatty() or "ipykernel" in sys.modules else FILE_INTERVAL
         layout = "{desc}: {elapsed}{postfix}" if self.total is None else BAR
         with self.lock:
-            bar = tqdm(desc=self.what, total=self.total, file=sys.stderr, mininterval=interval, miniters=0, bar_format=layout)
+            bar = tqdm(
+                desc=self.what, total=self.total, file=sys.stderr, mininterval=self.interval, miniters=0, bar_format=layout
+            )
             bar.start_t = self.begun
             self.bar = bar
             self._update()

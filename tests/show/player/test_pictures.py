@@ -104,7 +104,7 @@ def test_every_kind_of_mark_is_drawn():
             udk.Spring(("ground", "plate"), [(3.2, 0.6), (0.1, -0.1)], 20.0, 0.5, 1.0),
             udk.Force("plate", (3.0, 1.0), frame="body"),
             udk.Friction("o", 0.1, 0.1),
-            udk.Torque(("ground", "pinion"), -1.0),
+            udk.Torque(("ground", "pinion"), udk.Held([-1.0, 1.0], 0.1)),
         ],
     )
     every = marks(mech, mech.q0[None])

@@ -20,8 +20,8 @@ mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How large a pin or
     piston    a, b                          a driver of a length
     motor     body, at                      a driver of an angle
     friction  body, at                      friction in a revolute joint
-    force     body, at, vector, turns       a constant force, whose direction `turns` with the body or not
-    torque    body, at, sign                a constant torque
+    force     body, at, vector, turns       a force, as it is at time 0, whose direction `turns` with the body or not
+    torque    body, at, sign                a torque, as it is at time 0
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,6 +52,7 @@ from udkjax.scene import (
     TorsionSpring,
     Weld,
 )
+from udkjax.scene.held import value_at
 from udkjax.show.player.packing import Json
 
 Mark = Json
@@ -204,10 +205,10 @@ class _Drawing:
                 self.elements.append({"kind": "friction", **self._axle(self.mechanism.joints[force.joint].bodies)})
             case Force():
                 place = self._at(force.body, force.point)
-                vector = np.asarray(force.vector, float).tolist()
+                vector = np.asarray(value_at(force.vector, 0.0), float).tolist()
                 self.elements.append({"kind": "force", **place, "vector": vector, "turns": force.frame == "body"})
             case Torque():
-                sign = 1 if float(force.value) >= 0 else -1
+                sign = 1 if float(value_at(force.value, 0.0)) >= 0 else -1
                 self.elements.append({"kind": "torque", **self._axle(force.bodies), "sign": sign})
 
     def _rail(self, joint: Prismatic | Slot) -> None:
