@@ -44,11 +44,6 @@ def stone(law):
     return udk.Mechanism({"stone": udk.Body(1.0, 1.0, [0.3, 0.2], 0.1, [1.0, 0.5], 0.2)}, forces={"wind": Push("stone", law)})
 
 
-@pytest.fixture(scope="module")
-def pendulum():
-    return udk.library.compound_pendulum()
-
-
 @pytest.mark.parametrize(
     ("scale", "choices", "ts"),
     [

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.integrate.scenes import TS
 from udkjax.equations.abstract_system import TangentPart
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.solvers.counting import NOT_KNOWN, CountingController, count_evaluations, evaluations
@@ -185,14 +186,6 @@ def test_a_projection_is_no_jump_to_a_multistep_method(calls, jumped):
 # --- the first step
 
 
-@pytest.fixture(scope="module")
-def pendulum():
-    return udk.library.compound_pendulum()
-
-
-TS = np.linspace(0.0, 1.0, 11)
-
-
 def test_the_first_step_may_be_given(pendulum):
     """One right-hand side at the start, and one that is too long is rejected."""
     stats = {dt0: udk.simulate(pendulum, TS, dt0=dt0).stats for dt0 in (0.01, 2.0, 1e-9)}
@@ -207,3 +200,40 @@ def test_the_first_step_may_be_given(pendulum):
 def test_a_first_step_is_checked(pendulum, dt0, problem):
     with pytest.raises(ValueError, match=problem):
         udk.simulate(pendulum, TS, dt0=dt0)
+
+
+# --- as a whole run says
+
+
+def counted(held):
+    """A stone that counts how often its force is asked for; `held` on a circle."""
+    count = Calls()
+
+    def force(t, q, v):
+        jax.debug.callback(count.add)
+        return jnp.stack([-q[0], -9.81 + 0.0 * t])
+
+    return udk.ConstrainedSystem(lambda q: jnp.eye(2), force, (lambda t, q: q @ q - 1.0) if held else None), count
+
+
+@pytest.mark.parametrize(
+    ("solver", "held"),
+    [
+        pytest.param(diffrax.Dopri8(), False, id="Dopri8-free", marks=pytest.mark.slow),
+        pytest.param(diffrax.Tsit5(), True, id="Tsit5-projected"),
+        pytest.param(diffrax.Tsit5(), False, id="Tsit5-free", marks=pytest.mark.slow),
+        *(
+            pytest.param(s(), held, marks=pytest.mark.slow)
+            for s, held in ((diffrax.Dopri8, True), (diffrax.Heun, True), (diffrax.Heun, False))
+        ),
+    ],
+)
+def test_right_hand_sides_are_counted(solver, held):
+    """A method that keeps its last stage for the next step takes one fewer, unless the step was projected away from it."""
+    system, count = counted(held)
+    sol = udk.simulate(system, TS, udk.State(np.array([0.6, 0.8]), np.zeros(2)), rtol=1e-5, atol=1e-5, solver=solver)
+    jax.effects_barrier()
+    stats = {k: int(v) for k, v in sol.stats.items()}
+    assert stats["steps"] == stats["accepted"] + stats["rejected"] > 3
+    assert count.value == stats["right_hand_sides"]
+    assert stats["projections"] == (stats["steps"] + 2 * (len(TS) - 1) if held else 0)

@@ -1,4 +1,4 @@
-"""Events: times and states against closed forms, jumps against their identities, derivatives against closed forms."""
+"""Events: times and states against closed forms, jumps against their identities."""
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false
 # All of these runs have events; wrong arguments are meant.
@@ -10,21 +10,10 @@ from scipy.special import ellipk
 
 import udkjax as udk
 from tests.choices import fast
+from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, ROOM, SWING, TS, G, floor
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.events.impacts import contact_rows
-
-G = 9.81
-ROOM = 24  # events of a run
-BALL = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(0.0, 1.0))})
-PENDULUM = udk.Mechanism(
-    {"link": udk.Body(1.0, 0.1, position=(0.5, 0.0))}, {"A": udk.Revolute(("ground", "link"), [[0, 0], [-0.5, 0]])}
-)
-SWING = G * 0.5 / (0.1 + 0.25)  # the square of its small frequency
-
-
-def floor(restitution, **more):
-    return udk.Contact("ball", restitution=restitution, name="floor", **more)
 
 
 def bounce(restitution, ts, height=1.0, speed=0.0, inertia=0.1, **more):
@@ -39,9 +28,6 @@ def exact_bounces(restitution, count, height=1.0):
     v = np.sqrt(2 * G * height) * restitution ** np.arange(1, count + 1)
     first = np.sqrt(2 * height / G)
     return first + np.append(0.0, np.cumsum(2 * v[:-1] / G)), v
-
-
-TS = np.linspace(0.0, 8.0, 40)
 
 
 def test_ball_bounces_at_its_exact_times():
@@ -164,24 +150,6 @@ def test_a_contact_lets_go_where_it_would_have_to_pull():
     assert np.isnan(sol.q[3:]).all() and np.isfinite(sol.q[:3]).all()
 
 
-# A ball flies into the tip of a pendulum, is caught there by a joint, and where the pendulum passes -60 degrees its pin is cut.
-CATCH = udk.Mechanism(
-    {
-        "link": udk.Body(1.0, 0.1, position=(0.0, -0.5), angle=-np.pi / 2),
-        "ball": udk.Body(0.5, 0.05, position=(-1.0, -1.0 + G / 72), velocity=(6.0, 0.0)),
-    },
-    {"A": udk.Revolute(("ground", "link"), [[0, 0], [-0.5, 0]])},
-)
-CAUGHT = [
-    udk.Event(
-        lambda t, at: at["link"].point((0.5, 0)).x - at["ball"].x,
-        udk.Attach(udk.Weld(("link", "ball"), [[0.5, 0], [0, 0]]), "catch"),
-        name="caught",
-    ),
-    udk.Event(lambda t, at: at["link"].angle + np.pi / 3, udk.Release("A"), name="cut"),
-]
-
-
 def test_catch_and_release():
     """Angular momentum about the pin at the catch, energy until the cut, and free flight behind it."""
     ts = np.linspace(0.0, 1.0, 11)
@@ -290,70 +258,6 @@ def test_an_impact_that_the_constraints_block_says_so():
     assert not jax.jit(contact_rows)(equations, 0.0, PENDULUM.q0.ravel(), along).free.any()
 
 
-def test_gradients_of_a_bouncing_ball():
-    """Forward, of the end, an output and an impact's time, by restitution, height and gravity."""
-    ts = TS[:9]
-
-    def run(x):
-        ball = BALL.with_parameters({"body.ball.position": jnp.stack([0 * x[1], x[1]]), "gravity": jnp.stack([0 * x[2], -x[2]])})
-        sol = udk.simulate(ball, ts, events=floor(x[0], at_rest="stop"), max_events=4)
-        return jnp.stack([sol.q[-1, 0, 1], sol.v[-1, 0, 1], sol.q[4, 0, 1], sol.events.time[1]])
-
-    def exact(x):
-        e, height, g = x
-        first, v = jnp.sqrt(2 * height / g), jnp.sqrt(2 * height * g)
-        second = first + 2 * e * v / g
-        d, one = ts[-1] - second, ts[4] - first
-        return jnp.stack([e**2 * v * d - g / 2 * d**2, e**2 * v - g * d, e * v * one - g / 2 * one**2, second])
-
-    x = jnp.array([0.8, 1.0, G])
-    found, expected = (jax.jit(jax.jacfwd(lambda x, f=f: (f(x),) * 2, has_aux=True))(x) for f in (run, exact))
-    assert np.abs(found[1] - expected[1]).max() < 1e-11
-    assert np.abs(found[0] - expected[0]).max() < 1e-10
-
-
-@pytest.mark.slow
-def test_second_derivatives_are_refused():
-    end = lambda e: udk.simulate(BALL, TS[:3], events=floor(e, at_rest="stop"), max_events=1).q[-1, 0, 1]  # noqa: E731
-    with pytest.raises(NotImplementedError, match="first derivatives only"):
-        jax.make_jaxpr(jax.jacfwd(jax.jacfwd(end)))(0.8)
-
-
-@pytest.mark.slow
-def test_gradients_through_catch_and_release():
-    """Forward against differences, and reverse against forward: a joint added, another released, masses and speed."""
-    ts = np.linspace(0.0, 0.6, 4)
-
-    def run(x):
-        speed, m, g = x
-        ball = {"position": jnp.stack([-1 + 0 * g, -1 + g / 2 / speed**2]), "velocity": jnp.stack([speed, 0 * speed]), "mass": m}
-        numbers = {**{f"body.ball.{name}": value for name, value in ball.items()}, "gravity": jnp.stack([0 * g, -g])}
-        sol = udk.simulate(CATCH.with_parameters(numbers), ts, events=CAUGHT, rtol=1e-11, atol=1e-11, max_events=2)
-        return jnp.concatenate([sol.events.time, sol.q[-1].ravel(), sol.v[-1].ravel(), sol.q[2].ravel()])
-
-    x, h = jnp.array([6.0, 0.5, G]), 1e-5
-    value = jax.jit(run)
-    differences = np.stack([(value(x.at[k].add(h)) - value(x.at[k].add(-h))) / (2 * h) for k in range(3)], axis=1)
-    forward = jax.jit(jax.jacfwd(run))(x)
-    assert np.abs(forward - differences).max() < 1e-6
-    w = jnp.linspace(-1.0, 1.0, len(forward))
-    assert np.abs(jax.jit(jax.grad(lambda x: run(x) @ w))(x) - w @ forward).max() < 1e-11
-
-
-@pytest.mark.slow
-def test_gradients_of_what_comes_to_rest():
-    """A pendulum that has come to rest at its stop is where the stop is, and forgets all else."""
-
-    def end(limit, restitution, speed):
-        numbers = {"body.link.velocity": jnp.stack([0 * speed, speed / 2]), "body.link.angular_velocity": speed}
-        stop = udk.JointLimit("A", lower=limit, restitution=restitution)
-        sol = udk.simulate(PENDULUM.with_parameters(numbers), TS[:20], events=stop, max_events=ROOM)
-        return sol.q[-1, 0, 2]
-
-    x = -1.0, 0.3, 0.1
-    assert np.abs(np.array(jax.grad(end, (0, 1, 2))(*x)) - np.array([1.0, 0.0, 0.0])).max() < 1e-9
-
-
 @pytest.mark.slow
 def test_both_engines_find_the_same():
     ts = TS[:9]
@@ -361,58 +265,3 @@ def test_both_engines_find_the_same():
     assert [sol.settings["engine"] for sol in found] == ["native", "diffrax: it was asked for"]
     assert np.abs(found[0].events.time - found[1].events.time).max() < 1e-10
     assert np.abs(found[0].q - found[1].q).max() < 1e-9
-
-
-@pytest.mark.parametrize(
-    ("events", "message"),
-    [
-        (udk.JointLimit("B", lower=0.0), 'no joint named "B"'),
-        (udk.JointLimit("A"), "give `lower` or `upper`"),
-        (udk.JointLimit("A", lower=np.nan), 'limit "A": lower must be a finite number, not nan'),
-        (udk.JointLimit("A", upper=np.inf), 'limit "A": upper must be a finite number, not inf'),
-        (udk.JointLimit("A", lower=[0, 1]), 'limit "A": lower must be one number'),
-        (udk.JointLimit("A", lower=1, upper=0.5), 'limit "A": lower must not be above upper, is 1, above 0.5'),
-        (udk.JointLimit("A", lower=0, restitution=np.nan), 'event "A.lower": the restitution must be a finite number, not nan'),
-        (udk.Contact("link", point=[np.nan, 0]), r'contact "link on ground": point\[0\] is nan'),
-        (udk.Contact("link", point=[0, 0, 9]), r"point must be two numbers, x and y, not an array of the shape \(3,\)"),
-        (udk.Contact("link", through=[0, np.inf]), r"through\[1\] is inf"),
-        (udk.Contact("link", normal=[0, 1, 5]), "normal must be two numbers"),
-        (udk.Contact("link", normal=[0, 0]), "normal must not be zero"),
-        (udk.Contact("link", point="here"), 'contact "link on ground": point must be real numbers, not the text "here"'),
-        (udk.Contact("link", restitution=[0.5, 0.5]), "the restitution must be one number"),
-        (udk.Contact("link", name=3), "Contact: name must be a text, not 3"),
-        (udk.Event(lambda t, at: at["link"].x, direction=1.5), 'event "event1": the direction must be -1, 0 or 1, not 1.5'),
-        (udk.Event(lambda t, at: at["link"].x, udk.Release(7)), "the name of Release must be a text, not 7"),
-        (udk.Event(lambda t, at: at["link"].x, udk.Lock(None)), "the joint of Lock must be a text, not None"),
-        (udk.Event(lambda t, at: at["link"].x, udk.Attach("weld", "w")), "the joint of Attach must be a joint"),
-        (
-            udk.Event(lambda t, at: at["link"].x, udk.Attach(udk.Weld(("ground", "link"), [[0, np.nan], [0, 0]]), "w")),
-            r"the joint of Attach\[0, 1\] is nan: it must be finite",
-        ),
-        (udk.Contact("lnik"), 'no body named "lnik"; did you mean "link"'),
-        (udk.Event(lambda t, at: at["lnik"].x), 'event "event1": no body named "lnik"; did you mean "link"'),
-        (udk.Event(lambda t, at: at["link"].omega, udk.Impact(0.5)), "must depend on positions alone"),
-        (udk.Event(lambda t, at: at["link"].x, udk.Impact(0.5), 1), "its condition falls to zero, and not where direction=1"),
-        (udk.Event(lambda t, at: at["link"].x, udk.Impact(1.5)), "restitution must be from 0 to 1, is 1.5"),
-        (udk.Event(lambda t, at: at["link"].x, udk.Release("C")), 'no joint or driver named "C"'),
-        (udk.Event(lambda t, at: jnp.ones(2)), r"must return one number, not an array of shape \(2,\)"),
-        ([udk.Contact("link"), udk.Contact("link")], "two events have this name"),
-        ([], "the list is empty"),
-        ([1.0], r"events\[0\]: must be an Event"),
-    ],
-)
-def test_mistakes_are_named(events, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        udk.simulate(PENDULUM, TS, events=events)
-
-
-def test_conditions_do_not_close_over_traced_numbers():
-    """Their derivatives would be lost."""
-
-    def end(height):
-        event = udk.Event(lambda t, at: at["ball"].y - height, udk.Stop())
-        return udk.simulate(BALL, TS, events=event).time
-
-    for function in (jax.grad(end), jax.jit(end)):
-        with pytest.raises(ValueError, match="closes over traced numbers"):
-            function(0.5)

@@ -1,0 +1,87 @@
+"""Derivatives of runs with events, against closed forms and differences."""
+
+# pyright: reportOptionalMemberAccess=false, reportArgumentType=false
+# All of these runs have events; wrong arguments are meant.
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, ROOM, TS, G, floor
+
+
+def test_gradients_of_a_bouncing_ball():
+    """Forward, of the end, an output and an impact's time, by restitution, height and gravity."""
+    ts = TS[:9]
+
+    def run(x):
+        ball = BALL.with_parameters({"body.ball.position": jnp.stack([0 * x[1], x[1]]), "gravity": jnp.stack([0 * x[2], -x[2]])})
+        sol = udk.simulate(ball, ts, events=floor(x[0], at_rest="stop"), max_events=4)
+        return jnp.stack([sol.q[-1, 0, 1], sol.v[-1, 0, 1], sol.q[4, 0, 1], sol.events.time[1]])
+
+    def exact(x):
+        e, height, g = x
+        first, v = jnp.sqrt(2 * height / g), jnp.sqrt(2 * height * g)
+        second = first + 2 * e * v / g
+        d, one = ts[-1] - second, ts[4] - first
+        return jnp.stack([e**2 * v * d - g / 2 * d**2, e**2 * v - g * d, e * v * one - g / 2 * one**2, second])
+
+    x = jnp.array([0.8, 1.0, G])
+    found, expected = (jax.jit(jax.jacfwd(lambda x, f=f: (f(x),) * 2, has_aux=True))(x) for f in (run, exact))
+    assert np.abs(found[1] - expected[1]).max() < 1e-11
+    assert np.abs(found[0] - expected[0]).max() < 1e-10
+
+
+@pytest.mark.slow
+def test_second_derivatives_are_refused():
+    end = lambda e: udk.simulate(BALL, TS[:3], events=floor(e, at_rest="stop"), max_events=1).q[-1, 0, 1]  # noqa: E731
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.make_jaxpr(jax.jacfwd(jax.jacfwd(end)))(0.8)
+
+
+@pytest.mark.slow
+def test_gradients_through_catch_and_release():
+    """Forward against differences, and reverse against forward: a joint added, another released, masses and speed."""
+    ts = np.linspace(0.0, 0.6, 4)
+
+    def run(x):
+        speed, m, g = x
+        ball = {"position": jnp.stack([-1 + 0 * g, -1 + g / 2 / speed**2]), "velocity": jnp.stack([speed, 0 * speed]), "mass": m}
+        numbers = {**{f"body.ball.{name}": value for name, value in ball.items()}, "gravity": jnp.stack([0 * g, -g])}
+        sol = udk.simulate(CATCH.with_parameters(numbers), ts, events=CAUGHT, rtol=1e-11, atol=1e-11, max_events=2)
+        return jnp.concatenate([sol.events.time, sol.q[-1].ravel(), sol.v[-1].ravel(), sol.q[2].ravel()])
+
+    x, h = jnp.array([6.0, 0.5, G]), 1e-5
+    value = jax.jit(run)
+    differences = np.stack([(value(x.at[k].add(h)) - value(x.at[k].add(-h))) / (2 * h) for k in range(3)], axis=1)
+    forward = jax.jit(jax.jacfwd(run))(x)
+    assert np.abs(forward - differences).max() < 1e-6
+    w = jnp.linspace(-1.0, 1.0, len(forward))
+    assert np.abs(jax.jit(jax.grad(lambda x: run(x) @ w))(x) - w @ forward).max() < 1e-11
+
+
+@pytest.mark.slow
+def test_gradients_of_what_comes_to_rest():
+    """A pendulum that has come to rest at its stop is where the stop is, and forgets all else."""
+
+    def end(limit, restitution, speed):
+        numbers = {"body.link.velocity": jnp.stack([0 * speed, speed / 2]), "body.link.angular_velocity": speed}
+        stop = udk.JointLimit("A", lower=limit, restitution=restitution)
+        sol = udk.simulate(PENDULUM.with_parameters(numbers), TS[:20], events=stop, max_events=ROOM)
+        return sol.q[-1, 0, 2]
+
+    x = -1.0, 0.3, 0.1
+    assert np.abs(np.array(jax.grad(end, (0, 1, 2))(*x)) - np.array([1.0, 0.0, 0.0])).max() < 1e-9
+
+
+def test_conditions_do_not_close_over_traced_numbers():
+    """Their derivatives would be lost."""
+
+    def end(height):
+        event = udk.Event(lambda t, at: at["ball"].y - height, udk.Stop())
+        return udk.simulate(BALL, TS, events=event).time
+
+    for function in (jax.grad(end), jax.jit(end)):
+        with pytest.raises(ValueError, match="closes over traced numbers"):
+            function(0.5)
