@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND
+from udkjax.scene.drawing.drawn_forces import Motor
+from udkjax.scene.drawing.drawn_joints import Slide
 from udkjax.scene.drawing.link import Link
-from udkjax.scene.drivers import Driver, Polynomial
 from udkjax.scene.fields import array_namespace
 from udkjax.scene.forces import Spring
-from udkjax.scene.joints import Prismatic, Revolute, Slot
+from udkjax.scene.joints import Revolute, Slot
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     apex,
@@ -126,27 +127,24 @@ def slider_crank(
     that holds the slider to the origin, from which it is rod - crank to rod + crank away.
     """
 
-    def pose(s):
+    def places(s):
         xp = array_namespace(s, crank, rod)
         tilt = -xp.arcsin(crank * xp.sin(s) / rod)
-        pin, along = crank * unit_vector(s), rod * unit_vector(tilt)
-        return [(0.5 * pin, s), (pin + 0.5 * along, tilt), (pin + along, 0.0 * s)]
+        pin = crank * unit_vector(s)
+        return {"O": np.zeros(2), "P": pin, "B": pin + rod * unit_vector(tilt)}
 
-    physics = [uniform_rod(masses[0], crank), uniform_rod(masses[1], rod), (masses[2], slider_inertia)]
-    motor = Driver((GROUND, "crank"), "angle", Polynomial([angle, angular_velocity]))
-    a, b = 0.5 * crank, 0.5 * rod
-    return Mechanism(
-        bodies_on_pose(("crank", "rod", "slider"), physics, pose, angle, angular_velocity),
-        {
-            "O": Revolute((GROUND, "crank"), [(0.0, 0.0), (-a, 0.0)]),
-            "P": Revolute(("crank", "rod"), [(a, 0.0), (-b, 0.0)]),
-            "B": Revolute(("rod", "slider"), [(b, 0.0), (0.0, 0.0)]),
-            "guide": Prismatic((GROUND, "slider"), ORIGINS, axis=0.0, angle=0.0),
-        },
-        {"motor": motor} if driven else {},
-        {} if spring is None else {"spring": Spring((GROUND, "slider"), ORIGINS, *spring)},
-        gravity=gravity_vector(gravity),
-        name="slider-crank",
+    links = {"crank": Link(["O", "P"], mass=masses[0]), "rod": Link(["P", "B"], mass=masses[1])}
+    return draw_on_pose(
+        places,
+        angle,
+        angular_velocity,
+        links | {"slider": Link(["B"], mass=masses[2], inertia=slider_inertia)},
+        ["O"],
+        gravity,
+        "slider-crank",
+        slides={"guide": Slide("slider", direction=0.0)},
+        motors={"motor": Motor("O", speed=angular_velocity)} if driven else {},
+        forces={} if spring is None else {"spring": Spring((GROUND, "slider"), ORIGINS, *spring)},
     )
 
 

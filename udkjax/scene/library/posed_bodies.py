@@ -8,7 +8,7 @@ the pose is traced, JAX does. So it is written in the functions of `array_namesp
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from inspect import signature
-from typing import ParamSpec, TypeAlias
+from typing import Any, ParamSpec, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -77,10 +77,11 @@ def draw_on_pose(
     ground: Sequence[str],
     gravity: ArrayLike,
     name: str,
+    **more: Any,
 ) -> Mechanism:
-    """Draw links through pins at {name: place} of places(s), moving as s does at its rate."""
+    """Draw links through pins at {name: place} of places(s), moving as s does at its rate; and more, as `Drawing` takes it."""
     pins, velocities = derivative(places, as_array(s), rate)
-    drawing = Drawing(pins, links, ground, velocities=velocities, gravity=gravity_vector(gravity), name=name)
+    drawing = Drawing(pins, links, ground, velocities=velocities, gravity=gravity_vector(gravity), name=name, **more)
     return drawing.mechanism()
 
 
