@@ -6,12 +6,16 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.joints import Gear, Joint, Prismatic, Revolute, Slot
+from udkjax.scene.drawing.drawn_joints import PinInSlot, Slide
+from udkjax.scene.drawing.link import Link
+from udkjax.scene.joints import Gear, Joint, Revolute
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     apex,
+    as_array,
     bar_pose,
     bodies_on_pose,
+    draw_on_pose,
     gravity_vector,
     uniform_disc,
     uniform_rod,
@@ -35,33 +39,35 @@ def scissor_lift(
 
     The bars rising0, falling0, ... cross at their middles, pinned, at `angle` to the horizontal; left ends stay on the y axis.
     """
-    half = 0.5 * length
+    left = ["foot", *(f"left{i}" for i in range(stages - 1)), "head"]  # pins, from the bottom up
+    right = ["sliding foot", *(f"right{i}" for i in range(stages))]
 
-    def pose(s):
-        reach = length * unit_vector(s)
-        bars = []
-        for i in range(stages):
-            middle = np.array([0.5, i + 0.5]) * reach
-            bars += [(middle, s), (middle, -s)]
-        return [*bars, (half * np.array([1.0, 0.0]) + np.array([0.0, stages]) * reach, 0.0 * s)]
+    def places(s):
+        x, y = length * unit_vector(s)
+        found = {f"middle{i}": (0.5 * x, (i + 0.5) * y) for i in range(stages)}
+        found |= {pin: (x * k, i * y) for k, side in enumerate((left, right)) for i, pin in enumerate(side)}
+        found["end"] = (0.0 * x + length, stages * y)
+        return {name: as_array(place) for name, place in found.items()}
 
-    names = [f"{kind}{i}" for i in range(stages) for kind in ("rising", "falling")]
-    left, right = (-half, 0.0), (half, 0.0)
-    joints = {
-        "foot": Revolute((GROUND, "rising0"), [(0.0, 0.0), left]),
-        "sliding foot": Slot((GROUND, "falling0"), [(0.0, 0.0), right], axis=0.0),
-    }
+    links = {}
     for i in range(stages):
-        joints[f"middle{i}"] = Revolute((f"rising{i}", f"falling{i}"), ORIGINS)
-    for i in range(stages - 1):
-        joints[f"left{i}"] = Revolute((f"falling{i}", f"rising{i + 1}"), [left, left])
-        joints[f"right{i}"] = Revolute((f"rising{i}", f"falling{i + 1}"), [right, right])
-    joints["head"] = Revolute((f"falling{stages - 1}", "platform"), [left, left])
-    joints["sliding head"] = Slot(("platform", f"rising{stages - 1}"), [left, right], axis=0.0)
-    joints["guide"] = Prismatic((GROUND, "platform"), [(0.0, 0.0), left], axis=np.pi / 2, angle=0.0)
-    physics = [uniform_rod(mass, length)] * len(names) + [uniform_rod(platform_mass, length)]
-    bodies = bodies_on_pose((*names, "platform"), physics, pose, angle, angular_velocity)
-    return Mechanism(bodies, joints, gravity=gravity_vector(gravity), name="scissor lift")
+        links[f"rising{i}"] = Link([left[i], f"middle{i}", right[i + 1]], mass=mass, width=0.0)
+        links[f"falling{i}"] = Link([left[i + 1], f"middle{i}", right[i]], mass=mass, width=0.0)
+    slots = {
+        "sliding foot": PinInSlot("sliding foot", direction=0.0),
+        "sliding head": PinInSlot(right[-1], along=("head", "end"), on="platform"),
+    }
+    return draw_on_pose(
+        places,
+        angle,
+        angular_velocity,
+        links | {"platform": Link(["head", "end"], mass=platform_mass)},
+        ["foot"],
+        gravity,
+        "scissor lift",
+        slides={"guide": Slide("platform", direction=np.pi / 2)},
+        slots=slots,
+    )
 
 
 @with_known_numbers
