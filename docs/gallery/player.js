@@ -1,13 +1,6 @@
 const mount = (() => {
 "use strict";
-// The player: shows the motion of planar mechanisms. One module without dependencies, for a page, a notebook and documentation.
-//
-//   mount(element, data, {fill, theme, autoplay}) -> {time, playing, play(), pause(), seek(t), ...}     (see `mount`)
-//   default export: {render} for anywidget
-//
-// `data` is what udkjax/show/player/records.py describes. All texts go through `textContent` or a canvas: none is markup.
-
-// ---------------------------------------------------------------------------------------------------------------- numbers
+// Motions: packed tables, and where the bodies of a run are at any time.
 
 const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
 const floats = text => new Float32Array(bytesOf(text).buffer);
@@ -41,8 +34,6 @@ function nice(x) {
 
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const short = x => (x === 0 ? "0" : Math.abs(x) >= 1e5 || Math.abs(x) < 1e-3 ? x.toExponential(2) : String(+x.toPrecision(4))).replace("-", "−");
-
-// ------------------------------------------------------------------------------------------------------------------- runs
 
 /** Where the bodies of one run are at any time: cubic between its instants, whose rates are known; a mode is a sine. */
 class Run {
@@ -119,7 +110,8 @@ function place(pose, [body, x, y]) {
 
 const angleOf = (pose, body) => (body < 0 ? 0 : pose[3 * body + 2]);
 
-// ----------------------------------------------------------------------------------------------------------------- themes
+// Painting on a canvas: themes, lines and circles, arrows, texts, the grid, traces and reactions.
+
 
 // Okabe and Ito's colours, which everyone tells apart, and one more; on dark grounds, lighter.
 const THEMES = {
@@ -143,9 +135,7 @@ function mix(one, two, t) {
   return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
 }
 
-// ---------------------------------------------------------------------------------------------------------------- drawing
-
-/** Draws marks (udkjax/show/player/marks.py) at a pose. Lengths of what is a symbol are in `pt`, which grow with the panel. */
+/** Draws at a pose. Lengths of what is a symbol are in `pt`, which grow with the panel. */
 class Painter {
   constructor(context, view, theme, pt, pose) {
     Object.assign(this, {context, view, theme, pt, pose});
@@ -205,10 +195,6 @@ class Painter {
     c.restore();
   }
 
-  draw(marks) {
-    for (const mark of marks) this[mark.kind]?.(mark);
-  }
-
   /** Short strokes to the lower left of a line from x0 to x1 at height y of the frame: what does not move. */
   hatch(x0, x1, y) {
     const c = this.context, pt = this.pt, step = 5 * pt;
@@ -217,6 +203,115 @@ class Painter {
     c.lineWidth = pt;
     c.strokeStyle = this.theme.soft;
     c.stroke();
+  }
+
+  head([x, y], angle, colour) {
+    const size = 7.5 * this.pt, wide = 0.42;
+    const corner = turn => [x - size * Math.cos(angle + turn), y - size * Math.sin(angle + turn)];
+    this.line([[x, y], corner(wide), corner(-wide)], 0, colour, {closed: true, fill: colour});
+  }
+
+  arrow([x0, y0], [x1, y1], colour, dash = []) {
+    const angle = Math.atan2(y1 - y0, x1 - x0), length = Math.hypot(x1 - x0, y1 - y0), back = Math.min(5 * this.pt, length);
+    this.line([[x0, y0], [x1 - back * Math.cos(angle), y1 - back * Math.sin(angle)]], 2.2, colour, {dash});
+    if (length > 2 * this.pt) this.head([x1, y1], angle, colour);
+  }
+
+  text(words, [x, y], colour, {align = "left", size = 12, weight = 400, halo = true, back = this.theme.back} = {}) {
+    const c = this.context;
+    c.font = `${weight} ${size * Math.max(1, this.pt)}px system-ui, -apple-system, "Segoe UI", Roboto, sans-serif`;
+    c.textAlign = align;
+    c.textBaseline = "middle";
+    if (halo) {
+      c.lineWidth = 4;
+      c.strokeStyle = back;
+      c.strokeText(words, x, y);
+    }
+    c.fillStyle = colour;
+    c.fillText(words, x, y);
+  }
+
+  grid(width, height) {
+    const step = nice(80 / this.view.scale), c = this.context;
+    c.beginPath();
+    for (let k = Math.ceil(-this.view.x / this.view.scale / step); k * step * this.view.scale + this.view.x < width; k++) {
+      const x = Math.round(this.view.x + k * step * this.view.scale) + 0.5;
+      c.moveTo(x, 0);
+      c.lineTo(x, height);
+    }
+    for (let k = Math.ceil((this.view.y - height) / this.view.scale / step); this.view.y - k * step * this.view.scale > 0; k++) {
+      const y = Math.round(this.view.y - k * step * this.view.scale) + 0.5;
+      c.moveTo(0, y);
+      c.lineTo(width, y);
+    }
+    c.lineWidth = 1;
+    c.strokeStyle = this.theme.grid;
+    c.stroke();
+    return step;
+  }
+
+  /** How long one step of the grid is. */
+  bar(step, height) {
+    const {soft} = this.theme, length = step * this.view.scale, x = 14, y = height - 14;
+    this.line([[x, y - 3], [x, y + 3], [x, y], [x + length, y], [x + length, y - 3], [x + length, y + 3]], 1.2 / this.pt, soft);
+    const [value, unit] = step >= 1e3 ? [step / 1e3, "km"] : step >= 1 ? [step, "m"] : step >= 1e-2 ? [step * 100, "cm"]
+      : step >= 1e-3 ? [step * 1e3, "mm"] : [step * 1e6, "µm"];
+    this.text(`${+value.toPrecision(3)} ${unit}`, [x + length + 7, y], soft, {size: 11 / Math.max(1, this.pt)});
+  }
+
+  traces(run, t) {
+    const c = this.context, {first, last, count, lines} = run.trace();
+    const now = clamp((t - first) / (last - first || 1) * (count - 1), 0, count - 1), tail = Math.max(2, 0.06 * count);
+    lines.forEach((line, k) => {
+      const colour = this.colour(run.traces[k][0]);
+      const stroke = (from, to, width, alpha) => {
+        c.beginPath();
+        for (let i = from; i <= to; i++) {
+          const [x, y] = this.px([line[2 * i], line[2 * i + 1]]);
+          if (i === from) c.moveTo(x, y); else c.lineTo(x, y);
+        }
+        c.globalAlpha = alpha;
+        c.lineWidth = width * this.pt;
+        c.strokeStyle = colour;
+        c.stroke();
+        c.globalAlpha = 1;
+      };
+      stroke(0, count - 1, 1, 0.4);
+      stroke(Math.max(0, Math.ceil(now - tail)), Math.floor(now), 2.4, 0.8);
+    });
+  }
+
+  /** Arrows of forces, and one whose force is told. An arrow that would be longer than three times the usual one is cut. */
+  reactions(run, t, width, height) {
+    const forces = run.force(t), {anchors, usual, unique} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
+    anchors.forEach((anchor, k) => {
+      const [x, y] = this.anchor(anchor), fx = forces[2 * k] / usual, fy = forces[2 * k + 1] / usual;
+      const size = length * Math.min(1, 3 / Math.hypot(fx, fy));
+      if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour, unique[k] ? [] : NOT_UNIQUE);
+    });
+    const told = nice(usual / 2), y = height - 14, words = `${short(told)} N${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
+    this.text(words, [width - 14, y], colour, {align: "right", size: 11 / Math.max(1, this.pt)});
+    const end = width - 14 - this.context.measureText(words).width - 7;
+    this.arrow([end - length * told / usual, y], [end, y], colour);
+  }
+
+  names(run) {
+    run.bodies.forEach((name, body) => this.text(name, this.anchor([body, 0, 0]), this.colour(body), {align: "center", weight: 600}));
+    for (const mark of run.marks) {
+      if (mark.kind !== "pin") continue;
+      const [x, y] = this.at(mark);
+      this.text(mark.name, [x + 8 * this.pt, y - 10 * this.pt], this.theme.ink, {size: 11});
+    }
+  }
+}
+
+// The symbols of marks (udkjax/show/player/marks.py), a method for each kind.
+
+
+/** Draws marks: each by the method of its kind. */
+class MarkPainter extends Painter {
+  draw(marks) {
+    for (const mark of marks) this[mark.kind]?.(mark);
   }
 
   link({body, points, closed}) {
@@ -427,108 +522,10 @@ class Painter {
     this.head([x + 4 * pt * dx, y + 4 * pt * dy], Math.atan2(dy, dx), colour);
     c.restore();
   }
-
-  head([x, y], angle, colour) {
-    const size = 7.5 * this.pt, wide = 0.42;
-    const corner = turn => [x - size * Math.cos(angle + turn), y - size * Math.sin(angle + turn)];
-    this.line([[x, y], corner(wide), corner(-wide)], 0, colour, {closed: true, fill: colour});
-  }
-
-  arrow([x0, y0], [x1, y1], colour, dash = []) {
-    const angle = Math.atan2(y1 - y0, x1 - x0), length = Math.hypot(x1 - x0, y1 - y0), back = Math.min(5 * this.pt, length);
-    this.line([[x0, y0], [x1 - back * Math.cos(angle), y1 - back * Math.sin(angle)]], 2.2, colour, {dash});
-    if (length > 2 * this.pt) this.head([x1, y1], angle, colour);
-  }
-
-  text(words, [x, y], colour, {align = "left", size = 12, weight = 400, halo = true, back = this.theme.back} = {}) {
-    const c = this.context;
-    c.font = `${weight} ${size * Math.max(1, this.pt)}px system-ui, -apple-system, "Segoe UI", Roboto, sans-serif`;
-    c.textAlign = align;
-    c.textBaseline = "middle";
-    if (halo) {
-      c.lineWidth = 4;
-      c.strokeStyle = back;
-      c.strokeText(words, x, y);
-    }
-    c.fillStyle = colour;
-    c.fillText(words, x, y);
-  }
-
-  grid(width, height) {
-    const step = nice(80 / this.view.scale), c = this.context;
-    c.beginPath();
-    for (let k = Math.ceil(-this.view.x / this.view.scale / step); k * step * this.view.scale + this.view.x < width; k++) {
-      const x = Math.round(this.view.x + k * step * this.view.scale) + 0.5;
-      c.moveTo(x, 0);
-      c.lineTo(x, height);
-    }
-    for (let k = Math.ceil((this.view.y - height) / this.view.scale / step); this.view.y - k * step * this.view.scale > 0; k++) {
-      const y = Math.round(this.view.y - k * step * this.view.scale) + 0.5;
-      c.moveTo(0, y);
-      c.lineTo(width, y);
-    }
-    c.lineWidth = 1;
-    c.strokeStyle = this.theme.grid;
-    c.stroke();
-    return step;
-  }
-
-  /** How long one step of the grid is. */
-  bar(step, height) {
-    const {soft} = this.theme, length = step * this.view.scale, x = 14, y = height - 14;
-    this.line([[x, y - 3], [x, y + 3], [x, y], [x + length, y], [x + length, y - 3], [x + length, y + 3]], 1.2 / this.pt, soft);
-    const [value, unit] = step >= 1e3 ? [step / 1e3, "km"] : step >= 1 ? [step, "m"] : step >= 1e-2 ? [step * 100, "cm"]
-      : step >= 1e-3 ? [step * 1e3, "mm"] : [step * 1e6, "µm"];
-    this.text(`${+value.toPrecision(3)} ${unit}`, [x + length + 7, y], soft, {size: 11 / Math.max(1, this.pt)});
-  }
-
-  traces(run, t) {
-    const c = this.context, {first, last, count, lines} = run.trace();
-    const now = clamp((t - first) / (last - first || 1) * (count - 1), 0, count - 1), tail = Math.max(2, 0.06 * count);
-    lines.forEach((line, k) => {
-      const colour = this.colour(run.traces[k][0]);
-      const stroke = (from, to, width, alpha) => {
-        c.beginPath();
-        for (let i = from; i <= to; i++) {
-          const [x, y] = this.px([line[2 * i], line[2 * i + 1]]);
-          if (i === from) c.moveTo(x, y); else c.lineTo(x, y);
-        }
-        c.globalAlpha = alpha;
-        c.lineWidth = width * this.pt;
-        c.strokeStyle = colour;
-        c.stroke();
-        c.globalAlpha = 1;
-      };
-      stroke(0, count - 1, 1, 0.4);
-      stroke(Math.max(0, Math.ceil(now - tail)), Math.floor(now), 2.4, 0.8);
-    });
-  }
-
-  /** Arrows of forces, and one whose force is told. An arrow that would be longer than three times the usual one is cut. */
-  reactions(run, t, width, height) {
-    const forces = run.force(t), {anchors, usual, unique} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
-    anchors.forEach((anchor, k) => {
-      const [x, y] = this.anchor(anchor), fx = forces[2 * k] / usual, fy = forces[2 * k + 1] / usual;
-      const size = length * Math.min(1, 3 / Math.hypot(fx, fy));
-      if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour, unique[k] ? [] : NOT_UNIQUE);
-    });
-    const told = nice(usual / 2), y = height - 14, words = `${short(told)} N${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
-    this.text(words, [width - 14, y], colour, {align: "right", size: 11 / Math.max(1, this.pt)});
-    const end = width - 14 - this.context.measureText(words).width - 7;
-    this.arrow([end - length * told / usual, y], [end, y], colour);
-  }
-
-  names(run) {
-    run.bodies.forEach((name, body) => this.text(name, this.anchor([body, 0, 0]), this.colour(body), {align: "center", weight: 600}));
-    for (const mark of run.marks) {
-      if (mark.kind !== "pin") continue;
-      const [x, y] = this.at(mark);
-      this.text(mark.name, [x + 8 * this.pt, y - 10 * this.pt], this.theme.ink, {size: 11});
-    }
-  }
 }
 
-// ------------------------------------------------------------------------------------------------------------------ strip
+// The strip below the scene: curves of a measure over time.
+
 
 /** Curves of one measure of all runs over the timeline, and a line at the time that is shown. */
 function drawStrip(context, width, height, runs, name, start, end, t, theme, taken) {
@@ -583,20 +580,7 @@ function drawStrip(context, width, height, runs, name, start, end, t, theme, tak
   }
 }
 
-// ----------------------------------------------------------------------------------------------------------------- player
-
-const SPEEDS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100];
-const ICONS = {
-  play: "M7 4.5v15l13-7.5z",
-  pause: "M6 4.5h4.2v15H6zM13.8 4.5H18v15h-4.2z",
-  loop: "M17 3l4 4-4 4V8H8a3 3 0 0 0-3 3v1H3v-1a5 5 0 0 1 5-5h9zM7 21l-4-4 4-4v3h9a3 3 0 0 0 3-3v-1h2v1a5 5 0 0 1-5 5H7z",
-  theme: "M12 3a9 9 0 1 0 0 18zM12 3a9 9 0 0 1 0 18v-2a7 7 0 0 0 0-14z",
-};
-const HELP = [
-  ["Space", "play, pause"], ["← →", "one frame back, ahead"], ["Shift ← →", "a twentieth back, ahead"], ["Home End", "start, end"],
-  ["+ −", "faster, slower"], ["T", "traces"], ["N", "names"], ["R", "reactions"], ["L", "repeat"], ["D", "dark or light"],
-  ["0", "whole view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
-];
+// The look of the player's elements.
 
 const STYLE = `
 :host { display: block; }
@@ -649,6 +633,21 @@ input[type="range"] { accent-color: var(--accent); height: 32px; margin: 0; curs
 @media (pointer: coarse) { button, select { height: 38px; } button.icon { width: 40px; } button.primary { width: 44px; height: 44px; } }
 `;
 
+// Elements of a page: how they are made, and what is written on them.
+
+const SPEEDS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100];
+const ICONS = {
+  play: "M7 4.5v15l13-7.5z",
+  pause: "M6 4.5h4.2v15H6zM13.8 4.5H18v15h-4.2z",
+  loop: "M17 3l4 4-4 4V8H8a3 3 0 0 0-3 3v1H3v-1a5 5 0 0 1 5-5h9zM7 21l-4-4 4-4v3h9a3 3 0 0 0 3-3v-1h2v1a5 5 0 0 1-5 5H7z",
+  theme: "M12 3a9 9 0 1 0 0 18zM12 3a9 9 0 0 1 0 18v-2a7 7 0 0 0 0-14z",
+};
+const HELP = [
+  ["Space", "play, pause"], ["← →", "one frame back, ahead"], ["Shift ← →", "a twentieth back, ahead"], ["Home End", "start, end"],
+  ["+ −", "faster, slower"], ["T", "traces"], ["N", "names"], ["R", "reactions"], ["L", "repeat"], ["D", "dark or light"],
+  ["0", "whole view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
+];
+
 /** An element with properties and children; texts are texts. */
 function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
@@ -669,6 +668,51 @@ function icon(name) {
   svg.append(path);
   return svg;
 }
+
+// Fingers, mouse and wheel on a canvas.
+
+/** Drag moves the view, two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
+function followPointers(player, canvas) {
+  const down = new Map();
+  let moved = 0;
+  const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+  canvas.addEventListener("pointerdown", event => {
+    canvas.setPointerCapture(event.pointerId);
+    down.set(event.pointerId, point(event));
+    moved = 0;
+  });
+  canvas.addEventListener("pointermove", event => {
+    if (!down.has(event.pointerId)) return;
+    const before = [...down.values()], old = down.get(event.pointerId), now = point(event);
+    down.set(event.pointerId, now);
+    moved += Math.hypot(now[0] - old[0], now[1] - old[1]);
+    if (moved < 4) return;
+    const after = [...down.values()], centre = list => [0, 1].map(k => list.reduce((sum, p) => sum + p[k], 0) / list.length);
+    const [cx, cy] = centre(before), [nx, ny] = centre(after);
+    if (down.size === 2) {
+      const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]);
+      player.zoomAt(canvas, cx, cy, apart(after) / (apart(before) || 1));
+    }
+    player.zoom.x += nx - cx;
+    player.zoom.y += ny - cy;
+    player.draw();
+  });
+  const up = event => {
+    if (down.delete(event.pointerId) && event.type === "pointerup" && moved < 4) player.toggle("playing");
+  };
+  canvas.addEventListener("pointerup", up);
+  canvas.addEventListener("pointercancel", up);
+  canvas.addEventListener("dblclick", () => player.whole());
+  canvas.addEventListener("wheel", event => {
+    if (!player.options.fill && !event.ctrlKey && document.activeElement?.shadowRoot !== player.root.getRootNode()) return;
+    event.preventDefault();
+    player.zoomAt(canvas, ...point(event), Math.exp(-0.0015 * event.deltaY));
+    player.draw();
+  }, {passive: false});
+}
+
+// The player's elements, what they do, and how they look.
+
 
 class Player {
   constructor(element, data, options) {
@@ -747,7 +791,7 @@ class Player {
     if (this.runs.length > 1 || this.modes) caption.append(make("b", {}, run.label));
     if (run.note) caption.append(" ", run.note);
     const panel = {run, canvas, figure: make("figure", {class: "panel"}, canvas, caption)};
-    this.pointers(panel);
+    followPointers(this, canvas);
     return panel;
   }
 
@@ -763,47 +807,6 @@ class Player {
     this.stripCanvas.addEventListener("pointermove", event => { if (event.buttons) seek(event); });
     return make("div", {class: "strip"}, this.stripCanvas, select);
   }
-
-  /** Drag moves the view, two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
-  pointers({canvas}) {
-    const down = new Map();
-    let moved = 0;
-    const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
-    canvas.addEventListener("pointerdown", event => {
-      canvas.setPointerCapture(event.pointerId);
-      down.set(event.pointerId, point(event));
-      moved = 0;
-    });
-    canvas.addEventListener("pointermove", event => {
-      if (!down.has(event.pointerId)) return;
-      const before = [...down.values()], old = down.get(event.pointerId), now = point(event);
-      down.set(event.pointerId, now);
-      moved += Math.hypot(now[0] - old[0], now[1] - old[1]);
-      if (moved < 4) return;
-      const after = [...down.values()], centre = list => [0, 1].map(k => list.reduce((sum, p) => sum + p[k], 0) / list.length);
-      const [cx, cy] = centre(before), [nx, ny] = centre(after);
-      if (down.size === 2) {
-        const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]);
-        this.zoomAt(canvas, cx, cy, apart(after) / (apart(before) || 1));
-      }
-      this.zoom.x += nx - cx;
-      this.zoom.y += ny - cy;
-      this.draw();
-    });
-    const up = event => {
-      if (down.delete(event.pointerId) && event.type === "pointerup" && moved < 4) this.toggle("playing");
-    };
-    canvas.addEventListener("pointerup", up);
-    canvas.addEventListener("pointercancel", up);
-    canvas.addEventListener("dblclick", () => this.whole());
-    canvas.addEventListener("wheel", event => {
-      if (!this.options.fill && !event.ctrlKey && document.activeElement?.shadowRoot !== this.root.getRootNode()) return;
-      event.preventDefault();
-      this.zoomAt(canvas, ...point(event), Math.exp(-0.0015 * event.deltaY));
-      this.draw();
-    }, {passive: false});
-  }
-
   zoomAt(canvas, x, y, factor) {
     const next = clamp(this.zoom.factor * factor, 0.2, 100), ratio = next / this.zoom.factor;
     const cx = canvas.clientWidth / 2, cy = canvas.clientHeight / 2;
@@ -971,7 +974,7 @@ class Player {
       const {context, width, height} = this.context(canvas);
       if (!width || !height) continue;
       const view = this.view(width, height), pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
-      const painter = new Painter(context, view, theme, pt, null);
+      const painter = new MarkPainter(context, view, theme, pt, null);
       const step = painter.grid(width, height);
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
@@ -999,6 +1002,15 @@ class Player {
     this.root.remove();
   }
 }
+
+// The player: shows the motion of planar mechanisms. Modules without dependencies, which page.py joins to
+// one for a page and a notebook.
+//
+//   mount(element, data, {fill, theme, autoplay}) -> {time, playing, play(), pause(), seek(t), ...}     (see `mount`)
+//   default export: {render} for anywidget
+//
+// `data` is what udkjax/show/player/records.py describes. All texts go through `textContent` or a canvas: none is markup.
+
 
 /** Show `data` in an element.
  *
