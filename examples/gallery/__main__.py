@@ -89,9 +89,10 @@ def share_player(player: Path) -> None:
     It is a script, since browsers read no modules from a disk, and the page loses its policy, which allows no scripts beside it.
     """
     text = player.read_text(encoding="utf-8")
-    start, module, end = re.fullmatch(r'(.*)<script type="module">\n(.*)\n(mount\(.*)', text, re.DOTALL).groups()
+    start, _, rest = text.partition('<script type="module">\n')
+    module, mount, end = rest.rpartition("\nmount(")
     start = re.sub(r'<meta http-equiv="Content-Security-Policy"[^\n]*\n', "", start)
-    player.write_text(f'{start}<script src="{PLAYER}"></script>\n<script>\n{end}', encoding="utf-8")
+    player.write_text(f'{start}<script src="{PLAYER}"></script>\n<script>{mount}{end}', encoding="utf-8")
     program = re.sub(r"^export (default .*|)", "", module, flags=re.MULTILINE)
     shared = f'const mount = (() => {{\n"use strict";\n{program}\nreturn mount;\n}})();\n'
     (player.parent / PLAYER).write_text(shared, encoding="utf-8")
