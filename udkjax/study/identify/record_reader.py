@@ -1,8 +1,9 @@
 """Reads measurements into records, whatever they come as: every mistake is named with its file, row and column."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple, TypeAlias, TypeVar, cast
+import os
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +13,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import conversion_factor
 from udkjax.study.channels import Channel, Quantity, channel_of
 from udkjax.study.identify.records import ByChannel, IdentificationError, Key, Noise, Record, key_of
-from udkjax.study.identify.tables import NOISE, RECORD, TIME, Column, Table, TableData, quantities_by_name, read_tables
+from udkjax.study.identify.tables import NOISE, RECORD, TIME, Table, TableData, read_tables
 
 Data: TypeAlias = "Record | TableData | Sequence[Record | TableData]"
 MOST_SHOWN = 3  # mistakes of one kind in a column; the others are counted
@@ -43,7 +44,7 @@ def records_of(
     Raises:
         IdentificationError: with every mistake, each with its file, line and column.
     """
-    reader = _DataReader(mechanism, tuple(ignore), quantities_by_name(quantities))
+    reader = _DataReader(mechanism, tuple(ignore), _quantities_by_name(quantities))
     found = [reader.with_usual_names(record) for record in reader.read(data, "data")]
     if not found and not reader.problems:
         reader.problems.append("data: there are no records")
@@ -63,22 +64,13 @@ def records_of(
 # --- one table
 
 
-class _ChannelColumns(NamedTuple):
-    """A channel, and the columns of its values and of their standard deviation."""
-
-    heading: str
-    channel: Channel | Quantity
-    values: Column
-    noise: Column | None
-
-
 class _TableReader:
     """Reads the records of one table. `channel` finds channels by name, or raises ValueError; mistakes go to `problems`."""
 
     def __init__(self, table: Table, channel: Callable[[str], Channel | Quantity], ignore: Sequence[str], problems: list[str]):
         self.table, self.channel, self.problems = table, channel, problems
         self.columns = {name: column for name, column in table.columns.items() if name not in ignore}
-        self.ignore = tuple(ignore)
+        self.ignore = ignore
 
     def records(self) -> Iterator[Record]:
         """Iterate over the records."""
@@ -89,20 +81,18 @@ class _TableReader:
                 near = suggestion(TIME[0], self.columns)
                 self.problems.append(f"{self.table.source}: there is no column {quote(TIME[0])}{near}")
             return
-        times = self.numbers(time, self.columns[time], "s")
+        times = self.numbers(time, "s")
         numbers = len(self.problems) == before
-        found = self.channels([name for name in self.columns if name not in (time, RECORD)])
-        values = {key_of(m.channel): self.numbers(m.heading, m.values, m.channel.units) for m in found}
-        noise = {key_of(m.channel): self.numbers(m.heading + NOISE, m.noise, m.channel.units) for m in found if m.noise}
+        values, noise = self.channels([name for name in self.columns if name not in (time, RECORD)])
         for label, places in self.rows_by_record():
             if numbers:
                 self.check_times(time, times, places)
             if len(self.problems) == before:
                 yield from self.record(label, places, times, values, noise)
 
-    def channels(self, headings: Sequence[str]) -> list[_ChannelColumns]:
-        """Return the channels, with their columns."""
-        found: dict[str, _ChannelColumns] = {}
+    def channels(self, headings: Sequence[str]) -> tuple[dict[Key, np.ndarray], dict[Key, np.ndarray]]:
+        """Return the values of each channel, and the standard deviations where they have a column."""
+        found: dict[Key, tuple[str, str]] = {}  # headings and units
         for heading in headings:
             of = heading.removesuffix(NOISE)
             if of != heading:
@@ -114,31 +104,29 @@ class _TableReader:
             except ValueError as error:
                 self.add(heading, f"{error} (what is not to be read must be listed in `ignore`)")
                 continue
-            if channel.name in found:
-                self.add(heading, f"is the same channel as {quote(found[channel.name].heading)}")
-            values, noise = self.columns[heading], self.columns.get(heading + NOISE)
-            if noise is not None and noise.units is None:
-                noise = noise._replace(units=values.units)
-            found[channel.name] = _ChannelColumns(heading, channel, values, noise)
-        return list(found.values())
+            if (key := key_of(channel)) in found:
+                self.add(heading, f"is the same channel as {quote(found[key][0])}")
+            else:
+                found[key] = heading, channel.units
+        values = {key: self.numbers(heading, units) for key, (heading, units) in found.items()}
+        with_noise = {key: (h, units) for key, (h, units) in found.items() if h + NOISE in self.columns}
+        return values, {key: self.numbers(h + NOISE, units, self.columns[h].units) for key, (h, units) in with_noise.items()}
 
-    def numbers(self, heading: str, column: Column, wanted: str) -> np.ndarray:
-        """Return the numbers of a column in SI units; gaps are not a number."""
-        scale, cells, count = 1.0, column.values, len(self.table.rows)
+    def numbers(self, heading: str, wanted: str, units: str | None = None) -> np.ndarray:
+        """Return the numbers of a column in SI units, which it has in its own or these `units`; gaps are not a number."""
+        cells, own = self.columns[heading]
+        scale, count, units = 1.0, len(self.table.rows), own or units
         try:
-            scale = conversion_factor(column.units, wanted) if column.units else 1.0
+            scale = conversion_factor(units, wanted) if units else 1.0
         except ValueError as error:
             self.add(heading, str(error))
         kind, shape = (cells.dtype.kind, cells.shape) if isinstance(cells, np.ndarray) else ("O", (len(cells),))
         if kind in "mM" or shape != (count,):
-            self.add(
-                heading,
-                f"must be {count} numbers, is of {f'type {np.asarray(cells).dtype}' if kind in 'mM' else f'shape {shape}'}",
-            )
+            what = f"type {np.asarray(cells).dtype}" if kind in "mM" else f"shape {shape}"
+            self.add(heading, f"must be {count} numbers, is of {what}")
             return np.full(count, np.nan)
         found = np.asarray(cells, float) if kind in "iuf" else np.array([_number(cell) for cell in cells], float)
-        wrong = np.flatnonzero(np.isinf(found))
-        self.add_each(heading, wrong, lambda k: f"must be a number, is {abbreviate(cells[k])}")
+        self.add_each(heading, np.flatnonzero(np.isinf(found)), lambda k: f"must be a number, is {abbreviate(cells[k])}")
         return scale * found
 
     def rows_by_record(self) -> list[tuple[str, np.ndarray]]:
@@ -151,25 +139,22 @@ class _TableReader:
 
     def check_times(self, time: str, times: np.ndarray, places: np.ndarray) -> None:
         """Note times that are missing or do not increase."""
-        own = times[places]
-        missing = np.isnan(own)
+        missing = np.isnan(times[places])
         self.add_each(time, places[missing], lambda k: "is empty")
-        there, own = places[~missing], own[~missing]
-        late = np.flatnonzero(np.diff(own) <= 0) + 1
-        before = dict(zip(there[1:], own[:-1], strict=True)) if len(there) else {}
+        there = places[~missing]
+        late = np.flatnonzero(np.diff(times[there]) <= 0) + 1
+        before = dict(zip(there[1:], times[there[:-1]], strict=True)) if len(there) else {}
         self.add_each(time, there[late], lambda k: f"{times[k]:g} s does not exceed the one before, {before[k]:g} s")
 
     def record(
         self, label: str, places: np.ndarray, times: np.ndarray, values: dict[Key, np.ndarray], noise: dict[Key, np.ndarray]
     ) -> Iterator[Record]:
         """Make a record of some rows, of those channels that were measured in it."""
-        own = {name: x[places] for name, x in values.items()}
-        own = {name: x for name, x in own.items() if not np.isnan(x).all()}
-        if self.table.padded and own:
-            some = np.flatnonzero(~np.isnan(np.stack(list(own.values()))).all(0))
-            inside = slice(some[0], some[-1] + 1)
-            own, places = {name: x[inside] for name, x in own.items()}, places[inside]
-        sigma = {name: noise[name][places] for name in own if name in noise}
+        measured = [name for name, x in values.items() if not np.isnan(x[places]).all()]
+        if self.table.padded and measured:
+            some = np.flatnonzero(~np.isnan(np.stack([values[name][places] for name in measured])).all(0))
+            places = places[some[0] : some[-1] + 1]
+        own, sigma = ({name: x[name][places] for name in measured if name in x} for x in (values, noise))
         try:
             yield Record(times[places], own, sigma, name=label)
         except IdentificationError as error:
@@ -207,6 +192,11 @@ def _label(cell: str | float | None) -> str:
 # --- anything that holds tables
 
 
+def _quantities_by_name(given: Iterable[Hashable]) -> dict[str, Quantity]:
+    """Return those of some channels that are the user's own, by name."""
+    return {quantity.name: quantity for quantity in given if isinstance(quantity, Quantity)}
+
+
 class _DataReader:
     """Reads data for a mechanism, and gathers every mistake in `problems`."""
 
@@ -222,8 +212,9 @@ class _DataReader:
             for k, item in enumerate(data):
                 yield from self.read(item, f"{source}[{k}]")
         else:
+            if not isinstance(data, str | os.PathLike) and isinstance(data, Iterable):  # of headings
+                self.quantities |= _quantities_by_name(cast("Iterable[Hashable]", data))
             for table in read_tables(cast(TableData, data), self.mechanism.body_names, source, self.problems):
-                self.quantities |= table.quantities
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
     def channel(self, given: Key) -> Channel | Quantity:

@@ -6,7 +6,7 @@ Files are read by the standard library: messages name the line of each mistake, 
 import csv
 import os
 import re
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from udkjax.extras import OptionalImport
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import abbreviate, quote, suggestion
-from udkjax.study.channels import RATES, Quantity
+from udkjax.study.channels import RATES
 from udkjax.study.identify.records import ByChannel
 
 if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tables
@@ -45,7 +45,6 @@ class Table(NamedTuple):
     rows: Sequence[str]
     name: str = ""  # of the record, where the table holds one
     padded: bool = False  # whether rows at the ends in which nothing was measured are there for longer records
-    quantities: Mapping[str, Quantity] = {}  # headings that were channels of the user's own, not text
 
 
 def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: list[str]) -> Iterator[Table]:
@@ -53,39 +52,32 @@ def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: l
     if isinstance(data, str | os.PathLike):
         yield from _read_file(Path(data), bodies, problems)
     elif hasattr(data, "data_vars"):
-        yield from read_dataset(cast("xarray.Dataset", data), bodies, source, problems)
+        yield from _read_dataset(cast("xarray.Dataset", data), bodies, source, problems)
     elif hasattr(data, "columns") and hasattr(data, "index"):
-        frame = cast("pandas.DataFrame", data)
-        yield table_of_frame(frame, source, problems)._replace(quantities=quantities_by_name(frame.columns))
+        yield _table_of_frame(cast("pandas.DataFrame", data), source, problems)
     elif isinstance(data, Mapping):
-        table = table_of_columns(source, [(str(key), value) for key, value in data.items()], problems)
-        yield table._replace(quantities=quantities_by_name(data))
+        yield _table_of_columns(source, [(str(key), value) for key, value in data.items()], problems)
     else:
         what = "a Record, a mapping, a pandas DataFrame, an xarray Dataset, the path of a .csv or .nc file, or a list of such"
         problems.append(f"{source}: must be {what}, is {type(data).__name__}")
 
 
-def quantities_by_name(given: Iterable[Hashable]) -> dict[str, Quantity]:
-    """Return those of some channels that are the user's own, by name."""
-    return {quantity.name: quantity for quantity in given if isinstance(quantity, Quantity)}
-
-
 def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterator[Table]:
     try:
         if path.suffix.lower() == ".csv":
-            yield from read_csv(path, problems)
+            yield from _read_csv(path, problems)
         elif path.suffix.lower() == ".nc":
             with OptionalImport():
                 import xarray
             data = xarray.load_dataset(path, decode_times=False)  # else xarray makes durations of seconds
-            yield from read_dataset(data, bodies, str(path), problems, path.stem)
+            yield from _read_dataset(data, bodies, str(path), problems, path.stem)
         else:
             problems.append(f"{path}: must be a .csv or a .nc file")
     except (OSError, ValueError, csv.Error) as error:
         problems.append(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})")
 
 
-def read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
+def _read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
     """Iterate over the table of a CSV file: a header, after lines of comments if there are any, and rows of cells."""
     lines = path.read_text(encoding="utf-8-sig").splitlines()
     first = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
@@ -94,20 +86,18 @@ def read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
         return
     delimiter = next((d for d in _DELIMITERS if d in lines[first]), ",")
     reader = csv.reader(lines[first:], delimiter=delimiter, skipinitialspace=True)
-    header, rows, places = _join_points(_cut_empty_end(next(reader)), delimiter), [], []
+    header, rows = _join_points(_cut_empty_end(next(reader)), delimiter), {}
     for cells in reader:
-        if not any(cell.strip() for cell in cells):
-            continue
-        line = f"line {first + reader.line_num}"
-        cells = cells[: max(len(header), len(_cut_empty_end(cells)))]
-        if len(cells) == len(header):
-            rows.append(cells)
-            places.append(line)
-        else:
-            problems.append(f"{path}, {line}: has {len(cells)} cells, the header has {len(header)}")
-    columns = list(zip(header, zip(*rows, strict=True) if rows else [()] * len(header), strict=True))
+        if any(cell.strip() for cell in cells):
+            cells = cells[: max(len(header), len(_cut_empty_end(cells)))]
+            if len(cells) == len(header):
+                rows[f"line {first + reader.line_num}"] = cells
+            else:
+                where = f"{path}, line {first + reader.line_num}"
+                problems.append(f"{where}: has {len(cells)} cells, the header has {len(header)}")
+    columns = zip(header, zip(*rows.values(), strict=True) if rows else [()] * len(header), strict=True)
     named = [(name, cells) for name, cells in columns if name.strip() or any(cell.strip() for cell in cells)]
-    yield table_of_columns(str(path), named, problems, places, path.stem)
+    yield _table_of_columns(str(path), named, problems, list(rows), path.stem)
 
 
 def _cut_empty_end(cells: list[str]) -> list[str]:
@@ -126,23 +116,19 @@ def _join_points(cells: Sequence[str], delimiter: str) -> list[str]:
     return found
 
 
-def table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) -> Table:
+def _table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) -> Table:
     """Return the table of a pandas DataFrame; its index is a column if it is called a time or a record."""
-    columns = [(str(name), _values(data.iloc[:, k])) for k, name in enumerate(data.columns)]
-    if data.index.name is not None and _heading(str(data.index.name))[0] in (*TIME, RECORD):
-        columns.insert(0, (str(data.index.name), data.index.to_numpy()))
-    return table_of_columns(source, columns, problems)
+    indexed = data.index.name is not None and _heading(str(data.index.name))[0] in (*TIME, RECORD)
+    columns = [data.index.to_series()] if indexed else []
+    columns += [data.iloc[:, k] for k in range(data.shape[1])]
+    values = [x.to_numpy(float, na_value=np.nan) if x.dtype.kind in "iuf" else x.to_numpy() for x in columns]
+    return _table_of_columns(source, [(str(x.name), v) for x, v in zip(columns, values, strict=True)], problems)
 
 
-def _values(column: "pandas.Series") -> np.ndarray:
-    """Return the values of a pandas Series; missing numbers become nan."""
-    return column.to_numpy(float, na_value=np.nan) if column.dtype.kind in "iuf" else column.to_numpy()
-
-
-def table_of_columns(
+def _table_of_columns(
     source: str, given: Sequence[tuple[str, ArrayLike]], problems: list[str], rows: Sequence[str] | None = None, name: str = ""
 ) -> Table:
-    """Return the table of columns whose headings may name their units."""
+    """Return the table of columns whose headings may name their units; one value stands for all rows."""
     columns: dict[str, Column] = {}
     for text, values in given:
         heading, units = _heading(text)
@@ -152,16 +138,11 @@ def table_of_columns(
         else:
             cells = np.asarray(values) if hasattr(values, "dtype") else cast("Sequence[str | float | None]", values)
             columns[heading] = Column(cells, units)
+    alone = {h for h, c in columns.items() if isinstance(c.values, str) or np.ndim(cast(ArrayLike, c.values)) == 0}
     if rows is None:
-        sizes = [len(c.values) for c in columns.values() if not _is_scalar(c.values)]
-        rows = [f"entry {k}" for k in range(max(sizes, default=0))]
-    columns = {h: c._replace(values=[c.values] * len(rows)) if _is_scalar(c.values) else c for h, c in columns.items()}
+        rows = [f"entry {k}" for k in range(max((len(c.values) for h, c in columns.items() if h not in alone), default=0))]
+    columns = {h: c._replace(values=[c.values] * len(rows)) if h in alone else c for h, c in columns.items()}
     return Table(source, columns, rows, name)
-
-
-def _is_scalar(values: ArrayLike) -> bool:
-    """Return whether this is one value for all rows."""
-    return isinstance(values, str) or not hasattr(values, "__len__") or getattr(values, "shape", None) == ()
 
 
 def _heading(text: str) -> tuple[str, str | None]:
@@ -173,7 +154,7 @@ def _heading(text: str) -> tuple[str, str | None]:
 # --- xarray
 
 
-def read_dataset(
+def _read_dataset(
     data: "xarray.Dataset", bodies: Sequence[str], source: str, problems: list[str], name: str = ""
 ) -> Iterator[Table]:
     """Iterate over the tables of an xarray Dataset: one for each of its records."""
@@ -182,8 +163,8 @@ def read_dataset(
         return
     for k in range(data.sizes[RECORD]):
         label = str(data[RECORD].values[k]) if RECORD in data.coords else str(k)
-        one = data.isel({RECORD: k}).drop_vars(RECORD, errors="ignore")
         found: list[str] = []
+        one = data.isel({RECORD: k}).drop_vars(RECORD, errors="ignore")
         yield _read_record(one, bodies, source, found, label)._replace(padded=True)
         problems += [problem for problem in found if problem not in problems]
 
