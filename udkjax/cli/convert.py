@@ -25,7 +25,7 @@ def convert(
         leave_out: of an MJCF model, what may be passed over.
         key: the keyframe of an MJCF model from which the initial state is taken.
     """
-    check_target(target, (".toml", ".xml"))
+    check_target(target, (".toml", ".xml"), "target")
     mechanism, _ = load(scene, leave_out, key)
 
     import udkjax as udk

@@ -15,7 +15,8 @@ EVEN = 1e-12  # of the largest term: what angles that cancel leave
 class CoupledLength(NamedTuple):
     """A coordinate that springs, motors and equalities act on: that of a joint, or the length of a tendon.
 
-    It is made of angles of bodies, by their factors; or it is a slide; or the distance of two points; or none of these.
+    It is made of angles of bodies, by their factors; or it is a slide; or the distance of two points. Negative numbers of bodies
+    stand for rods without mass, whose angles are nowhere.
     """
 
     length: float  # rad or m, where the model is written down
@@ -51,10 +52,10 @@ class CoupledLengths:
         lengths = self.model.reference(joint), self.model.reference(joint, "springref")
         if joint.kind == "slide":
             return CoupledLength(*lengths, slide=joint)
-        if self.model.has_rod(joint.body):
-            return CoupledLength(*lengths)
-        sign = self.model.sign(joint)
-        return CoupledLength(*lengths, angles={self.model.holder(joint.body): -sign, joint.body: sign})
+        sign, body, holder = self.model.sign(joint), joint.body, self.model.holder(joint.body)
+        if self.model.has_rod(body):  # its number is that of the body, negative
+            holder, body = (holder, -body) if joint is self.model.tree.bodies[body].joints[0] else (-body, body)
+        return CoupledLength(*lengths, angles={holder: -sign, body: sign})
 
     def _tendon_length(self, read: AttributeReader) -> CoupledLength | None:
         parts = [AttributeReader(child, child.attributes, self.settings.problems) for child in read.element.children]
@@ -94,7 +95,7 @@ class CoupledLengths:
         if not all(term.angles for term, _ in terms):
             if len(terms) == 1 and terms[0][1] == 1.0:
                 return terms[0][0]
-            read.refuse("couples slides, or one of two hinges of a body: not taken over")
+            read.refuse("couples slides: not taken over")
             return None
         angles: dict[int, float] = {}
         for term, factor in terms:
@@ -103,4 +104,7 @@ class CoupledLengths:
         largest = max(map(abs, angles.values()), default=0.0)
         angles = {body: part for body, part in sorted(angles.items()) if abs(part) > EVEN * largest}
         length, at_rest = (sum(factor * getattr(term, name) for term, factor in terms) for name in ("length", "at_rest"))
+        if min(angles, default=0) < 0:
+            read.refuse("couples one of the two hinges of a body: not taken over")
+            return None
         return CoupledLength(length, at_rest, angles)

@@ -63,7 +63,7 @@ class ForceReader:
 
     def _limit_cure(self, name: str, length: CoupledLength, read: AttributeReader) -> str:
         low, high = read.numbers("range", (0.0, 0.0))
-        if len(length.angles) == 2 and read.element.tag == "joint":
+        if len(length.angles) == 2 and min(length.angles) >= 0 and read.element.tag == "joint":
             holder, body = sorted(length.angles)
             sign, radians = length.angles[body], self.settings.radians
             ends = sorted(self.model.relative_angle(holder, body) + sign * (x * radians - length.length) for x in (low, high))
@@ -116,7 +116,7 @@ class ForceReader:
             self._add_slide_force(name, length, read, force)
         elif length.ends and constant is None:
             self._put(name, Spring(*self.model.attached(length.ends), stiffness, max(at_rest, 0.0), damping or None))
-        elif len(length.angles) == 2:
+        elif len(length.angles) == 2 and min(length.angles) >= 0:
             (one, _), (two, factor) = length.angles.items()
             bodies, angle = self.model.names((one, two)), self.model.relative_angle(one, two)
             if stiffness or damping:

@@ -1,7 +1,7 @@
 """Mechanisms as MJCF models: a tree of bodies in the world's x-z plane, closed by equalities."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import jax
@@ -13,17 +13,18 @@ from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Point, between
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.fields import Number
 from udkjax.scene.forces import Spring, Torque, TorsionSpring
+from udkjax.scene.held import Held
 from udkjax.scene.joints import Angle, Constraint, Distance, Gear, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.scene.mechanism_tables import check_known
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import EVEN
 from udkjax.scene.mjcf.mjcf_reader import CLOSED, INITIAL
+from udkjax.scene.mjcf.spanning_tree import spanning_tree
 from udkjax.scene.reshaping import attachments
 from udkjax.scene.suspicions import body_sizes
 
 NORMAL = "0 -1 0"  # of the x-z plane: angles are anticlockwise about it, seen from where x is to the right and z is up
-IN_TREE = ((Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,))  # what no equality can express comes before the others
 THICKNESS = 0.04  # of bars that are drawn, beside the largest body
 
 Values = dict[str, str]
@@ -72,7 +73,7 @@ class _Writer:
         self.sections: dict[str, list[str]] = {"tendon": [], "equality": [], "actuator": []}
         self.controls: list[float] = []
         self.taken: set[str] = set()  # names of sites and tendons
-        self.parents, self.holders = self._tree()
+        self.parents, self.holders = spanning_tree(mechanism)
         self.turns: dict[str, dict[str, float]] = {GROUND: {}}  # hinges whose sum is the angle of a body
         self.joints = {name: self._joints(name) for name in self.parents}
         for name, joint in mechanism.joints.items():
@@ -116,37 +117,6 @@ class _Writer:
         if self.problems:
             raise SceneError(self.problems, self.mechanism.name)
         return "\n".join([*lines, "</mujoco>", ""])
-
-    def _tree(self) -> tuple[dict[str, str], dict[str, str]]:
-        """Return the body on which each hangs, from the ground on, and the joint by which; without one it is free."""
-        groups, edges = {name: name for name in self.frames}, dict[str, list[tuple[str, str]]]()
-
-        def group(name: str) -> str:
-            while groups[name] != name:
-                name = groups[name]
-            return name
-
-        orders = {
-            name: next((k for k, kinds in enumerate(IN_TREE) if isinstance(joint, kinds)), None)
-            for name, joint in self.mechanism.joints.items()
-        }
-        for name in sorted((name for name, order in orders.items() if order is not None), key=lambda name: orders[name] or 0):
-            one, two = self.mechanism.joints[name].bodies
-            if group(one) != group(two):
-                groups[group(one)] = group(two)
-                edges.setdefault(one, []).append((two, name))
-                edges.setdefault(two, []).append((one, name))
-        parents, holders = dict[str, str](), dict[str, str]()
-        for root in (GROUND, *self.mechanism.body_names):
-            reached = [root] if root == GROUND or root not in parents else []
-            if reached and root != GROUND:
-                parents[root] = GROUND
-            for name in reached:
-                for other, joint in edges.get(name, []):
-                    if other != GROUND and other not in parents:
-                        parents[other], holders[other] = name, joint
-                        reached.append(other)
-        return parents, holders
 
     def _joints(self, name: str) -> list[_TreeJoint]:
         """Return the hinges and slides by which a body hangs on its parent."""
@@ -241,32 +211,38 @@ class _Writer:
             closes = " that closes a loop" if isinstance(joint, Slot | Prismatic) else ""
             self.problems.append(f"joint {quote(name)}: MJCF has no equality for a {type(joint).__name__.lower()}{closes}")
 
-    def _add_force(self, name: str, force: object) -> None:
-        if isinstance(force, Spring):
+    def _add_force(self, name: str, force: Any) -> None:
+        if any(isinstance(value, Held) for value in vars(force).values()):
+            self.problems.append(f"force {quote(name)}: MJCF has no samples; give a number, and MuJoCo the samples as controls")
+        elif isinstance(force, Spring):
             rest = {"springlength": _numbers(force.length), "stiffness": _numbers(force.stiffness)}
             self._add_spatial(name, force.bodies, force.points, **rest, **_damping(force.damping))
         elif isinstance(force, TorsionSpring | Torque):
-            one, two = force.bodies
-            hinges = self._hinges({two: 1.0, one: -1.0})
-            (hinge, sign), *others = [*hinges.items(), ("", 0.0)]
-            alone = len(others) == 1 and abs(sign) == 1
-            if isinstance(force, Torque):
-                tendon = "" if alone else self._add_fixed(name, hinges, "force")
-                target = {"joint": hinge, "gear": _numbers(sign)} if alone else {"tendon": tendon}
-                if alone or tendon:
-                    self.sections["actuator"].append(f"<motor{_attributes(name=name, **target)}/>")
-                    self.controls.append(float(force.value))
-                return
-            rest = float(force.angle - self.frames[two].angle + self.frames[one].angle)
-            spring = {"stiffness": _numbers(force.stiffness)} | _damping(force.damping)
-            if alone and hinge not in self.springs:
-                self.springs[hinge] = {"springref": _numbers(sign * rest), **spring}
-            else:
-                turned = -1.0 if rest < 0 else 1.0  # a springlength of -1 says that it is the length as written
-                parts = {joint: turned * part for joint, part in hinges.items()}
-                self._add_fixed(name, parts, "force", springlength=_numbers(abs(rest)), **spring)
+            self._add_turning(name, force)
         else:
             self.problems.append(f"force {quote(name)}: MJCF has no element for a {type(force).__name__.lower()}")
+
+    def _add_turning(self, name: str, force: Any) -> None:
+        """Add a torsion spring, or a torque, to the hinge between its bodies, or to a tendon over several hinges."""
+        one, two = force.bodies
+        hinges = self._hinges({two: 1.0, one: -1.0})
+        (hinge, sign), *others = [*hinges.items(), ("", 0.0)]
+        alone = len(others) == 1 and abs(sign) == 1
+        if (value := getattr(force, "value", None)) is not None:  # a torque
+            tendon = "" if alone else self._add_fixed(name, hinges, "force")
+            target = {"joint": hinge, "gear": _numbers(sign)} if alone else {"tendon": tendon}
+            if alone or tendon:
+                self.sections["actuator"].append(f"<motor{_attributes(name=name, **target)}/>")
+                self.controls.append(float(value))
+            return
+        rest = float(force.angle - self.frames[two].angle + self.frames[one].angle)
+        spring = {"stiffness": _numbers(force.stiffness)} | _damping(force.damping)
+        if alone and hinge not in self.springs:
+            self.springs[hinge] = {"springref": _numbers(sign * rest), **spring}
+        else:
+            turned = -1.0 if rest < 0 else 1.0  # a springlength of -1 says that it is the length as written
+            parts = {joint: turned * part for joint, part in hinges.items()}
+            self._add_fixed(name, parts, "force", springlength=_numbers(abs(rest)), **spring)
 
     def _hinges(self, parts: dict[str, float]) -> dict[str, float]:
         """Return a sum of angles of bodies, each times its factor, as one of hinges."""

@@ -2,7 +2,7 @@
 
 import math
 
-from udkjax.scene.checks import abbreviate, suggestion
+from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.mjcf.orientations import SpaceFrame, frame_of
 from udkjax.scene.mjcf.vocabulary import ACTUATORS
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
@@ -38,9 +38,10 @@ class ModelSettings:
         pending = [(child, MAIN) for child in root.children if child.tag == "default"]
         while pending:
             element, parent = pending.pop()
-            name = element.attributes.get("class", MAIN if element in root.children else "")
-            if not name:
-                problems.append(f"{element.where}: needs a class")
+            at_top = element in root.children
+            name = element.attributes.get("class", MAIN if at_top else "")
+            if not name or (at_top and name != MAIN):
+                problems.append(f"{element.where}: class={quote(name)}: it is main at the top, and needs a name of its own below")
             found = self._defaults.setdefault(name, {tag: dict(values) for tag, values in self._defaults[parent].items()})
             for child in element.children:
                 if child.tag == "default":

@@ -12,7 +12,7 @@ from udkjax.scene.mjcf.xml_tree import XmlElement
 WITHOUT_EFFECT = ("visual", "statistic", "asset", "sensor", "custom", "size", "light", "camera")  # on the motion
 TOLD_BY_PARENT = ("equality", "spatial", "fixed")  # whose children are called as other elements are
 ACTUATORS = ("motor", "position", "velocity", "general")
-SHAPELESS = ("material", "mesh", "pair")  # in defaults alone
+SHAPELESS = ("material", "mesh", "texture", "pair")  # in defaults alone
 
 _POSE = "pos quat axisangle xyaxes zaxis euler"
 _LOOK = "group material rgba user"
@@ -74,7 +74,7 @@ _KNOWN: dict[str, _Attributes] = {
         {"shellinertia": "false", "fluidshape": "none"},
     ),
     "site": _Attributes(f"name class fromto {_POSE}", f"type mesh size {_LOOK}"),
-    "equality": _Attributes(""),
+    "equality": _EQUALITY,
     "connect": _EQUALITY._replace(used=f"{_EQUALITY.used} body1 body2 anchor site1 site2"),
     "weld": _EQUALITY._replace(
         used=f"{_EQUALITY.used} body1 body2 anchor relpose site1 site2 torquescale",

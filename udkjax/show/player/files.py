@@ -1,5 +1,6 @@
 """Runs that `udkjax simulate` or `Solution.to_xarray` wrote, read again to be shown."""
 
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result
-from udkjax.scene import Mechanism, SceneError, loads
+from udkjax.scene import Mechanism, MjcfWarning, SceneError, loads
 
 with OptionalImport():
     import xarray
@@ -39,7 +40,8 @@ def read_run(path: Path) -> RunFile:
                 f"{path} has no {' and no '.join(missing or ['text of a scene'])}: it is not a run of `udkjax simulate`"
             )
         try:
-            mechanism = loads(data.attrs["scene"])
+            with warnings.catch_warnings(action="ignore", category=MjcfWarning):  # it was said when the run was made
+                mechanism = loads(data.attrs["scene"])
         except SceneError as error:  # classes of the user's own are not in the format
             raise ValueError(f"{path}: its scene cannot be read, use `udkjax.animate` in Python: {error}") from error
         if data["q"].dims != ("time", "body", "coordinate"):
