@@ -142,6 +142,7 @@ ELSEWHERE = (
     "equinox",
     "eqx",
     "optax",
+    "pandas",
     "lineax",
     "optimistix",
     "equinox.internal",

@@ -100,9 +100,25 @@ def _require_array(name: str, value: Any, given: Given) -> None:
     require_finite(name, value)
 
 
-def _require_mapping(name: str, value: Any, given: Given) -> None:
-    if value is not None and not isinstance(value, Mapping):
-        raise ArgumentTypeError(f"{name} must map names to numbers, such as {{name: number}}, {describe(value)}")
+def _of_kind(meant: str, suits: Callable[[Any], bool]) -> Check:
+    """Return the check of an argument that must suit; `meant` says in words what does."""
+
+    def check(name: str, value: Any, given: Given):
+        if not suits(value):
+            raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
+
+    return check
+
+
+def _has(method: str) -> Callable[[Any], bool]:
+    return lambda x: x is None or (hasattr(x, method) and not isclass(x))
+
+
+def _are_names(x: Any) -> bool:
+    return isinstance(x, Sequence) and not isinstance(x, str) and all(isinstance(name, str) for name in x)
+
+
+_require_mapping = _of_kind("map names to numbers, such as {name: number}", lambda x: x is None or isinstance(x, Mapping))
 
 
 def _require_point(name: str, value: Any, given: Given) -> None:
@@ -111,11 +127,6 @@ def _require_point(name: str, value: Any, given: Given) -> None:
     if array(name, value).shape != (2,):
         raise ArgumentError(f"{name} must be two numbers, x and y in m, {describe(value)}")
     require_finite(name, value)
-
-
-def _require_names(name: str, value: Any, given: Given) -> None:
-    if not isinstance(value, str) and not (isinstance(value, list | tuple) and all(isinstance(x, str) for x in value)):
-        raise ArgumentTypeError(f"{name} must be the name of a body, or a list of names, {describe(value)}")
 
 
 def _require_drivers(name: str, value: Any, given: Given) -> None:
@@ -128,40 +139,17 @@ def _require_drivers(name: str, value: Any, given: Given) -> None:
         raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
 
 
-def _require_path(name: str, value: Any, given: Given) -> None:
-    if value is not None and not isinstance(value, str | os.PathLike):
-        raise ArgumentTypeError(f"{name} must be a path, or None, {describe(value)}")
-
-
-def _require_client(name: str, value: Any, given: Given) -> None:
-    if value is not None and (isclass(value) or not hasattr(value, "submit")):
-        raise ArgumentTypeError(f"{name} must be a dask.distributed.Client, or None, {describe(value)}")
-
-
-def _require_optimizer(name: str, value: Any, given: Given) -> None:
-    if value is not None and not isinstance(value, str) and (isclass(value) or not hasattr(value, "update")):
-        raise ArgumentTypeError(f"{name} must be an optimizer of optax's, or None, {describe(value)}")
-
-
-def _require_parameters(name: str, value: Any, given: Given) -> None:
-    """Require parameters to identify: a name, an object that stands for one, or a list of these."""
-    if not isinstance(value, str | list | tuple) and not callable(value) and not dataclasses.is_dataclass(value):
-        raise ArgumentTypeError(f"{name} must be the name of a parameter, a Parameter, or a list of these, {describe(value)}")
-
-
-def _require_texts(name: str, value: Any, given: Given) -> None:
-    if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(x, str) for x in value):
-        raise ArgumentTypeError(f"{name} must be a list of names, {describe(value)}")
-
-
 CHECKS: dict[str, Check] = {
-    "out": _require_path,
+    "out": _of_kind("be a path, or None", lambda x: x is None or isinstance(x, str | os.PathLike)),
     "memory": _optional(require_count),
     "drivers": _require_drivers,
-    "parameters": _require_parameters,
-    "ignore": _require_texts,
-    "client": _require_client,
-    "optimizer": _require_optimizer,
+    "parameters": _of_kind(
+        "be the name of a parameter, a Parameter, or a list of these",
+        lambda x: isinstance(x, str | list | tuple) or callable(x) or dataclasses.is_dataclass(x),
+    ),
+    "ignore": _of_kind("be a list of names", _are_names),
+    "client": _of_kind("be a dask.distributed.Client, or None", _has("submit")),
+    "optimizer": _of_kind("be an optimizer of optax's, or None", lambda x: isinstance(x, str) or _has("update")(x)),
     "mechanism": _check_mechanism,
     "method": _check_thresholds,
     "stabilization": _check_thresholds,
@@ -197,7 +185,7 @@ CHECKS: dict[str, Check] = {
     "weights": _require_mapping,
     "compliances": _require_mapping,
     "point": _require_point,
-    "bodies": _require_names,
+    "bodies": _of_kind("be the name of a body, or a list of names", lambda x: isinstance(x, str) or _are_names(x)),
     "solver": _of_diffrax("AbstractSolver", "diffrax.Tsit5()"),
     "adjoint": _of_diffrax("AbstractAdjoint", "diffrax.ForwardMode()"),
 }

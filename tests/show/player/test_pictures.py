@@ -1,6 +1,9 @@
 """Pictures and films: what is drawn is where it must be."""
 
+import json
 import re
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -9,7 +12,9 @@ from PIL import Image
 import udkjax as udk
 from udkjax.show.player import films
 from udkjax.show.player.marks import marks
+from udkjax.show.player.page import module
 from udkjax.show.player.sketch import THEMES, Sketch, view_of
+from udkjax.show.player.symbols import SYMBOLS, symbols_of
 
 INK = np.array([int(THEMES["light"]["ink"][k : k + 2], 16) for k in (1, 3, 5)])
 REACH = 7  # px around a pin's centre within which its ring is
@@ -79,7 +84,26 @@ def test_a_dxf_is_in_metres_in_layers(animation, closed_form, tmp_path):
     assert {"links", "joints", "ground", "motors", "blocks"} <= {layer.dxf.name for layer in drawing.layers}
 
 
-def test_every_kind_of_mark_is_drawn():
+def painted_by_script(symbols, pose, view, folder):
+    """What the player's script paints: points or a centre, a radius, stroke and fill of each symbol."""
+    if (node := shutil.which("node")) is None:
+        pytest.skip("there is no node")
+    script = """
+        class Recorder extends SymbolPainter {
+          line(points, width, stroke, {fill}) { this.painted.push([points, 0, stroke ?? "", fill ?? ""]); }
+          circle(centre, radius, {stroke, fill}) { this.painted.push([centre, radius, stroke ?? "", fill ?? ""]); }
+        }
+        const painter = Object.assign(new Recorder({}, VIEW, THEMES.light, VIEW.pt, POSE), {painted: []});
+        painter.draw(SYMBOLS);
+        console.log(JSON.stringify(painter.painted));
+    """
+    for name, value in {"VIEW": view._asdict(), "POSE": pose.ravel().tolist(), "SYMBOLS": symbols}.items():
+        script = script.replace(name, json.dumps(value))
+    (folder / "script.mjs").write_text(module() + script, encoding="utf-8")
+    return json.loads(subprocess.run([node, folder / "script.mjs"], capture_output=True, text=True, check=True).stdout)
+
+
+def test_every_kind_of_mark_is_drawn(tmp_path):
     angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     B, names = udk.Body, ("cam", "follower", "pinion", "rack", "free", "plate")
     spots = ((0, 0), (0, 0.5), (1.5, 0.2), (1.5, 0), (2.7, 0.6), (2.6, 0))
@@ -109,12 +133,15 @@ def test_every_kind_of_mark_is_drawn():
     )
     every = marks(mech, mech.q0[None])
     found = {mark["kind"] for mark in every}
-    methods = {name[1:] for name in vars(Sketch) if name.startswith("_") and not name.startswith("__")}
-    helpers = {"body", "anchor", "at", "edge", "fill", "line", "circle", "rotate", "hatch", "rail_frame", "along", "turn", "head"}
-    assert found == methods - helpers
-    sketch = Sketch(every, np.asarray(mech.q0), view_of((-1, -1, 4, 2), 600))
+    assert found == SYMBOLS.keys()
+    view = view_of((-1, -1, 4, 2), 600)
+    sketch = Sketch(every, np.asarray(mech.q0), view)
     assert {shape.layer for shape in sketch.shapes} == found
     assert all(np.isfinite(shape[1]).all() for shape in sketch.shapes)  # points or centre
+    painted = painted_by_script(symbols_of(every, view.pt / view.scale), np.asarray(mech.q0), view, tmp_path)
+    for shape, (points, radius, *look) in zip(sketch.shapes, painted, strict=True):
+        np.testing.assert_allclose(points, shape[1], atol=1e-6)
+        assert look == [shape.stroke, shape.fill] and radius == pytest.approx(getattr(shape, "radius", 0.0))
 
 
 def test_wrong_names_and_themes(animation, tmp_path):

@@ -1,7 +1,7 @@
 """Marks of a mechanism's picture: a list of plain data that the player in the browser and the writers of pictures share.
 
 A mark is a dict with a `kind`. Places are in metres in the frame of a body, which is a number: the body's place in the
-mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How large a pin or an arrow is drawn is for who draws it.
+mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How each kind is drawn, symbols.py says.
 
     link      body, points, closed          a bar through the points that hold a body, or a plate
     disc      body, at, radius              a body that has no other shape: a disc of its radius of gyration
@@ -15,7 +15,7 @@ mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How large a pin or
     roller    body, at                      what slides in a slot or follows a cam
     weld      body, at                      no relative motion
     rod       a, b                          a distance joint, between two anchors
-    spring    a, b, damper                  a spring, between two anchors
+    spring    a, b, damper, length          a spring, between two anchors, which is usually so long (m)
     spiral    body, at                      a torsion spring
     piston    a, b                          a driver of a length
     motor     body, at                      a driver of an angle
@@ -198,7 +198,9 @@ class _Drawing:
         match force:
             case Spring():
                 a, b = self._anchors(force.bodies, force.points)
-                self.elements.append({"kind": "spring", "a": a, "b": b, "damper": force.damping is not None})
+                ends = (self._path(body, point) for body, point in zip(force.bodies, np.asarray(force.points), strict=True))
+                length = float(np.median(np.linalg.norm(np.subtract(*ends), axis=1)))
+                self.elements.append({"kind": "spring", "a": a, "b": b, "damper": force.damping is not None, "length": length})
             case TorsionSpring():
                 self.elements.append({"kind": "spiral", **self._axle(force.bodies)})
             case Friction():
@@ -248,14 +250,16 @@ class _Drawing:
 
     def _travel(self, one: str, at: ArrayLike, axis: float, two: str, point: ArrayLike) -> tuple[float, float]:
         """The least and the largest displacement (m) along an axis of body `one`, from its point `at`, of a point of `two`."""
-        frames, others = self._frames(one), self._frames(two)
-        gap = to_ground(point, others) - to_ground(at, frames)
-        direction = axis + frames[:, 2]
+        gap = self._path(two, point) - self._path(one, at)
+        direction = axis + self._frames(one)[:, 2]
         along = gap[:, 0] * np.cos(direction) + gap[:, 1] * np.sin(direction)
         return float(along.min()), float(along.max())
 
     def _frames(self, body: str) -> Float[np.ndarray, "T 3"]:
         return np.zeros((len(self.poses), 3)) if body == GROUND else self.poses[:, self.number[body]]
+
+    def _path(self, body: str, point: ArrayLike) -> Float[np.ndarray, "T 2"]:
+        return to_ground(point, self._frames(body))
 
     def _at(self, body: str, point: ArrayLike) -> Mark:
         return {"body": self.number[body], "at": np.asarray(point, float).tolist()}

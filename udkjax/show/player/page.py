@@ -9,7 +9,7 @@ from string import Template
 
 from udkjax.show.player.packing import Json
 
-MODULES = ("motion", "painter", "marks", "strip", "style", "elements", "pointers", "player", "mount")  # after those they import
+MODULES = ("motion", "painter", "symbols", "strip", "style", "elements", "pointers", "player", "mount")  # after those they import
 # Within <script> no character of a text may end it, begin markup or break a line of JavaScript.
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 

@@ -19,7 +19,7 @@ export const THEMES = {
 const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
 
 /** A colour on the way to another one: t from 0 to 1. */
-function mix(one, two, t) {
+export function mix(one, two, t) {
   const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
   return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
 }
@@ -47,10 +47,6 @@ export class Painter {
     return body < 0 ? this.theme.soft : this.theme.bodies[body % this.theme.bodies.length];
   }
 
-  fillOf(body) {
-    return mix(this.colour(body), this.theme.back, this.theme.tint);
-  }
-
   line(points, width, colour, {closed = false, fill = null, dash = []} = {}) {
     const c = this.context;
     c.beginPath();
@@ -72,26 +68,6 @@ export class Painter {
     c.arc(x, y, radius, from, to);
     if (fill) { c.fillStyle = fill; c.fill(); }
     if (stroke) { c.lineWidth = width * this.pt; c.strokeStyle = stroke; c.stroke(); }
-  }
-
-  /** Draw in a frame of pixels with its origin at a place and its x axis turned anticlockwise by an angle. */
-  inFrame([x, y], angle, draw) {
-    const c = this.context;
-    c.save();
-    c.translate(x, y);
-    c.rotate(-angle);
-    draw(c);
-    c.restore();
-  }
-
-  /** Short strokes to the lower left of a line from x0 to x1 at height y of the frame: what does not move. */
-  hatch(x0, x1, y) {
-    const c = this.context, pt = this.pt, step = 5 * pt;
-    c.beginPath();
-    for (let x = x0 + step; x <= x1 + 0.01 * pt; x += step) { c.moveTo(x, y); c.lineTo(x - step, y + step); }
-    c.lineWidth = pt;
-    c.strokeStyle = this.theme.soft;
-    c.stroke();
   }
 
   head([x, y], angle, colour) {

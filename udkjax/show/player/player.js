@@ -1,12 +1,12 @@
 // The player's elements, what they do, and how they look.
 
 import {HELP, SPEEDS, icon, make} from "./elements.js";
-import {MarkPainter} from "./marks.js";
 import {Run, clamp} from "./motion.js";
 import {THEMES} from "./painter.js";
 import {followPointers} from "./pointers.js";
 import {drawStrip} from "./strip.js";
 import {STYLE} from "./style.js";
+import {SymbolPainter} from "./symbols.js";
 
 export class Player {
   constructor(element, data, options) {
@@ -268,11 +268,11 @@ export class Player {
       const {context, width, height} = this.context(canvas);
       if (!width || !height) continue;
       const view = this.view(width, height), pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
-      const painter = new MarkPainter(context, view, theme, pt, null);
+      const painter = new SymbolPainter(context, view, theme, pt, null);
       const step = painter.grid(width, height);
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
-      painter.draw(run.marks);
+      painter.draw(run.symbols);
       if (show.reactions && run.reactions) painter.reactions(run, t, width, height);
       if (show.names) painter.names(run);
       painter.bar(step, height);

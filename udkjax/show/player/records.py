@@ -11,6 +11,7 @@ runs       a list of
     label, note    texts
     bodies         names
     marks          what is drawn (marks.py)
+    symbols        how it is drawn (symbols.py)
     traces         a list of [body, x, y] whose paths are drawn
     time, q, v     packed (packing.py) tables of T rows: time; coordinates x, y, angle of each body; their rates times `frame`
     frame          s, the typical time between two instants
@@ -31,6 +32,8 @@ from udkjax.scene import Mechanism
 from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
 from udkjax.show.player.measures import Measures, ShownMotion, measures_of, reaction_arrows
 from udkjax.show.player.packing import Json, floats, pack, unpack
+from udkjax.show.player.sketch import POINT, view_of
+from udkjax.show.player.symbols import symbols_of
 from udkjax.study.channels import locate
 
 Record = Json
@@ -150,6 +153,8 @@ def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.nda
     ends = [(0.0, 1.0)] if is_mode else [_ends(record) for _, record, _ in runs]
     start, end = min(first for first, _ in ends), max(last for _, last in ends)
     boxes = np.array([_box(mechanism, record, poses) for mechanism, record, poses in runs])
+    bounds = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
+    view = view_of(bounds, int(POINT))
     return {
         "format": 1,
         "title": title,
@@ -158,8 +163,8 @@ def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.nda
         "end": end,
         "speed": 1 / MODE_PERIOD if is_mode else _speed(end - start),
         "length": float(analyse(runs[0][0]).length),
-        "bounds": [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()],
-        "runs": [record for _, record, _ in runs],
+        "bounds": bounds,
+        "runs": [record | {"symbols": symbols_of(record["marks"], view.pt / view.scale)} for _, record, _ in runs],
     }
 
 
