@@ -235,6 +235,19 @@ def test_all_kinds_of_equalities_and_tendons_are_the_same_there_and_back():
     is_there_and_back(mech, q, rng.normal(size=q.shape))
 
 
+@pytest.mark.slow
+def test_a_four_bar_moves_in_mujoco_as_it_does_here():
+    mujoco = pytest.importorskip("mujoco")
+    mech, step = library.four_bar(), 1e-4
+    settings = f'<option timestep="{step}" integrator="RK4" tolerance="1e-14" '
+    model = mujoco.MjModel.from_xml_string(udk.mjcf_text(mech).replace("<option ", settings))
+    model.eq_solref[:], model.eq_solimp[:, :2] = (3 * step, 1), 0.9999  # as hard as the step allows
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, round(1 / step))
+    found = data.xipos[[model.body(name).id for name in mech.body_names]][:, [0, 2]]
+    assert_allclose(found, udk.simulate(mech, [0.0, 1.0]).q[-1, :, :2], atol=1e-7)
+
+
 # --- what is not ours
 
 BODY = '<body name="a"><joint name="h" axis="0 1 0"{joint}/><geom name="g" size="0.1" pos="0.3 0 0"{geom}/>{body}</body>'
