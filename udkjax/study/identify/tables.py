@@ -1,6 +1,6 @@
 """Tables of measurements from files, pandas, xarray and mappings: columns under their headings, nothing interpreted.
 
-Files are read by the standard library: messages name the line of each mistake, which `pandas.read_csv` does not.
+Files are read by the standard library: messages name the line of each mistake, which the reader of pandas does not.
 """
 
 import csv
