@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.expressions.loop_program import ADD, MINIMUM, Address, KernelLoop, LoopProgram, Reset
+from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, Address, KernelLoop, LoopProgram, Reset
 
 
 def run(program: LoopProgram, arrays: dict[str, np.ndarray]) -> None:
@@ -29,5 +29,5 @@ def run(program: LoopProgram, arrays: dict[str, np.ndarray]) -> None:
             ]
             for value, slot in zip(kernel.program(values), kernel.outputs, strict=True):
                 array, place = at(slot)
-                how = {ADD: np.add, MINIMUM: np.fmin}.get(slot.update, lambda old, new: new)
+                how = {ADD: np.add, MAXIMUM: np.fmax, ALL: np.fmin}.get(slot.update, lambda old, new: new)
                 array[place] = how(array[place], float(value))

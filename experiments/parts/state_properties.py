@@ -17,9 +17,10 @@ import udkjax as udk
 from experiments.parts.random_scenes import RandomScene, Table, build, random_scene, state_of
 from experiments.parts.reference_equations import Terms, evaluate
 from experiments.parts.tally import Property, Tally, relative
-from udkjax.equations.loop_programs import loop_programs
-from udkjax.equations.scene_programs import elimination_programs, scene_programs
+from udkjax.equations.scene_arrays import SceneArrays
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
+from udkjax.equations.written_out import WrittenOut
 from udkjax.expressions import ScalarProgram
 from udkjax.pinv.rank_policy import RankPolicy
 
@@ -126,28 +127,40 @@ class Programs:
 
     def __init__(self, mechanism: udk.Mechanism, redundant: Sequence[int], tables: Sequence[Table] = ()):
         """Of one mechanism, or of `tables` of its structure, whose numbers take the places of its own."""
-        self.scene = scene_programs(mechanism)
-        self.elimination = elimination_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE)
+        programs = scene_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE)
+        self._written_out = WrittenOut(programs, ["accelerations", "tangent_part", "rows_and_loads"])
+        self.entries, (self.rows, self.coordinates) = programs.psi_q_entries, (programs.row_count, programs.coordinate_count)
         own = np.concatenate([np.ravel(x) for x in jax.tree.leaves(mechanism)])
         rows = numbers_of(mechanism, tables) if tables else own[None]
         numbers = np.hstack([rows, np.tile([0.0, SAFE], (len(rows), 1))])
-        self._constants = {id(p): _run(p.prologue, numbers) for p in (self.scene, self.elimination)}
+        self._constants = _run(self._written_out.prologue, numbers)
 
-    def run(self, program: ScalarProgram, q: np.ndarray, v: np.ndarray, more: Any = None, eliminates: bool = False) -> np.ndarray:
-        """Return the outputs (members, outputs) at q and v (members, n), t = 0."""
-        constants = self._constants[id(self.elimination if eliminates else self.scene)]
-        more = np.zeros((len(q), 0)) if more is None else more
-        return _run(program, np.hstack([constants, np.zeros((len(q), 1)), q, v, more]))
+    def run(self, name: str, q: np.ndarray, v: np.ndarray, dv: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:
+        """Return the results (members, ...) of a program at q and v (members, n), t = 0, by array."""
+        given = {"constants": self._constants, "t": np.zeros((len(q), 1)), "q": q, "v": v, "dq": 0.0 * q, "dv": dv + 0.0 * v}
+        program, inputs, outputs = self._written_out.program(name)
+        values = _run(program, np.stack([given[x][:, k] for x, k in inputs], 1))
+        return {x: values[:, [i for i, (y, _) in enumerate(outputs) if y == x]] for x in dict.fromkeys(y for y, _ in outputs)}
 
     def accelerations(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """a (members, n) by elimination, and whether each is safe."""
-        found = self.run(self.elimination.accelerations, q, v, eliminates=True)
-        return found[:, :-1], found[:, -1] > 0
+        found = self.run("accelerations", q, v)
+        return found["a"], found["safe"][:, 0] > 0
 
     def impulse_response(self, q: np.ndarray, v: np.ndarray, change: np.ndarray) -> np.ndarray:
         """The change of the velocities that constraints leave of one."""
-        found = self.run(self.elimination.tangent_part, q, v, np.hstack([0.0 * change, change]), eliminates=True)
-        return found[:, change.shape[1] : 2 * change.shape[1]]
+        return self.run("tangent_part", q, v, change)["dv1"]
+
+    def terms(self, q: np.ndarray, v: np.ndarray) -> list[dict[str, np.ndarray]]:
+        """Psi, Psi_q, Psi_dot, b and a_F of each member."""
+        found = self.run("rows_and_loads", q, v)
+        row, column, place, factor = self.entries
+        psi_q = np.zeros((len(q), self.rows, self.coordinates))
+        if len(row):
+            psi_q[:, row, column] = found["psi_q"][:, place] * factor
+        free, b = np.split(found["terms"], [self.coordinates], axis=1)
+        rows = {x: found.get(x, np.zeros((len(q), 0))) for x in ("psi", "psi_dot")}
+        return [{"psi_q": psi_q[k], "free": free[k], "b": b[k]} | {x: rows[x][k] for x in rows} for k in range(len(q))]
 
 
 def names_of(mechanism: udk.Mechanism) -> list[str]:
@@ -219,24 +232,29 @@ def accelerate(scene: RandomScene, mechanism: udk.Mechanism, redundant: Sequence
     return a[0], bool(safe[0])
 
 
-def check_terms(tally: Tally, scene: RandomScene, solved: Solved, found: dict[str, np.ndarray], pattern: Any) -> None:
+def check_terms(tally: Tally, scene: RandomScene, solved: Solved, found: dict[str, np.ndarray]) -> None:
     """Hold the terms of the programs against those of the reference."""
     (q, v), terms, at = state_of(scene.table), solved.terms, scene.label
     length, rate = np.tile([scene.length, scene.length, 1.0], len(q)), 1 / scene.time
-    n, rows, entries = q.size, len(terms.psi), pattern.value_count
-    values, b, free, root = np.split(found["equation_terms"], [entries, entries + rows, entries + rows + n])
+    free = found["free"]
     speed = max(1.0, np.max(abs(v.ravel() / (length * rate))))
-    if rows:
-        w, psi_q = solved.weights, pattern.dense(values, np) / root
+    if len(terms.psi):
+        w, psi_q = solved.weights, found["psi_q"]
         reach = max(1.0, np.max(abs(q[:, :2])) / scene.length)
         tally.add("Psi", np.max(abs(w * (found["psi"] - terms.psi))) / reach, at)
         tally.add("Psi_q", np.max(abs(w[:, None] * (psi_q - terms.psi_q) * length)) / reach, at)
         tally.add("Psi_dot", np.max(abs(w * (found["psi_dot"] - terms.psi_dot))) / (rate * speed * reach), at)
         size = rate**2 * max(speed**2 * reach, np.max(abs(free / (length * rate**2))), np.max(abs(w * terms.gamma)) / rate**2)
-        tally.add("gamma", np.max(abs(w * (b + psi_q @ free - terms.gamma))) / size, at)
+        tally.add("gamma", np.max(abs(w * (found["b"] + psi_q @ free - terms.gamma))) / size, at)
     tally.add("loads", relative(free, terms.force / terms.mass, length * rate**2, 1.0), at)
+
+
+def check_energy(tally: Tally, scene: RandomScene, mechanism: udk.Mechanism, terms: Terms) -> None:
+    """Hold the kinetic and the potential energy of one mechanism of a structure against those of the reference."""
+    q, v = state_of(scene.table)
+    found = udk.equations.kinetic_energy(mechanism, v), udk.equations.potential_energy(mechanism, 0.0, q, v)
     right = np.array([0.5 * terms.mass @ v.ravel() ** 2, terms.potential])
-    tally.add("energy", relative(found["energy"], right, scene.mass * (scene.length * rate) ** 2, 1.0), at)
+    tally.add("energy", relative(np.array(found, float), right, scene.mass * (scene.length / scene.time) ** 2, 1.0), scene.label)
 
 
 def check_accelerations(tally: Tally, scene: RandomScene, solved: Solved, a: np.ndarray, grown: float) -> None:
@@ -508,13 +526,13 @@ def _check_structure(
     grown = [growth(s, without=redundant) for s in solved]
     mechanism = build(scenes[0].table)
     programs, (q, v) = Programs(mechanism, redundant, [scene.table for scene in scenes]), states_of(scenes)
-    names = ("equation_terms", "psi", "psi_dot", "energy")
-    terms = {name: programs.run(getattr(programs.scene, name), q, v) for name in names}
+    terms = programs.terms(q, v)
+    check_energy(tally, scenes[0], mechanism, solved[0].terms)
     a, safe = programs.accelerations(q, v)
     check_reciprocity(tally, scenes, programs, solved, grown, rng)
     tally.leave_out("elimination says that it is not safe", int(np.sum(~safe)))
     for k, (scene, s) in enumerate(both):
-        check_terms(tally, scene, s, {name: found[k] for name, found in terms.items()}, programs.scene.pattern)
+        check_terms(tally, scene, s, terms[k])
         if safe[k]:
             check_accelerations(tally, scene, s, a[k], grown[k])
 
@@ -547,13 +565,13 @@ def check_large(tally: Tally, seed: int, structures: Iterable[int]) -> int:
         scene = random_scene(seed, structure, 0, bodies=(22, 40))
         mechanism, solved = build(scene.table), solve(scene)
         q, v = (x.ravel() for x in state_of(scene.table))
-        programs, terms, at = loop_programs(mechanism), solved.terms, scene.label
+        programs, terms, at = scene_programs(mechanism), solved.terms, scene.label
         numbers = np.asarray(numbers_as_vector(jax.tree.leaves(mechanism)))
-        row, column, *_ = programs.d_entries
-        psi, rate, values = programs.geometry(numbers, np)(0.0, q, v)
-        free, b = programs.loads(numbers, np)(0.0, q, v)
+        row, column, *_ = programs.psi_q_entries
+        arrays = SceneArrays(programs, numbers, np)
+        (psi, rate, values), (free, b) = arrays.geometry(0.0, q, v), arrays.loads(0.0, q, v)
         psi_q = np.zeros_like(terms.psi_q)
-        np.add.at(psi_q, (row, column), values * np.sqrt(terms.mass)[column])
+        np.add.at(psi_q, (row, column), values)
         found = {"psi": psi, "psi_q": psi_q, "psi_dot": rate, "gamma": b + psi_q @ free, "free": free}
         w, length = solved.weights, np.tile([scene.length, scene.length, 1.0], len(q) // 3)
         speed, reach = (max(1.0, np.max(abs(x / length))) for x in (v * scene.time, q))

@@ -9,11 +9,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.programs import run
 from udkjax import GROUND
-from udkjax.equations.implicit_derivative import acceleration_derivative, projection_derivative
-from udkjax.equations.scene_programs import elimination_programs
+from udkjax.equations.scene_arrays import constants_of
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_scalars
 from udkjax.equations.textbook import TextbookEquations, prepare
+from udkjax.equations.written_out import WrittenOut
 from udkjax.pinv.rank_policy import RankPolicy
 
 
@@ -35,7 +37,7 @@ SCENES = "double_pendulum elliptic_trammel parallelogram peaucellier planetary_g
 @pytest.mark.parametrize("scene", ["driven", "slider_crank", *(pytest.param(s, marks=pytest.mark.slow) for s in SCENES[:-1])])
 @pytest.mark.parametrize("name", ["accelerations", "projection"])
 def test_they_are_those_of_the_textbook(scene, name):
-    """Along all numbers of the scene, t, q and v, where it is closed. Reverse mode is the transpose: w (J d) = (w J) d."""
+    """Along all numbers of the scene, q and v, where it is closed. Reverse mode is the transpose: w (J d) = (w J) d."""
     mechanism = driven() if scene == "driven" else getattr(udk.library, scene)()
     random, t = np.random.default_rng(1), 0.3
     state = udk.assemble(mechanism, t)
@@ -43,15 +45,17 @@ def test_they_are_those_of_the_textbook(scene, name):
     analysis, gains = udk.analyse(mechanism), udk.Baumgarte(2.0, 3.0)
     leaves, tree = jax.tree.flatten(mechanism.without_origin)
     dleaves = [random.standard_normal(np.shape(x)) * 0.1 for x in leaves]
-    dt, dq, dv = 0.7, random.standard_normal(q.size), random.standard_normal(v.size)
-    programs = elimination_programs(mechanism, analysis.redundant_rows or (), True, RankPolicy.REFUSE)
+    dq, dv = random.standard_normal((2, q.size))
+    programs = scene_programs(mechanism, analysis.redundant_rows or (), True, RankPolicy.FALL_BACK)
 
     @jax.jit
     def by_jax(leaves, dleaves):
-        numbers = lambda leaves: [*numbers_as_scalars(leaves), 2.0, 3.0, 1e-14, 1e-14]  # noqa: E731
-        constants = lambda leaves: jnp.stack([jnp.asarray(c) for c in programs.prologue(numbers(leaves))])  # noqa: E731
+        gains_and_thresholds = jnp.array([2.0, 3.0])
 
-        def expected(leaves, t, q, v):
+        def constants(leaves):
+            return constants_of(programs, jnp.concatenate([jnp.stack(numbers_as_scalars(leaves)), gains_and_thresholds]), jnp)
+
+        def expected(leaves, q, v):
             mech = tree.unflatten(leaves)
             kept = np.ones(len(analysis.row_names))
             kept[list(analysis.redundant_rows or ())] = 0.0
@@ -62,21 +66,27 @@ def test_they_are_those_of_the_textbook(scene, name):
             found = equations.accelerations(t, q, v) if name == "accelerations" else equations.correct(t, q, v)
             return jnp.concatenate(found) if isinstance(found, tuple) else found
 
-        at, along = (leaves, t, q, v), (dleaves, dt, dq, dv)
-        return jax.jvp(constants, (leaves,), (dleaves,)), jax.jvp(expected, at, along)[1]
+        return jax.jvp(constants, (leaves,), (dleaves,))[1], jax.jvp(expected, (leaves, q, v), (dleaves, dq, dv))[1]
 
-    (constants, dconstants), expected = by_jax([jnp.asarray(x, float) for x in leaves], dleaves)
-    make = acceleration_derivative if name == "accelerations" else projection_derivative
-    derivative = make(programs, (*[True] * len(constants), True, True, True))
-    given = [*map(float, constants), t, *q.tolist(), *v.tolist()]
-    stored = derivative.evaluation(given)[len(derivative.evaluation.outputs) - len(derivative.stored) :]
-    dots = [*map(float, dconstants), dt, *dq.tolist(), *dv.tolist()]
-    found = np.array(derivative.forward([*given, *stored, *dots]))
+    dconstants, expected = by_jax([jnp.asarray(x, float) for x in leaves], dleaves)
+    numbers = [*map(float, numbers_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14]
+    active = [True] * (programs.number_count - 2) + [False] * 2
+    results = ["a"] if name == "accelerations" else ["q1", "v1"]
+
+    def differentiated(reverse, seeds):
+        written_out = WrittenOut(programs, [], [name], active, reverse)
+        evaluation, derivative = written_out.derivative(name)
+        given = {"constants": np.array(written_out.prologue(numbers)), "t": np.array([t]), "q": q, "v": v}
+        moving = np.asarray(dconstants)[list(written_out.moving)]
+        return moving, run(derivative, given | {"stored": run(evaluation, given)["stored"]} | seeds(moving))
+
+    moving, found = differentiated(False, lambda moving: {"d_constants": moving, "d_q": dq, "d_v": dv})
+    found = np.concatenate([found[f"d_{x}"] for x in results])
     assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * float(1 + np.abs(expected).max()))
     weights = random.standard_normal(len(found))
-    back = np.array(derivative.reverse([*given, *stored, *weights.tolist()]))
-    terms = np.abs(weights) @ np.abs(found)
-    assert_allclose(back @ dots, weights @ found, rtol=0, atol=1e-10 * float(terms))
+    _, back = differentiated(True, lambda _: {f"bar_{x}": weights[k * q.size : (k + 1) * q.size] for k, x in enumerate(results)})
+    total = back["bar_constants"] @ moving + back["bar_q"] @ dq + back["bar_v"] @ dv
+    assert_allclose(total, weights @ found, rtol=0, atol=1e-10 * float(np.abs(weights) @ np.abs(found)))
 
 
 class _Weighted:
@@ -84,12 +94,3 @@ class _Weighted:
 
     def __init__(self, weights):
         self.weights = weights
-
-
-def test_a_driver_that_is_not_differentiated_changes_nothing():
-    programs = elimination_programs(driven(), (), False, RankPolicy.REFUSE)
-    still, moving = (
-        acceleration_derivative(programs, (*[False] * len(programs.constants), t, True, True)) for t in (False, True)
-    )
-    assert len(moving.inputs) == len(still.inputs) + 1
-    assert len(moving.forward.order) > len(still.forward.order)

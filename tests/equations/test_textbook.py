@@ -1,6 +1,6 @@
 """The textbook against what must hold of it, and the programs against the textbook, in every scene of the library.
 
-Every type of joint, driver and force element is held against it in test_scalar_equations.py.
+Every type of joint, driver and force element is held against it in test_scene_programs.py.
 """
 
 import inspect
@@ -14,17 +14,18 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.choices import fast
+from tests.programs import dense, evaluate_programs
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.scene_programs import elimination_programs
-from udkjax.equations.structure import is_large, numbers_as_scalars
+from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.structure import numbers_as_scalars
 from udkjax.pinv.rank_policy import RankPolicy
 
 SVD = udk.SVD(1e-9)
 T0 = jnp.array(0.3)
 
 
-# Pins, slides, wheels and a driver, and redundant rows; each type of element: test_scalar_equations.py.
+# Pins, slides, wheels and a driver, and redundant rows; each type of element: test_scene_programs.py.
 CHOSEN = "driven_pendulum", "slider_crank", "parallelogram", "planetary_gear"
 
 
@@ -180,43 +181,26 @@ def test_row_names_are_those_of_the_analysis(moved):
 # --- what else there is, against it
 
 
-def named(program, constants, t, q, v):
-    return np.array(program([*constants, float(t), *q.tolist(), *v.tolist()]), float)
-
-
 @pytest.mark.parametrize("policy", RankPolicy)
 def test_programs_are_the_textbook(moved, policy):
-    """Terms, energies and accelerations; on the rows that are kept, since off the manifold the others disagree."""
+    """Terms and accelerations; on the rows that are kept, since off the manifold the others disagree."""
     mech, q, v = moved
     gains, analysis = udk.Baumgarte(2.0, 3.0), udk.analyse(mech)
     redundant = analysis.redundant_rows or ()
-    if is_large(mech):
-        pytest.skip("written as loops (tests/native/test_loops.py)")
-    programs = elimination_programs(mech, redundant, True, policy)
-    leaves = jax.tree.leaves(mech.without_origin)
-    constants = programs.prologue([*map(float, numbers_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14])
-    run = lambda program: named(program, constants, T0, q, v)  # noqa: E731
-    (m, n), slots = programs.pattern.shape, programs.pattern.value_count
-    values, b, free, root = np.split(run(programs.equation_terms), [slots, slots + m, slots + m + n])
-    psi_q = programs.pattern.dense(values, np) / root
-    psi, psi_dot, (T, V) = run(programs.psi), run(programs.psi_dot), run(programs.energy)
-    gamma = b + psi_q @ free + 4.0 * psi_dot + 9.0 * psi
-    found = {
-        "psi": psi,
-        "psi_q": psi_q,
-        "psi_dot": psi_dot,
-        "gamma": gamma,
-        "M": 1 / root**2,
-        "F": free / root**2,
-        "T": T,
-        "V": V,
-    }
+    programs = scene_programs(mech, redundant, True, policy)
+    leaves, n = jax.tree.leaves(mech.without_origin), q.size
+    numbers = [*map(float, numbers_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14]
+    found = evaluate_programs(programs, ["accelerations", "rows_and_loads"], numbers, float(T0), q, v)
+    (free, b), psi, psi_dot = np.split(found["terms"], [n]), found["psi"], found["psi_dot"]
+    psi_q = dense(programs, found["psi_q"])
+    terms = {"psi": psi, "psi_q": psi_q, "psi_dot": psi_dot, "gamma": b + psi_q @ free + 4.0 * psi_dot + 9.0 * psi}
+    terms["F"] = free * np.asarray(loads.mass(mech))
     kept = np.ones(len(analysis.row_names))
     kept[list(redundant)] = 0.0
     expected = textbook(mech.without_origin, q, v, udk.SVD(1e-11), gains, analysis.scales.weights * kept)
-    for name, array in found.items():
+    for name, array in terms.items():
         close_to(array, expected[name], 1e-11)
-    close_to(run(programs.accelerations)[:n], expected["a"], 1e-8)
+    close_to(found["a"], expected["a"], 1e-8)
 
 
 METHODS = {"Elimination": udk.Elimination(1e-6), "Varga": udk.Varga(1e-6), "Auto": udk.Auto(1e-6)}

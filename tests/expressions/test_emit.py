@@ -108,7 +108,8 @@ def test_what_opaque_nodes_take_can_be_replaced():
     q = graph.input("q", "state")
     (ordered,), bent = trace(jnp.sort, jnp.asarray(X))(graph, m), trace(jnp.tanh, 0.5)(graph, q * m[1])
     outputs = [ordered[2] * q, ordered[0] + bent[0].item()]
-    found = graph.substitute(outputs, {m[1].index: -q, q.index: q + 1.0})
+    inputs = {m[0].index: m[0], m[1].index: -q, m[2].index: m[2], q.index: q + 1.0}
+    found = graph.copy(ScalarProgram(graph, [*m, q], outputs), inputs)
     values = [*map(float, X), 0.4]
     expected = ScalarProgram(graph, [*m, q], outputs)([values[0], -0.4, values[2], 1.4])
     assert ScalarProgram(graph, [*m, q], found)(values) == pytest.approx(expected)

@@ -198,8 +198,9 @@ def test_an_input_can_be_replaced_by_an_expression(tree, another, values):
     inputs = [graph.input(k, "state") for k in range(3)]
     built = lambda tree, inputs: evaluated(tree, lambda k: inputs[k] if isinstance(k, int) else graph.constant(k), graph.sqrt)  # noqa: E731
     whole, other = built(tree, inputs), built(another, inputs)
-    assert graph.substitute([whole, -whole], {}) == [whole, -whole]
-    replaced = graph.substitute([whole], {inputs[0].index: other})
+    same, program = {s.index: s for s in inputs}, ScalarProgram(graph, inputs, [whole, -whole])
+    assert graph.copy(program, same) == [whole, -whole]
+    replaced = graph.copy(program, same | {inputs[0].index: other})[:1]
     with np.errstate(all="ignore"):
         known = lambda k: np.float64(values[k] if isinstance(k, int) else k)  # noqa: E731
         first = evaluated(another, known, np.sqrt)

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
-from udkjax.equations.implicit_derivative import acceleration_derivative
+from udkjax.equations.written_out import WrittenOut
 from udkjax.native import operation
 from udkjax.study.exact import exact_coordinates
 
@@ -179,22 +179,16 @@ def test_one_direction_for_all_members(pendulum):
 
 
 def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
-    """A link's mass stands in few of the constants of a linkage; no other has a derivative."""
-    moving = []
-
-    def derivative(programs, active):
-        moving.append(active)
-        return acceleration_derivative(programs, active)
-
-    monkeypatch.setattr("udkjax.native.linearization.acceleration_derivative", derivative)
-    operation.generate.cache_clear()  # what another test has had written or compiled would not be derived again
-    operation.machine_code.cache_clear()
-    linkage = udk.library.parallelogram(np.deg2rad(-45))
+    """A link's mass is one number of many, and stands in few of the constants of a linkage; no other has a derivative."""
+    linkage, kinds, machine_code = udk.library.parallelogram(np.deg2rad(-45)), [], operation.machine_code
 
     def angle(mass):
         changed = linkage.with_parameters({"body.link1.mass": mass})
         return udk.simulate(changed, jnp.linspace(0.0, 1.0, 3), adjoint=diffrax.ForwardMode()).q[-1, 0, 2]
 
+    monkeypatch.setattr(operation, "machine_code", lambda kind, *lanes: kinds.append(kind) or machine_code(kind, *lanes))
     jax.jit(jax.jacfwd(angle)).lower(1.0)
-    assert moving and len(moving[0]) > 60  # the constants, t, q and v
-    assert max(sum(constants) for *constants, _, _, _ in moving) <= 8
+    (run,) = (kind for kind in kinds if kind.mode == "forward")
+    assert sum(run.active) == 1 and len(run.active) > 30
+    written_out = WrittenOut(run.code, [], ["accelerations"], run.active)
+    assert 1 <= len(written_out.moving) <= 8 < len(run.code.constants)

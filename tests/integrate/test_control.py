@@ -122,7 +122,7 @@ def code_of(samples: int) -> list[str]:
     numbers: Any = (equations, TS, state.q.ravel(), state.v.ravel(), *tolerances, None, None, jnp.ones(()))
     problem = Problem(*numbers, solver=None, projected=True, max_steps=100, breakpoints=mechanism.breakpoints)
     kind = _kind(problem)
-    reverse = kind._replace(code=kind.code.for_derivatives, active=(True,) * len(kind.code.prologue.inputs), mode="reverse")
+    reverse = kind._replace(code=kind.code.for_derivatives, active=(True,) * kind.code.number_count, mode="reverse")
     return [generate(k, 1, False).module for k in (kind, reverse)]
 
 

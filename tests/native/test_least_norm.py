@@ -14,7 +14,7 @@ def solve(code):
     def solved(D, b, tol=1e-9):
         D, b = np.array(D, float), np.array(b, float)
         x, rank = np.full(D.shape[1], np.nan), np.full(1, np.nan)
-        run(D.copy(), b, x, *D.shape, float(tol), rank)
+        run(D.copy(), b, x, *D.shape, 1, float(tol), rank)
         if np.all(np.isfinite(D)):
             assert rank[0] == np.linalg.matrix_rank(D, rtol=tol)
         return x

@@ -1,5 +1,6 @@
-"""Large scenes as programs of loops: held against the textbook, run row by row; their derivatives against differences."""
+"""The programs of scenes as loops: held against the textbook, run row by row; their derivatives against differences."""
 
+import dataclasses
 from functools import cached_property
 
 import equinox as eqx
@@ -11,13 +12,13 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests import loops
-from tests.choices import fast
+from tests.programs import run
 from udkjax.equations import constraints, loads
-from udkjax.equations import structure as size
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse
-from udkjax.equations.loop_programs import loop_programs
-from udkjax.equations.scales import known_scales
+from udkjax.equations.scene_arrays import constants_of
+from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.written_out import WrittenOut
 from udkjax.expressions.loop_program import KernelLoop, Reset
 from udkjax.native import machine
 from udkjax.native.loops import LoopWriter
@@ -74,7 +75,7 @@ class At:
     def __init__(self, mechanism, baumgarte=None, every=False):
         redundant = analyse(mechanism).redundant_rows or ()
         gains = [] if baumgarte is None else [baumgarte.alpha, baumgarte.beta]
-        code = loop_programs(mechanism, redundant, bool(gains), RankPolicy.FALL_BACK)
+        code = scene_programs(mechanism, redundant, bool(gains), RankPolicy.FALL_BACK)
         self.code, self.mechanism = code.with_all_rows if every else code, mechanism
         state, random = udk.assemble(mechanism, throw=False), np.random.default_rng(1)
         n = self.code.coordinate_count
@@ -195,7 +196,7 @@ def test_no_number_is_written_once_it_was_read():
             for inputs, outputs in zip(places[::2], places[1::2], strict=True):
                 used = [p for p, s in zip(inputs, part.kernel.program.inputs, strict=True) if part.kernel.program.uses(s)]
                 read |= set(used)
-                assert not {p for p in outputs if p[0] != "ratio"} & read
+                assert not {p for p in outputs if p[0] not in ("nearness", "trusted")} & read
 
 
 @pytest.mark.parametrize("name", RESULTS)
@@ -212,7 +213,12 @@ def test_derivatives_against_differences(at, name):
     dq, dv = random.standard_normal((2, code.coordinate_count))
 
     def value(h):
-        found = at.arrays(at.constants + h * dconstants, q + h * dq, v + h * dv)
+        constants, moved_q, moved_v = at.constants + h * dconstants, q + h * dq, v + h * dv
+        if name == "projection":
+            for _ in range(3):
+                moved_q = at.run("newton_q", constants=constants, q=moved_q)["q1"]
+            return np.append(moved_q, at.run("newton_v_and_psi", constants=constants, q=moved_q, v=moved_v)["v1"])
+        found = at.arrays(constants, moved_q, moved_v)
         loops.run(evaluated.program, found)
         return np.concatenate([found[x] for x in results])
 
@@ -236,7 +242,7 @@ def test_derivatives_against_differences(at, name):
 
 
 def test_constants_by_jax_are_those_of_the_loops(at):
-    found = jax.jit(lambda numbers: at.code.constants_of(numbers, jnp))(jnp.asarray(at.numbers[:-2]))
+    found = jax.jit(lambda numbers: constants_of(at.code, numbers, jnp))(jnp.asarray(at.numbers[:-2]))
     assert_allclose(found[2:], at.constants[2:], rtol=1e-14, atol=1e-14)
 
 
@@ -263,7 +269,7 @@ def test_machine_code_runs_the_loops(at, name, code, width):
 
 
 def test_the_code_does_not_grow_with_the_scene():
-    few, many = (loop_programs(udk.library.n_four_bar(n)) for n in (7, 70))
+    few, many = (scene_programs(udk.library.n_four_bar(n)) for n in (7, 70))
     for code in (few, many):
         for name in ("accelerations", "end_of_step", "equation_terms"):
             getattr(code, name)
@@ -282,55 +288,76 @@ def test_blocks_that_are_alike_are_eliminated_in_a_run():
     assert len(found) <= 8
 
 
-# --- trajectories
+# --- written out
 
 
-def changed(mechanism, scale):
-    """A mechanism with all its numbers changed a little."""
-    leaves, tree = jax.tree.flatten(mechanism.without_origin)
-    factors = 1.0 + 0.01 * np.sin(np.arange(len(leaves)))
-    return jax.tree.unflatten(tree, [x * (1.0 + scale * (f - 1.0)) for x, f in zip(leaves, factors, strict=True)])
+PROGRAMS = "accelerations newton_q newton_v_and_psi project end_of_step tangent_part equation_terms psi psi_dot".split()
 
 
-@pytest.mark.parametrize(
-    ("name", "assembled"),
-    [pytest.param(name, how, marks=pytest.mark.slow) for name, how in (("loaded", True), ("scissor lift", False))]
-    + [("linkage", False)],
-)
-def test_derivatives_of_runs_are_those_of_code_that_is_written_out(name, assembled, monkeypatch):
-    """And of closing what they start with, forward and reverse."""
-    mechanism = SCENES[name]()
-    analysis, state, ts = udk.analyse(mechanism), udk.assemble(mechanism), np.linspace(0.0, 0.3, 4)
-    random = np.random.default_rng(0)
-    dq, dv, w = random.standard_normal((3, *state.q.shape))
-    guess = udk.State(state.q + 5e-3 * dq, state.v) if assembled else state
+def test_written_out_programs_compute_what_loops_do(at):
+    code, random = at.code, np.random.default_rng(6)
+    dq, dv = random.standard_normal((2, code.coordinate_count))
+    written_out = WrittenOut(code, PROGRAMS)
+    given = {"constants": np.array(written_out.prologue(at.numbers.tolist())), "t": np.array([at.t]), "q": at.q, "v": at.v}
+    for name in PROGRAMS:
+        found, expected = run(written_out.program(name), given | {"dq": dq, "dv": dv}), at.run(name, dq=dq, dv=dv)
+        assert found or not code.row_count
+        for x, value in found.items():
+            size = max(1.0, np.abs(expected[x]).max(initial=0.0))
+            assert_allclose(value, expected[x], rtol=1e-9, atol=1e-9 * size, err_msg=name)
 
-    def measure(scale, q, v):
-        scene = changed(mechanism, scale)
-        start = udk.State(q, v)
-        if assembled:
-            start = udk.assemble(scene, 0.0, start, throw=False, analysis=analysis)
-        run = udk.simulate(scene, ts, start, rtol=1e-9, atol=1e-9, throw=False, analysis=analysis)
-        return jnp.sum(w * run.q[-1]) + jnp.sum(w * run.v[1])
 
-    at, along = (0.0, guess.q, guess.v), (1.0, jnp.asarray(dq), jnp.asarray(dv))
-    found = []
-    for large in (10**6, 0):
-        monkeypatch.setattr(size, "LARGE_SCENE", large)
-        jax.clear_caches()  # which do not know of it, nor shall others
-        value, slope = jax.jit(lambda *x: jax.jvp(measure, x, along))(*at)
+# --- trajectories: many mechanisms side by side are a large scene, and each moves as it does alone
+
+
+def beside_each_other(mechanism: udk.Mechanism, copies: int) -> udk.Mechanism:
+    """So many copies of a mechanism in one scene."""
+
+    def renamed(element, k):
+        return dataclasses.replace(element, bodies=tuple(b if b == "ground" else f"{b} {k}" for b in element.bodies))
+
+    bodies = {f"{name} {k}": body for k in range(copies) for name, body in mechanism.bodies.items()}
+    joints = {f"{name} {k}": renamed(joint, k) for k in range(copies) for name, joint in mechanism.joints.items()}
+    return udk.Mechanism(bodies, joints, gravity=mechanism.gravity)
+
+
+@pytest.fixture(scope="module")
+def linkages():
+    """A linkage, and five of it in one scene."""
+
+    def pair(angle):
+        alone = udk.library.parallelogram(np.deg2rad(angle))
+        return alone, beside_each_other(alone, 5)
+
+    alone, many = pair(-50.0)
+    assert scene_programs(alone).is_small and not scene_programs(many).is_small
+    return pair
+
+
+@pytest.mark.parametrize(("angle", "bound"), [(-50.0, 1e-9), (60.0, 2e-5)], ids=["ordinary", "through a singular configuration"])
+def test_a_large_scene_moves_as_its_parts_do(linkages, angle, bound):
+    alone, many = linkages(angle)
+    one, all_of_them = (udk.simulate(m, np.linspace(0.0, 2.0, 6), rtol=1e-9, atol=1e-9) for m in (alone, many))
+    assert_allclose(all_of_them.q.reshape(6, 5, 4, 3), np.repeat(one.q[:, None], 5, 1), atol=bound)
+
+
+def test_derivatives_of_a_large_scene_are_those_of_its_parts(linkages):
+    """Of runs, and of closing what they start with, forward and reverse."""
+    ts, slopes = np.linspace(0.0, 0.3, 4), []
+    for mechanism, copies in zip(linkages(-50.0), (1, 5), strict=True):
+        names = [f"body.{name}.mass" for name in mechanism.body_names if name.startswith("link1")]
+        analysis, state = udk.analyse(mechanism), udk.assemble(mechanism)
+        dq, dv, w = (np.tile(x, (copies, 1)) for x in np.random.default_rng(0).standard_normal((3, 4, 3)))
+
+        def measure(mass, q, v, mechanism=mechanism, analysis=analysis, names=names, w=w):
+            scene = mechanism.with_parameters(dict.fromkeys(names, mass))
+            start = udk.assemble(scene, 0.0, udk.State(q, v), throw=False, analysis=analysis)
+            run = udk.simulate(scene, ts, start, rtol=1e-9, atol=1e-9, throw=False, analysis=analysis)
+            return jnp.sum(w * run.q[-1]) + jnp.sum(w * run.v[1])
+
+        at, along = (1.0, state.q + 5e-3 * dq, state.v), (0.3, jnp.asarray(dq), jnp.asarray(dv))
+        value, slope = jax.jit(lambda *x, f=measure, d=along: jax.jvp(f, x, d))(*at)
         gradient = jax.jit(jax.grad(measure, (0, 1, 2)))(*at)
         assert_allclose(sum(jnp.vdot(g, d) for g, d in zip(gradient, along, strict=True)), slope, rtol=1e-9, atol=1e-9)
-        found.append((value, slope))
-    assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-6)
-    jax.clear_caches()
-
-
-@pytest.mark.parametrize("name", fast(["linkage", "gears", "loaded"], SCENES))
-def test_scales_are_those_of_code_that_is_written_out(name, monkeypatch):
-    found = []
-    for large in (10**6, 0):
-        monkeypatch.setattr(size, "LARGE_SCENE", large)
-        found.append(jax.tree.leaves(known_scales(SCENES[name]())))
-    for one, other in zip(*found, strict=True):
-        assert_allclose(other, one, rtol=1e-12)
+        slopes.append((value / copies, slope / copies))
+    assert_allclose(slopes[1], slopes[0], rtol=1e-5, atol=1e-6)

@@ -16,11 +16,9 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
-from udkjax.equations import analysis, constraints, loads, structure
+from udkjax.equations import constraints, loads
 
 TOL = 1e-9
-# Loops know no pieces of the state; and what does not depend on how the equations are written is tested once.
-WRITTEN_OUT = pytest.mark.parametrize("served", ["written out"], indirect=True)
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
 LARGE = """simple_pendulum compound_pendulum driven_pendulum chain excavator n_four_bar peaucellier planetary_gear scissor_lift
     four_bar""".split()
@@ -68,19 +66,9 @@ def agrees(mechanism, ts, atol=1e-6, **choices):
     return solution
 
 
-@pytest.fixture(scope="module", autouse=True)
-def forgotten():
-    """What was traced with another limit of size is not left to other tests."""
-    yield
-    jax.clear_caches()
-
-
-@pytest.fixture(autouse=True, params=["written out", "loops"])
+@pytest.fixture(autouse=True)
 def served(monkeypatch, request):
     """All of these runs are by machine code, but for those of tests that look themselves."""
-    if request.param == "loops":
-        monkeypatch.setattr(structure, "LARGE_SCENE", 0)
-        monkeypatch.setattr(analysis, "_analyses", analysis._Cache())  # what is found by loops is not left to other tests
     seen, module = [], sys.modules["udkjax.integrate.simulate"]
     reason = module.reason_for_diffrax
 
@@ -95,17 +83,8 @@ def served(monkeypatch, request):
         assert all(seen)
 
 
-LOOPS = "parallelogram", "andrews_squeezer"  # by loops, too, in the fast tests
-
-
 @pytest.mark.parametrize(
-    ("served", "name"),
-    [
-        pytest.param(way, name, marks=[pytest.mark.slow] * (name in LARGE or (way == "loops" and name not in LOOPS)))
-        for way in ("written out", "loops")
-        for name in sorted(udk.library.__all__)
-    ],
-    indirect=["served"],
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LARGE)) for name in sorted(udk.library.__all__)]
 )
 def test_the_library(name):
     mechanism = getattr(udk.library, name)()
@@ -174,12 +153,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize(
-    ("served", "name"),
-    [("written out", name) for name in SCENES]
-    + [("loops", "slides and springs"), *(pytest.param("loops", name, marks=pytest.mark.slow) for name in ("wheels", "driven"))],
-    indirect=["served"],
-)
+@pytest.mark.parametrize("name", SCENES)
 def test_joints_drivers_and_forces(name):
     solution = agrees(SCENES[name](), np.linspace(0.0, 1.0, 6))
     assert solution.result == udk.Result.successful
@@ -212,7 +186,6 @@ def test_stabilizations(double, stabilization):
     assert drift < (1e-11 if stabilization == udk.Projection() else 1e-6)
 
 
-@WRITTEN_OUT
 @pytest.mark.parametrize(
     "solver", [diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Bosh3(), diffrax.Heun(), diffrax.Ralston(), diffrax.Midpoint()], ids=str
 )
@@ -229,7 +202,6 @@ def test_explicit_methods(double, solver):
     assert stats["right_hand_sides"] >= stats["steps"] * (stages - 1)
 
 
-@WRITTEN_OUT
 @pytest.mark.parametrize("projected", [True, False])
 def test_errors_follow_the_tolerance(projected):
     """Also those of outputs between steps."""
@@ -263,7 +235,6 @@ def pushed(times=(0.25, 0.6)):
 @pytest.mark.parametrize(
     "ts", [np.linspace(0.0, 1.0, 11), np.linspace(0.1, 0.55, 4), np.array([0.0, 0.25, 0.6]), np.array([0.25, 0.3, 0.9])], ids=str
 )
-@WRITTEN_OUT
 @pytest.mark.parametrize("projected", [True, False])
 def test_runs_start_anew_behind_breakpoints(ts, projected):
     """Also where output times are breakpoints, and where the first and the last are."""
@@ -295,7 +266,6 @@ def turned_by_a_cam(lift=0.2):
     )
 
 
-@WRITTEN_OUT
 def test_cams():
     """Also between steps, close to where one cubic of the profile meets the next."""
     mechanism, ts = turned_by_a_cam(), np.linspace(0.0, 1.5, 61)
@@ -304,7 +274,6 @@ def test_cams():
     assert_allclose(batch.q, np.broadcast_to(solution.q, batch.q.shape), atol=1e-9)
 
 
-@WRITTEN_OUT
 def test_derivatives_along_cams():
     def lifted(lift):
         return udk.simulate(turned_by_a_cam(lift), np.linspace(0.0, 1.5, 4), rtol=1e-11, atol=1e-11).q[-1, 0, 2]
@@ -390,7 +359,6 @@ def test_what_was_reached_before_a_run_failed_is_right():
     assert q.shape == short.q.shape
 
 
-@WRITTEN_OUT
 @pytest.mark.slow
 def test_a_mechanism_that_cannot_be_closed_is_no_run(served):
     del served
@@ -444,7 +412,6 @@ def traced(mechanism, **choices):
     jax.eval_shape(lambda start: udk.simulate(mechanism, [0.0, 0.1], start, **choices).q, udk.State(mechanism.q0, mechanism.v0))
 
 
-@WRITTEN_OUT
 def test_what_has_no_machine_code_is_integrated_by_another_engine(served):
     scene = udk.library.compound_pendulum()
 
@@ -473,7 +440,6 @@ def test_a_small_network_is_integrated_by_either_engine(served):
     agrees(mechanism, np.linspace(0.0, 0.5, 4))
 
 
-@WRITTEN_OUT
 @pytest.mark.parametrize("choices", [{"method": udk.SVD()}, {"solver": diffrax.Kvaerno3()}], ids=["SVD", "implicit"])
 def test_other_methods_and_solvers_are_not_served(served, choices):
     traced(udk.library.compound_pendulum(), **choices)

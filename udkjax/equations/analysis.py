@@ -21,11 +21,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.scales import Scales, known_scales, traced_scales
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import is_large, structure
+from udkjax.equations.structure import structure
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbers
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
@@ -173,9 +172,7 @@ def _geometry(mechanism: Mechanism) -> PyTree[Array]:
 
 
 def _row_names(mechanism: Mechanism) -> tuple[tuple[str, int], ...]:
-    if is_large(mechanism):
-        return tuple(loop_programs(mechanism).row_names)
-    return tuple(scene_programs(mechanism).equations.row_names)
+    return tuple(scene_programs(mechanism).row_names)
 
 
 def _bytes_of(tree: PyTree[Array]) -> bytes:

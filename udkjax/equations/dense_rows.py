@@ -9,11 +9,11 @@ import jax
 import numpy as np
 
 from udkjax.equations.abstract_system import Time
-from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed, try_to_close
-from udkjax.equations.scales import Scales, known_scales, rank_tolerance
+from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
+from udkjax.equations.scales import Scales, known_scales, mass_of, rank_tolerance
+from udkjax.equations.scene_arrays import SceneArrays
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_scalars
-from udkjax.expressions import ScalarProgram
+from udkjax.equations.structure import numbers_as_vector
 from udkjax.scene.fields import ROUNDING
 from udkjax.scene.mechanism import Mechanism
 
@@ -51,35 +51,32 @@ class DenseRows:
 
     def __init__(self, mechanism: Mechanism, scales: Scales):
         self.scales = jax.tree.map(np.asarray, scales)
-        self._programs = scene_programs(mechanism)
-        leaves = [np.asarray(leaf) for leaf in mechanism.numbers]
-        self._constants = self._programs.prologue([*map(float, numbers_as_scalars(leaves)), 0.0, 0.0])
-        self.count, self.size = self._programs.pattern.shape
-        self.names = self._programs.equations.row_names
-        self.root = self._run(self._programs.closure_terms, 0.0, np.zeros(self.size), np.zeros(self.size))[-self.size :]
-        self.metric, self._tol = self.root, float(rank_tolerance(mechanism))
-
-    def _run(self, program: ScalarProgram, t: Time, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return np.array(program([*self._constants, t, *q.tolist(), *v.tolist()]), float)
+        programs, numbers = scene_programs(mechanism), np.asarray(numbers_as_vector(mechanism.numbers))
+        self.count, self.size, self.names = programs.row_count, programs.coordinate_count, programs.row_names
+        arrays = SceneArrays(programs, numbers, np)
+        self._geometry, self._psi = arrays.geometry, arrays.psi
+        self._entries = tuple(programs.psi_q_entries[:2])
+        self.metric, self._tol = 1 / np.sqrt(mass_of(mechanism, np)), float(rank_tolerance(mechanism))
 
     def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Psi and Psi_dot."""
-        return self._run(self._programs.psi, t, q, v), self._run(self._programs.psi_dot, t, q, v)
+        return self._geometry(t, q, v)[:2]
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
-        return self._run(self._programs.psi, t, q, q) / self.scales.rows
+        return self._psi(t, q) / self.scales.rows
 
     def jacobian(self, t: Time, q: np.ndarray) -> np.ndarray:
         """Psi_q (m, n)."""
-        values = self._run(self._programs.closure_terms, t, q, q)[: self._programs.pattern.value_count]
-        return self._programs.pattern.dense(values, np) / self.root
+        found = np.zeros((self.count, self.size))
+        found[self._entries] = self._geometry(t, q, q)[2]
+        return found
 
     def plus(self, t: Time, q: np.ndarray) -> TruncatedPseudoinverse:
         """D^+ of weighted rows in the metric."""
         return TruncatedPseudoinverse.of(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
-        return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._run(self._programs.psi, t, q, q)))
+        return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._psi(t, q)))
 
     def assemble(self, t: Time, q: np.ndarray, v: np.ndarray) -> Assembly[np.ndarray]:
         """Return q closed, v as the constraints allow it, the remaining Psi and Psi_dot, and the rank of D."""
@@ -87,8 +84,8 @@ class DenseRows:
             return q, v, *self.violation(t, q, v), 0
         q = close_position(self, t, q, np)
         plus = self.plus(t, q)
-        for _ in range(2):  # the second removes the rounding errors of the first
-            v = v - self.metric * (plus @ (self.scales.weights * self._run(self._programs.psi_dot, t, q, v)))
+        for _ in range(VELOCITIES):
+            v = v - self.metric * (plus @ (self.scales.weights * self._geometry(t, q, v)[1]))
         return q, v, *self.violation(t, q, v), plus.rank
 
 
@@ -139,7 +136,7 @@ class KinematicRows(DenseRows):
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
         length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # a row of rounding errors has no direction
-        return self._run(self._programs.psi, t, q, q), length, D / length[:, None]
+        return self._psi(t, q), length, D / length[:, None]
 
     def split_rows(self, positions: list[DensePosition]) -> list[tuple[np.ndarray, list[DensePosition]]]:
         """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""

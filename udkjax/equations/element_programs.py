@@ -1,12 +1,13 @@
-"""Elements of equal structure as one program over scalars, which loops run for all of them (loop_programs.py)."""
+"""Elements of equal structure as one program over scalars, which loops run for all of them (scene_programs.py)."""
 
 from collections.abc import Sequence
 from functools import lru_cache
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.elements import differentiate_constraint, trace_force
+from udkjax.equations.elements import differentiate_constraint, has_pieces, trace_force, trace_piece
 from udkjax.equations.structure import ElementStructure
 from udkjax.expressions import Graph, Scalar, frontier
 
@@ -39,6 +40,8 @@ class ElementPrograms:
 
     def _find_constants(self):
         """Find the sines and cosines, which bodies share, and the constants, which depend on parameters alone."""
+        if has_pieces(jax.tree.unflatten(self.structure.tree, self.leaves)):
+            self.outputs["piece"] = [trace_piece(self.graph, self.structure, self.leaves, self.t, self.q, self.v)]
         angles = {s.index: body for name, body, s in self.state if name == "angle"}
         for index, node in enumerate(self.graph.nodes):
             name = node.detail.primitive.name if node.kind == "apply" else ""
@@ -51,23 +54,21 @@ class ElementPrograms:
 
 
 class ConstraintPrograms(ElementPrograms):
-    """Outputs by rows: `D`, 3 columns a body; `psi`, `psi_dot`, `b`."""
+    """Outputs by rows: `psi_q`, 3 columns a body; `psi`, `psi_dot`, `gamma`, `b`."""
 
     def __init__(self, structure: ElementStructure, baumgarte: bool, loaded: bool):
         super().__init__(structure)
         graph = self.graph
         value, slopes, rate, gamma = differentiate_constraint(graph, structure, self.leaves, self.t, self.q, self.v)
         self.row_count = len(value)
-        self.roots = [graph.input((name, k), "parameter") for k in range(structure.body_count) for name in ("mass", "inertia")]
-        root = [self.roots[2 * k + i] for k in range(structure.body_count) for i in (0, 0, 1)]  # M^(-1/2)
         # Without force elements every body falls freely.
         self.gravity = [graph.input(name, "parameter") for name in ("gx", "gy")]
         falling = [*self.gravity, graph.constant(0.0)] * structure.body_count
         free = [s for k in range(structure.body_count) for s in self._inputs(FREE_INPUTS, k, "velocity")] if loaded else falling
         self.gains = [graph.input(name, "parameter") for name in ("alpha", "beta")] if baumgarte else []
         zero = graph.constant(0.0)
-        self.outputs = {"psi": value, "psi_dot": rate}
-        self.outputs["D"] = [row.get(k, zero) * root[k] for row in slopes for k in range(len(root))]
+        self.outputs = {"psi": value, "psi_dot": rate, "gamma": gamma}
+        self.outputs["psi_q"] = [row.get(k, zero) for row in slopes for k in range(len(self.q))]
         self.outputs["b"] = [g - sum((s * free[k] for k, s in row.items()), zero) for g, row in zip(gamma, slopes, strict=True)]
         if self.gains:
             alpha, beta = self.gains

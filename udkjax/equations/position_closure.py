@@ -2,9 +2,9 @@
 
     q <- q - s W D^+ Psi,        D = Psi_q W,
 
-with W the metric (M^(-1/2) in assembly), D^+ truncated for small scenes and damped for large, sparse ones. s limits the length of
-a step, so that the branch of the guess is kept, and is halved until the residual falls: no step makes a state worse. Numbers that
-are known are closed by NumPy: nothing is compiled for it. Numbers that are traced take the same steps in JAX.
+with W the metric (M^(-1/2) in assembly) and D^+ truncated for small scenes, damped for large, sparse ones. s limits the length
+of a step, so that the branch of the guess is kept, and is halved until the residual falls: no step makes a state worse. Numbers
+that are known are closed by NumPy: nothing is compiled for it. Numbers that are traced take the same steps in JAX.
 """
 
 from collections.abc import Callable
@@ -26,6 +26,7 @@ ROUNDING_UNITS = 32.0  # of eps and of the largest coordinate: a residual below 
 LONGEST_STEP = 0.3  # rad, and characteristic lengths: the longest change of a coordinate in one step, so that the branch stays
 CLOSURE_ITERATIONS = 40  # of Gauss-Newton: near a solution it doubles the digits, and five or six are usual
 PACE_STEPS = 4  # steps by which the pace of a closure is measured: see `try_to_close`
+VELOCITIES = 2  # corrections of v: the second removes the rounding errors of the first
 STEP_HALVINGS = 12  # of one step: 2^-12 of it has to lower the residual, or the position cannot be closed
 
 State = TypeVar("State")
@@ -147,7 +148,7 @@ class TracedRows(NamedTuple):
         if not self.equations.constrained:
             return q, v, *self.equations.violation(t, q, v), 0
         q, rank = close(self, t, q), 0
-        for _ in range(2):  # the second removes the rounding errors of the first
+        for _ in range(VELOCITIES):
             plus, residual, root = self.equations.linearized_velocity(t, q, v)
             v, rank = v - root * (plus @ residual), plus.rank
         return q, v, *self.equations.violation(t, q, v), rank

@@ -17,7 +17,7 @@ from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import NEGLIGIBLE_SHARE, KinematicRows
 from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.equations.scales import Scales
-from udkjax.equations.structure import is_large
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.mechanism import Mechanism
 
 POSITION_SAMPLES = 24  # positions of the random motion, where the first one shows rows that depend on each other
@@ -168,7 +168,7 @@ def ordinary_position(mechanism: Mechanism) -> np.ndarray | None:
 
 def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> PositionRows:
     """Psi and D of a mechanism with known numbers: `KinematicRows`, or for large scenes `SparseRows`."""
-    if not (is_large(mechanism) if large is None else large):
+    if not (large or (large is None and not scene_programs(mechanism).is_small)):
         return KinematicRows(mechanism)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 

@@ -12,10 +12,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from udkjax.equations.loop_programs import loop_programs
+from udkjax.equations.scene_arrays import SceneArrays
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, is_large, numbers_as_scalars, numbers_as_vector
-from udkjax.expressions import ScalarProgram
+from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, numbers_as_vector
 from udkjax.printing import PrintsTable, units
 from udkjax.scene.fields import ROUNDING, number
 from udkjax.scene.mechanism import Mechanism
@@ -72,7 +71,7 @@ def known_scales(mechanism: Mechanism) -> Scales:
     mechanism = jax.tree.map(np.asarray, mechanism)
     q, v = (np.asarray(x, float).ravel() for x in (mechanism.q0, mechanism.v0))
     with np.errstate(all="ignore"):  # what is not finite is no scale
-        found = _scales(mechanism, (_large_scene_terms if is_large(mechanism) else _small_scene_terms)(mechanism, q, v, np), np)
+        found = _scales(mechanism, _guess_terms(mechanism, q, v, np), np)
     return jax.tree.map(number, found)
 
 
@@ -80,43 +79,16 @@ def traced_scales(mechanism: Mechanism) -> Scales:
     """The same in a trace; without derivatives."""
     mechanism = jax.lax.stop_gradient(mechanism)
     q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
-    return jax.lax.stop_gradient(
-        _scales(mechanism, (_large_scene_terms if is_large(mechanism) else _small_scene_terms)(mechanism, q, v, jnp), jnp)
-    )
+    return jax.lax.stop_gradient(_scales(mechanism, _guess_terms(mechanism, q, v, jnp), jnp))
 
 
-def _small_scene_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, xp: ArrayLibrary) -> GuessTerms:
-    """Return the terms of a small scene at the initial guess, by its programs."""
+def _guess_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, xp: ArrayLibrary) -> GuessTerms:
+    """Return the terms of a scene at the initial guess, by its programs."""
     programs = scene_programs(mechanism)
-    rows, columns = programs.pattern.shape
-    given = [*numbers_as_scalars(mechanism.numbers), 0.0, 0.0]
-    constants = programs.prologue([*map(float, given)] if xp is np else given)
-
-    def run(program: ScalarProgram, v: NumericArray) -> NumericArray:
-        state = [0.0, *numbers_as_scalars([q]), *numbers_as_scalars([v])] if xp is jnp else [0.0, *q.tolist(), *v.tolist()]
-        return xp.stack([xp.asarray(x, float) for x in program([*constants, *state])])
-
-    if not rows:
-        free, root = xp.split(run(programs.equation_terms, v), 2)
-        none = xp.zeros(0)
-        return GuessTerms(np.zeros(0, int), np.zeros(0, int), none, free, none, none)
-    value_count = programs.pattern.value_count
-    values, b, free, root = xp.split(
-        run(programs.equation_terms, v), [value_count, value_count + rows, value_count + rows + columns]
-    )
-    psi_q = programs.pattern.dense(values, xp) / root
-    rows, columns = np.nonzero(programs.pattern.dense(np.ones(value_count), np))
-    return GuessTerms(rows, columns, psi_q[rows, columns], free, run(programs.psi_dot, 0 * v), b + psi_q @ free)
-
-
-def _large_scene_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, xp: ArrayLibrary) -> GuessTerms:
-    """Return the terms of a large scene at the initial guess, by its loops."""
-    programs = loop_programs(mechanism)
-    row, column, *_ = programs.d_entries
-    numbers = xp.asarray(numbers_as_vector(mechanism.numbers))
-    _, rate, values = programs.geometry(numbers, xp)(0.0, q, 0 * v)
-    psi_q = values * xp.sqrt(mass_of(mechanism, xp))[column]
-    free, b = programs.loads(numbers, xp)(0.0, q, v)
+    row, column, *_ = programs.psi_q_entries
+    arrays = SceneArrays(programs, xp.asarray(numbers_as_vector(mechanism.numbers)), xp)
+    _, rate, psi_q = arrays.geometry(0.0, q, 0 * v)
+    free, b = arrays.loads(0.0, q, v)
     gamma = (
         np.bincount(row, psi_q * free[column], programs.row_count)
         if xp is np

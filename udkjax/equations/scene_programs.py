@@ -1,262 +1,390 @@
-"""The scalar programs of a scene's structure: each computes its outputs, and nothing else."""
+"""The programs of a scene: each computes its results, and nothing else.
 
-from collections.abc import Sequence
+Terms come from loops over elements of the same structure (scene_terms.py), linear systems from elimination by blocks
+(block_elimination.py), and derivatives from loops, too (`DifferentiableProgram`). Small scenes run them written out
+(written_out.py).
+"""
+
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
-from udkjax.equations.scalar_equations import ScalarEquations, scalar_equations
+import jax
+import numpy as np
+
+from udkjax.equations.block_elimination import BlockElimination
+from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, SceneLayout, abstract_mechanism
+from udkjax.equations.scene_prologue import write_prologue
+from udkjax.equations.scene_terms import Parts, SceneTerms, compliance
 from udkjax.equations.structure import Shapes, TreeDef, structure
-from udkjax.expressions import Scalar, ScalarProgram, frontier
-from udkjax.expressions.selection import all_of
+from udkjax.expressions.loop_derivative import LoopDerivative
+from udkjax.expressions.loop_program import ADD, Kernel, KernelLoop, KernelWriter, LoopProgram, Reset
 from udkjax.pinv.rank_policy import RankPolicy
-from udkjax.pinv.sparse import Row, SparseFactors, factorize, find_pattern, solve, transpose_times
 from udkjax.scene.mechanism import Mechanism
+
+# Operations of the accelerations up to which programs are written out. Written out they evaluate faster, up to several times this
+# size, but take the longer to trace and compile, the larger the scene is (python -m benchmarks scaling).
+WRITTEN_OUT_OPERATIONS = 2800
+
+REFINEMENTS = 2
+
+# The arrays that programs take, and those that they return; all others are scratch.
+INPUTS = ("constants", "t", "q", "v", "dq", "dv")
+RESULTS = ("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root")
+
+# Arrays that derivatives take as fixed. Sines and cosines are known functions of q to every kernel that reads them.
+NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
+
+
+class DifferentiableProgram(NamedTuple):
+    """A program, and loops whose derivative is its own, with respect to all arrays but those `NOT_DIFFERENTIATED`.
+
+    No factorization is differentiated. With M^(-1) = C and J = Psi_q, accelerations, and corrections such as q - C J^T x, are
+
+        a = a_F + z,        z = C J^T x,        J C J^T x = b,
+
+    and along a change of the inputs, by the factors at hand,
+
+        dz = d(C J^T) x + C J^T dx,        J C J^T dx = db - dJ z - J d(C J^T) x.
+
+    The loops say so in terms of x1, which is zero and changes by dx. A projection is differentiated where all residuals vanish,
+    and with them whatever they multiply.
+    """
+
+    program: LoopProgram
+    parts: Sequence[KernelLoop | Reset]
+
+    def derivative(self, fixed: Collection[str] = ()) -> LoopDerivative:
+        """Return the derivative, with further arrays fixed."""
+        return LoopDerivative(self.parts, {*NOT_DIFFERENTIATED, *fixed})
 
 
 class ScenePrograms:
-    """Programs over the graph of a scene that need no elimination.
+    """Programs over arrays of numbers: the results `RESULTS` from the `INPUTS` that each needs.
 
-    Each takes the `constants`, t, q and v as one list of scalars. D is given by the distinct values of its entries; `pattern`
-    holds their places.
-    """
-
-    def __init__(self, equations: ScalarEquations, baumgarte: bool):
-        self.equations = equations
-        graph = self.graph = equations.graph
-        self.gains = [graph.input(name, "parameter") for name in ("alpha", "beta")] if baumgarte else []
-        self.drop_tol = graph.input("drop_tol", "parameter")
-        self.safe_tol = graph.input("safe_tol", "parameter")
-        self.root = [graph.constant(1.0) / graph.sqrt(m) for m in equations.mass]
-        self.coordinate_count, self.row_count = len(equations.q), len(equations.psi)
-        self.D: list[Row] = [{k: entry * self.root[k] for k, entry in row.items()} for row in equations.psi_q]
-        self.pattern, self.entries = find_pattern(self.D, self.coordinate_count)
-        self._outputs: dict[str, list[Scalar]] = {
-            "equation_terms": [*self.entries, *(self.b(i) for i in range(self.row_count)), *equations.free, *self.root],
-            "closure_terms": [*self.entries, *equations.psi, *self.root],
-            "psi": equations.psi,
-            "psi_dot": equations.psi_dot,
-            "pieces": equations.pieces,
-            "energy": [equations.kinetic_energy, equations.potential_energy],
-        }
-
-    @cached_property
-    def constants(self) -> list[Scalar]:
-        """The inputs of the programs that depend on numbers of the scene alone: `prologue` computes them once a run."""
-        return self._constants_of(self)
-
-    def _constants_of(self, *programs: "ScenePrograms") -> list[Scalar]:
-        wanted = [s for p in programs for outputs in p._outputs.values() for s in outputs]
-        return frontier(self.graph, wanted, lambda node: node.depends <= {"parameter"})
-
-    @cached_property
-    def prologue(self) -> ScalarProgram:
-        """The constants, from all numbers of the scene, the gains, `drop_tol` and `safe_tol` (in every kind of programs)."""
-        inputs = [*self.equations.inputs, *self.gains, self.drop_tol, self.safe_tol]
-        return ScalarProgram(self.graph, inputs, self.constants)
-
-    @cached_property
-    def equation_terms(self) -> ScalarProgram:
-        """D, b, a_F and M^(-1/2), of all rows."""
-        return self._program("equation_terms")
-
-    @cached_property
-    def closure_terms(self) -> ScalarProgram:
-        """D, Psi and M^(-1/2), of all rows."""
-        return self._program("closure_terms")
-
-    @cached_property
-    def psi(self) -> ScalarProgram:
-        """Psi of all rows."""
-        return self._program("psi")
-
-    @cached_property
-    def psi_dot(self) -> ScalarProgram:
-        """Psi_dot of all rows."""
-        return self._program("psi_dot")
-
-    @cached_property
-    def pieces(self) -> ScalarProgram:
-        """The number of the smooth piece of each element that has several."""
-        return self._program("pieces")
-
-    @cached_property
-    def energy(self) -> ScalarProgram:
-        """The kinetic and the potential energy."""
-        return self._program("energy")
-
-    def _program(self, name: str, more: Sequence[Scalar] = ()) -> ScalarProgram:
-        e = self.equations
-        return ScalarProgram(self.graph, [*self.constants, e.t, *e.q, *e.v, *more], self._outputs[name])
-
-    @property
-    def term_count(self) -> int:
-        """The number of values that `equation_terms` returns."""
-        return len(self._outputs["equation_terms"])
-
-    @property
-    def drop_tol_index(self) -> int | None:
-        """The index of `drop_tol` among the constants, or None."""
-        return next((k for k, s in enumerate(self.constants) if s.index == self.drop_tol.index), None)
-
-    def b(self, i: int) -> Scalar:
-        """gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F of one row."""
-        e = self.equations
-        b = e.gamma[i] - sum((entry * e.free[k] for k, entry in e.psi_q[i].items()), self.graph.constant(0.0))
-        if self.gains:
-            alpha, beta = self.gains
-            b = b - alpha * 2.0 * e.psi_dot[i] - beta * beta * e.psi[i]
-        return b
-
-
-class EliminationPrograms(ScenePrograms):
-    """Programs by elimination of D D^T of the independent rows, which treats small pivots by a `RankPolicy`.
-
-    `safe`, their last output, is whether all pivots exceed `safe_tol`; always true where the policy does not report. Each program
-    factorizes D D^T itself: to hand the factors from one to the next takes longer, and longer still to compile.
+    What a program computes on the way stays in arrays of its own, of the sizes `scratch`: no number is written again once it has
+    been read. `safe` is whether all pivots exceed `safe_tol`, `distance` the root of the smallest pivot relative to its diagonal
+    entry: the distance from dependence. What the `policy` does with small pivots concerns the accelerations; corrections leave
+    out the rows whose pivots do not exceed `drop_tol`.
     """
 
     def __init__(
         self,
-        equations: ScalarEquations,
+        tree: TreeDef,
+        shapes: Shapes,
         redundant_rows: tuple[int, ...],
         baumgarte: bool,
         policy: RankPolicy,
-        constants_from: "EliminationPrograms | None" = None,
+        every_row: bool = False,
+        kernels: dict[Hashable, Kernel] | None = None,
     ):
-        super().__init__(equations, baumgarte)
+        self._settings = tree, shapes, redundant_rows, baumgarte
+        self._kernels = {} if kernels is None else kernels
         self.policy, self.redundant_rows = policy, redundant_rows
-        self.independent_rows = [i for i in range(self.row_count) if i not in redundant_rows]
-        self._eliminate()
-        self._constants_from = constants_from
-        # Derivatives are those of the rows that are left where dependent ones are dropped. Tangents of the constants are taken
-        # once for both: they have the same.
-        self.for_derivatives = self
-        if policy is RankPolicy.REFUSE:
-            self.for_derivatives = EliminationPrograms(equations, redundant_rows, baumgarte, RankPolicy.FALL_BACK, self)
+        layout = self._layout = SceneLayout(abstract_mechanism(tree, shapes), redundant_rows, baumgarte, every_row)
+        self._terms = SceneTerms(layout, self._kernels)
+        self._elimination = BlockElimination(self._terms)
+        self.scratch, self.row_names = layout.sizes, layout.row_names
+        self.coordinate_count, self.row_count = layout.coordinate_count, layout.row_count
+        self.constants = range(layout.constant_count)
+        starts = np.cumsum([0, *(int(np.prod(shape)) for shape, _ in shapes)])
+        places = [np.arange(a, b).reshape(s) for a, b, (s, _) in zip(starts, starts[1:], shapes, strict=False)]
+        self._number_count = int(starts[-1])
+        self._places: Mechanism = jax.tree.unflatten(tree, places)  # where each number of the scene is among all of them
+
+    @property
+    def stored_sizes(self) -> dict[str, int]:
+        """The sizes of all arrays that derivatives may need of a state."""
+        n = self.coordinate_count
+        return self.scratch | {"sines1": 2 * (n // 3), "q1": n, "v1": n}
+
+    @property
+    def term_count(self) -> int:
+        """The number of values that `equation_terms` returns."""
+        return self.coordinate_count + self.row_count
+
+    @property
+    def piece_count(self) -> int:
+        """The number of elements that are smooth in pieces of the state."""
+        return self.scratch["pieces"]
 
     @cached_property
-    def constants(self) -> list[Scalar]:
-        if self._constants_from is not None:
-            return self._constants_from.constants
-        return self._constants_of(*dict.fromkeys((self, self.for_derivatives)))
+    def is_small(self) -> bool:
+        """Whether the programs are written out, as those of the accelerations take few operations."""
+        loops = [part for part in self.accelerations.parts if isinstance(part, KernelLoop)]
+        return sum(len(part.table) * part.kernel.operation_count for part in loops) <= WRITTEN_OUT_OPERATIONS
 
-    def _eliminate(self):
-        """The equation for rows that are independent: a = a_F + M^(-1) Psi_q^T y with D D^T y = b."""
-        graph, e, n = self.graph, self.equations, self.coordinate_count
-        self.compliance = [r * r for r in self.root]
-        rows = [self.D[i] for i in self.independent_rows]
-        self._factors_dropping = factorize(rows, graph, self.drop_tol)
-        self._factors = self._factors_dropping if self.policy.drops else factorize(rows, graph)
-        self.y = self.solve_gram([self.b(i) for i in self.independent_rows])
-        self.a = [f + s for f, s in zip(e.free, self.minv_jt(self.y), strict=True)]
-        safe = self._safe(self._factors)  # looked at when all else is done: nothing waits for it
-        self._outputs["accelerations"] = [*self.a, safe]
-        psi, psi_dot = ([residual[i] for i in self.independent_rows] for residual in (e.psi, e.psi_dot))
-        self._outputs["newton_q"] = [*self._correct(e.q, psi), self._safe(self._factors_dropping)]
-        self._outputs["newton_v_and_psi"] = [*self._correct(e.v, psi_dot), *e.psi]
-        closed = self._outputs["newton_q"][:n]
-        there = graph.substitute([*psi_dot, *e.psi], dict(zip((x.index for x in e.q), closed, strict=True)))
-        self._outputs["project"] = [*closed, *self._correct(e.v, there[: len(psi_dot)]), *there[len(psi_dot) :]]
-        v = self._correct(e.v, psi_dot, dropping=False)
-        projected = dict(zip((x.index for x in e.v), v, strict=True))
-        loads = graph.substitute([*e.free, *(self.b(i) for i in self.independent_rows)], projected)
-        a = [f + s for f, s in zip(loads[:n], self.minv_jt(self.solve_gram(loads[n:])), strict=True)]
-        self._outputs["project_and_accelerate"] = [*v, *a, safe]
-        self.changes = [graph.input(f"d{k}", "change") for k in range(2 * n)]
-        self._outputs["tangent_part"] = [*self._tangent_part(dropping=True), self._factors_dropping.distance(graph)]
-        self._outputs["end_of_step"] = [*v, *a, *self._tangent_part(dropping=False), self._factors.distance(graph), safe]
+    @property
+    def drop_tol_index(self) -> int:
+        """The index of `drop_tol` among the constants."""
+        return DROP_TOL
+
+    @property
+    def number_count(self) -> int:
+        """The number of values that `prologue` takes: all numbers of the scene, the gains, `drop_tol` and `safe_tol`."""
+        return self._number_count + self._layout.gains + 2
+
+    @cached_property
+    def for_derivatives(self) -> "ScenePrograms":
+        """The programs whose derivatives are taken: those of the rows that are left where dependent ones are dropped."""
+        if self.policy.drops:
+            return self
+        return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, kernels=self._kernels)
+
+    @cached_property
+    def with_all_rows(self) -> "ScenePrograms":
+        """The same programs, of the same constants, on all rows: redundant ones may be independent in singular configurations."""
+        return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, every_row=True, kernels=self._kernels)
 
     # --- programs
 
     @cached_property
-    def accelerations(self) -> ScalarProgram:
+    def accelerations(self) -> LoopProgram:
         """a; safe."""
-        return self._program("accelerations")
+        solve = [*self._factorize, *self._elimination.solve(), self._terms.add_solution("free", "a", 0), self._safe]
+        return _program(self._acceleration_system, solve)
 
     @cached_property
-    def newton_q(self) -> ScalarProgram:
-        """q after a Newton step to Psi = 0, without dependent rows; safe."""
-        return self._program("newton_q")
+    def newton_q(self) -> LoopProgram:
+        """q1, q after a Newton step to Psi = 0; safe."""
+        return _program(self._newton("psi", "q"), [self._safe])
 
     @cached_property
-    def newton_v_and_psi(self) -> ScalarProgram:
-        """v after the Newton step to Psi_dot = 0, without dependent rows; and Psi of all rows."""
-        return self._program("newton_v_and_psi")
+    def newton_v_and_psi(self) -> LoopProgram:
+        """v1, v after the Newton step to Psi_dot = 0; and psi, of all rows."""
+        return _program(self._newton("psi_dot", "v"), self._terms.row_terms("psi", "psi"))
 
     @cached_property
-    def project(self) -> ScalarProgram:
-        """q and v after a Newton step to Psi = 0 and Psi_dot = 0 with the factors of D at the q before it; Psi of all rows there.
+    def corrections_and_accelerations(self) -> LoopProgram:
+        """q1 and v1, corrected by a Newton step each, and a: the three of one state, by the same factors."""
+        terms, right = self._terms, ("b", "psi", "psi_dot")
+        system = [terms.sincos(), *terms.free_accelerations("v"), *terms.element_terms(("psi_q", *right))]
+        solves = [part for k in range(3) for part in self._refined_solve(k, 3)]
+        results = [terms.add_solution("free", "a", 0), *(terms.add_solution(x, f"{x}1", k, -1) for k, x in enumerate("qv", 1))]
+        return _program(system, self._factorize_dropping, solves, results)
 
-        Where the step in q is small, what it turns D by is a small part of the step in v, which is as small.
+    @cached_property
+    def project(self) -> LoopProgram:
+        """q1 and v1 after a Newton step to Psi = 0 and Psi_dot = 0 with the factors of Psi_q at the q before it; psi at q1.
+
+        Where the step in q is small, what it turns Psi_q by is a small part of the step in v, which is as small.
         """
-        return self._program("project")
+        return _program(self._project, self._terms.row_terms("psi", "psi", q="q1", sines="sines1"))
 
     @cached_property
-    def project_and_accelerate(self) -> ScalarProgram:
-        """v after the Newton step to Psi_dot = 0, and a there; safe."""
-        return self._program("project_and_accelerate")
+    def project_and_accelerate(self) -> LoopProgram:
+        """v1, and a there; safe."""
+        return _program(self._project_and_accelerate)
 
     @cached_property
-    def tangent_part(self) -> ScalarProgram:
-        """The parts of changes of q and v within the manifold (after v), without dependent rows; `SparseFactors.distance`."""
-        return self._program("tangent_part", self.changes)
+    def tangent_part(self) -> LoopProgram:
+        """dq1 and dv1: the parts of the changes dq and dv within the manifold; distance."""
+        return _program(self._position_terms("psi_q"), self._factorize_dropping, self._tangent_parts(0))
 
     @cached_property
-    def end_of_step(self) -> ScalarProgram:
-        """v, a and the tangent part of changes, all by the same factors; their distance; safe."""
-        return self._program("end_of_step", self.changes)
+    def end_of_step(self) -> LoopProgram:
+        """The results of `project_and_accelerate` and `tangent_part`, by the same factors."""
+        return _program(self._project_and_accelerate, self._tangent_parts(2))
 
-    # --- operators, of the independent rows
+    @cached_property
+    def psi(self) -> LoopProgram:
+        """psi: Psi of all rows."""
+        return _program([self._terms.sincos()], self._terms.row_terms("psi", "psi"))
 
-    def solve_gram(self, b: Sequence[Scalar], dropping: bool = False) -> list[Scalar]:
-        """y with D D^T y = b; zero for a row that was dropped, if `dropping` is asked for or the policy drops."""
-        return solve(self._factors_dropping if dropping else self._factors, b) if b else []
+    @cached_property
+    def psi_dot(self) -> LoopProgram:
+        """psi: Psi_dot of all rows."""
+        return _program([self._terms.sincos()], self._terms.row_terms("psi_dot", "psi"))
 
-    def jt(self, y: Sequence[Scalar]) -> list[Scalar]:
-        """Psi_q^T y."""
-        rows = [self.equations.psi_q[i] for i in self.independent_rows]
-        return transpose_times(rows, y, self.coordinate_count, self.graph.constant(0.0))
+    @cached_property
+    def equation_terms(self) -> LoopProgram:
+        """terms: a_F, and b of all rows."""
+        terms = self._terms
 
-    def minv_jt(self, y: Sequence[Scalar]) -> list[Scalar]:
-        """M^(-1) Psi_q^T y."""
-        return [c * s for c, s in zip(self.compliance, self.jt(y), strict=True)]
+        def write(w: KernelWriter):
+            for k in range(3):
+                w.write(terms.read_free(w, k), "terms", BODY_COORDINATES, k)
 
-    def _correct(self, x: Sequence[Scalar], residual: Sequence[Scalar], dropping: bool = True) -> list[Scalar]:
-        """x - M^(-1) Psi_q^T (D D^T)^(-1) residual: x corrected so that the residual vanishes."""
-        return [c - s for c, s in zip(x, self.minv_jt(self.solve_gram(residual, dropping)), strict=True)]
+        free = [terms.sincos(), *terms.free_accelerations("v"), terms.over_bodies("copy free", write)]
+        return _program(free, terms.row_terms("b", "terms", self.coordinate_count))
 
-    def _tangent_part(self, dropping: bool) -> list[Scalar]:
-        rows, zero = [self.equations.psi_q[i] for i in self.independent_rows], self.graph.constant(0.0)
-        found, n = [], self.coordinate_count
-        for change in (self.changes[:n], self.changes[n:]):
-            residual = [sum((entry * change[k] for k, entry in row.items()), zero) for row in rows]
-            found += self._correct(change, residual, dropping)
-        return found
+    @cached_property
+    def geometry(self) -> LoopProgram:
+        """psi, psi_dot and psi_q, of all rows."""
+        terms = self._terms
+        rows = [*terms.row_terms("psi", "psi"), *terms.row_terms("psi_dot", "psi_dot")]
+        return _program([terms.sincos(), *terms.every_entry()], rows)
 
-    def _safe(self, factors: SparseFactors) -> Scalar:
-        return all_of(factors.exceeding(self.safe_tol) if self.policy.reports else [], self.graph)
+    @property
+    def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The entries of Psi_q: their rows, columns, places in the array `psi_q`, and factors."""
+        return self._layout.psi_q_entries
+
+    @cached_property
+    def rows_and_loads(self) -> LoopProgram:
+        """What rank-revealing methods take, of all rows: psi_q, psi, psi_dot, terms; and root, M^(-1/2)."""
+        psi_dot = self._terms.row_terms("psi_dot", "psi_dot")
+        return _program(self.equation_terms.parts, self.rows("psi"), psi_dot)
+
+    @property
+    def sincos(self) -> KernelLoop:
+        """The sines and cosines of a state."""
+        return self._terms.sincos()
+
+    def rows(self, residual: str) -> list[KernelLoop | Reset]:
+        """Psi_q, Psi or Psi_dot as psi, of all rows, and root, M^(-1/2); of a state whose sines are known."""
+        terms = self._terms
+
+        def write(w: KernelWriter):
+            for k in range(3):
+                w.write(w.graph.sqrt(compliance(w, k)), "root", BODY_COORDINATES, k)
+
+        return [*terms.every_entry(), *terms.row_terms(residual, "psi"), terms.over_bodies("root", write)]
+
+    @cached_property
+    def pieces(self) -> LoopProgram:
+        """pieces: the number of the smooth piece of each element that has several."""
+        return _program([self._terms.sincos()], self._terms.pieces())
+
+    @cached_property
+    def rank(self) -> LoopProgram:
+        """rank: how many rows the last factorization did not leave out."""
+        return LoopProgram(list(self._elimination.rank()))
+
+    @cached_property
+    def value_derivatives(self) -> LoopProgram:
+        """Of a mechanism whose time is a driver's value: q' and q'' as dq1 and dv1; psi of all rows; distance.
+
+        They solve Psi_q q' = -Psi_t and Psi_q q'' = gamma, which is of the velocities q'.
+        """
+        terms, solve, count = self._terms, self._elimination.solve, self.coordinate_count
+        at_rest = [Reset("rest", 0, count), *self._position_terms("psi_q", "psi_dot", v="rest"), *self._factorize]
+        first = [*solve(0), terms.scaled_solution("dq1", 0, sign=-1), *terms.element_terms(("gamma",), "dq1", 1)]
+        second = [*solve(1), terms.scaled_solution("dv1", 1), *terms.row_terms("psi", "psi"), self._elimination.distance()]
+        return _program(at_rest, first, second)
+
+    @cached_property
+    def prologue(self) -> LoopProgram:
+        """`constants`, from `numbers`: all numbers of the scene, the gains, `drop_tol` and `safe_tol`."""
+        return write_prologue(self._layout, self._places, self._number_count)
+
+    # --- parts of programs
+
+    @property
+    def _safe(self) -> KernelLoop | Reset:
+        return self._elimination.safe() if self.policy.reports else Reset("safe", 0, 1, 1.0)
+
+    @property
+    def _factorize(self) -> Parts:
+        return self._elimination.factorize(self.policy.drops)
+
+    @property
+    def _factorize_dropping(self) -> Parts:
+        return self._elimination.factorize(True)
+
+    def _position_terms(self, *outputs: str, v: str = "v") -> list[KernelLoop | Reset]:
+        return [self._terms.sincos(), *self._terms.element_terms(outputs, v)]
+
+    @property
+    def _acceleration_system(self) -> list[KernelLoop | Reset]:
+        """Psi_q, a_F, and b as the right-hand side."""
+        return [self._terms.sincos(), *self._terms.free_accelerations("v"), *self._terms.element_terms(("psi_q", "b"))]
+
+    def _newton(self, residual: str, x: str, dropping: bool = True) -> list[KernelLoop | Reset]:
+        """x - M^(-1) Psi_q^T y, of q or v, so that a residual vanishes."""
+        factorize = self._factorize_dropping if dropping else self._factorize
+        step = [*self._elimination.solve(), self._terms.add_solution(x, f"{x}1", 0, -1)]
+        return [*self._position_terms("psi_q", residual), *factorize, *step]
+
+    def _refined_solve(self, solve: int, further: int) -> Parts:
+        """A linear system, refined by the solution of `further` ones (corrected seminormal equations, Bjorck 1987)."""
+        terms, elimination = self._terms, self._elimination
+        yield from elimination.solve(solve)
+        for _ in range(REFINEMENTS):
+            yield from terms.remainder(solve, further)
+            yield from elimination.solve(further)
+            yield terms.copy(f"jt_x{further}", f"jt_x{solve}", update=ADD)
+
+    @property
+    def _project(self) -> list[KernelLoop | Reset]:
+        terms = self._terms
+        at_q1 = terms.element_terms(("psi_dot",), "v", 1, q="q1", sines="sines1")
+        velocity = [*at_q1, *self._elimination.solve(1), terms.add_solution("v", "v1", 1, -1)]
+        return [*self._newton("psi", "q"), terms.sincos("q1", "sines1"), *velocity]
+
+    @property
+    def _project_and_accelerate(self) -> list[KernelLoop | Reset]:
+        terms = self._terms
+        system = [*terms.free_accelerations("v1"), *terms.element_terms(("b",), "v1", 1)]
+        solve = [*self._elimination.solve(1), terms.add_solution("free", "a", 1), self._safe]
+        return [*self._newton("psi_dot", "v", dropping=False), *system, *solve]
+
+    def _tangent_parts(self, solve: int) -> Parts:
+        for k, change in enumerate(("dq", "dv"), solve):
+            yield from self._terms.rates(change, k)
+            yield from self._elimination.solve(k)
+            yield self._terms.add_solution(change, f"{change}1", k, -1)
+        yield self._elimination.distance()
+
+    # --- derivatives
+
+    @cached_property
+    def differentiable_accelerations(self) -> DifferentiableProgram:
+        """a; safe."""
+        return self._implicit(list(self._terms.free_accelerations("v")), "b", "free", "a", 1)
+
+    @cached_property
+    def differentiable_newton_q(self) -> DifferentiableProgram:
+        """q1."""
+        return self._implicit([], "psi", "q", "q1", -1)
+
+    @cached_property
+    def differentiable_newton_v(self) -> DifferentiableProgram:
+        """v1."""
+        return self._implicit([], "psi_dot", "v", "v1", -1)
+
+    @cached_property
+    def differentiable_projection(self) -> DifferentiableProgram:
+        """q1 and v1, of a state on the manifold: where they are q and v."""
+        terms, solve = self._terms, self._elimination.solve
+        copies = [terms.copy("q", "q1"), terms.copy("v", "v1"), terms.copy("sines", "sines1", 2)]
+        program = _program(self._position_terms("psi_q"), self._factorize_dropping, copies)
+        position = [*terms.element_terms(("psi",), "v", 1), *solve(1), self._correction("q", 1)]
+        at_q1 = terms.element_terms(("psi_dot",), "v", 2, q="q1", sines="sines1")
+        return DifferentiableProgram(program, [*position, *at_q1, *solve(2), self._correction("v", 2)])
+
+    def _correction(self, x: str, solve: int) -> KernelLoop:
+        return self._terms.add_solution(x, f"{x}1", solve, -1, fixed=("constants",))
+
+    def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, to: str, sign: int) -> DifferentiableProgram:
+        """x + z or x - z, with z = C J^T y and J C J^T y = `right`."""
+        terms, elimination = self._terms, self._elimination
+        z, result = terms.scaled_solution("z", 0), terms.add("z", x, to, sign)
+        system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *self._factorize]
+        program = _program(system, elimination.solve(), [z, result], [self._safe] if to == "a" else [])
+        implicit = [*terms.residuals(right), z, *terms.subtract_rates("z", 1), *elimination.solve(1)]
+        parts = [*loads, *implicit, terms.scaled_solution("z", 1, ADD, fixed=("constants",)), result]
+        return DifferentiableProgram(program, parts)
 
 
-@lru_cache(maxsize=64)
-def _scene_programs(tree: TreeDef, shapes: Shapes) -> ScenePrograms:
-    return ScenePrograms(scalar_equations(tree, shapes), baumgarte=False)
+def _program(*parts: Iterable[KernelLoop | Reset]) -> LoopProgram:
+    return LoopProgram([part for some in parts for part in some])
 
 
-@lru_cache(maxsize=64)
-def _elimination_programs(
+@lru_cache(maxsize=16)
+def _scene_programs(
     tree: TreeDef, shapes: Shapes, redundant_rows: tuple[int, ...], baumgarte: bool, policy: RankPolicy
-) -> EliminationPrograms:
-    return EliminationPrograms(scalar_equations(tree, shapes), redundant_rows, baumgarte, policy)
+) -> ScenePrograms:
+    return ScenePrograms(tree, shapes, redundant_rows, baumgarte, policy)
 
 
-def scene_programs(mechanism: Mechanism) -> ScenePrograms:
-    """Return the programs without elimination of a mechanism's structure, whatever its numbers are."""
-    return _scene_programs(*structure(mechanism))
-
-
-def elimination_programs(
-    mechanism: Mechanism, redundant_rows: tuple[int, ...], baumgarte: bool, policy: RankPolicy
-) -> EliminationPrograms:
-    """Return the programs by elimination of a mechanism's structure, whatever its numbers are.
+def scene_programs(
+    mechanism: Mechanism,
+    redundant_rows: tuple[int, ...] = (),
+    baumgarte: bool = False,
+    policy: RankPolicy = RankPolicy.DROP,
+) -> ScenePrograms:
+    """Return the programs of a mechanism's structure , whatever its numbers are.
 
     Args:
         mechanism: The scene; its numbers may be traced.
@@ -267,4 +395,4 @@ def elimination_programs(
     Returns:
         The programs; the same object for the same structure and settings.
     """
-    return _elimination_programs(*structure(mechanism), redundant_rows, baumgarte, policy)
+    return _scene_programs(*structure(mechanism), redundant_rows, baumgarte, policy)

@@ -19,9 +19,10 @@ from scipy.sparse.linalg import splu
 
 from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE
-from udkjax.equations.loop_programs import loop_programs
-from udkjax.equations.position_closure import Assembly, close_position, driver_time_step, is_closed, try_to_close
+from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
+from udkjax.equations.scene_arrays import SceneArrays
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
@@ -107,22 +108,22 @@ class SparseRows:
     """
 
     def __init__(self, mechanism: Mechanism, kinematic: bool = False):
-        self._programs = programs = loop_programs(mechanism)
+        self._programs = programs = scene_programs(mechanism)
         self.count, self.size = programs.row_count, programs.coordinate_count
         self.names = programs.row_names
         self.scales = jax.tree.map(np.asarray, known_scales(mechanism))
         root = 1 / np.sqrt(mass_of(mechanism, np))
         arm = float(self.scales.arm)
         self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
-        self._stretch = self.metric / root
         self.driver_time_step = driver_time_step(self.scales)
         numbers = np.asarray(numbers_as_vector(mechanism.numbers))
-        self._evaluate, self._psi = programs.geometry(numbers, np), programs.psi_by_numpy(numbers)
+        arrays = SceneArrays(programs, numbers, np)
+        self._evaluate, self._psi = arrays.geometry, arrays.psi
 
     @cached_property
     def _order(self) -> list[int]:
         rows: list[set[int]] = [set() for _ in range(self.count)]
-        for i, k in zip(*self._programs.d_entries[:2], strict=True):
+        for i, k in zip(*self._programs.psi_q_entries[:2], strict=True):
             rows[i].add(k // 3)
         return minimum_degree(rows)
 
@@ -133,8 +134,8 @@ class SparseRows:
         return psi, length, D
 
     def _normalize_rows(self, values: np.ndarray) -> tuple[SparseMatrix, np.ndarray]:
-        row, column, *_ = self._programs.d_entries
-        D = csr_array((values * self._stretch[column], (row, column)), shape=(self.count, self.size))
+        row, column, *_ = self._programs.psi_q_entries
+        D = csr_array((values * self.metric[column], (row, column)), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
         length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # a row of rounding errors has no direction
         return csr_array(D.multiply(1 / length[:, None])), length
@@ -170,7 +171,7 @@ class SparseRows:
         if not np.all(np.isfinite(D.data)):
             return q, v, psi, psi, 0
         rank = self._position(t, q, D).rank
-        for _ in range(3):  # what the first leaves because of its damping, and of rounding
+        for _ in range(VELOCITIES + 1):  # what the first leaves because of its damping
             v = v + self._solve(D, self._evaluate(t, q, v)[1] / length)
         return q, v, psi, self._evaluate(t, q, v)[1], rank
 

@@ -20,17 +20,6 @@ from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism, attached_bodies
 
-# Bodies, constraints and force elements beyond which the programs are loops over elements of the same structure. Straight-line
-# programs evaluate faster, up to several times this size, but take the longer to trace and compile, the larger the scene is
-# (python -m benchmarks scaling).
-LARGE_SCENE = 40
-
-
-def is_large(mechanism: Mechanism) -> bool:
-    """Whether a scene has more than `LARGE_SCENE` elements."""
-    return len(mechanism.body_names) + len(mechanism.constraints) + len(mechanism.force_names) > LARGE_SCENE
-
-
 Time: TypeAlias = Float[ArrayLike, ""]  # s
 TreeDef: TypeAlias = Hashable  # JAX's description of a tree without its leaves
 Shapes: TypeAlias = tuple[tuple[tuple[int, ...], np.dtype], ...]  # the shape and the type of each number of a tree

@@ -89,23 +89,34 @@ class Differential:
         return {k: self.graph.apply(detail.primitive, detail.parameters, p, node.dtype, choose) for k, p in parts.items()}
 
 
-def tangents(graph: Graph, outputs: Sequence[Scalar], seeds: Mapping[Scalar, Scalar]) -> list[Scalar]:
+def tangents(
+    graph: Graph, outputs: Sequence[Scalar], seeds: Mapping[Scalar, Scalar], given: Collection[int] | None = None
+) -> list[Scalar]:
     """Differentiate outputs along tangents of inputs: the directional derivatives sum (df/dx) dx.
 
     Args:
         graph: The graph of all scalars.
         outputs: The functions f.
         seeds: The tangents dx by input; an input without one is constant.
+        given: Nodes that are known; with them a factor that all df/dx of an x hold is taken out of the sums, and multiplies dx.
 
     Returns:
         The tangent of each output.
     """
     differential = Differential(graph, outputs, list(seeds))
     known = differential.forward({s.index: t if s.sign > 0 else -t for s, t in seeds.items()})
-    return [product(differential.row(s), known, graph) for s in outputs]
+    rows, factors = _factored(differential, outputs, given)
+    known = {k: t * factors[k] if k in factors else t for k, t in known.items()}
+    return [product(row, known, graph) for row in rows]
 
 
-def cotangents(graph: Graph, outputs: Sequence[Scalar], seeds: Sequence[Scalar], inputs: Sequence[Scalar]) -> list[Scalar]:
+def cotangents(
+    graph: Graph,
+    outputs: Sequence[Scalar],
+    seeds: Sequence[Scalar],
+    inputs: Sequence[Scalar],
+    given: Collection[int] | None = None,
+) -> list[Scalar]:
     """Differentiate sum(seeds * outputs) with respect to inputs.
 
     Args:
@@ -113,14 +124,22 @@ def cotangents(graph: Graph, outputs: Sequence[Scalar], seeds: Sequence[Scalar],
         outputs: The functions.
         seeds: The cotangent of each output.
         inputs: The variables.
+        given: Nodes that are known; see `tangents`.
 
     Returns:
         The cotangent of each input.
     """
     differential, found = Differential(graph, outputs, inputs), {}
-    for output, seed in zip(outputs, seeds, strict=True):
-        accumulate(found, differential.row(output), seed)
+    rows, factors = _factored(differential, outputs, given)
+    for row, seed in zip(rows, seeds, strict=True):
+        accumulate(found, row, seed)
+    found = {k: c * factors[k] if k in factors else c for k, c in found.items()}
     return [c if s.sign > 0 else -c for c, s in zip(differential.reverse(found), inputs, strict=True)]
+
+
+def _factored(differential: Differential, outputs: Sequence[Scalar], given: Collection[int] | None) -> tuple[list[Row], Row]:
+    rows = [differential.row(s) for s in outputs]
+    return (rows, {}) if given is None else common_factors(rows, given)
 
 
 def product(row: Row, known: Mapping[int, Scalar], graph: Graph) -> Scalar:

@@ -6,8 +6,8 @@ never emitted (scalar_program.py), so a caller builds freely and chooses later.
 """
 
 import math
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jax.extend.core import Primitive
@@ -215,27 +215,34 @@ class Graph:
                 stack.extend(a.index for a in self.nodes[index].arguments)
         return sorted(found)
 
-    def substitute(self, wanted: Sequence[Scalar], others: Mapping[int, Scalar]) -> list[Scalar]:
-        """Return expressions with other scalars in place of some nodes, by their index."""
-        found = dict(others)
+    def copy(self, program: "Expressions", known: Mapping[int, Scalar]) -> list[Scalar]:
+        """Return the outputs of a program of another graph, with scalars of this one for its inputs, by their index there."""
+        found = dict(known)
 
-        def other(a: Scalar) -> Scalar:
-            new = found.get(a.index, Scalar(self, a.index))
+        def here(a: Scalar) -> Scalar:
+            new = found[a.index]
             return new if a.sign > 0 else -new
 
-        arithmetic = {"add": self.add, "mul": self.multiply, "div": self.divide, "sqrt": self.sqrt}
-        for index in self.dependencies([s.index for s in wanted], found):
-            node = self.nodes[index]
-            values = tuple(map(other, node.arguments))
-            if values == node.arguments:
-                continue
-            if node.kind == "sub":
-                found[index] = values[0] - values[1]
-            elif node.kind in arithmetic:
-                found[index] = arithmetic[node.kind](*values)
-            else:
-                found[index] = Scalar(self, self._operation(node.kind, values, node.detail, node.dtype))
-        return [other(s) for s in wanted]
+        for index in program.order:
+            node = program.graph.nodes[index]
+            match node.kind:
+                case "constant":
+                    found[index] = self.constant(node.detail, node.dtype)
+                case "add":
+                    found[index] = here(node.arguments[0]) + here(node.arguments[1])
+                case "sub":
+                    found[index] = here(node.arguments[0]) - here(node.arguments[1])
+                case "mul":
+                    found[index] = self.multiply(here(node.arguments[0]), here(node.arguments[1]))
+                case "div":
+                    found[index] = self.divide(here(node.arguments[0]), here(node.arguments[1]))
+                case "sqrt":
+                    found[index] = self.sqrt(here(node.arguments[0]))
+                case _:
+                    found[index] = Scalar(
+                        self, self._operation(node.kind, tuple(map(here, node.arguments)), node.detail, node.dtype)
+                    )
+        return [here(s) for s in program.outputs]
 
     def _operation(self, kind, arguments, detail=None, dtype=None) -> int:
         depends = frozenset().union(*(a.node.depends for a in arguments)) if arguments else frozenset()
@@ -248,6 +255,14 @@ class Graph:
             index = self._known[key] = len(self.nodes)
             self.nodes.append(Node(kind, arguments, detail, dtype, depends))
         return index
+
+
+class Expressions(Protocol):
+    """Some nodes of a graph in an order of evaluation, and the outputs among them."""
+
+    graph: Graph
+    order: list[int]
+    outputs: list[Scalar]
 
 
 class BoundPrimitive:

@@ -45,7 +45,8 @@ class LoopDerivative:
         return LoopProgram(parts)
 
     def _differentiate(self, part: KernelLoop, prefix: str, write: Callable, table: np.ndarray) -> list[KernelLoop]:
-        constant_arrays = frozenset(name for name in part.kernel.arrays if part.array(name) in self._fixed)
+        named = {x.array for x in (*part.kernel.inputs, *part.kernel.outputs)}
+        constant_arrays = frozenset(name for name in named if part.array(name) in self._fixed or name in part.fixed)
         key = prefix, part.kernel, constant_arrays
         if key not in self._kernels:
             self._kernels[key] = write(part.kernel, constant_arrays)
@@ -57,8 +58,10 @@ class LoopDerivative:
         active, outputs = _active(kernel, constant_arrays)
         graph = kernel.program.graph
         seeds = {s: graph.input((TANGENT, s.index), "tangent") for s, _ in active}
-        found = tangents(graph, [s for s, _ in outputs], seeds)
-        places = [address for _, address in outputs]
+        given = {s.index for s in kernel.program.inputs}
+        stored, added = ([x for x in outputs if (x[1].update == SET) == is_stored] for is_stored in (True, False))
+        found = [*tangents(graph, [s for s, _ in stored], seeds, given), *tangents(graph, [s for s, _ in added], seeds)]
+        places = [address for _, address in (*stored, *added)]
         writes = [(s, address) for s, address in zip(found, places, strict=True) if address.update == SET or not s.is_zero]
         reads = [(seeds[s], address) for s, address in active]
         return _kernel(kernel, reads, writes, TANGENT)
@@ -67,7 +70,8 @@ class LoopDerivative:
         active, outputs = _active(kernel, constant_arrays)
         graph = kernel.program.graph
         seeds = [graph.input((COTANGENT, k), "cotangent") for k in range(len(outputs))]
-        found = cotangents(graph, [s for s, _ in outputs], seeds, [s for s, _ in active])
+        given = {s.index for s in kernel.program.inputs}
+        found = cotangents(graph, [s for s, _ in outputs], seeds, [s for s, _ in active], given)
         places = [address._replace(update=ADD) for _, address in active]
         writes = [(s, address) for s, address in zip(found, places, strict=True) if not s.is_zero]
         return _kernel(kernel, list(zip(seeds, (address for _, address in outputs), strict=True)), writes, COTANGENT)
@@ -77,10 +81,14 @@ Addressed = list[tuple[Scalar, Address]]
 
 
 def _active(kernel: Kernel, constant_arrays: frozenset[str]) -> tuple[Addressed, Addressed]:
-    """Return the inputs that are used, and the outputs, that have derivatives."""
-    program = kernel.program
-    inputs = [(s, address) for s, address in zip(program.inputs, kernel.inputs, strict=True) if program.uses(s)]
-    outputs = zip(program.outputs, kernel.outputs, strict=True)
+    """Return the inputs and the outputs that have derivatives.
+
+    An input that is fixed but computed from others, as a sine is of an angle, is differentiated with respect to them.
+    """
+    inputs, outputs = (
+        zip(kernel.program.inputs, kernel.inputs, strict=True),
+        zip(kernel.program.outputs, kernel.outputs, strict=True),
+    )
     return [x for x in inputs if x[1].array not in constant_arrays], [x for x in outputs if x[1].array not in constant_arrays]
 
 

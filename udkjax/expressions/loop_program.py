@@ -1,10 +1,10 @@
-"""Programs of large scenes: loops over elements that are alike, each running a small straight-line program.
+"""Programs of scenes: loops over elements that are alike, each running a small straight-line program.
 
 A `Kernel` is the program with the addresses of its inputs and outputs, relative to some bases; a `KernelLoop` runs it for every
 row of a table of bases, in order. The code grows with the number of kinds of elements, the tables with the number of elements.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,7 +13,8 @@ import numpy as np
 from udkjax.expressions.graph import Graph, Scalar
 from udkjax.expressions.scalar_program import ScalarProgram
 
-SET, ADD, MINIMUM = "set", "add", "least"  # an output replaces what is there, is added to it, or the smaller of both stays
+# What an output does with the number in its place: replace it, be added to it, stay if it is larger, or if it is not true.
+SET, ADD, MAXIMUM, ALL = "set", "add", "maximum", "all"
 
 
 class Address(NamedTuple):
@@ -32,6 +33,7 @@ class Kernel:
         self.program, self.inputs, self.outputs = program, list(inputs), list(outputs)
         used = {s.array for x, s in zip(program.inputs, inputs, strict=True) if program.uses(x)}
         self.arrays = sorted(used | {s.array for s in outputs})
+        self.operation_count = len(program.order)
 
 
 class KernelWriter:
@@ -68,6 +70,7 @@ class KernelLoop(NamedTuple):
     kernel: Kernel
     table: np.ndarray
     names: Mapping[str, str] = {}  # from the kernel's names of arrays to the program's, where they differ
+    fixed: Collection[str] = ()  # the kernel's names of arrays that its derivative takes as fixed
 
     def array(self, name: str) -> str:
         """Return the program's name of one of the kernel's arrays."""

@@ -1,11 +1,9 @@
 """Comparisons and choices between scalars, by primitives of JAX."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jax import lax
 
-from udkjax.expressions.graph import Graph, Scalar
+from udkjax.expressions.graph import Scalar
 
 
 def absolute(a: Scalar) -> Scalar:
@@ -30,10 +28,6 @@ def where(condition: Scalar, yes: Scalar, no: Scalar) -> Scalar:
     return yes.graph.apply(lax.select_n_p, {}, (condition, no, yes), yes.node.dtype, lambda c, n, y: y if c else n)
 
 
-def all_of(conditions: Sequence[Scalar], graph: Graph) -> Scalar:
-    """Whether all conditions hold."""
-    result = graph.constant(True, bool)
-    for c in conditions:
-        if c.constant is not True:
-            result = c if result.constant is True else result.graph.apply(lax.and_p, {}, (result, c), bool, np.logical_and)
-    return result
+def both(a: Scalar, b: Scalar) -> Scalar:
+    """Whether two conditions hold."""
+    return a.graph.apply(lax.and_p, {}, (a, b), bool, np.logical_and)

@@ -28,7 +28,7 @@ from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.position_closure import is_closed
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
-from udkjax.equations.structure import is_large
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.integrate import native_closing
 from udkjax.integrate.assembly_moves import moves_of_assembly
 from udkjax.integrate.causes.open_rows import explain_open
@@ -158,7 +158,7 @@ def close(
 
 def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> tuple:
     """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D, of known numbers."""
-    if not is_large(mechanism):  # for which it takes longer to compile anything
+    if scene_programs(mechanism).is_small:  # for which it takes longer to compile anything
         return DenseRows(mechanism, scales).assemble(t, q, v)
     if native_closing.can_close(mechanism):
         return native_closing.close_known(mechanism, scales, rank_tolerance(mechanism), t, q, v)

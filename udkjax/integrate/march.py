@@ -12,8 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.dense_rows import DenseRows
-from udkjax.equations.kinematic_programs import kinematic_programs
-from udkjax.equations.structure import is_large
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.native.layout import INPUTS, SETTINGS
 from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
 from udkjax.native.tableau import EULER
@@ -36,7 +35,7 @@ class March(NamedTuple):
 
 def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
     """Tell whether machine code can follow a mechanism."""
-    if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64 or is_large(mechanism):
+    if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     return not unsupported(_kind(mechanism, analysis))
 
@@ -97,5 +96,5 @@ def _of_unit_masses(mechanism: Mechanism, length: Scalar, xp: ModuleType) -> Mec
 
 
 def _kind(mechanism: Mechanism, analysis: Analysis) -> Kind:
-    programs = kinematic_programs(mechanism, analysis.redundant_rows or ())
+    programs = scene_programs(mechanism, analysis.redundant_rows or ())
     return Kind(programs, Tableau(EULER), projected=False, breaks=False, mode="marching")

@@ -7,14 +7,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike
 
-from udkjax.equations.loop_programs import loop_programs
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import is_large, numbers_as_vector
+from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.native_numbers import active_numbers, active_tangents, cotangent_tree
+from udkjax.integrate.native_numbers import active_numbers, cotangent_tree, number_tangents
 from udkjax.native.layout import INPUTS, SETTINGS
 from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
 from udkjax.native.tableau import EULER
@@ -51,8 +50,8 @@ def _unpack(found: Sequence[Any], n: int) -> Closed:
 def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
     """The changes of q and v along a `change` of what is active of (mechanism, scales, tol, t, q, v)."""
     (mechanism, *_, q, _), (*_, dq, dv) = guess, change
-    n, kind = len(q), _closing(mechanism, _active_in_closing(mechanism, active[0]), "closing forward")
-    numbers = jnp.asarray(numbers_as_vector(active_tangents(mechanism, active[0], change[0], kind.active or ())))
+    n, kind = len(q), _closing(mechanism, active_numbers(mechanism, active[0]), "closing forward")
+    numbers = jnp.asarray(numbers_as_vector(number_tangents(mechanism, active[0], change[0])))
     along = [numbers, *(jnp.zeros(n) if dx is None else dx for dx in (dq, dv))]
     dstate = native_p.bind(*_inputs(*guess), *(x[None, None] for x in along), kind=kind, times=2)[-1][0, 0]
     return dstate[:n], dstate[n:]
@@ -61,17 +60,11 @@ def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
 def close_vjp(guess: Any, active: Any, qbar: Array, vbar: Array) -> Any:
     """The cotangents of what is active, from those of q and v."""
     mechanism = guess[0]
-    kind = _closing(mechanism, _active_in_closing(mechanism, active[0]), "closing reverse")
+    kind = _closing(mechanism, active_numbers(mechanism, active[0]), "closing reverse")
     bars = jnp.concatenate([qbar, vbar])[None]
     numbers, *states = (x[0] for x in native_p.bind(*_inputs(*guess), bars, kind=kind, times=2)[-3:])
-    found = cotangent_tree(numbers, mechanism, active[0], kind.active or ())
+    found = cotangent_tree(numbers, mechanism, active[0])
     return found, *(x if m is True else None for x, m in zip(states, active[-2:], strict=True))
-
-
-def _active_in_closing(mechanism: Mechanism, active: PyTree[bool]) -> tuple[bool, ...]:
-    """Of the numbers of closing: which have derivatives. Loops do not tell them apart."""
-    numbers = active_numbers(mechanism, active)
-    return (True,) * len(numbers) if is_large(mechanism) else numbers
 
 
 def _inputs(
@@ -80,7 +73,7 @@ def _inputs(
     """Those of a run of the closing code, of one member: by JAX without derivatives, by NumPy as they are."""
     settings = {"length": scales.length, "fallback_tol": tol, "rtol": 1.0, "atol": 1.0, "smallest": 1.0, "omega": 1.0}
     given = {
-        "numbers": numbers_as_vector([*mechanism.numbers, tol**2 if is_large(mechanism) else 0.0, 0.0]),
+        "numbers": numbers_as_vector([*mechanism.numbers, tol**2, 0.0]),
         "ts": numbers_as_vector([t, t]),
         "q": q,
         "v": v,
@@ -93,5 +86,4 @@ def _inputs(
 
 
 def _closing(mechanism: Mechanism, active: tuple[bool, ...] | None = None, mode: str = "closing") -> Kind:
-    programs = loop_programs(mechanism) if is_large(mechanism) else scene_programs(mechanism)
-    return Kind(programs, Tableau(EULER), projected=False, breaks=False, active=active, mode=mode)
+    return Kind(scene_programs(mechanism).with_all_rows, Tableau(EULER), projected=False, breaks=False, active=active, mode=mode)

@@ -11,13 +11,12 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.elements import has_pieces
-from udkjax.equations.loop_programs import LoopPrograms, loop_programs
-from udkjax.equations.scene_programs import EliminationPrograms, elimination_programs
-from udkjax.equations.structure import is_large, numbers_as_vector
+from udkjax.equations.scene_programs import ScenePrograms, scene_programs
+from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.held_rows import breakpoints_of, first_rows, rows_of, sampled_places, with_cotangents
-from udkjax.integrate.native_numbers import active_numbers, active_tangents, cotangent_tree
+from udkjax.integrate.native_numbers import active_numbers, cotangent_tree, number_tangents
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.solvers import is_explicit, method_of
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS
@@ -44,8 +43,6 @@ def reason_for_diffrax(problem: Problem, adjoint: Any = None, meter: Any = None)
         return "which rows are redundant is not known"
     if not is_explicit(problem.solver):
         return f"{type(problem.solver).__name__} is no explicit Runge-Kutta method"
-    if is_large(equations.mechanism) and _has_pieces(equations.mechanism):
-        return "an element of a large scene is smooth in pieces of the state"
     if jax.default_backend() != "cpu":
         return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
     if not jax.config.jax_enable_x64:
@@ -98,7 +95,7 @@ def _all_numbers_of(problem: Any) -> tuple[Any, Any]:
 def jvp(problem: Problem, active: Problem, change: Problem) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is active."""
     kind, n = _kind(problem, _active(problem, active), "forward"), len(problem.q)
-    tangents = active_tangents(_numbers_of(problem), _numbers_of(active), _numbers_of(change), kind.active or ())
+    tangents = number_tangents(_numbers_of(problem), _numbers_of(active), _numbers_of(change))
     along = jnp.asarray(numbers_as_vector(tangents))
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     directions = [along, dq, dv]
@@ -121,7 +118,7 @@ def vjp(problem: Problem, active: Problem, run: tuple[Sequence[Array], Array], y
     found = native_p.bind(*_inputs(problem, kind.code), *given, kind=kind, times=len(problem.ts))
     numbersbar, qbar, vbar = found[len(OUTPUTS) : len(OUTPUTS) + 3]
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
-    numbers = cotangent_tree(numbersbar[0], _numbers_of(problem), _numbers_of(active), kind.active or ())
+    numbers = cotangent_tree(numbersbar[0], _numbers_of(problem), _numbers_of(active))
     if kind.sampled:
         of_problem, breaks = _all_numbers_of(problem), breakpoints_of(problem, jnp)
         numbers = with_cotangents(numbers, of_problem, _numbers_of(active), found[len(OUTPUTS) + 3][0], breaks, jnp)
@@ -130,19 +127,16 @@ def vjp(problem: Problem, active: Problem, run: tuple[Sequence[Array], Array], y
 
 
 def _active(problem: Problem, active: Problem) -> tuple[bool, ...]:
-    """Of the numbers of a run: which have derivatives. Loops do not tell them apart."""
-    numbers = active_numbers(_numbers_of(problem), _numbers_of(active))
-    return (any(numbers),) * len(numbers) if is_large(_numbers_of(problem)[0]) else numbers
+    """Of the numbers of a run: which have derivatives."""
+    return active_numbers(_numbers_of(problem), _numbers_of(active))
 
 
-def _programs(problem: Problem) -> EliminationPrograms | LoopPrograms:
+def _programs(problem: Problem) -> ScenePrograms:
     """The programs of a problem's scene: with pivots that are refused, where the method falls back on a rank-revealing one."""
     equations: Any = problem.equations
     mechanism, rows, baumgarte = equations.mechanism, equations.redundant or (), equations.baumgarte is not None
-    drops = isinstance(equations.method, Elimination)
-    if is_large(mechanism):
-        return loop_programs(mechanism, rows, baumgarte, RankPolicy.DROP if drops else RankPolicy.FALL_BACK)
-    return elimination_programs(mechanism, rows, baumgarte, RankPolicy.DROP if drops else RankPolicy.REFUSE)
+    policy = RankPolicy.DROP if isinstance(equations.method, Elimination) else RankPolicy.REFUSE
+    return scene_programs(mechanism, rows, baumgarte, policy)
 
 
 def _kind(problem: Any, active: tuple[bool, ...] | None = None, mode: str = "run") -> Kind:

@@ -1,6 +1,5 @@
 """Numbers of a scene as machine code takes them: in one vector, and those with derivatives among them."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -14,28 +13,20 @@ def active_numbers(numbers: PyTree[Array], active: PyTree[bool]) -> tuple[bool, 
     return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
 
 
-def active_tangents(numbers: PyTree[Array], active: PyTree[bool], change: PyTree[Array], wanted: Sequence[bool]) -> list[Any]:
-    """The tangents of the numbers that are `wanted`, in order: zeros of those that are not active."""
-    found, place = [], 0
-    for x, m, dx in zip(*(leaves_and_none(tree) for tree in (numbers, active, change)), strict=True):
-        if x is not None:
-            if m is True:
-                found.append(dx)
-            elif wanted[place]:
-                found.append(np.zeros(np.shape(x)))
-            place += np.size(x)
-    return [*found, np.zeros(sum(wanted[place:]))]
+def number_tangents(numbers: PyTree[Array], active: PyTree[bool], change: PyTree[Array]) -> list[Any]:
+    """The tangents of all numbers and of two thresholds, in order: zeros of those that are not active."""
+    leaves = zip(*(leaves_and_none(tree) for tree in (numbers, active, change)), strict=True)
+    return [*(dx if m is True else np.zeros(np.shape(x)) for x, m, dx in leaves if x is not None), np.zeros(2)]
 
 
-def cotangent_tree(bars: Array, numbers: PyTree[Array], active: PyTree[bool], wanted: Sequence[bool]) -> PyTree[Array]:
-    """The tree of the cotangents of what is active, from those of the numbers that are `wanted`, in order."""
+def cotangent_tree(bars: Array, numbers: PyTree[Array], active: PyTree[bool]) -> PyTree[Array]:
+    """The tree of the cotangents of what is active, from those of all numbers, in order."""
     leaves, tree = jax.tree.flatten(numbers, is_leaf=lambda x: x is None)
-    parts, place, found = [], 0, 0
+    parts, place = [], 0
     for x, m in zip(leaves, leaves_and_none(active), strict=True):
         size = 0 if x is None else np.size(x)
-        count = sum(wanted[place : place + size])
-        parts.append(bars[found : found + count].reshape(np.shape(x)) if m is True else None)
-        place, found = place + size, found + count
+        parts.append(bars[place : place + size].reshape(np.shape(x)) if m is True else None)
+        place += size
     return jax.tree.unflatten(tree, parts)
 
 

@@ -2,15 +2,17 @@
 
 How the code of a run is made, and where to look:
 
-1. `udkjax.equations` writes a scene as programs of scalar expressions: accelerations, projection, residuals, derivatives.
-2. `program` (straight-line programs) and `loops` (large scenes) turn each program into one function of LLVM's text, by the thin
-   layer of values, branches and loops in `ir`. A function serves one member or W side by side, in the lanes of vectors.
+1. `udkjax.equations` writes a scene as programs: loops over its elements that read and write arrays of numbers. Accelerations,
+   projection, residuals and derivatives are such programs. Those of small scenes are written out: without loops and arrays.
+2. `loops` and `program` (written out) turn each program into one function of LLVM's text, by the thin layer of values, branches
+   and loops in `ir`. A function serves one member or W side by side, in the lanes of vectors.
 3. `layout` says where the numbers of a run lie in memory; `module` is the text of all functions, with access to these numbers.
 4. `trajectory` adds the algorithm: `runge_kutta` (stages and errors of a step), `manifold` (projection), `controller` (accept or
    reject, and the next step), `singular` and `fallback` (steps near singular configurations), `breakpoints` and `pieces` (where
    the motion is not smooth), `dense_output` (states between steps), `members` (which member runs in which lane).
 5. `tangents` (forward mode) and `backpropagation` (reverse mode) add derivatives, with the programs of `linearization` and
-   `prologue`; `closing*` are modules that assemble a mechanism instead, `marching` one that follows its positions.
+   `prologue`; `closing`, `closing_derivatives` and `corrections` are a module that assembles a mechanism instead, `marching` one
+   that follows its positions.
 6. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operation` makes it a primitive
    of JAX with its batching rule. `udkjax.integrate` calls that and knows the rules of differentiation.
 """

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.layout import Plan
-from udkjax.native.prologue import REVERSE, write_prologue_reverse
+from udkjax.native.prologue import REVERSE, write_prologue_derivative
 from udkjax.native.record import Recorded
 from udkjax.native.runge_kutta import stage_state
 from udkjax.native.samples import ARGUMENTS, count_breakpoints, numbers_of_row
@@ -28,6 +28,7 @@ class Reverse(Recorded):
 
     inputs = ("given record", "given qs", "given vs", "ysbar", "endbar")
     outputs = ("numbersbar", "qbar", "vbar", "record")
+    reverse = True
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
         super().__init__(plan, active)
@@ -52,7 +53,7 @@ class Reverse(Recorded):
         for each in self._linearizations:
             each.reverse()
         if self.count:
-            write_prologue_reverse(self, self.active_numbers, self.active)
+            write_prologue_derivative(self, self.active, True)
         self._write_transposed_differences()
         self._write_step_back()
         self._write_leave_row()
@@ -73,7 +74,7 @@ class Reverse(Recorded):
         """Y through the projection that led to the state in X: G q and G v."""
         if self.of_projection:
             self._evaluate_end(f)
-            f.call("reverse_projection", f.given["work"], self.address(f, "KP"))
+            f.call("reverse_projection", f.given["work"], self.address(f, "KP"), f.given["work"])
             self._accumulate_constants(f, mask)
         else:
             with f.each(self.rowcount) as r:
@@ -221,7 +222,7 @@ class Reverse(Recorded):
         if self.plan.sampled:
             rows = (f.load(call, self.call_fields.index("knots"), base=INT) + 1) * len(self.plan.sampled)
         for k in self._each_lane(f, s.ready > 0.5):
-            cleared = [("numbersbar", f.const(sum(self.active_numbers), INT))]
+            cleared = [("numbersbar", f.const(self.code.number_count, INT))]
             if self.plan.sampled:
                 cleared.append(("samplesbar", rows))
             for name, length in cleared:
@@ -307,7 +308,7 @@ class Reverse(Recorded):
         if not self.count:
             return
         f, _ = self.function("leave_row", ARGUMENTS)
-        call, k, count = f.given["call"], f.given["lane"], sum(self.active_numbers)
+        call, k, count = f.given["call"], f.given["lane"], self.code.number_count
         constants, bars, found = (Value(f, f.reserve(DOUBLE, c), POINTER) for c in (max(self.constants, 1), self.count, count))
         self.copy_lane(f, constants, 0, "constants", k, count=self.constants)
         self.copy_lane(f, bars, 0, "cbar", k, count=self.count)

@@ -1,54 +1,53 @@
 """Machine code that closes a mechanism: the loop of equations/position_closure.py, for numbers that are known when it runs.
 
-    q <- q - s M^(-1/2) D^+ Psi
+    q <- q - s C J^T y,      J C J^T y = Psi,      J = Psi_q,      C = M^(-1)
 
-by steps that are limited, and halved until the residual falls; then the velocities that the constraints allow. D^+ is that of all
-rows, weighted, by rotations (least_norm.py).
+by steps that are limited, and halved until the residual falls; then the velocities that the constraints allow. Corrections are
+those of corrections.py, of all rows.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from udkjax.equations.position_closure import CLOSURE_ITERATIONS, LONGEST_STEP, ROUNDING_UNITS, STEP_HALVINGS
+from udkjax.equations.position_closure import CLOSURE_ITERATIONS, LONGEST_STEP, ROUNDING_UNITS, STEP_HALVINGS, VELOCITIES
 from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.native.fallback import write_solve
+from udkjax.native.corrections import EliminationCorrection, LeastNormCorrection
 from udkjax.native.ir import INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
-from udkjax.native.least_norm import least_norm
 from udkjax.native.members import write_begin, write_run
+from udkjax.native.module import Module
 from udkjax.native.tableau import EULER
-from udkjax.native.trajectory import Trajectory
 
-POSITION, VELOCITY = 0, 1  # what a correction is of
-VELOCITIES = 2  # corrections: the second removes the rounding errors of the first
+CORRECTED = "qv"  # what a correction is of, by its number in a record
 
 
-class Closing(Trajectory):
+class Closing(Module):
     """The text of a module whose `run` closes members, from their guesses q and v at the time ts[0]."""
 
     results = ("state", "residuals", "rank")
 
-    def __init__(self, code: Any, vector: int):
-        super().__init__(Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector))
+    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool] = ()):
+        plan = Plan(code, EULER, False, False, 1, vector, written_out=False, steps=False)
+        super().__init__(plan, active=active)
+        self.active, self.count = active, len(self.moving)
+        correction = LeastNormCorrection if code.is_small else EliminationCorrection
+        self.corrections = {x: correction(self, f"newton_{x}") for x in CORRECTED}
+        self.places.add("correction", max(x.stored for x in self.corrections.values()))
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
         self.write_programs()
-        self._write_solver()
+        for correction in self.corrections.values():
+            correction.evaluation()
+        self.write_derivatives()
         write_begin(self)
         self._close()
         write_run(self)
         return self.module_text()
 
-    def program_names(self, code: ScenePrograms) -> dict[str, Any]:
-        return {"equation_terms": code.equation_terms, "psi": code.psi, "psi_dot": code.psi_dot}
-
-    def _write_solver(self):
-        """The functions of D^+."""
-        self.functions.append(least_norm())
-        write_solve(self)
+    def program_names(self) -> list[str]:
+        return ["psi", "psi_dot"] if self.code.is_small else ["psi", "psi_dot", "rank"]
 
     def _close(self):
         """`close(work, call)`: the member in the one lane."""
@@ -84,7 +83,7 @@ class Closing(Trajectory):
                 f.store(q, work, i + p["C"])
             better.value = f.select(before > largest.value * (ROUNDING_UNITS * np.finfo(float).eps), f.const(1.0), 0.0)
             with f.if_(better.value > 0.5):
-                self._correction(f, s, POSITION, "X dq")
+                self._correct(f, "q")
                 with f.each(n) as i:
                     step = f.abs(f.load(work, i + p["X dq"])) * f.load(work, i + p["inverse unit"])
                     longest.value = f.max(step, longest.value)
@@ -100,11 +99,11 @@ class Closing(Trajectory):
                 with f.if_(better.value > 0.5):
                     taken = scale.value * 2.0
                     limited = f.select(longest.value > LONGEST_STEP, f.const(1.0), 0.0)
-                    self._at_previous_state(f, "q", lambda: self._record_correction(f, POSITION, taken, limited))
-        self._record_correction(f, POSITION, f.const(1.0), f.const(0.0))
+                    self._at_previous_state(f, "q", lambda: self._record_correction(f, "q", taken, limited))
+        self._record_correction(f, "q", f.const(1.0), f.const(0.0))
         for _ in range(VELOCITIES):
-            self._record_correction(f, VELOCITY, f.const(1.0), f.const(0.0))
-            self._correction(f, s, VELOCITY, "X dv")
+            self._record_correction(f, "v", f.const(1.0), f.const(0.0))
+            self._correct(f, "v")
             with f.each(n) as i:
                 f.store(f.load(work, i + p["X v"]) + f.load(work, i + p["X dv"]), work, i + p["X v"])
         self._write_result(f, s)
@@ -123,29 +122,29 @@ class Closing(Trajectory):
             self.invoke(f, name)
             with f.each(self.m) as i:
                 f.store(f.load(work, i + self.places["psi"]), residuals, i + offset)
-        self._set_rank(f)
+        self._evaluate(f, "q")
+        self.corrections["q"].find_rank(f)
         f.store(s.rank, address("rank", 1))
         self._finish_closing(f, member)
 
-    def _set_rank(self, f: Function):
-        """Leave the rank of D in `rank`: `solve` does."""
+    def _evaluate(self, f: Function, x: str):
+        """Evaluate a correction of q or v at the state in X, with what its derivatives know of it."""
+        f.call(f"evaluation_newton_{x}", f.given["work"], f.given["work"], self.address(f, "correction"))
 
-    def _correction(self, f: Function, s: Lane, kind: int, to: str):
-        """-M^(-1/2) D^+ Psi at the state in X, or of Psi_dot, as coordinates."""
-        work, n, m, p = f.given["work"], self.n, self.m, self.places
-        right, x = (Value(f, f.reserve("double", max(c, 1)), POINTER) for c in (m, n))
-        self.invoke(f, "psi_dot" if kind == VELOCITY else "psi")
-        self.invoke(f, "equation_terms")
-        with f.each(m) as i:
-            f.store(f.load(work, i + p["psi"]), right, i)
-        f.call("solve", work, f.const(0, INT), right, x, s.fallback_tol)
-        with f.each(n) as i:
-            root = f.load(work, i + (p["R"] + self.code.pattern.value_count + m + n))
-            f.store(-(root * f.load(x, i)), work, i + p[to])
+    def change(self, f: Function, x: str, i: Value) -> Value:
+        """A coordinate of the whole correction."""
+        place = self.places["correction"] + self.corrections[x].place(f"{x}1")
+        return f.load(f.given["work"], i + place) - f.load(f.given["work"], i + self.places[f"X {x}"])
+
+    def _correct(self, f: Function, x: str):
+        """The whole correction of q or v, in X dq or X dv."""
+        self._evaluate(f, x)
+        with f.each(self.n) as i:
+            f.store(self.change(f, x, i), f.given["work"], i + self.places[f"X d{x}"])
 
     # What closing with derivatives does besides (closing_derivatives.py).
 
-    def _record_correction(self, f: Function, kind: int, scale: Value, limited: Value):
+    def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
         """What it does with a correction of the state in X: so much of it was taken, less where it was limited."""
 
     def _finish_closing(self, f: Function, member: Value):

@@ -1,153 +1,149 @@
-"""Fallback steps: where elimination must not trust a pivot, a rank-revealing method on all rows takes its place."""
+"""Fallback steps: where elimination must not trust a pivot, a rank-revealing method on all rows takes its place.
 
-from typing import Any
+It has two functions of `work`, for the lanes that are `wanted`, at the state in X:
+
+    fallback        accelerations a, and q and v after a Newton step each, in arrays of their own
+    tangent_part    what is within the manifold of X dq and X dv, in O dq and O dv
+
+For small scenes the method is the pseudoinverse by singular values (least_norm.py), lane by lane; for large ones elimination
+of all rows, without those that depend on others, which near singular configurations has about half as many digits.
+"""
+
+from collections.abc import Iterator
 
 import numpy as np
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane
-from udkjax.native.least_norm import LEAST_NORM
+from udkjax.native.least_norm import LEAST_NORM, least_norm
 from udkjax.native.manifold import iterate_newton, with_threshold
 from udkjax.native.module import Module
 from udkjax.native.steps import ROUNDING_PIVOT
 
 
-def entries(t: Module, f: Function) -> Any:
-    """What is done for every entry of D: its row, column, place among the values, and sign."""
-    table = Value(f, "@entries", POINTER)
-    with f.each(len(t.code.pattern.entries)) as e:
-        yield tuple(f.load(table, e * 4 + j, base=INT) for j in range(4))
-
-
-def write_solve(t: Module):
-    """`solve`: x = D^+ right of one lane, with the rows weighted; D is that of R."""
-    n, m = t.n, t.m
-    table = [x for e in t.code.pattern.entries for x in (e.row, e.column, e.value, e.sign)]
-    t.loops.globals.append(f"@entries = private constant [{len(table)} x i64] [{', '.join(f'i64 {x}' for x in table)}]")
-    arguments = [(POINTER, "work"), (INT, "lane"), (POINTER, "right"), (POINTER, "x"), (DOUBLE, "tol")]
-    f, s = t.function("solve", arguments)
-    k, right = f.given["lane"], f.given["right"]
-    D, b = (Value(f, f.reserve(DOUBLE, max(c, 1)), POINTER) for c in (m * n, m))
-    with f.each(m * n) as i:
-        f.store(0.0, D, i)
-    length = f.lane(s.length, k)
-    with f.each(m) as i:
-        f.store(f.load(right, i) * length / t.lane_number(f, "rows", k, i), b, i)
-    for row, column, slot, sign in entries(t, f):
-        weight = length / t.lane_number(f, "rows", k, row)
-        f.store(t.lane_number(f, "R", k, slot) * weight * sign, D, row * n + column)
-    rank = f.at(f.given["work"], k + t.places["rank"] * f.width)
-    f.call(LEAST_NORM, D, b, f.given["x"], *(f.const(c, INT) for c in (m, n)), f.given["tol"], rank)
-
-
 def write_fallback(t: Module):
-    """What a rank-revealing method on all rows finds, of lanes that fall back on it, one after the other."""
-    code, p, n, m, width = t.code, t.places, t.n, t.m, t.plan.width
-    slots, number, one = code.pattern.value_count, t.lane_number, lambda f: f.const(1.0, DOUBLE, width)
+    """Write what a fallback step does besides: accelerations, the end of a step, outputs that elimination leaves open."""
+    (_write_singular_values if t.written_out else _write_elimination)(t)
 
-    def put(f: Function, name: str, k: Value, i: Value, x: Value):
-        f.store(x, f.given["work"], (i + p[name]) * width + k)
+    def invoke(f: Function, s: Lane, mask: Value, name: str = "fallback"):
+        s.wanted = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+        t.invoke(f, name)
 
-    def each_lane(f: Function, mask: Value) -> Any:
-        marked = f.select(mask, one(f), 0.0)
-        right, x = (Value(f, f.reserve(DOUBLE, c), POINTER) for c in (m, n))
-        with f.each(width) as k, f.if_(f.lane(marked, k) > 0.5):
-            yield k, right, x
-
-    def solved(f: Function, k: Value, right: Value, x: Value, name: str, start: int = 0):
-        """`x` of a lane, with D and what else is in R of the state in X."""
-        with f.each(m) as i:
-            f.store(number(f, name, k, i + start), right, i)
-        f.call("solve", f.given["work"], k, right, x, number(f, "fallback_tol", k, 0))
-
-    def root(f: Function, k: Value, i: Value) -> Value:
-        return number(f, "R", k, i + (slots + m + n))
-
-    def close_in_position(f: Function, s: Lane, mask: Value):
-        """Newton's method in positions, of some lanes."""
-
+    def close_position(f: Function, s: Lane, mask: Value):
         def closer(active: Value):
-            t.invoke(f, "equation_terms")
-            t.invoke(f, "psi")
-            with f.each(t.rowcount) as r:
-                t.put(f, "C", r, t.vector(f, "X q", r))
-            for k, right, x in each_lane(f, active):
-                solved(f, k, right, x, "psi")
-                with f.each(n) as i:
-                    put(f, "C", k, i, number(f, "X q", k, i) - root(f, k, i) * f.load(x, i))
+            invoke(f, s, active)
+            t.copy(f, "fallback q", "C")
 
         iterate_newton(t, f, s, mask, closer)
-        t.invoke(f, "equation_terms")
-
-    def close_in_velocity(f: Function, mask: Value):
-        """X v, as the constraints allow it, in O v, of some lanes."""
-        t.invoke(f, "psi_dot")
-        for k, right, x in each_lane(f, mask):
-            solved(f, k, right, x, "psi")
-            with f.each(n) as i:
-                put(f, "O v", k, i, number(f, "X v", k, i) - root(f, k, i) * f.load(x, i))
 
     # The accelerations of lanes whose pivots were not safe.
     f, s = t.function("accelerate_by_fallback", [(POINTER, "work"), (POINTER, "out")])
-    t.invoke(f, "equation_terms")
-    for k, right, x in each_lane(f, (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5)):
-        solved(f, k, right, x, "R", slots)
-        with f.each(n) as i:
-            a = f.fma(root(f, k, i), f.load(x, i), number(f, "R", k, i + (slots + m)))
-            f.store(a, f.given["out"], i * width + k)
+    mask = (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5)
+    invoke(f, s, mask)
+    t.copy(f, "fallback a", "out", mask)
     # The end of a fallback step: Newton's method in position, velocities and accelerations there where the pivots are
     # not safe; and, whether they are or not, what projection leaves of the errors.
     f, s = t.function("finish_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
-
-    close_in_position(f, s, fallback & (s.ok < 0.5))
-    due_for_fallback = fallback & (s.ok < 0.5)
-    with f.if_(f.any_of(due_for_fallback)):
-        close_in_velocity(f, due_for_fallback)
-        with f.each(t.rowcount) as r:
-            t.put(f, "X v", r, f.select(due_for_fallback, t.vector(f, "O v", r), t.vector(f, "X v", r)))
-        t.invoke(f, "accelerations", "C")
-        with f.each(t.rowcount) as r:
-            t.put(f, "O a", r, f.select(due_for_fallback, t.vector(f, "C", r), t.vector(f, "O a", r)))
-        with f.if_(f.any_of(due_for_fallback & (s.safe < 0.5))):
-            f.call("accelerate_by_fallback", f.given["work"], t.address(f, "O a"))
-    for k, right, x in each_lane(f, fallback):
-        for d in ("dq", "dv"):
-            with f.each(m) as i:
-                f.store(0.0, right, i)
-            for row, column, slot, sign in entries(t, f):
-                part = number(f, "R", k, slot) * sign * number(f, f"X {d}", k, column) / root(f, k, column)
-                f.store(f.load(right, row) + part, right, row)
-            f.call("solve", f.given["work"], k, right, x, f.const(np.sqrt(ROUNDING_PIVOT)))
-            with f.each(n) as i:
-                put(f, f"O {d}", k, i, number(f, f"X {d}", k, i) - root(f, k, i) * f.load(x, i))
+    unsafe = fallback & (s.ok < 0.5)
+    close_position(f, s, unsafe)
+    with f.if_(f.any_of(unsafe)):
+        invoke(f, s, unsafe)
+        for to in ("X v", "O v"):
+            t.copy(f, "fallback v", to, unsafe)
+        invoke(f, s, unsafe)
+        t.copy(f, "fallback a", "O a", unsafe)
+    invoke(f, s, fallback, "fallback_tangent_part")
+    for x in ("dq", "dv"):
+        t.copy(f, f"fallback {x}", f"O {x}", fallback)
     # An output that elimination leaves open.
     f, s = t.function("close_output")
-    close_in_position(f, s, s.open > 0.5)
-    close_in_velocity(f, s.open > 0.5)
+    close_position(f, s, s.open > 0.5)
+    invoke(f, s, s.open > 0.5)
+    t.copy(f, "fallback v", "O v", s.open > 0.5)
     t.invoke(f, "psi")
 
 
-def write_fallback_by_loops(t: Module):
-    """As `write_fallback`, of a large scene: by elimination of all rows, without those whose pivots are small."""
-    f, s = t.function("accelerate_by_fallback", [(POINTER, "work"), (POINTER, "out")])
-    t.invoke(f, "fallback_accelerations")
-    select_lanes(t, f, (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5), "fallback a", "out")
-    f, s = t.function("finish_by_fallback", [(POINTER, "work"), (POINTER, "out")])
-    fallback, due_for_fallback = (s.stepping > 0.5) & (s.fallback > 0.5), s.ok < 0.5
-    iterate_newton(t, f, s, fallback & due_for_fallback, lambda active: t.invoke(f, "fallback_newton_q"))
-    with f.if_(f.any_of(fallback & due_for_fallback)):
-        t.invoke(f, "fallback_project_and_accelerate")
-        for x in "va":
-            select_lanes(t, f, fallback & due_for_fallback, f"fallback {x}", f"O {x}")
-    with_threshold(t, f, s, f.const(ROUNDING_PIVOT, DOUBLE, f.width), lambda: t.invoke(f, "fallback_tangent_part"))
+def _write_elimination(t: Module):
+    """Write `fallback` and `fallback_tangent_part` by elimination, with constants of their own: another threshold."""
+    every = t.code.with_all_rows
+    at = t.arrays | {x: ("work", t.places[f"fallback {x}"]) for x in (*every.scratch, "constants", "a")}
+    at |= {f"{x}1": ("work", t.places[f"fallback {x}"]) for x in ("q", "v", "dq", "dv")}
+    at |= dict.fromkeys(("safe", "distance"), ("work", t.places["rank"]))
+    t.loops.write(every.corrections_and_accelerations, "fallback", ("work", "out"), at)
+    t.loops.write(every.tangent_part, "tangent_part_of_all_rows", ("work", "out"), at)
+    t.write_prologue("fallback_prologue", None)
+    f, _ = t.function("fallback_tangent_part", [(POINTER, "work"), (POINTER, "out")])
+    place = t.places["fallback constants"] + t.code.drop_tol_index
+    threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
+    with_threshold(f, place, threshold, lambda: t.invoke(f, "tangent_part_of_all_rows"))
 
 
-def select_lanes(t: Module, f: Function, mask: Value, source: str, to: str):
-    """An array of coordinates from another, in some lanes."""
-    start = 0 if to == "out" else t.places[to] * f.width
-    pointer = f.given["out" if to == "out" else "work"]
-    with f.each(t.rowcount) as r:
-        place = r * t.plan.vector + start
-        old = f.load(pointer, place, t.plan.vector)
-        f.store(f.select(mask, t.vector(f, source, r), old), pointer, place, t.plan.vector)
+def _write_singular_values(t: Module):
+    """Write `fallback` and `fallback_tangent_part` by singular values."""
+    n, m = t.n, t.m
+    t.functions.append(least_norm())
+    rows, columns, places, factors = t.code.psi_q_entries
+    entries = ", ".join(f"i64 {x}" for entry in zip(rows, columns, places, strict=True) for x in entry)
+    t.loops.globals.append(f"@entries = private constant [{3 * len(rows)} x i64] [{entries}]")
+    numbers = ", ".join(f"double {float(x)}" for x in factors)
+    t.loops.globals.append(f"@factors = private constant [{len(rows)} x double] [{numbers}]")
+
+    def each_lane(f: Function, s: Lane) -> Iterator[Value]:
+        t.invoke(f, "rows_and_loads")
+        with f.each(f.width) as k, f.if_(f.lane(s.wanted, k) > 0.5):
+            yield k
+
+    def each_entry(f: Function, k: Value) -> Iterator[tuple[Value, Value, Value]]:
+        """The row, the column and the value of each entry of Psi_q."""
+        with f.each(len(rows)) as e:
+            row, column, place = (f.load(Value(f, "@entries", POINTER), e * 3 + j, base=INT) for j in range(3))
+            value = t.lane_number(f, "psi_q", k, place) * f.load(Value(f, "@factors", POINTER), e)
+            yield row, column, value
+
+    def solve(f: Function, s: Lane, k: Value, right: Value, count: int, tol: Value, x: Value):
+        """Solve D y = W right for so many right-hand sides, with D = W Psi_q M^(-1/2)."""
+        D = Value(f, f.reserve(DOUBLE, m * n), POINTER)
+        with f.each(m * n) as i:
+            f.store(0.0, D, i)
+        length = f.lane(s.length, k)
+        for row, column, value in each_entry(f, k):
+            weight = length / t.lane_number(f, "rows", k, row)
+            f.store(value * weight * t.lane_number(f, "root", k, column), D, row * n + column)
+        with f.each(m) as i:
+            weight = length / t.lane_number(f, "rows", k, i)
+            with f.each(count) as j:
+                place = i * count + j
+                f.store(f.load(right, place) * weight, right, place)
+        rank = f.at(f.given["work"], k + t.places["rank"] * f.width)
+        f.call(LEAST_NORM, D, right, x, *(f.const(c, INT) for c in (m, n, count)), tol, rank)
+
+    def put(f: Function, name: str, k: Value, i: Value, x: Value):
+        f.store(x, f.given["work"], (i + t.places[name]) * f.width + k)
+
+    f, s = t.function("fallback", [(POINTER, "work"), (POINTER, "out")])
+    right, x = (Value(f, f.reserve(DOUBLE, 3 * c), POINTER) for c in (m, n))
+    for k in each_lane(f, s):
+        with f.each(m) as i:
+            for j, (name, start) in enumerate((("terms", n), ("psi", 0), ("psi_dot", 0))):
+                f.store(t.lane_number(f, name, k, i + start), right, i * 3 + j)
+        solve(f, s, k, right, 3, t.lane_number(f, "fallback_tol", k, 0), x)
+        with f.each(n) as i:
+            root = t.lane_number(f, "root", k, i)
+            for j, (name, start, sign) in enumerate((("a", "terms", 1.0), ("q", "X q", -1.0), ("v", "X v", -1.0))):
+                part = root * f.load(x, i * 3 + j) * sign
+                put(f, f"fallback {name}", k, i, t.lane_number(f, start, k, i) + part)
+    f, s = t.function("fallback_tangent_part", [(POINTER, "work"), (POINTER, "out")])
+    right, x = (Value(f, f.reserve(DOUBLE, 2 * c), POINTER) for c in (m, n))
+    for k in each_lane(f, s):
+        with f.each(2 * m) as i:
+            f.store(0.0, right, i)
+        for row, column, value in each_entry(f, k):
+            for j, name in enumerate(("X dq", "X dv")):
+                place = row * 2 + j
+                f.store(f.fma(value, t.lane_number(f, name, k, column), f.load(right, place)), right, place)
+        solve(f, s, k, right, 2, f.const(np.sqrt(ROUNDING_PIVOT)), x)
+        with f.each(n) as i:
+            root = t.lane_number(f, "root", k, i)
+            for j, name in enumerate(("dq", "dv")):
+                put(f, f"fallback {name}", k, i, t.lane_number(f, f"X {name}", k, i) - root * f.load(x, i * 2 + j))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.steps import POINTS
 from udkjax.native.tableau import Method
@@ -15,14 +16,16 @@ INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a trajectory's code depends on."""
+    """What a module's code depends on."""
 
-    code: Any  # `ScenePrograms` or `LoopPrograms`
+    code: ScenePrograms
     method: Method
     projected: bool
     breaks: bool
     width: int  # lanes
     vector: int  # numbers that a register holds
+    written_out: bool  # programs are written out, or loops
+    steps: bool = True  # it integrates
     sampled: tuple[int, ...] = ()  # places of the numbers of the scene that have samples
 
 
@@ -79,6 +82,7 @@ LANE_NUMBERS = {  # numbers of each lane, and what they are
     **{f"distance{k}": "the same of the accepted states before" for k in range(POINTS - 1)},
     "tolerance": "what the fastest velocity may err, in its unit",
     "rank": "of D, as the fallback found it",
+    "wanted": "whether a rank-revealing method is asked for",
     "iterating": "whether Newton's method goes on",
     "violated": "the largest violation of Psi at an output, over the row's scale",
     "open": "whether the output is open after its projection",

@@ -14,10 +14,11 @@ ROUNDING = 1e-15  # cosines of angles between rows that are orthogonal but for r
 
 
 def least_norm() -> Function:
-    """`least_norm(D (m, n), b (m), x (n), m, n, tol, rank)`: x = D^+ b, and the rank of D. D and b are turned."""
-    arguments = [(POINTER, "D"), (POINTER, "b"), (POINTER, "x"), (INT, "m"), (INT, "n"), (DOUBLE, "tol"), (POINTER, "rank")]
+    """`least_norm(D (m, n), b (m, c), x (n, c), m, n, c, tol, rank)`: x = D^+ b, and the rank of D. D and b are turned."""
+    sizes = [(INT, "m"), (INT, "n"), (INT, "c")]
+    arguments = [(POINTER, "D"), (POINTER, "b"), (POINTER, "x"), *sizes, (DOUBLE, "tol"), (POINTER, "rank")]
     f = Function(LEAST_NORM, arguments)
-    D, b, x, m, n, tol, rank = (f.given[name] for _, name in arguments)
+    D, b, x, m, n, columns, tol, rank = (f.given[name] for _, name in arguments)
 
     def dot(i: Value, j: Value) -> Value:
         total = f.variable(0.0)
@@ -45,18 +46,21 @@ def least_norm() -> Function:
                 sine = cosine * t
                 with f.each(n) as k:
                     turn(D, i * n + k, j * n + k, cosine, sine)
-                turn(b, i, j, cosine, sine)
+                with f.each(columns) as k:
+                    turn(b, i * columns + k, j * columns + k, cosine, sine)
     longest = f.variable(0.0)
     with f.each(m) as i:
         longest.value = f.max(dot(i, i), longest.value)
-    with f.each(n) as k:
+    with f.each(n * columns) as k:
         f.store(0.0, x, k)
     f.store(0.0, rank)
     with f.each(m) as i:
         square = dot(i, i)
         with f.if_(square > tol * tol * longest.value):
             f.store(f.load(rank) + 1.0, rank)
-            share = f.load(b, i) / square
-            with f.each(n) as k:
-                f.store(f.fma(share, f.load(D, i * n + k), f.load(x, k)), x, k)
+            with f.each(columns) as j:
+                share = f.load(b, i * columns + j) / square
+                with f.each(n) as k:
+                    place = k * columns + j
+                    f.store(f.fma(share, f.load(D, i * n + k), f.load(x, place)), x, place)
     return f

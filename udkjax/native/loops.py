@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from udkjax.expressions.loop_program import ADD, MINIMUM, Address, Kernel, LoopProgram, Reset
+from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, Address, Kernel, LoopProgram, Reset
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.program import Place, Writer, from_memory
 
@@ -12,8 +12,8 @@ from udkjax.native.program import Place, Writer, from_memory
 class LoopWriter:
     """The functions that programs of loops are made of, in one module: every kernel once."""
 
-    def __init__(self, width: int):
-        self.width = width
+    def __init__(self, width: int, cold: bool = False):
+        self.width, self._cold = width, cold
         self.functions: list[Function] = []
         self.globals: list[str] = []
         self._kernels: dict[tuple[Kernel, int, int], str] = {}
@@ -22,12 +22,17 @@ class LoopWriter:
     def write(
         self, program: LoopProgram, name: str, pointers: Sequence[str], at: Mapping[str, Place], width: int | None = None
     ) -> None:
-        """A function of some pointers; `at` says from where on each array lies: which pointer, and the how manieth number.
+        """Write a program as a function of some pointers.
 
-        `width` is the number of lanes, if it is another than that of the others.
+        Args:
+            program: The program.
+            name: The function's name.
+            pointers: The names of its arguments.
+            at: Where each array begins: which pointer, and how many numbers behind it.
+            width: The number of lanes, if it is another than that of the others.
         """
         width = width or self.width
-        f = Function(name, [(POINTER, x) for x in pointers], width)
+        f = Function(name, [(POINTER, x) for x in pointers], width, cold=self._cold)
 
         def address(array: str) -> Value:
             pointer, place = at[array]
@@ -52,7 +57,7 @@ class LoopWriter:
 
     def _write_result(self, kernel: Kernel, columns: int, width: int, name: str) -> Function:
         """`name(arrays..., table, count)`, of a table with so many columns."""
-        f = Function(name, [*((POINTER, a) for a in kernel.arrays), (POINTER, "table"), (INT, "count")], width)
+        f = Function(name, [*((POINTER, a) for a in kernel.arrays), (POINTER, "table"), (INT, "count")], width, cold=self._cold)
         f.noinline = True  # copies of kernels in each of their programs would take as often as long to compile
         with f.each(f.given["count"]) as i:
             row = f.at(f.given["table"], i * columns, "i32")
@@ -75,8 +80,9 @@ class LoopWriter:
                 new = f.like(value, DOUBLE, width)
                 if slot.update == ADD:
                     new = f.load(*address(slot), width) + new
-                elif slot.update == MINIMUM:  # what is not a number stays
-                    new = f.intrinsic("minimum", f.load(*address(slot), width), new)
+                elif slot.update in (MAXIMUM, ALL):  # what is not a number stays
+                    name = "maximum" if slot.update == MAXIMUM else "minimum"
+                    new = f.intrinsic(name, f.load(*address(slot), width), new)
                 f.store(new, *address(slot), width)
         return f
 

@@ -1,9 +1,7 @@
 """Projection: Newton's method that returns positions and velocities to the constraint manifold."""
 
 from collections.abc import Callable
-from typing import Any
 
-from udkjax.equations.scene_programs import EliminationPrograms
 from udkjax.native.ir import DOUBLE, INT, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.module import Module
@@ -43,16 +41,15 @@ def take_newton_step(t: Module, f: Function, active: Value) -> Value:
     return t.largest(f, change)
 
 
-def with_threshold(t: Module, f: Function, s: Lane, threshold: Value, do: Any):
-    """What is done with another threshold of pivots."""
-    if t.drop is None:
+def with_threshold(f: Function, place: int | None, threshold: Value, do: Callable[[], None]):
+    """Do something with another threshold of pivots, which lies at a place; at none where no pivot is looked at."""
+    if place is None:
         do()
         return
-    place = (t.places["constants"] + t.drop) * f.width
-    before = f.load(f.given["work"], place, f.width)
-    f.store(threshold, f.given["work"], place, f.width)
+    before = f.load(f.given["work"], place * f.width, f.width)
+    f.store(threshold, f.given["work"], place * f.width, f.width)
     do()
-    f.store(before, f.given["work"], place, f.width)
+    f.store(before, f.given["work"], place * f.width, f.width)
 
 
 def velocity_tolerance(t: Module, f: Function, s: Lane, name: str) -> Value:
@@ -70,10 +67,6 @@ def project_output(t: Module, f: Function, s: Lane, which: str):
         t.invoke(f, "newton_v_and_psi")
 
     def project():
-        if not isinstance(t.code, EliminationPrograms):
-            iterate(mask)
-            s.violated = largest_violation(t, f)
-            return
         t.invoke(f, "project")
         s.violated = largest_violation(t, f)
         far = mask & ~(take_newton_step(t, f, mask) <= SINGLE_STEP_TOL)
@@ -91,7 +84,8 @@ def project_output(t: Module, f: Function, s: Lane, which: str):
                 s.where(s.open > 0.5, violated=largest_violation(t, f))
 
     if t.plan.projected:
-        with_threshold(t, f, s, f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width), project) if t.falls_back else project()
+        threshold = f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width)
+        with_threshold(f, t.drop_tol_place if t.falls_back else None, threshold, project)
         return
     t.invoke(f, "psi")
     with f.each(t.rowcount) as r:

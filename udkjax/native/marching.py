@@ -6,16 +6,14 @@ on is counted: as long as each position is closed to rounding, lies near its pre
 one before, and no row is near dependence. From there on, the caller goes on by singular values.
 """
 
-from typing import Any
-
 import numpy as np
 
-from udkjax.equations.kinematic_programs import KinematicPrograms
+from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
 from udkjax.native.members import write_begin, write_run
+from udkjax.native.module import Module
 from udkjax.native.tableau import EULER
-from udkjax.native.trajectory import Trajectory
 
 CORRECTIONS = 2
 STRAIGHT = 0.95  # cosine of the angle by which the tangent may turn in a step
@@ -24,29 +22,26 @@ ROUNDING = 32.0  # units of rounding of the coordinates: what closed positions l
 DISTANT = 1e-2  # from dependence: nearer, elimination loses more than half of the digits of q''
 
 
-class Marching(Trajectory):
+class Marching(Module):
     """The text of a module whose `run` follows members from their positions q at the value ts[0] over all values ts."""
 
     results = ("qs", "dqs", "ddqs", "trusted")
 
-    def __init__(self, code: KinematicPrograms, width: int, vector: int):
-        super().__init__(Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector))
-        for name in ("M dq", "M ddq", "M dq0", "M ddq0", "M dddq", "M p"):
+    def __init__(self, code: ScenePrograms, width: int, vector: int):
+        super().__init__(Plan(code, EULER, False, False, width, vector, code.is_small, steps=False))
+        for name in ("M dq0", "M ddq0", "M dddq", "M p"):
             self.places.add(name, self.n)
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
         self.write_programs()
-        counts = {"M dq": self.n, "M ddq": self.n, "psi": self.m, "distance": 1}
-        outputs = [place for name, count in counts.items() for place in self.work_places(name, count)]
-        self.write_program(self.code.value_derivatives, "value_derivatives", ("work", "out"), self.state_places(), outputs)
         write_begin(self)
         self._march()
         write_run(self)
         return self.module_text()
 
-    def program_names(self, code: Any) -> dict[str, Any]:
-        return {"newton_q": code.newton_q}
+    def program_names(self) -> list[str]:
+        return ["newton_q", "value_derivatives"]
 
     def _march(self):
         """`march(work, call)`: the members in all lanes, over all values."""
@@ -67,7 +62,7 @@ class Marching(Trajectory):
         trusted, good, before = f.variable(0.0), f.variable(1.0), f.variable(s.start)
         with f.each(self.n) as i:
             put("X q", i, get("P3 q", i))
-            for name in ("M dq", "M ddq", "M dddq"):
+            for name in ("O dq", "O dv", "M dddq"):
                 put(name, i, wide(0.0))
         with f.each(times) as k:
             with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
@@ -75,7 +70,7 @@ class Marching(Trajectory):
             now = get("X t", f.const(0, INT))
             h = now - before.value
             with f.each(self.n) as i:
-                first, second = get("M dq", i), get("M ddq", i)
+                first, second = get("O dq", i), get("O dv", i)
                 bend = f.fma(h * (1 / 6), get("M dddq", i), second * 0.5)
                 ahead = f.fma(f.fma(bend, h, first), h, get("X q", i))
                 for name, x in (("M dq0", first), ("M ddq0", second), ("X q", ahead), ("M p", ahead)):
@@ -87,17 +82,17 @@ class Marching(Trajectory):
             self.invoke(f, "value_derivatives")
             off, largest = f.variable(0.0), f.variable(1.0)
             along, one, other = f.variable(0.0), f.variable(0.0), f.variable(0.0)
-            noinline = h.is_not(0.0)
-            per_h = f.select(noinline, wide(1.0) / f.select(noinline, h, wide(1.0)), wide(0.0))
+            moves_on = h.is_not(0.0)
+            per_h = f.select(moves_on, wide(1.0) / f.select(moves_on, h, wide(1.0)), wide(0.0))
             with f.each(self.n) as i:
                 unit, q = get("inverse unit", i), get("X q", i)
                 largest.value = f.max(f.abs(q) * unit, largest.value)
                 off.value = f.max(f.abs(q - get("M p", i)) * unit, off.value)
-                old, new = get("M dq0", i) * unit, get("M dq", i) * unit
+                old, new = get("M dq0", i) * unit, get("O dq", i) * unit
                 along.value = f.fma(old, new, along.value)
                 one.value = f.fma(old, old, one.value)
                 other.value = f.fma(new, new, other.value)
-                put("M dddq", i, (get("M ddq", i) - get("M ddq0", i)) * per_h)
+                put("M dddq", i, (get("O dv", i) - get("M ddq0", i)) * per_h)
             violated = f.variable(0.0)
             with f.each(self.m) as i:
                 x = f.abs(get("psi", i)) / get("rows", i)
@@ -117,7 +112,7 @@ class Marching(Trajectory):
             before.value = now
             with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
                 row = self.to_int(f, f.lane(s.member, lane)) * times + k
-                for name, x in (("qs", "X q"), ("dqs", "M dq"), ("ddqs", "M ddq")):
+                for name, x in (("qs", "X q"), ("dqs", "O dq"), ("ddqs", "O dv")):
                     self.copy_lane(f, f.at(f.load(call, self.call_fields.index(name), base=POINTER), row * self.n), 0, x, lane)
         with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
             to = f.load(call, self.call_fields.index("trusted"), base=POINTER)

@@ -84,7 +84,7 @@ def write_finish(t: Module):
             t.invoke(f, "equation_terms")
             total = f.variable(0.0)
             with f.each(t.code.term_count) as i:
-                x = f.load(work, i * width + p["R"] * width, width)
+                x = f.load(work, i * width + p["terms"] * width, width)
                 total.value = f.fma(x, 0.0, total.value)
             s.where(stopped & total.value.is_not(0.0), code=NOT_FINITE)
     # The last state, once more to the manifold; and then the first, which is taken as it is.

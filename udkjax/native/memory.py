@@ -92,6 +92,14 @@ class Memory:
                 total = a * float(weight) if total is None else f.fma(a, float(weight), total)
         return total
 
+    def copy(self, f: Function, source: str, to: str, mask: Value | None = None):
+        """An array of coordinates, or that of some lanes, in another one, or at the pointer `out`."""
+        pointer, start = f.given["out" if to == "out" else "work"], 0 if to == "out" else self.start(to, "work")
+        with f.each(self.rowcount) as r:
+            place, new = r * self.plan.vector + start, self.vector(f, source, r)
+            old = f.load(pointer, place, self.plan.vector)
+            f.store(new if mask is None else f.select(mask, new, old), pointer, place, self.plan.vector)
+
     def copy_point(self, f: Function, mask: Value, source: str | tuple[str, ...], to: str):
         sources = source if isinstance(source, tuple) else [f"{source} {x}" for x in "qva"]
         with f.each(self.rowcount) as r:

@@ -1,11 +1,8 @@
 """One module of machine code: its functions, and what the memory of a run has room for."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
-from udkjax.equations.loop_programs import LoopPrograms
-from udkjax.equations.scene_programs import EliminationPrograms, ScenePrograms
-from udkjax.expressions import ScalarProgram
+from udkjax.equations.written_out import WrittenOut, WrittenOutProgram
 from udkjax.native.ir import POINTER, Function, Value
 from udkjax.native.layout import LANE_NUMBERS, Lane, Layout, Plan
 from udkjax.native.loops import LoopWriter
@@ -18,25 +15,40 @@ COLD = (
     "leave",
     "finish_members",
     "begin",
+    "rows_and_loads",
+    "fallback",
+    "fallback_tangent_part",
     "finish_by_fallback",
     "close_output",
     "accelerate_by_fallback",
     "equation_terms",
-    "psi_dot",
     "newton_v_and_psi",
 )
 
 
 class Module(Memory):
-    """The text of one module of machine code: its functions."""
+    """The text of one module of machine code: its functions.
 
-    def __init__(self, plan: Plan):
+    Args:
+        plan: What the code depends on.
+        differentiated: Of which differentiable programs of the scene the module takes derivatives.
+        active: Of the numbers of the scene: along which there are derivatives.
+        reverse: Whether these are of reverse mode.
+    """
+
+    def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = (), reverse: bool = False):
         self.plan, self.code, self.method = plan, plan.code, plan.method
         code, n, m = plan.code, plan.code.coordinate_count, plan.code.row_count
         self.n, self.m = n, m
-        self.constants = len(code.constants)
         if plan.sampled:
             self.inputs = ("samples", *self.inputs)
+        self.falls_back = plan.steps and code.policy.reports and m > 0  # pivots may be too small to be trusted
+        self.pieces = code.piece_count if plan.breaks else 0
+        self.programs = {name: getattr(code, name) for name in self.program_names()}
+        self.written_out = WrittenOut(code, list(self.programs), differentiated, active, reverse) if plan.written_out else None
+        self.constants = len(self.written_out.constants if self.written_out else code.constants)
+        self.moving = range(self.constants if any(active) else 0) if self.written_out is None else self.written_out.moving
+        """The constants, by their numbers in the layout of the scene, along which there are derivatives."""
         p = self.places = Layout(plan.width, plan.vector)
         for name in LANE_NUMBERS:
             p.add(name)
@@ -53,129 +65,105 @@ class Module(Memory):
             p.add(f"N{k}", n)
         p.add("rows", m)
         p.add("psi", m)
-        p.add("R", code.term_count)
-        self.pieces = len(code.equations.pieces) if isinstance(code, ScenePrograms) and plan.breaks else 0
-        for name in ("G", "G0"):
+        p.add("terms", code.term_count)
+        for name in ("pieces", "pieces before"):
             p.add(name, self.pieces)
         if plan.sampled:
-            p.add("numbers", -(-self.number_count // plan.width))
-        if isinstance(code, LoopPrograms):
-            for name, count in code.scratch.items():
-                p.add(name, count)
-            if self.falls_back:
-                for name, count in code.with_all_rows.scratch.items():
-                    p.add(f"fallback {name}", count)
-                for name in ("fallback v", "fallback a"):
-                    p.add(name, n)
+            p.add("numbers", -(-code.number_count // plan.width))
+        if not self.written_out:
+            self._add_arrays("", code.scratch)
+        if self.falls_back:
+            self._add_arrays("fallback ", dict.fromkeys(("a", "q", "v", "dq", "dv"), n))
+            if self.written_out:
+                self._add_arrays("", {"psi_q": code.scratch["psi_q"], "psi_dot": m, "root": n})
+            else:
+                self._add_arrays("fallback ", code.with_all_rows.scratch | {"constants": len(code.constants)})
         self.tangents = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
-        self.loops = LoopWriter(plan.width)
+        self.loops = LoopWriter(plan.width, cold=plan.written_out)
         self.stage_accelerations = ["P3 a", *(f"A{i}" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
-        self.drop = code.drop_tol_index
+
+    @property
+    def drop_tol_place(self) -> int | None:
+        """Where the threshold of pivots lies, if one is looked at."""
+        place = (self.written_out or self.code).drop_tol_index
+        return None if place is None else self.places["constants"] + place
+
+    def _add_arrays(self, prefix: str, sizes: Mapping[str, int]):
+        for name, count in sizes.items():
+            self.places.add(prefix + name, count)
 
     def module_text(self) -> str:
         functions = [*self.functions, *self.loops.functions]
         declared = sorted(set().union(*(f.declared for f in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
         return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
 
-    @property
-    def number_count(self) -> int:
-        """How many numbers the prologue takes."""
-        return self.code.prologue_input_count if isinstance(self.code, LoopPrograms) else len(self.code.prologue.inputs)
+    # --- programs
+
+    def program_names(self) -> list[str]:
+        """The names of the scene's programs that the module calls."""
+        names = ["accelerations", "equation_terms", "psi"]
+        if self.pieces:
+            names.append("pieces")
+        if self.plan.projected:
+            of_step = ["project_and_accelerate", "tangent_part"] if self.method.ends else ["end_of_step"]
+            names += ["newton_q", *of_step, "newton_v_and_psi", "project"]
+        if self.falls_back and self.plan.written_out:
+            names.append("rows_and_loads")
+        return names
 
     @property
-    def falls_back(self) -> bool:
-        """Whether pivots may be too small to be trusted, and steps are taken again by a rank-revealing method."""
-        reports = isinstance(self.code, EliminationPrograms | LoopPrograms) and self.code.policy.reports
-        return reports and self.m > 0
+    def arrays(self) -> dict[str, Place]:
+        """Where the arrays of the scene's programs lie."""
+        named = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
+        named |= {"dq1": "O dq", "dv1": "O dv"} | {
+            x: x for x in ("constants", "psi", "terms", "pieces", "safe", "distance", "rank")
+        }
+        if not self.written_out:
+            named |= {x: x for x in self.code.scratch}
+        elif self.falls_back:
+            named |= {x: x for x in ("psi_q", "psi_dot", "root")}
+        return {x: ("work", self.places[place]) for x, place in named.items()}
 
     def write_programs(self):
-        code, n = self.code, self.n
-        if isinstance(code, LoopPrograms):
-            self.write_loop_programs(code)
-            return
-        state, changes, safe = (
-            self.state_places(),
-            [*self.work_places("X dq", n), *self.work_places("X dv", n)],
-            self.work_places("safe", 1),
-        )
-        outputs = {
-            "accelerations": [*consecutive("out", n), *safe],
-            "newton_q": [*self.work_places("C", n), *safe],
-            "project_and_accelerate": [*self.work_places("O v", n), *self.work_places("O a", n), *safe],
-            "end_of_step": [
-                *(x for name in ("O v", "O a", "O dq", "O dv") for x in self.work_places(name, n)),
-                *self.work_places("distance", 1),
-                *safe,
-            ],
-            "tangent_part": [*self.work_places("O dq", n), *self.work_places("O dv", n), *self.work_places("distance", 1)],
-            "project": [*self.work_places("C", n), *self.work_places("O v", n), *self.work_places("psi", self.m)],
-            "newton_v_and_psi": [*self.work_places("O v", n), *self.work_places("psi", self.m)],
-            "psi": self.work_places("psi", self.m),
-            "equation_terms": self.work_places("R", code.term_count),
-            "psi_dot": self.work_places("psi", self.m),
-            "pieces": self.work_places("G", self.pieces),
-        }
-        for name, program in self.program_names(code).items():
-            inputs = [*state, *changes] if name in ("tangent_part", "end_of_step") else state
-            self.write_program(program, name, ("work", "out"), inputs, outputs[name])
-        inputs = consecutive("work", len(code.prologue.inputs))
-        self.functions.append(write(code.prologue, "prologue", 1, ("work", "out"), inputs, consecutive("out", self.constants)))
+        for name in self.programs:
+            out = {"a": ("out", 0)} if name == "accelerations" else {}
+            self.write_program(name, self.arrays | out)
+        self.write_prologue("prologue", self.written_out)
 
-    def write_loop_programs(self, code: LoopPrograms):
-        found = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
-        found |= {"dq1": "O dq", "dv1": "O dv", "terms": "R"}
-        results = (*found, "constants", "psi", "safe", "distance", "rank")
-        at = {x: ("work", self.places[found.get(x, x)]) for x in (*results, *code.scratch)}
-        for name, program in self.program_names(code).items():
-            self.loops.write(program, name, ("work", "out"), at | ({"a": ("out", 0)} if name == "accelerations" else {}))
-        if self.falls_back:
-            every = code.with_all_rows
-            places = {x: f"fallback {x}" for x in every.scratch}
-            places |= {"v1": "fallback v", "a": "fallback a", "safe": "rank", "distance": "rank"}
-            fallback = at | {x: ("work", self.places[place]) for x, place in places.items()}
-            for name, program in {
-                "accelerations": every.accelerations,
-                "newton_q": every.newton_q,
-                "project_and_accelerate": every.project_and_accelerate,
-                "tangent_part": every.tangent_part,
-            }.items():
-                self.loops.write(program, f"fallback_{name}", ("work", "out"), fallback)
-        at = {"numbers": ("work", 0), "constants": ("out", 0)}
-        self.loops.write(code.prologue, "prologue", ("work", "out"), at, width=1)
+    def write_program(self, name: str, at: Mapping[str, Place]):
+        """Write one of the scene's programs, with its arrays where `at` says, as a function of `work` and `out`."""
+        if self.written_out:
+            self.write_scalars(self.written_out.program(name), name, ("work", "out"), at)
+        else:
+            self.loops.write(self.programs[name], name, ("work", "out"), at)
 
-    def program_names(self, code: Any) -> dict[str, Any]:
-        """The programs that it calls, by the names of their functions."""
-        wanted = {"accelerations": code.accelerations, "equation_terms": code.equation_terms, "psi": code.psi}
-        if self.pieces:
-            wanted["pieces"] = code.pieces
-        if self.plan.projected:
-            wanted["newton_q"] = code.newton_q
-            if self.method.ends:
-                wanted |= {"project_and_accelerate": code.project_and_accelerate, "tangent_part": code.tangent_part}
-            else:
-                wanted["end_of_step"] = code.end_of_step
-            wanted["newton_v_and_psi"] = code.newton_v_and_psi
-            if isinstance(code, EliminationPrograms):
-                wanted["project"] = code.project
-        if self.falls_back and isinstance(code, ScenePrograms):
-            wanted["psi_dot"] = code.psi_dot
-        return wanted
-
-    def write_program(
-        self, program: ScalarProgram, name: str, pointers: Sequence[str], inputs: list[Place], outputs: list[Place]
+    def write_scalars(
+        self, program: WrittenOutProgram, name: str, pointers: Sequence[str], at: Mapping[str, Place], width: int | None = None
     ):
+        """Write a program without loops."""
+
+        def find(places: Sequence[Place]) -> list[Place]:
+            return [(at[x][0], at[x][1] + k) if x in at else (pointers[0], 0) for x, k in places]
+
         lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers}
-        self.functions.append(write(program, name, self.plan.width, pointers, inputs, outputs, name in COLD, lanes))
+        inputs, outputs = find(program.inputs), find(program.outputs)
+        self.functions.append(
+            write(program.program, name, width or self.plan.width, pointers, inputs, outputs, name in COLD, lanes)
+        )
+
+    def write_prologue(self, name: str, written_out: WrittenOut | None):
+        """Write `name(numbers, constants)`, of one member."""
+        if written_out:
+            inputs, outputs = consecutive("numbers", self.code.number_count), consecutive("constants", self.constants)
+            self.functions.append(write(written_out.prologue, name, 1, ("numbers", "constants"), inputs, outputs))
+        else:
+            at = {"numbers": ("numbers", 0), "constants": ("constants", 0)}
+            self.loops.write(self.code.prologue, name, ("numbers", "constants"), at, width=1)
 
     def work_places(self, name: str, count: int) -> list[Place]:
         return [("work", self.places[name] + k) for k in range(count)]
-
-    def state_places(self) -> list[Place]:
-        """The constants, and t, q and v in X."""
-        counts = {"constants": self.constants, "X t": 1, "X q": self.n, "X v": self.n}
-        return [place for name, count in counts.items() for place in self.work_places(name, count)]
 
     def function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
         f = Function(name, arguments, self.plan.width, cold=name in COLD)
@@ -206,6 +194,10 @@ class Module(Memory):
     def goes_on(self, f: Function, s: Lane) -> Value:
         """Whether there is something to do in the lanes."""
         return f.any_of(s.active > 0.5)
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        raise NotImplementedError
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
         """One step of all lanes, and what becomes of those that are done."""

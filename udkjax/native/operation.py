@@ -17,15 +17,15 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from udkjax.equations.loop_programs import LoopPrograms
+from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native import machine
 from udkjax.native.backpropagation import Reverse
 from udkjax.native.closing import Closing
-from udkjax.native.closing_by_loops import ClosingByLoops, ForwardByLoops, ReverseByLoops
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
 from udkjax.native.ffi import handler
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS, Plan
 from udkjax.native.marching import Marching
+from udkjax.native.module import Module
 from udkjax.native.program import UnsupportedError
 from udkjax.native.record import STORED, record_length
 from udkjax.native.tableau import Method
@@ -38,7 +38,7 @@ FEW = 2  # members up to which one follows another: eight lanes take as long as 
 class Kind(NamedTuple):
     """Which trajectory: all that its code depends on but the number of lanes."""
 
-    code: Any  # `ScenePrograms` or `LoopPrograms`
+    code: ScenePrograms
     method: "Tableau"
     projected: bool
     breaks: bool
@@ -63,24 +63,25 @@ class Tableau:
 
 
 CLOSING: dict[str, Any] = {"closing forward": ClosingForward, "closing reverse": ClosingReverse}
-CLOSING_BY_LOOPS: dict[str, Any] = {"closing forward": ForwardByLoops, "closing reverse": ReverseByLoops}
 
 
 @lru_cache(maxsize=256)
-def generate(kind: Kind, width: int, several: bool) -> Trajectory:
+def generate(kind: Kind, width: int, several: bool) -> Module:
     """A kind of trajectory in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it.
 
     `several`: whether there may be more than one direction of a single member, which then are side by side.
     """
-    loops = isinstance(kind.code, LoopPrograms)
     if kind.mode == "marching":
-        trajectory: Trajectory = Marching(kind.code, width, machine.lanes())
+        trajectory: Module = Marching(kind.code, width, machine.lanes())
     elif kind.mode == "closing":
-        trajectory = (ClosingByLoops if loops else Closing)(kind.code, machine.lanes())
+        trajectory = Closing(kind.code, machine.lanes())
     elif kind.mode in CLOSING:
-        trajectory = (CLOSING_BY_LOOPS if loops else CLOSING)[kind.mode](kind.code, kind.active, machine.lanes())
+        trajectory = CLOSING[kind.mode](kind.code, machine.lanes(), kind.active)
     else:
-        plan = Plan(kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes(), kind.sampled)
+        written_out = kind.code.is_small
+        plan = Plan(
+            kind.code, kind.method.method, kind.projected, kind.breaks, width, machine.lanes(), written_out, sampled=kind.sampled
+        )
         if kind.mode == "forward":
             assert kind.active is not None
             trajectory = Forward(plan, kind.active, machine.lanes() if several else width)
@@ -175,17 +176,15 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
         if kind.mode == "closing forward":
             shapes += [(members, inputs[-1].shape[1], 2 * n)]
         if kind.mode == "closing reverse":
-            assert kind.active is not None
-            shapes += [(members, sum(kind.active)), (members, n), (members, n)]
+            shapes += [(members, kind.code.number_count), (members, n), (members, n)]
         return shapes
     shapes = [(members, times, n), (members, times, n), (members, times), (members, len(INFO) + 2 * n)]
     if kind.mode == "forward":
         directions = inputs[-1].shape[1]
         shapes += [(members, directions, times, 2 * n), (members, directions, 2 * n)]
     if kind.mode == "reverse":
-        assert kind.active is not None
         is_first = not inputs[-1].shape[0]  # without cotangents
-        shapes += [(members, sum(kind.active)), (members, n), (members, n)]
+        shapes += [(members, kind.code.number_count), (members, n), (members, n)]
         if kind.sampled:
             rows = 0 if is_first else inputs[INPUTS.index("breaks")].shape[1] + 1
             shapes.append((members, rows, len(kind.sampled)))
@@ -195,7 +194,7 @@ def shapes_of(inputs: Sequence[Any], kind: Kind, times: int) -> list[tuple[int, 
 
 def _select_code(inputs: Sequence[Any], kind: Kind) -> Compiled:
     few = kind.mode.startswith("closing") or max(x.shape[0] for x in inputs) <= FEW
-    several = kind.mode == "forward" and few and inputs[-1].shape[1] > 1 and not isinstance(kind.code, LoopPrograms)
+    several = kind.mode == "forward" and few and inputs[-1].shape[1] > 1 and kind.code.is_small
     return machine_code(kind, 1 if few else machine.lanes(), several)
 
 

@@ -28,7 +28,7 @@ def write_leave(t: Module):
     def moved() -> Value:
         found = f.variable(f.const(False, BOOL, f.width), BOOL)
         with f.each(t.pieces) as k:
-            one, other = (f.load(f.given["work"], k * f.width + t.start(x, "work"), f.width) for x in ("G", "G0"))
+            one, other = (f.load(f.given["work"], k * f.width + t.start(x, "work"), f.width) for x in ("pieces", "pieces before"))
             found.value = found.value | one.is_not(other)
         return found.value
 
@@ -37,9 +37,9 @@ def write_leave(t: Module):
     find_pieces(s.T3, lambda r: (t.vector(f, "P3 q", r), t.vector(f, "P3 v", r)))
     with f.each(t.pieces) as k:
         f.store(
-            f.load(f.given["work"], k * f.width + t.start("G", "work"), f.width),
+            f.load(f.given["work"], k * f.width + t.start("pieces", "work"), f.width),
             f.given["work"],
-            k * f.width + t.start("G0", "work"),
+            k * f.width + t.start("pieces before", "work"),
             f.width,
         )
     find_pieces(s.t1, lambda r: (t.vector(f, "C", r), t.vector(f, "O v", r)))

@@ -53,7 +53,8 @@ def write_attempt(t: Module):
             s.where(unsafe, ok=0.0)
         if method.ends:
             estimate_errors(t, f, s, "O a", "X dq", "X dv")
-            with_threshold(t, f, s, f.const(ROUNDING_PIVOT, DOUBLE, f.width), lambda: t.invoke(f, "tangent_part"))
+            threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
+            with_threshold(f, t.drop_tol_place, threshold, lambda: t.invoke(f, "tangent_part"))
         if t.falls_back:
             again = (s.stepping > 0.5) & (s.fallback > 0.5)
             with f.if_(f.any_of(again)):

@@ -49,6 +49,13 @@ def write_enter(t: Module):
     f.call("prologue", numbers, constants)
     with f.each(t.constants) as i:
         f.store(f.load(constants, i), work, i * f.width + place("constants"))
+    if t.falls_back and not t.written_out:
+        count = len(t.code.constants)
+        all_constants, tol = Value(f, f.reserve(DOUBLE, count), POINTER), f.load(work, place("fallback_tol"))
+        f.call("fallback_prologue", numbers, all_constants)
+        f.store(tol * tol, all_constants, t.code.drop_tol_index)
+        with f.each(count) as i:
+            f.store(f.load(all_constants, i), work, i * f.width + place("fallback constants"))
     t.begin_row(f, lane, member, numbers, constants)
 
 
@@ -56,7 +63,7 @@ def numbers_of_row(t: Module, f: Function, member: Value, row: Value) -> Value:
     """The address of a copy of a member's numbers, with a row of samples in."""
     given = t.member_address(f, f.given["call"], "numbers", member)
     copy = f.at(f.given["work"], t.places["numbers"] * f.width)
-    with f.each(t.number_count) as i:
+    with f.each(t.code.number_count) as i:
         f.store(f.load(given, i), copy, i)
     samples = row_address(t, f, "samples", member, row)
     for k, place in enumerate(t.plan.sampled):

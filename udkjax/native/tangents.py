@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from udkjax.native.dense_output import write_between, write_differences
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Layout, Plan
-from udkjax.native.linearization import Linearized, linearization
-from udkjax.native.prologue import FORWARD, active_constants, write_prologue_forward
+from udkjax.native.linearization import Linearization
+from udkjax.native.prologue import FORWARD, write_prologue_derivative
 from udkjax.native.samples import row_address
 from udkjax.native.steps import POINTS
 from udkjax.native.trajectory import Trajectory
@@ -25,17 +25,19 @@ from udkjax.native.trajectory import Trajectory
 class Differentiated(Trajectory):
     """What both modes have in common: programs of derivatives, and memory for what they know of a state.
 
-    `active` says which numbers of the scene have derivatives, and so which constants of the code; positions and velocities do.
+    `active` says which numbers of the scene have derivatives; positions and velocities do.
     """
 
+    reverse = False  # mode
+
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
-        super().__init__(plan)
-        self.active_numbers, self.active = active, active_constants(self, active)
-        self.count, self.last = sum(self.active), plan.method.stages
-        # Of each active number that has samples: its column there, and its place among the active numbers.
-        self.active_samples = {k: sum(active[:place]) for k, place in enumerate(plan.sampled) if active[place]}
-        self.of_accelerations = linearization(self, "accelerations")
-        self.of_projection = linearization(self, "projection") if plan.projected else None
+        differentiated = ("accelerations", "projection") if plan.projected else ("accelerations",)
+        super().__init__(plan, differentiated, active, self.reverse)
+        self.active, self.count, self.last = active, len(self.moving), plan.method.stages
+        # Of each active number that has samples: its column there, and its place among the numbers.
+        self.active_samples = {k: place for k, place in enumerate(plan.sampled) if active[place]}
+        self.of_accelerations = Linearization(self, "accelerations")
+        self.of_projection = Linearization(self, "projection") if plan.projected else None
         for i in range(1, self.last + 1):  # the last: of the end
             self.places.add(f"K{i}", self.of_accelerations.stored)
         if self.of_projection:
@@ -51,14 +53,14 @@ class Differentiated(Trajectory):
             each.evaluation()
 
     @property
-    def _linearizations(self) -> list[Linearized]:
+    def _linearizations(self) -> list[Linearization]:
         """What has derivatives."""
         return [x for x in (self.of_accelerations, self.of_projection) if x]
 
     def _evaluate_end(self, f: Function):
         """What is known of the state in X, that of a projection."""
         if self.of_projection:
-            f.call("evaluation_projection", f.given["work"], self.address(f, "KP"))
+            f.call("evaluation_projection", f.given["work"], f.given["work"], self.address(f, "KP"))
 
 
 class Forward(Differentiated):
@@ -94,7 +96,7 @@ class Forward(Differentiated):
         for each in self._linearizations:
             each.forward()
         if self.count:
-            write_prologue_forward(self, self.active_numbers, self.active)
+            write_prologue_derivative(self, self.active, False)
         w = self.tangents
         write_differences(self, "tangent_differences", ("tangent", w))
         write_between(self, "tangent_between", ("tangent", w))
@@ -217,8 +219,8 @@ class Forward(Differentiated):
                 f.store(f.load(dconstants, i), f.given["tangent"], (i + self.tangents["constants"]) * self.tangents.width + place)
 
     def _changes_of_numbers(self, f: Function, member: Value, direction: Value) -> Value:
-        """The address of the changes of a member's active numbers along a direction; of samples, those of their row."""
-        call, count = f.given["call"], sum(self.active_numbers)
+        """The address of the changes of a member's numbers along a direction; of samples, those of their row."""
+        call, count = f.given["call"], self.code.number_count
         given = f.at(self.member_address(f, call, "dnumbers", member), direction * count)
         places = self.active_samples
         if not places:

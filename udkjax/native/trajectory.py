@@ -10,7 +10,7 @@ cost no evaluation), and are returned to the manifold, too. Where the motion is 
 
 W members run side by side in the lanes of vectors, each with a time, a step and a result of its own. A lane whose member is done
 takes the next one. Where elimination meets a pivot that it must not trust, a step is taken a little shorter; where that does not
-help it is taken again by a fallback: a rank-revealing method on all rows (least_norm.py), lane by lane.
+help it is taken again by a fallback: elimination of all rows, without those that depend on others (fallback.py).
 
 The functions of one module, all of them on one piece of memory (`Layout`): `run` takes members and calls `attempt` (one step),
 `decide` (whether it counts, and the next), `outputs` (states between steps).
@@ -18,14 +18,12 @@ The functions of one module, all of them on one piece of memory (`Layout`): `run
 
 from collections.abc import Callable
 
-from udkjax.equations.loop_programs import LoopPrograms
 from udkjax.native.breakpoints import aim
 from udkjax.native.controller import write_decide
 from udkjax.native.dense_output import write_between, write_differences, write_outputs
-from udkjax.native.fallback import write_fallback, write_fallback_by_loops, write_solve
+from udkjax.native.fallback import write_fallback
 from udkjax.native.ir import DOUBLE, Function
 from udkjax.native.layout import Lane
-from udkjax.native.least_norm import least_norm
 from udkjax.native.members import write_begin, write_finish, write_run
 from udkjax.native.module import Module
 from udkjax.native.pieces import write_leave
@@ -48,12 +46,7 @@ class Trajectory(Module):
         write_between(self)
         write_outputs(self)
         if self.falls_back:
-            if isinstance(self.code, LoopPrograms):
-                write_fallback_by_loops(self)
-            else:
-                self.functions.append(least_norm())
-                write_solve(self)
-                write_fallback(self)
+            write_fallback(self)
         if self.plan.breaks:
             write_next_breakpoint(self)
         write_begin(self)

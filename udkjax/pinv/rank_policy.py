@@ -25,7 +25,7 @@ class RankPolicy(Enum):
 
     FALL_BACK = "fall back"
     """Leave out the rows whose pivots do not exceed `drop_tol`, and report whether all exceed `safe_tol`: what the rank-revealing
-    method that a refused step falls back on does, written as elimination. Derivatives and large scenes take it."""
+    method that a refused step falls back on does, written as elimination. Derivatives take it."""
 
     @property
     def drops(self) -> bool:

@@ -1,19 +1,29 @@
-"""Elimination of D D^T of a large scene by loops: block by block, in an order of least fill that is chosen once.
+"""Elimination of Psi_q M^(-1) Psi_q^T by loops: block by block, in an order of least fill that is chosen once.
 
-A diagonal block of D D^T belongs to a constraint, another one to two constraints that hold the same body. A front is a block that
+A diagonal block of it belongs to a constraint, another one to two constraints that hold the same body. A front is a block that
 is eliminated, with the later blocks that it meets: fronts of the same sizes are eliminated by the same kernel. A row whose pivot
-does not exceed `drop_tol` times its diagonal entry of D D^T is left out, with zero for the reciprocal of its pivot.
+does not exceed `drop_tol` times its diagonal entry is left out, with zero for the reciprocal of its pivot.
+
 """
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
 
 import numpy as np
 
-from udkjax.equations.loop_layout import DROP_TOL, ENTRIES, RIGHT, SAFE_TOL, ConstraintGroup, arrays_of_solve
-from udkjax.equations.loop_terms import LoopTerms, Parts, dot
+from udkjax.equations.scene_layout import (
+    BODIES,
+    BODY_CONSTANTS,
+    DROP_TOL,
+    ENTRIES,
+    RIGHT,
+    SAFE_TOL,
+    ConstraintGroup,
+    arrays_of_solve,
+)
+from udkjax.equations.scene_terms import Parts, SceneTerms, compliance, dot
 from udkjax.expressions import Scalar
-from udkjax.expressions.loop_program import ADD, MINIMUM, KernelLoop, KernelWriter, Reset
+from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, KernelLoop, KernelWriter, Reset
 from udkjax.expressions.selection import absolute, greater, where
 from udkjax.pinv.elimination_order import Fronts, order_blocks
 
@@ -24,14 +34,14 @@ def triangle(i: int, j: int) -> int:
 
 
 class BlockElimination:
-    """Loops that form D D^T, factorize it and solve with the factors, in arrays that it adds to the layout of `terms`.
+    """Loops that form Psi_q M^(-1) Psi_q^T, factorize it and solve with the factors, in arrays added to the layout of `terms`.
 
     `gram` holds first the diagonal blocks, each with its diagonal as it was before elimination, then the others. `factors` lies
-    as `gram` does: of a diagonal block the reciprocals of the pivots and L, of another one its part of L. `ratio` is the
-    smallest pivot relative to its diagonal entry.
+    as `gram` does: of a diagonal block the reciprocals of the pivots and L, of another one its part of L. `nearness` is the
+    largest diagonal entry relative to its pivot, `trusted` whether all pivots exceed `safe_tol` times theirs.
     """
 
-    def __init__(self, terms: LoopTerms):
+    def __init__(self, terms: SceneTerms):
         self.terms, layout = terms, terms.layout
         # Of each block: its group, and which of the group's elements it belongs to.
         self._elements = [(group, i) for group in layout.eliminated for i in range(len(group.members))]
@@ -54,26 +64,28 @@ class BlockElimination:
 
     # --- programs
 
-    def factorize(self) -> Parts:
-        """Form and factorize D D^T of the entries in `D`."""
+    def factorize(self, dropping: bool) -> Parts:
+        """Form Psi_q M^(-1) Psi_q^T of the entries in `psi_q`, and factorize it, with or without rows that depend on others."""
         if self._off_diagonal_size:
             yield Reset("gram", self._off_diagonal_start, self._off_diagonal_size)
         yield from self._gram
-        yield Reset("ratio", 0, 1, np.inf)
+        yield Reset("nearness", 0, 1)
+        yield Reset("trusted", 0, 1, 1.0)
         for e in self.order:
 
             def write(w: KernelWriter, e: Fronts = e):
-                _eliminate(w, e.size, e.later_sizes)
+                _eliminate(w, e.size, e.later_sizes, dropping)
 
-            yield KernelLoop(self.terms.kernel(("eliminate", e.size, e.later_sizes), write), self._front_table(e))
+            key = ("eliminate", e.size, e.later_sizes, dropping)
+            yield KernelLoop(self.terms.kernel(key, write), self._front_table(e))
 
     def solve(self, solve: int = 0) -> Parts:
-        """x = (D D^T)^(-1) right, and jt_x = D^T x."""
+        """x = (Psi_q M^(-1) Psi_q^T)^(-1) right, and jt_x = Psi_q^T x."""
         yield from self.substitute(solve)
         yield from self.terms.jt(solve)
 
     def substitute(self, solve: int) -> Parts:
-        """x = (D D^T)^(-1) right."""
+        """x = (Psi_q M^(-1) Psi_q^T)^(-1) right."""
         names = arrays_of_solve(solve)
         yield Reset(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
         for e in self.order:
@@ -93,7 +105,7 @@ class BlockElimination:
         """Whether all pivots exceed `safe_tol`."""
 
         def write(w: KernelWriter):
-            w.write(greater(w.read("ratio", None), w.read("constants", None, SAFE_TOL)), "safe", None)
+            w.write(w.read("trusted", None), "safe", None)
 
         return self.terms.single_round("safe", write)
 
@@ -101,12 +113,12 @@ class BlockElimination:
         """The distance from dependence: the root of the smallest pivot relative to its diagonal entry."""
 
         def write(w: KernelWriter):
-            w.write(w.graph.sqrt(w.read("ratio", None)), "distance", None)
+            w.write(w.graph.constant(1.0) / w.graph.sqrt(w.read("nearness", None)), "distance", None)
 
         return self.terms.single_round("distance", write)
 
     def rank(self) -> Parts:
-        """How many rows the last factorization did not drop."""
+        """How many rows the last factorization did not leave out."""
         yield Reset("rank", 0, 1)
         for p in sorted(set(self._sizes)):
 
@@ -119,7 +131,7 @@ class BlockElimination:
             blocks = [start for start, size in zip(self._diagonals, self._sizes, strict=True) if size == p]
             yield KernelLoop(self.terms.kernel(("rank", p), count), np.array(blocks)[:, None])
 
-    # --- D D^T
+    # --- the matrix
 
     @cached_property
     def _gram(self) -> list[KernelLoop]:
@@ -134,12 +146,13 @@ class BlockElimination:
 
         def write(w: KernelWriter):
             entries = [group.entries(w, row) for row in group.rows]
+            scaled = [_scaled(w, row, lambda body: BODIES + 3 * body + BODY_CONSTANTS) for row in entries]
             for i in range(p):
                 for j in range(i + 1):
-                    s = dot(w.graph, entries[i], entries[j])
-                    w.write(s, "gram", base, p + triangle(i, j))
+                    s = dot(w.graph, entries[i], scaled[j])
                     if i == j:
                         w.write(s, "gram", base, i)
+                    w.write(s, "gram", base, p + triangle(i, j))
 
         table = np.concatenate([group.table, np.array(places)[:, None]], 1)
         return KernelLoop(self.terms.kernel(("diagonal", group), write), table)
@@ -151,20 +164,21 @@ class BlockElimination:
             for slot, body in enumerate(group.bodies[:, i].tolist()):
                 holders.setdefault(body, []).append((block, slot))
         tables: dict[tuple[ConstraintGroup, int, ConstraintGroup, int], list[list[int]]] = {}
-        for blocks in holders.values():
+        for body, blocks in holders.items():
             blocks.sort(key=lambda x: self._position[x[0]])
             for j, (early, s) in enumerate(blocks):
                 for late, r in blocks[j + 1 :]:
                     if early != late:
                         entries = self._place(late, ENTRIES), self._place(early, ENTRIES)
                         key = self._elements[late][0], r, self._elements[early][0], s
-                        tables.setdefault(key, []).append([*entries, self._off_diagonal[late, early]])
+                        row = [*entries, self._off_diagonal[late, early], self.terms.layout.of_body(body)]
+                        tables.setdefault(key, []).append(row)
         return [KernelLoop(self._product(*key), np.array(table)) for key, table in tables.items()]
 
     def _product(self, g: ConstraintGroup, r: int, h: ConstraintGroup, s: int):
         def write(w: KernelWriter):
             one = [[g.entry(w, row, 3 * r + k, 0) for k in range(3)] for row in g.rows]
-            two = [[h.entry(w, row, 3 * s + k, 1) for k in range(3)] for row in h.rows]
+            two = [_scaled(w, [h.entry(w, row, 3 * s + k, 1) for k in range(3)], lambda _: 3) for row in h.rows]
             for i, x in enumerate(one):
                 for j, y in enumerate(two):
                     w.write(dot(w.graph, x, y), "gram", 2, i * len(two) + j, ADD)
@@ -189,20 +203,27 @@ class BlockElimination:
         return np.array(table)
 
 
+def _scaled(w: KernelWriter, row: list[Scalar], base: Callable[[int], int]) -> list[Scalar]:
+    """A row of Psi_q times M^(-1); `base` is the column of the table for a body's constants."""
+    return [s * compliance(w, k % 3, base(k // 3)) for k, s in enumerate(row)]
+
+
 # Kernels of a front: a block of p rows, and the later blocks that it meets, of so many rows each.
 
 
-def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
-    drop_tol = w.read("constants", None, DROP_TOL)
+def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...], dropping: bool) -> None:
+    drop_tol, safe_tol = (w.read("constants", None, tol) for tol in (DROP_TOL, SAFE_TOL))
     zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
     S = [[w.read("gram", 0, p + triangle(i, j)) for j in range(i + 1)] for i in range(p)]
     below = [[[w.read("gram", 2 + 2 * a, i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)]
     rows = [row for block in below for row in block]
-    ratios = []
     for j in range(p):
         pivot, diagonal = S[j][j], w.read("gram", 0, j)
-        inverse = where(greater(pivot, diagonal * drop_tol), one / pivot, zero)
-        ratios.append(absolute(pivot * (one / diagonal)))
+        inverse = reciprocal = one / pivot
+        if dropping:
+            inverse = where(greater(pivot, diagonal * drop_tol), reciprocal, zero)
+        w.write(absolute(diagonal * reciprocal), "nearness", None, 0, MAXIMUM)
+        w.write(greater(pivot, diagonal * safe_tol), "trusted", None, 0, ALL)
         for i in range(j + 1, p):
             lower = S[i][j] * inverse
             for k in range(j + 1, i + 1):
@@ -212,8 +233,6 @@ def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
             w.write(lower, "factors", 0, p + triangle(i, j))
         w.write(inverse, "factors", 0, p + triangle(j, j))
         S[j][j] = inverse
-    for x in ratios:
-        w.write(x, "ratio", None, 0, MINIMUM)
     scaled = [[[s * S[j][j] for j, s in enumerate(row)] for row in block] for block in below]
     for a, block in enumerate(scaled):
         for i, row in enumerate(block):

@@ -1,4 +1,4 @@
-"""The prologue of a large scene: the constants that depend on its numbers alone, computed once a run."""
+"""The prologue of a scene: the constants that depend on its numbers alone, computed once a run."""
 
 from collections.abc import Sequence
 
@@ -6,25 +6,20 @@ import jax
 import numpy as np
 
 from udkjax.equations.element_programs import ConstraintPrograms
-from udkjax.equations.loop_layout import (
-    BODIES,
-    BODY_CONSTANTS,
-    COMPLIANCE,
+from udkjax.equations.scene_layout import (
     DROP_TOL,
     GAINS,
     OWN_CONSTANTS,
-    ROOT,
     SAFE_TOL,
-    WEIGHT,
     ElementGroup,
-    LoopLayout,
+    SceneLayout,
 )
 from udkjax.equations.structure import Element
 from udkjax.expressions.loop_program import KernelLoop, KernelWriter, LoopProgram
 from udkjax.scene.mechanism import Mechanism
 
 
-def write_prologue(layout: LoopLayout, places: Mechanism, number_count: int) -> LoopProgram:
+def write_prologue(layout: SceneLayout, places: Mechanism, number_count: int) -> LoopProgram:
     """Write the program from the array `numbers` to `constants`.
 
     Args:
@@ -43,10 +38,7 @@ def write_prologue(layout: LoopLayout, places: Mechanism, number_count: int) -> 
         scene.write(scene.read("numbers", None, place), "constants", None, to)
     body = KernelWriter()
     for k in range(2):
-        mass = body.read("numbers", k)
-        root = body.graph.sqrt(body.graph.constant(1.0) / mass)
-        for start, value in ((ROOT, root), (COMPLIANCE, root * root), (WEIGHT, body.graph.constant(1.0) / root)):
-            body.write(value, "constants", 2, start + k)
+        body.write(1.0 / body.read("numbers", k), "constants", 2, k)
     bodies = [[int(b.mass), int(b.inertia), layout.of_body(k)] for k, b in enumerate(places.bodies.values())]
     parts = [KernelLoop(scene.kernel(), np.zeros((1, 1), int)), KernelLoop(body.kernel(), np.array(bodies).reshape(-1, 3))]
     constraints, forces = list(places.constraints.values()), list(places.forces.values())
@@ -55,7 +47,7 @@ def write_prologue(layout: LoopLayout, places: Mechanism, number_count: int) -> 
     return LoopProgram(parts)
 
 
-def _group_constants(layout: LoopLayout, group: ElementGroup, elements: Sequence[Element]) -> KernelLoop:
+def _group_constants(layout: SceneLayout, group: ElementGroup, elements: Sequence[Element]) -> KernelLoop:
     programs, table = group.programs, group.table
     members = [jax.tree.leaves(elements[i]) for i in group.members]
     starts = np.array([[np.ravel(x)[0] if np.size(x) else 0 for x in leaves] for leaves in members], int)
@@ -64,8 +56,6 @@ def _group_constants(layout: LoopLayout, group: ElementGroup, elements: Sequence
         for place, s in enumerate(leaf.flat):
             w.bind(s, "numbers", columns + k, place)
     if isinstance(programs, ConstraintPrograms):
-        for k, s in enumerate(programs.roots):
-            w.bind(s, "constants", BODIES + 3 * (k // 2) + BODY_CONSTANTS, ROOT + k % 2)
         for k, s in enumerate([*programs.gains, *programs.gravity]):
             w.bind(s, "constants", None, (GAINS if layout.gains else layout.gravity) + k)
     for k, s in enumerate(programs.constants):

@@ -1,7 +1,7 @@
-"""The layout of a large scene's numbers in the arrays of its programs of loops.
+"""The layout of a scene's numbers in the arrays of its programs.
 
 A loop runs one kernel for every element of a group, or for every body. Its table has one row for each of them, with the places in
-the arrays at which begins what belongs to it: its coordinates, its constants, its rows of Psi, its entries of D.
+the arrays at which begins what belongs to it: its coordinates, its constants, its rows of Psi, its entries of Psi_q.
 """
 
 from collections.abc import Hashable, Sequence
@@ -27,17 +27,17 @@ from udkjax.scene.mechanism import Mechanism
 # Columns of the table of bodies: where the coordinates of each, its sine and cosine, and its constants begin.
 BODY_COORDINATES, SINE, BODY_CONSTANTS = 0, 1, 2
 # Columns of the table of a group, before three for each of its bodies as above: where the constants of each element, its entries
-# of D, its eliminated rows and all of its rows begin.
+# of Psi_q, its eliminated rows and all of its rows begin.
 OWN_CONSTANTS, ENTRIES, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
-# Constants of the scene, then of each body: M^(-1/2), M^(-1) and M^(1/2), each of x and y, and of the angle.
+# Constants of the scene, then of each body: M^(-1), of x and y, and of the angle.
 DROP_TOL, SAFE_TOL, GAINS = 0, 1, 2
-ROOT, COMPLIANCE, WEIGHT, PER_BODY = 0, 2, 4, 6
+PER_BODY = 2
 MASS_OR_INERTIA = (0, 0, 1)  # which of the two, of x, y and the angle
 
 AnyIndex = TypeVar("AnyIndex", int, np.ndarray)
 
 SOLVES = 4  # linear systems in one program, at most
-# Arrays of each: D D^T x = right, and jt_x = D^T x; y = right - sum, where L y = right.
+# Arrays of each: Psi_q M^(-1) Psi_q^T x = right, and jt_x = Psi_q^T x; y = right - sum, where L y = right.
 SOLVE_ARRAYS = ("right", "sum", "y", "x", "jt_x")
 
 
@@ -67,18 +67,20 @@ class ConstraintGroup(ElementGroup):
 
     programs: ConstraintPrograms
     rows: tuple[int, ...] = ()  # the rows of each that are eliminated
-    entry_index: dict[int, int] = field(default_factory=dict)  # of the nodes of D that are no constants: which number of `D`
+    entry_index: dict[int, int] = field(
+        default_factory=dict
+    )  # of the nodes of Psi_q that are no constants: which number of `psi_q`
 
     def entry(self, w: KernelWriter, row: int, k: int, base: int = ENTRIES) -> Scalar:
-        """Read an entry of D from where the elements wrote it; `base` is the column of a table."""
-        s = self.programs.outputs["D"][row * self.coordinates + k]
+        """Read an entry of Psi_q from where the elements wrote it; `base` is the column of a table."""
+        s = self.programs.outputs["psi_q"][row * self.coordinates + k]
         if s.constant is not None:
             return w.graph.constant(s.constant)
-        found = w.read("D", base, self.entry_index[s.index])
+        found = w.read("psi_q", base, self.entry_index[s.index])
         return found if s.sign > 0 else -found
 
     def entries(self, w: KernelWriter, row: int, base: int = ENTRIES) -> list[Scalar]:
-        """Read all entries of a row of D."""
+        """Read all entries of a row of Psi_q."""
         return [self.entry(w, row, k, base) for k in range(self.coordinates)]
 
 
@@ -89,7 +91,7 @@ class ForceGroup(ElementGroup):
     programs: ForcePrograms
 
 
-class LoopLayout:
+class SceneLayout:
     """The groups of a scene's elements, and the sizes of all arrays, for one choice of rows that are eliminated."""
 
     def __init__(self, mechanism: Mechanism, redundant_rows: tuple[int, ...], baumgarte: bool, every_row: bool):
@@ -100,14 +102,31 @@ class LoopLayout:
         self.first_body = self.gravity + 2
         self.constant_count = self.first_body + PER_BODY * self.body_count
         n = self.coordinate_count
-        self.sizes = {"sines": 2 * self.body_count, "free": n, "load": n, "ratio": 1, "D": 0, "gram": 0}
+        self.sizes = {
+            "sines": 2 * self.body_count,
+            "free": n,
+            "load": n,
+            "z": n,
+            "rest": n,
+            "nearness": 1,
+            "trusted": 1,
+            "psi_q": 0,
+            "gram": 0,
+        }
         self._eliminated = 0  # rows so far
         self._mechanism, self._loaded = mechanism, bool(mechanism.forces)
         rows = self._find_rows(redundant_rows)
         self.constraints = [self._constraint_group(kind, rows, every_row) for kind in self._kinds(rows)]
         forces = element_kinds(mechanism, list(mechanism.forces.values()))
         self.forces = [self._force_group(kind) for kind in forces]
+        self.one = self.reserve("psi_q", 1)
         self.eliminated = [group for group in self.constraints if group.rows]
+        self.sizes["pieces"] = 0
+        self.pieces = [
+            (group, self.reserve("pieces", len(group.table)) + np.arange(len(group.table)))
+            for group in (*self.constraints, *self.forces)
+            if "piece" in group.programs.outputs
+        ]
         self.body_table = np.array([[3 * b, 2 * b, self.of_body(b)] for b in range(self.body_count)]).reshape(-1, 3)
 
     def _kinds(self, labels: Sequence[Hashable] | None = None) -> list[ElementKind]:
@@ -133,10 +152,10 @@ class LoopLayout:
         programs, size = self._programs(kind), len(kind.members)
         chosen = tuple(range(programs.row_count)) if every_row else rows[kind.members[0]]
         index: dict[int, int] = {}
-        for s in programs.outputs["D"]:
+        for s in programs.outputs["psi_q"]:
             if s.constant is None:
                 index.setdefault(s.index, len(index))
-        starts = self._own_constants(programs, size), self.reserve("D", len(index) * size), self._eliminated
+        starts = self._own_constants(programs, size), self.reserve("psi_q", len(index) * size), self._eliminated
         steps = len(programs.constants), len(index), len(chosen)
         self._eliminated += len(chosen) * size
         columns = [start + step * np.arange(size) for start, step in zip(starts, steps, strict=True)]
@@ -172,16 +191,16 @@ class LoopLayout:
             self.sizes |= {f"{name}{k}": self.coordinate_count if name == "jt_x" else self._eliminated for name in SOLVE_ARRAYS}
 
     @cached_property
-    def d_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The entries of D: their rows, columns, places in the array `D` (with a one behind it), and factors."""
+    def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The entries of Psi_q: their rows, columns, places in the array `psi_q`, and factors."""
         found = [np.zeros((4, 0))]
         for group in self.constraints:
-            for place, s in enumerate(group.programs.outputs["D"]):
+            for place, s in enumerate(group.programs.outputs["psi_q"]):
                 if s.is_zero:
                     continue
                 row, k = divmod(place, group.coordinates)
                 ones = np.ones(len(group.table))
-                where = self.sizes["D"] * ones if s.constant is not None else group.table[:, ENTRIES] + group.entry_index[s.index]
+                where = self.one * ones if s.constant is not None else group.table[:, ENTRIES] + group.entry_index[s.index]
                 factor = ones * (s.sign if s.constant is None else s.constant)
                 column = group.table[:, BODIES + 3 * (k // 3)] + k % 3
                 found.append(np.stack([group.table[:, ROW] + row, column, where, factor]))

@@ -1,0 +1,68 @@
+"""The programs of a scene by arrays, without machine code: by NumPy, where nothing is compiled for it, or by JAX."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, Generic
+
+import numpy as np
+
+from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.equations.structure import AnyArray, ArrayLibrary, Time
+from udkjax.expressions.loop_program import NumpyLoops, evaluate_loops
+
+RESULTS = ("psi", "psi_dot", "psi_q", "terms")
+
+
+class SceneArrays(Generic[AnyArray]):
+    """Psi, Psi_dot, Psi_q and loads of a mechanism.
+
+    Args:
+        programs: The programs of its scene.
+        numbers: All numbers of the scene and the gains.
+        xp: NumPy or jax.numpy.
+    """
+
+    def __init__(self, programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary):
+        self.programs, self._xp = programs, xp
+        self._constants = constants_of(programs, numbers, xp)
+
+    def psi(self, t: Time, q: AnyArray) -> AnyArray:
+        """Psi (m,)."""
+        return self._run("psi", t, q, q)["psi"]
+
+    def geometry(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+        """Psi (m,), Psi_dot (m,), and the entries of Psi_q, as `ScenePrograms.psi_q_entries` has them."""
+        found = self._run("geometry", t, q, v)
+        _, _, places, factors = self.programs.psi_q_entries
+        return found["psi"], found["psi_dot"], found["psi_q"][places] * factors
+
+    def loads(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
+        """a_F (n,), and b (m,)."""
+        terms = self._run("equation_terms", t, q, v)["terms"]
+        return terms[: self.programs.coordinate_count], terms[self.programs.coordinate_count :]
+
+    def _run(self, name: str, t: Time, q: AnyArray, v: AnyArray) -> dict[str, AnyArray]:
+        """Run a program in which no round of a loop takes anything from another."""
+        p, xp = self.programs, self._xp
+        evaluate, arrays = _evaluator(p, name, xp)
+        sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count}
+        blank = {x: xp.zeros(size) for x, size in sizes.items() if x in arrays}
+        return evaluate(blank | {"constants": self._constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v})
+
+
+def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
+    """Return the constants of the loops, of the numbers of a scene and the gains."""
+    evaluate, _ = _evaluator(programs, "prologue", xp)
+    given = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(programs.constants))}
+    return evaluate(given)["constants"]
+
+
+Evaluate = Callable[[dict[str, Any]], dict[str, Any]]
+
+
+@lru_cache(maxsize=256)
+def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> tuple[Evaluate, set[str]]:
+    """Return a program as a function of its arrays, and the names of those: made once."""
+    program = getattr(programs, name)
+    arrays = program.arrays | set(RESULTS)
+    return (NumpyLoops(program) if xp is np else lambda given: evaluate_loops(program, given)), arrays

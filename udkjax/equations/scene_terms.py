@@ -1,0 +1,298 @@
+"""Loops over the bodies and the elements of a scene: the terms of its equations, and products with Psi_q and its transpose."""
+
+from collections.abc import Callable, Collection, Hashable, Iterator
+
+import jax.numpy as jnp
+import numpy as np
+
+from udkjax.equations.element_programs import FREE_INPUTS, POSITION_INPUTS, VELOCITY_INPUTS
+from udkjax.equations.scene_layout import (
+    BODIES,
+    BODY_CONSTANTS,
+    BODY_COORDINATES,
+    ENTRIES,
+    MASS_OR_INERTIA,
+    OWN_CONSTANTS,
+    RIGHT,
+    ROW,
+    SINE,
+    ConstraintGroup,
+    ElementGroup,
+    SceneLayout,
+    arrays_of_solve,
+)
+from udkjax.expressions import Graph, Scalar, trace
+from udkjax.expressions.loop_program import ADD, SET, Kernel, KernelLoop, KernelWriter, Reset
+
+Parts = Iterator[KernelLoop | Reset]
+Write = Callable[[KernelWriter], None]
+
+
+def dot(graph: Graph, a: list[Scalar], b: list[Scalar]) -> Scalar:
+    """Return the scalar product of two lists of scalars."""
+    return sum((x * y for x, y in zip(a, b, strict=True)), graph.constant(0.0))
+
+
+class SceneTerms:
+    """Loops that read and write the arrays of a `SceneLayout`. Their kernels are made once, and shared."""
+
+    def __init__(self, layout: SceneLayout, kernels: dict[Hashable, Kernel]):
+        self.layout, self.kernels = layout, kernels
+
+    # --- kinds of loops
+
+    def kernel(self, key: Hashable, write: Write, graph: Graph | None = None) -> Kernel:
+        """Return the kernel of this key, made by `write` where there is none yet."""
+        if key not in self.kernels:
+            writer = KernelWriter(graph)
+            write(writer)
+            self.kernels[key] = writer.kernel()
+        return self.kernels[key]
+
+    def single_round(self, key: Hashable, write: Write) -> KernelLoop:
+        """A loop of one round."""
+        return KernelLoop(self.kernel(key, write), np.zeros((1, 1), int))
+
+    def over_bodies(self, key: Hashable, write: Write, fixed: Collection[str] = (), **names: str) -> KernelLoop:
+        """A loop over all bodies; `names` are those of its arrays in the program, where they differ from the kernel's."""
+        return KernelLoop(self.kernel(key, write), self.layout.body_table, names, fixed)
+
+    def over_group(
+        self, key: Hashable, group: ElementGroup, write: Write, fixed: Collection[str] = (), **names: str
+    ) -> KernelLoop:
+        """A loop over the elements of a group, in whose graph the inputs of their programs are bound to the scene's arrays."""
+        programs = group.programs
+
+        def bind_inputs(w: KernelWriter):
+            arrays = dict.fromkeys(POSITION_INPUTS, ("q", BODY_COORDINATES, 0)) | dict.fromkeys(
+                VELOCITY_INPUTS, ("v", BODY_COORDINATES, 0)
+            )
+            arrays |= dict.fromkeys(FREE_INPUTS, ("free", BODY_COORDINATES, 0)) | dict.fromkeys(
+                ("sin", "cos"), ("sines", SINE, 0)
+            )
+            order = [*POSITION_INPUTS, *VELOCITY_INPUTS, *FREE_INPUTS, "sin", "cos"]
+            for k, s in enumerate(programs.constants):
+                w.bind(s, "constants", OWN_CONSTANTS, k)
+            w.bind(programs.t, "t", None, 0)
+            for name, body, s in programs.state:
+                array, column, start = arrays[name]
+                w.bind(s, array, BODIES + 3 * body + column, start + order.index(name) % 3 if name != "cos" else start + 1)
+            write(w)
+
+        return KernelLoop(self.kernel((key, group), bind_inputs, programs.graph), group.table, names, fixed)
+
+    # --- terms of the equations
+
+    def sincos(self, q: str = "q", sines: str = "sines") -> KernelLoop:
+        """The sine and the cosine of the angle of each body."""
+
+        def write(w: KernelWriter):
+            angle = np.asarray(w.read("q", BODY_COORDINATES, 2), object)
+            found = trace(lambda x: [jnp.sin(x), jnp.cos(x)], np.zeros(()))(w.graph, angle)
+            for k, s in enumerate(found):
+                w.write(s.item(), "sines", SINE, k)
+
+        return self.over_bodies("sincos", write, q=q, sines=sines)
+
+    def free_accelerations(self, v: str) -> Parts:
+        """a_F, where there are force elements: without them it is gravity."""
+        if not self.layout.forces:
+            return
+        yield Reset("load", 0, self.layout.coordinate_count)
+        for group in self.layout.forces:
+
+            def write_loads(w: KernelWriter, group: ElementGroup = group):
+                for k, s in enumerate(group.programs.outputs["loads"]):
+                    w.write(s, "load", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
+
+            yield self.over_group("loads", group, write_loads, v=v)
+
+        def write(w: KernelWriter):
+            for k in range(3):
+                load = w.read("load", BODY_COORDINATES, k)
+                w.write(self._gravity(w, k) + compliance(w, k) * load, "free", BODY_COORDINATES, k)
+
+        yield self.over_bodies("free", write)
+
+    def _gravity(self, w: KernelWriter, k: int) -> Scalar:
+        return w.read("constants", None, self.layout.gravity + k) if k < 2 else w.graph.constant(0.0)
+
+    def read_free(self, w: KernelWriter, k: int) -> Scalar:
+        """Read a coordinate of a_F of a body."""
+        return w.read("free", BODY_COORDINATES, k) if self.layout.forces else self._gravity(w, k)
+
+    def element_terms(self, outputs: tuple[str, ...], v: str = "v", solve: int = 0, **names: str) -> Parts:
+        """Psi_q, where `outputs` has it, and others as right-hand sides of the linear system `solve` and of those after it."""
+        rights = [name for name in outputs if name != "psi_q"]
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                if "psi_q" in outputs:
+                    for index, place in group.entry_index.items():
+                        w.write(Scalar(group.programs.graph, index), "psi_q", ENTRIES, place)
+                for k, name in enumerate(rights):
+                    for i, row in enumerate(group.rows):
+                        w.write(group.programs.outputs[name][row], f"right{k}", RIGHT, i)
+
+            named = {f"right{k}": f"right{solve + k}" for k in range(len(rights))}
+            yield self.over_group(outputs, group, write, v=v, **named, **names)
+
+    def every_entry(self) -> Parts:
+        """Psi_q of all rows; behind its entries a one, for those that are constants."""
+        yield Reset("psi_q", self.layout.one, 1, 1.0)
+        for group in self.layout.constraints:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                for index, place in group.entry_index.items():
+                    w.write(Scalar(group.programs.graph, index), "psi_q", ENTRIES, place)
+
+            yield self.over_group("psi_q", group, write)
+
+    def row_terms(self, name: str, array: str, start: int = 0, **names: str) -> Parts:
+        """Psi, Psi_dot or b of all rows in their order, into an array."""
+        for group in self.layout.constraints:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                for i, s in enumerate(group.programs.outputs[name]):
+                    w.write(s, "to", ROW, start + i)
+
+            yield self.over_group((name, start), group, write, to=array, **names)
+
+    def pieces(self) -> Parts:
+        """The number of the smooth piece of each element that has several."""
+        for group, places in self.layout.pieces:
+            base = group.table.shape[1]
+
+            def write(w: KernelWriter, group: ElementGroup = group, base: int = base):
+                w.write(group.programs.outputs["piece"][0], "pieces", base)
+
+            part = self.over_group("piece", group, write)
+            yield part._replace(table=np.concatenate([group.table, places[:, None]], 1))
+
+    # --- products with Psi_q and its transpose, of the eliminated rows
+
+    def rates(self, name: str, solve: int) -> Parts:
+        """Psi_q times a change of coordinates, as the right-hand side of a linear system."""
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                change = [w.read("change", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
+                for i, row in enumerate(group.rows):
+                    w.write(dot(w.graph, group.entries(w, row), change), "right", RIGHT, i)
+
+            names = {"change": name, "right": f"right{solve}"}
+            yield KernelLoop(self.kernel(("rates", group), write), group.table, names)
+
+    def jt(self, solve: int) -> Parts:
+        """jt_x = Psi_q^T x of a linear system."""
+        names = arrays_of_solve(solve)
+        yield Reset(names["jt_x"], 0, self.layout.coordinate_count)
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                _write_jt(w, group, [group.entries(w, row) for row in group.rows], [w.read("x", RIGHT, i) for i in rows(group)])
+
+            yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
+
+    def remainder(self, solve: int, to: int) -> Parts:
+        """The remainder right - Psi_q M^(-1) Psi_q^T x of a linear system, as the right-hand side of another one."""
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                bases = [BODIES + 3 * (k // 3) for k in range(group.coordinates)]
+                jt_x = [w.read("jt_x", base + BODY_COORDINATES, k % 3) for k, base in enumerate(bases)]
+                z = [compliance(w, k % 3, base + BODY_CONSTANTS) * s for k, (base, s) in enumerate(zip(bases, jt_x, strict=True))]
+                for i, row in enumerate(group.rows):
+                    w.write(w.read("right", RIGHT, i) - dot(w.graph, group.entries(w, row), z), "remainder", RIGHT, i)
+
+            names = {"jt_x": f"jt_x{solve}", "right": f"right{solve}", "remainder": f"right{to}"}
+            yield KernelLoop(self.kernel(("remainder", group), write), group.table, names)
+
+    def add_solution(self, x: str, to: str, solve: int, sign: int = 1, fixed: Collection[str] = ()) -> KernelLoop:
+        """x + M^(-1) Psi_q^T y, or minus that, with the solution y of a linear system; x is an array, or `free`."""
+
+        def write(w: KernelWriter):
+            for k in range(3):
+                part = compliance(w, k) * w.read("jt_x", BODY_COORDINATES, k)
+                start = self.read_free(w, k) if x == "free" else w.read("from", BODY_COORDINATES, k)
+                w.write(start + part if sign > 0 else start - part, "to", BODY_COORDINATES, k)
+
+        key = ("add solution", x == "free", sign)
+        return self.over_bodies(key, write, fixed, **{"from": x, "to": to, "jt_x": f"jt_x{solve}"})
+
+    def scaled_solution(self, to: str, solve: int, update: str = SET, sign: int = 1, fixed: Collection[str] = ()) -> KernelLoop:
+        """M^(-1) Psi_q^T y, or minus that, with the solution y of a linear system."""
+
+        def write(w: KernelWriter):
+            for k in range(3):
+                part = compliance(w, k) * w.read("jt_x", BODY_COORDINATES, k)
+                w.write(part if sign > 0 else -part, "to", BODY_COORDINATES, k, update)
+
+        return self.over_bodies(("scaled solution", update, sign), write, fixed, to=to, jt_x=f"jt_x{solve}")
+
+    def copy(self, x: str, to: str, size: int = 3, update: str = SET) -> KernelLoop:
+        """An array of so many numbers of each body, in another one or added to it."""
+
+        def write(w: KernelWriter):
+            for k in range(size):
+                base = SINE if size == 2 else BODY_COORDINATES
+                w.write(w.read("from", base, k), "to", base, k, update)
+
+        return self.over_bodies(("copy", size, update), write, **{"from": x, "to": to})
+
+    def add(self, change: str, x: str, to: str, sign: int) -> KernelLoop:
+        """x plus or minus a change; x is an array, or `free`."""
+
+        def write(w: KernelWriter):
+            for k in range(3):
+                part = w.read("change", BODY_COORDINATES, k)
+                start = self.read_free(w, k) if x == "free" else w.read("from", BODY_COORDINATES, k)
+                w.write(start + part if sign > 0 else start - part, "to", BODY_COORDINATES, k)
+
+        return self.over_bodies(("add", x == "free", sign), write, **{"change": change, "from": x, "to": to})
+
+    # --- derivatives of a linear system (`ImplicitDerivative`)
+
+    def residuals(self, output: str, v: str = "v") -> Parts:
+        """right1 = b - Psi_q z, and jt_x0 = Psi_q^T x0, as functions of all but z = M^(-1) Psi_q^T x0 and x0."""
+        yield Reset("jt_x0", 0, self.layout.coordinate_count)
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                outputs, n = group.programs.outputs, group.coordinates
+                entries = [outputs["psi_q"][row * n : (row + 1) * n] for row in group.rows]
+                z = [w.read("z", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(n)]
+                for i, row in enumerate(group.rows):
+                    w.write(outputs[output][row] - dot(w.graph, entries[i], z), "right1", RIGHT, i)
+                _write_jt(w, group, entries, [w.read("x0", RIGHT, i) for i in rows(group)], "jt_x0")
+
+            yield self.over_group(("residual", output), group, write, fixed=("x0", "z"), v=v)
+
+    def subtract_rates(self, name: str, solve: int) -> Parts:
+        """Subtract Psi_q times a change of coordinates from the right-hand side of a linear system; a function of the change."""
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                change = [w.read("change", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
+                for i, row in enumerate(group.rows):
+                    w.write(-dot(w.graph, group.entries(w, row), change), "right", RIGHT, i, ADD)
+
+            names = {"change": name, "right": f"right{solve}"}
+            yield KernelLoop(self.kernel(("subtract rates", group), write), group.table, names)
+
+
+def rows(group: ConstraintGroup) -> range:
+    """Return the numbers of a group's eliminated rows."""
+    return range(len(group.rows))
+
+
+def compliance(w: KernelWriter, k: int, base: int = BODY_CONSTANTS) -> Scalar:
+    """Read the entry of M^(-1) of one of the coordinates of a body."""
+    return w.read("constants", base, MASS_OR_INERTIA[k])
+
+
+def _write_jt(w: KernelWriter, group: ConstraintGroup, entries: list[list[Scalar]], x: list[Scalar], to: str = "jt_x") -> None:
+    for k in range(group.coordinates):
+        total = dot(w.graph, [row[k] for row in entries], x)
+        if not total.is_zero:
+            w.write(total, to, BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)

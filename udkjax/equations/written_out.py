@@ -1,0 +1,158 @@
+"""The programs of a small scene written out: as expressions of one graph, without loops and without arrays in between.
+
+What depends on numbers of the scene alone is computed once a run: the `constants`, which `prologue` computes. They are not those
+of the loops, but whatever the programs need.
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+from udkjax.equations.scene_programs import RESULTS, DifferentiableProgram, ScenePrograms
+from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
+from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
+from udkjax.expressions.loop_program import LoopProgram
+from udkjax.expressions.unroll import Arrays, unroll
+
+Place = tuple[str, int]  # a number of an array: the array, and its place there
+
+
+class WrittenOutProgram(NamedTuple):
+    """A program, and where each of its inputs and outputs is."""
+
+    program: ScalarProgram
+    inputs: list[Place]
+    outputs: list[Place]
+
+
+class WrittenOutDerivative(NamedTuple):
+    """A program, and its derivative along directions, or the transpose of that."""
+
+    evaluation: WrittenOutProgram  # the results, and "stored": what the derivative needs of a state
+    derivative: WrittenOutProgram
+
+
+class WrittenOut:
+    """Programs of a scene, by their names, and the derivatives of some of them.
+
+    Args:
+        programs: The programs as loops.
+        names: Which of them.
+        differentiated: Which of the differentiable ones: `accelerations` for `differentiable_accelerations`, and so on.
+        active: Of the numbers that the prologue takes: along which there are derivatives.
+        reverse: Whether derivatives are transposed: from cotangents of the results to those of q, v and the constants.
+    """
+
+    def __init__(
+        self,
+        programs: ScenePrograms,
+        names: Sequence[str],
+        differentiated: Sequence[str] = (),
+        active: Sequence[bool] = (),
+        reverse: bool = False,
+    ):
+        graph = self.graph = Graph()
+        n, count = programs.coordinate_count, programs.number_count
+        # Thresholds of pivots are set anew for single programs: nothing is made of them beforehand.
+        groups = ["parameter"] * (count - 2) + ["threshold", "parameter"]
+        self.numbers = [graph.input(("numbers", k), group) for k, group in enumerate(groups)]
+        sizes = {"t": (1, "time"), "q": (n, "position"), "v": (n, "velocity"), "dq": (n, "change"), "dv": (n, "change")}
+        state = {x: {k: graph.input((x, k), group) for k in range(size)} for x, (size, group) in sizes.items()}
+        layout = unroll(programs.prologue, {"numbers": dict(enumerate(self.numbers))}, graph)["constants"]
+        self._arrays: Arrays = {"constants": layout, **state}
+        self._results = {
+            name: _entries(self._unroll(getattr(programs, name)), (*RESULTS, "psi_q") if name == "rows_and_loads" else RESULTS)
+            for name in names
+        }
+        moved = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])
+        self.moving = [k for k, s in sorted(layout.items()) if s.index in moved]
+        """The constants of the loops along which there are derivatives; programs count these alone."""
+        self._derivatives = {x: self._differentiate(getattr(programs, f"differentiable_{x}"), n, reverse) for x in differentiated}
+        wanted = [
+            s for found in (*self._results.values(), *(x for d in self._derivatives.values() for x in d)) for s in found.values()
+        ]
+        self.constants = frontier(graph, wanted, lambda node: node.depends <= {"parameter"})
+        drop_tol = self.numbers[-2]
+        if drop_tol.index in graph.dependencies([s.index for s in wanted]):
+            self.constants.append(drop_tol)
+        self.drop_tol_index = next((k for k, s in enumerate(self.constants) if s.index == drop_tol.index), None)
+        self.prologue = ScalarProgram(graph, self.numbers, self.constants)
+        self._inputs = {s: ("constants", k) for k, s in enumerate(self.constants)}
+        self._inputs |= {s: (x, k) for x, scalars in state.items() for k, s in scalars.items()}
+
+    def program(self, name: str) -> WrittenOutProgram:
+        """Return one of the programs."""
+        return self._program(self._results[name], {})
+
+    def derivative(self, name: str) -> WrittenOutDerivative:
+        """Return one of the differentiable programs with its derivative."""
+        results, outputs = self._derivatives[name]
+        early = frontier(self.graph, list(outputs.values()), lambda node: not node.depends & {"tangent", "cotangent"})
+        stored = [s for s in early if s not in self._inputs]
+        at = {s: ("stored", k) for k, s in enumerate(stored)}
+        evaluation = self._program(results | {place: s for s, place in at.items()}, {})
+        return WrittenOutDerivative(evaluation, self._program(outputs, at | self._seeds))
+
+    def prologue_derivative(self, active: Sequence[bool], reverse: bool) -> WrittenOutProgram:
+        """Return the program from the changes of the active numbers to those of the moving constants, or its transpose."""
+        graph, layout = self.graph, self._arrays["constants"]
+        numbers = {s: ("numbers", k) for k, s in enumerate(self.numbers)}
+        variables = [s for s, is_active in zip(self.numbers, active, strict=False) if is_active]
+        values = [layout[k] for k in self.moving]
+        seeded, prefix = (values, COTANGENT + "constants") if reverse else (variables, TANGENT + "numbers")
+        places = range(len(values)) if reverse else [k for _, k in (numbers[s] for s in variables)]
+        seeds = {graph.input((prefix, k), "tangent"): (prefix, k) for k in places}
+        if reverse:
+            found = dict(zip(variables, cotangents(graph, values, list(seeds), variables), strict=True))
+            outputs = {(COTANGENT + "numbers", k): found.get(s, graph.constant(0.0)) for s, (_, k) in numbers.items()}
+        else:
+            found = tangents(graph, values, dict(zip(seeded, seeds, strict=True)))
+            outputs = {(TANGENT + "constants", k): s for k, s in enumerate(found)}
+        program = ScalarProgram(graph, [*numbers, *seeds], list(outputs.values()))
+        return WrittenOutProgram(program, [*numbers.values(), *seeds.values()], list(outputs))
+
+    def _program(self, outputs: dict[Place, Scalar], further: dict[Scalar, Place]) -> WrittenOutProgram:
+        inputs = self._inputs | further
+        program = ScalarProgram(self.graph, list(inputs), list(outputs.values()))
+        return WrittenOutProgram(program, list(inputs.values()), list(outputs))
+
+    def _unroll(self, program: LoopProgram, further: Arrays | None = None, linear: str | None = None) -> Arrays:
+        return unroll(program, self._arrays | (further or {}), self.graph, linear)
+
+    @cached_property
+    def _seeds(self) -> dict[Scalar, Place]:
+        """The inputs of derivatives that are tangents or cotangents."""
+        return {}
+
+    def _differentiate(
+        self, given: DifferentiableProgram, n: int, reverse: bool
+    ) -> tuple[dict[Place, Scalar], dict[Place, Scalar]]:
+        """The results, and their changes, or the cotangents of what they depend on."""
+        arrays, derivative = self._unroll(given.program), given.derivative()
+        results = [x for x in ("a", "q1", "v1") if x in arrays]
+        variables = {"constants": self.moving, "q": range(n), "v": range(n)}
+        prefix, program = (COTANGENT, derivative.reverse) if reverse else (TANGENT, derivative.forward)
+        group = "cotangent" if reverse else "tangent"
+        seeded = {x: range(n) for x in results} if reverse else variables
+        seeds = {prefix + x: {k: self.graph.input((x, k), group) for k in places} for x, places in seeded.items()}
+        self._seeds |= {s: (x, i) for x, scalars in seeds.items() for i, s in enumerate(scalars.values())}
+        found = self._unroll(program, arrays | seeds, group)
+        outputs = variables if reverse else {x: range(n) for x in results}
+        zero = self.graph.constant(0.0)
+        changes = {
+            (prefix + x, i): found.get(prefix + x, {}).get(k, zero) for x, places in outputs.items() for i, k in enumerate(places)
+        }
+        return _entries(arrays, ("a", "safe")), changes
+
+
+def _entries(arrays: Arrays, names: Sequence[str]) -> dict[Place, Scalar]:
+    return {(name, k): s for name in names for k, s in sorted(arrays.get(name, {}).items())}
+
+
+def _depending(graph: Graph, scalars: Sequence[Scalar]) -> set[int]:
+    """Return the nodes that depend on some scalars."""
+    found = {s.index for s in scalars}
+    for index, node in enumerate(graph.nodes):
+        if any(a.index in found for a in node.arguments):
+            found.add(index)
+    return found
