@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from udkjax import Mechanism
-    from udkjax.show.player.measures import ShownMotion
+    from udkjax.show.player.measure_curves import ShownMotion
 
     ShownRun = tuple[Mechanism, ShownMotion, dict[str, np.ndarray]]  # and further measures by name
 
@@ -110,7 +110,7 @@ def _run(file: Path, t1: float, dt: float) -> "ShownRun":
         run = udk.simulate(mechanism, output_times(0.0, t1, dt), throw=False)
         return mechanism, run, {}
 
-    from udkjax.show.player.files import read_run
+    from udkjax.show.player.run_files import read_run
 
     try:
         run = read_run(file)

@@ -13,9 +13,9 @@ from udkjax.scene.description import drawing_table
 from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, SECTIONS, known_elements, placement_of, read_drawing
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Link, Pin
 from udkjax.scene.drawing.mistakes import joint_names, where
-from udkjax.scene.drawing.quantities import Units
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.forces import ForceElement

@@ -14,10 +14,10 @@ from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.requirements import require_history
 from udkjax.show.player import pictures
 from udkjax.show.player.marks import Shapes
-from udkjax.show.player.measures import Measures, ShownMotion
+from udkjax.show.player.measure_curves import Measures, ShownMotion
 from udkjax.show.player.packing import Json
 from udkjax.show.player.page import frame, page
-from udkjax.show.player.records import Traces, failure_of, mode_record, motion_of, player_data, run_record
+from udkjax.show.player.player_data import Traces, failure_of, mode_record, motion_of, player_data, run_record
 
 if TYPE_CHECKING:
     from udkjax.show.player.widget import PlayerWidget

@@ -4,7 +4,7 @@
 //   mount(element, data, {fill, theme, autoplay}) -> {time, playing, play(), pause(), seek(t), ...}     (see `mount`)
 //   default export: {render} for anywidget
 //
-// `data` is what udkjax/show/player/records.py describes. All texts go through `textContent` or a canvas: none is markup.
+// `data` is what udkjax/show/player/player_data.py describes. All texts go through `textContent` or a canvas: none is markup.
 
 import {Player} from "./player.js";
 

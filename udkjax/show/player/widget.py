@@ -9,7 +9,7 @@ with OptionalImport():
 
 
 class PlayerWidget(anywidget.AnyWidget):
-    """A widget that shows `data` (records.py).
+    """A widget that shows `data` (player_data.py).
 
     `time` (s) and `playing` follow the player when it stops or is moved, and move it when set.
     """

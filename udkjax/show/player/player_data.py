@@ -30,7 +30,7 @@ from udkjax.equations import analyse
 from udkjax.integrate.solution import Result
 from udkjax.scene import Mechanism
 from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
-from udkjax.show.player.measures import Measures, ShownMotion, measures_of, reaction_arrows
+from udkjax.show.player.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows
 from udkjax.show.player.packing import Json, floats, pack, unpack
 from udkjax.show.player.sketch import POINT, view_of
 from udkjax.show.player.symbols import symbols_of

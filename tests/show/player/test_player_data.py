@@ -11,9 +11,9 @@ import udkjax as udk
 from tests.show.player.conftest import Motion
 from udkjax.show.player.animation import FailedRunWarning
 from udkjax.show.player.marks import body_points, corners_of, marks, to_ground
-from udkjax.show.player.measures import measures_of, rank_of, reaction_arrows, singular_values_over_time
+from udkjax.show.player.measure_curves import measures_of, rank_of, reaction_arrows, singular_values_over_time
 from udkjax.show.player.page import page
-from udkjax.show.player.records import PRECISION, run_record
+from udkjax.show.player.player_data import PRECISION, run_record
 
 
 def kinds(animation, k=0):
