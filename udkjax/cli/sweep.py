@@ -57,8 +57,8 @@ def sweep(
     mech, text = load(scene)
     arguments = _arguments(grid)
 
+    from udkjax.study.sweep.dimensions import SweepError
     from udkjax.study.sweep.executors import ClusterError
-    from udkjax.study.sweep.layout import SweepError
     from udkjax.study.sweep.store import StoreError
 
     limit = int(memory * 2**20)

@@ -11,14 +11,14 @@ from udkjax.show.sweep_figures import RESULT_VARIABLE, scalars
 from udkjax.study.report import plural
 from udkjax.study.sweep.chunks import SweepCost
 from udkjax.study.sweep.dataset import bytes_per_member, variables_of
-from udkjax.study.sweep.plan import Plan
+from udkjax.study.sweep.plan import SweepPlan
 from udkjax.study.sweep.sweep_progress import duration
 
 if TYPE_CHECKING:
     import xarray
 
 
-def estimate_summary(plan: Plan, cost: SweepCost) -> str:
+def estimate_summary(plan: SweepPlan, cost: SweepCost) -> str:
     """Describe what a sweep will take."""
     shape = " x ".join(f"{dimension.size} {dimension.name}" for dimension in plan.dimensions)
     tried = "" if cost.tried == cost.groups else f", {cost.tried} of which were tried"

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import jax
 
-CHUNKED = ("cpu",)  # devices that take a batch in chunks; others take it whole
-MEMBERS = 64  # of a chunk, on them
+CHUNKED_PLATFORMS = ("cpu",)  # devices that take a batch in chunks; others take it whole
+PIECE_MEMBERS = 64  # of a chunk, on them
 
 
 def cores() -> int:
@@ -21,7 +21,7 @@ def concurrent_chunks() -> int:
     One CPU device runs as many programs side by side as it has cores; several devices share each chunk.
     """
     devices = jax.local_devices()
-    return cores() if len(devices) == 1 and devices[0].platform in CHUNKED else 1
+    return cores() if len(devices) == 1 and devices[0].platform in CHUNKED_PLATFORMS else 1
 
 
 def machine() -> str:

@@ -18,6 +18,8 @@ from jaxtyping import Array, PyTree
 
 from udkjax.study.machine import cores
 
+MOST_PROGRAMS = 64  # of identifications, and of sweeps, in memory: each holds the scene that it was made for
+
 T = TypeVar("T")
 Outputs: TypeAlias = dict[str, Array]
 Results: TypeAlias = tuple[dict[str, np.ndarray], dict[str, np.ndarray]]  # values (members, ...); slopes (members, ..., K)

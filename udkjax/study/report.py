@@ -1,4 +1,4 @@
-"""What studies say: counts, lists, numbers and rows of constraints in texts for people, and everything as plain data for JSON."""
+"""Reports of studies: counts, lists, numbers and rows of constraints in words, and everything as plain data for JSON."""
 
 import math
 from collections.abc import Mapping, Sequence

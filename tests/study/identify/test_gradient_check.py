@@ -7,10 +7,10 @@ import pytest
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
 from udkjax.integrate.solution import Result
+from udkjax.study.identify.fit_problem import FitProblem, build_problem
 from udkjax.study.identify.gradient_check import compare_gradients
 from udkjax.study.identify.identification import identify
 from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.problem import Problem, build_problem
 from udkjax.study.identify.shooting import MultipleShooting
 
 DATA = {"time": TS, ANGLE: np.zeros(len(TS))}
@@ -20,7 +20,7 @@ FIRST = 0.5, 0.15
 def exact():
     """The derivatives of the pendulum's angle, as exact as they can be integrated."""
     mech = pendulum(*FIRST)
-    problem = Problem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
+    problem = FitProblem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
     return problem.evaluate(np.zeros((1, 2)), (1e-13, 1e-13)).J[0]
 
 
@@ -41,7 +41,7 @@ def test_right_derivatives_agree_at_any_tolerance(tol):
 def test_errors_of_the_derivatives_themselves_are_measured():
     check = udk.check_gradients(pendulum(*FIRST), DATA, NAMES, tol=1e-7)
     mech = pendulum(*FIRST)
-    problem = Problem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
+    problem = FitProblem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
     off = problem.evaluate(np.zeros((1, 2)), (1e-7, 1e-7)).J[0] - exact()
     assert check.derivative_error[:, 0] == pytest.approx(np.sqrt(np.mean((check.directions @ off.T) ** 2, 1)), rel=0.05)
 
@@ -100,7 +100,7 @@ QUANTITIES = [
 def wrong_problem():
     mech = pendulum(*FIRST)
     parameters = [udk.Parameter(_inertia, "mine", guess=FIRST[0], transform="positive"), NAMES[1]]
-    return Problem(mech, unknowns_of(mech, parameters), [udk.Record(TS, dict.fromkeys([ANGLE, *QUANTITIES], DATA[ANGLE]))])
+    return FitProblem(mech, unknowns_of(mech, parameters), [udk.Record(TS, dict.fromkeys([ANGLE, *QUANTITIES], DATA[ANGLE]))])
 
 
 def test_wrong_derivatives_are_found(wrong_problem):
@@ -143,7 +143,7 @@ def test_what_is_below_the_floor_is_not_said_to_be_wrong(wrong_problem):
 def failing(monkeypatch):
     """A problem whose runs fail beyond some distance."""
     mech = pendulum(*FIRST)
-    problem = Problem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
+    problem = FitProblem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
     evaluate = problem.evaluate
 
     def beyond(distance):

@@ -6,9 +6,9 @@ import pytest
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
 from udkjax.study.identify import prediction
+from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.identification import identify
 from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.search import horizons
 from udkjax.study.identify.unknowns import sample_guesses, state_unknowns
 
@@ -171,7 +171,7 @@ def two_records(measured):
         udk.Record(TS[3:], {ANGLE: measured[1][3:]}, noise=0.01, t0=0.0, initial_state=udk.Start(estimate="both")),
         udk.Record(TS[:9], {ANGLE: swing(stiffer)[:9]}, noise=0.02, conditions={"force.spring.stiffness": 4.0}),
     ]
-    return Problem(measured[0], unknowns_of(measured[0], NAMES), records)
+    return FitProblem(measured[0], unknowns_of(measured[0], NAMES), records)
 
 
 def test_residuals_vanish_at_the_truth(two_records):
@@ -255,7 +255,7 @@ def test_a_mechanism_that_cannot_be_closed_at_all():
 def test_members_in_lanes_are_those_one_by_one(two_records, monkeypatch):
     z = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 4))
     single = two_records.evaluate(z, (1e-10, 1e-10))
-    monkeypatch.setattr(prediction, "LANES_FROM", 1)
+    monkeypatch.setattr(prediction, "FEWEST_IN_LANES", 1)
     lanes = two_records.evaluate(z, (1e-10, 1e-10))
     assert np.abs(lanes.r - single.r).max() < 1e-6 and np.abs(lanes.J - single.J).max() < 1e-4
 

@@ -5,15 +5,15 @@ import pytest
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
+from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.growing_records import fit_growing_records, noise_of_records
 from udkjax.study.identify.identification import identify
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import Record
 from udkjax.study.noise import noise_of_differences, outlier_rows
 
-LOOSE = 1e-7, 1e-7
+LOOSE_TOL = 1e-7, 1e-7
 
 
 def test_noise_is_seen_before_anything_is_fitted():
@@ -31,8 +31,8 @@ def test_a_record_grows_as_far_as_it_is_predicted():
     truth, ts = pendulum(damping=0.005), np.linspace(0.0, 40.0, len(TS))
     angle = swing(truth, ts) + 0.02 * np.random.default_rng(1).standard_normal(len(ts))
     first = pendulum(0.75, 0.01)
-    problem, parts = Problem(first, unknowns_of(first, NAMES), [Record(ts, {ANGLE: angle})]), []
-    fit = fit_growing_records(problem, np.zeros(2), LOOSE, Minimizer(report=parts.append))
+    problem, parts = FitProblem(first, unknowns_of(first, NAMES), [Record(ts, {ANGLE: angle})]), []
+    fit = fit_growing_records(problem, np.zeros(2), LOOSE_TOL, Minimizer(report=parts.append))
     found = problem.unknowns.values(fit.z[0])
     assert fit.settled[0] and np.all(np.abs(found / [0.375, 0.005] - 1.0) < [0.01, 0.2])
     assert len({text.split(":")[0] for text in parts}) <= 8
@@ -64,7 +64,7 @@ def test_noise_that_is_given_is_taken():
     first = pendulum()
     angle = np.sin(TS) + 0.01 * np.random.default_rng(0).standard_normal(len(TS))
     for noise, expected in ((0.3, 0.3), (None, noise_of_differences(TS, angle))):
-        problem = Problem(first, unknowns_of(first, NAMES), [Record(TS, {ANGLE: angle}, noise=noise)])
+        problem = FitProblem(first, unknowns_of(first, NAMES), [Record(TS, {ANGLE: angle}, noise=noise)])
         assert noise_of_records(problem) == pytest.approx(expected)
 
 

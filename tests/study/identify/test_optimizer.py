@@ -9,21 +9,21 @@ import optax
 import pytest
 
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
+from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.identification import identify
 from udkjax.study.identify.optimizer import GradientMethod, Minimizer, minimize_by_gradient
 from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import IdentificationError, Record
 
 TOL, NOISE = (1e-9, 1e-9), 1e-3
 
 
-def problem_of(angle: np.ndarray) -> Problem:
+def problem_of(angle: np.ndarray) -> FitProblem:
     first = pendulum(0.4, 0.15)
-    return Problem(first, unknowns_of(first, NAMES), [Record(TS, {ANGLE: angle}, noise=NOISE)])
+    return FitProblem(first, unknowns_of(first, NAMES), [Record(TS, {ANGLE: angle}, noise=NOISE)])
 
 
-def objective(problem: Problem):
+def objective(problem: FitProblem):
     return partial(problem.evaluate, tol=TOL)
 
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from udkjax.study.identify.problem import Residuals
+from udkjax.study.identify.fit_problem import Residuals
 from udkjax.study.identify.profile_likelihood import fix_unknown, profile_likelihood, profiles_dataset, trace_profile
 
 

@@ -7,11 +7,11 @@ import pytest
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
+from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.growing_records import fit_growing_records
 from udkjax.study.identify.identification import identify
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.records import Record
 from udkjax.study.identify.search import explains, search
 from udkjax.study.identify.shooting import MultipleShooting, cut_records, fit_pieces
@@ -24,7 +24,7 @@ NOISE = 1e-3
 def problem(measured):
     noisy = measured[1] + NOISE * np.random.default_rng(1).standard_normal(len(TS))
     first = pendulum(0.5, 0.1)
-    return Problem(first, unknowns_of(first, NAMES), [Record(TS, {ANGLE: noisy}, noise=NOISE)])
+    return FitProblem(first, unknowns_of(first, NAMES), [Record(TS, {ANGLE: noisy}, noise=NOISE)])
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_chaos():
     for factors in ((1.4, 0.6, 1.5), (0.55, 1.45, 0.6)):
         first = truth.with_parameters({names[0]: factors[0], names[2]: values[2] * factors[2]})
         first = udk.with_length(first, "upper", factors[1])
-        whole = Problem(first, unknowns_of(first, names), [record])
+        whole = FitProblem(first, unknowns_of(first, names), [record])
         along = fit_growing_records(whole, np.zeros(3), TOL, Minimizer())
         assert along.cost[0] > 1e3 * q.size  # half of it would be noise
         estimate = identify(first, record, names, progress=False)

@@ -58,7 +58,7 @@ def test_every_chunk_is_computed_once_and_few_are_under_way(client, monkeypatch)
         handed += 1
         found[chunk.index] = data["square"]
         assert seconds == 1.0
-    assert sorted(computed) == list(range(40)) and most <= cluster.AT_LEAST + 1
+    assert sorted(computed) == list(range(40)) and most <= cluster.LEAST_TASKS + 1
     for chunk in CHUNKS:
         np.testing.assert_array_equal(found[chunk.index], 2.0 * chunk.members**2.0)
 
@@ -73,7 +73,7 @@ def test_what_raises_once_is_tried_again_and_what_always_does_is_told(client, mo
         return squares(plan, chunk)
 
     compute(monkeypatch, run)
-    failures = cluster.RETRIES + 1
+    failures = cluster.CHUNK_RETRIES + 1
     assert len(list(dask_engine(client)(PLAN, CHUNKS[:5]))) == 5
     assert tried.count(3) == failures and tried.count(2) == 1
     failures, tried = 10**6, []

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.study.exact import exact_coordinates
-from udkjax.study.sweep.measures import NOT_REACHED, guess_label, measures_of
+from udkjax.study.sweep.measures import RANK_NOT_REACHED, guess_label, measures_of
 
 TS = np.linspace(0.0, 1.0, 6)
 FOUR_BAR = udk.library.four_bar()
@@ -83,7 +83,7 @@ def test_measures_by_name_are_what_one_would_compute():
         assert_allclose(member.position_error, np.abs(solution.q - exact)[..., :2].max(), rtol=0, atol=1e-12)
         assert np.all(member["rank"] == 11)
     lost = data.isel(stabilization=0, rank_tol=1)  # no row counts: the bodies fall apart, and that is seen at the first output
-    assert int(lost.result) == udk.Result.drift and lost["rank"].values.tolist()[2:] == [NOT_REACHED] * 4
+    assert int(lost.result) == udk.Result.drift and lost["rank"].values.tolist()[2:] == [RANK_NOT_REACHED] * 4
     assert np.all(lost["rank"].values[:2] == 0)
 
 

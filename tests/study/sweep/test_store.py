@@ -163,7 +163,7 @@ def test_two_processes_do_not_write_the_same_sweep(tmp_path):
 def test_what_was_being_written_when_the_process_died_is_removed(tmp_path):
     with FolderStore(tmp_path, FINGERPRINT) as stored:
         stored.write(CHUNKS[0], data(CHUNKS[0]))
-    torn = tmp_path / "chunks" / f"000001-abc.npz.123{store.UNFINISHED}"
+    torn = tmp_path / "chunks" / f"000001-abc.npz.123{store.UNFINISHED_SUFFIX}"
     torn.write_bytes(b"half")
     with FolderStore(tmp_path, FINGERPRINT) as stored:
         assert not torn.exists()

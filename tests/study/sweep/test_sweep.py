@@ -10,11 +10,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.sweep.chunks import SECONDS, _cut, compute_members, estimate_cost
+from udkjax.study.sweep.chunks import CHUNK_SECONDS, _cut, compute_members, estimate_cost
 from udkjax.study.sweep.dataset import NOT_COMPUTED, assemble, bytes_per_member
 from udkjax.study.sweep.executors import compute_on_devices, run
+from udkjax.study.sweep.groups import group_run
 from udkjax.study.sweep.plan import Chunk, make_plan
-from udkjax.study.sweep.program import group_run
 
 LINKS = ("link1", "link2", "link3")
 TS = np.linspace(0.0, 1.0, 6)
@@ -117,9 +117,9 @@ def test_a_member_does_not_depend_on_its_neighbours(plan, finished):
 
 
 def test_chunks_are_cut_by_work_and_by_memory():
-    parts = _cut(np.full(1000, SECONDS / 100), 8, 10_000)
+    parts = _cut(np.full(1000, CHUNK_SECONDS / 100), 8, 10_000)
     assert {part.stop - part.start for part in parts[:-1]} == {96} and parts[-1].stop == 1000
-    assert [part.stop - part.start for part in _cut(np.full(100, SECONDS), 8, 16)] == [8] * 12 + [4]
+    assert [part.stop - part.start for part in _cut(np.full(100, CHUNK_SECONDS), 8, 16)] == [8] * 12 + [4]
     assert {part.stop - part.start for part in _cut(np.zeros(64), 8, 17)} == {16}
     assert _cut(np.zeros(23), 8, 100) == [slice(0, 23)]
 

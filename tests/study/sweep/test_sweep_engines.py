@@ -16,8 +16,8 @@ from udkjax.integrate.assembly import close
 from udkjax.study.exact import exact_coordinates
 from udkjax.study.sweep.chunks import members_to_compute
 from udkjax.study.sweep.executors import run
+from udkjax.study.sweep.groups import group_run
 from udkjax.study.sweep.plan import Chunk, make_plan
-from udkjax.study.sweep.program import group_run
 
 LINKS = ("link1", "link2", "link3")
 DEVICES = 8
@@ -27,7 +27,7 @@ import jax, numpy as np, udkjax as udk
 from udkjax.study.sweep.chunks import compute_members
 from udkjax.study.sweep.executors import compute_on_devices
 from udkjax.study.sweep.plan import make_plan
-from udkjax.study.sweep.program import group_run
+from udkjax.study.sweep.groups import group_run
 
 axes = {"mass": udk.Axis(np.linspace(1.0, 3.0, 20), of="body.rod.mass"), "rtol": np.geomspace(1e-10, 1e-4, 30)}
 plan = make_plan(udk.library.compound_pendulum(), axes, [0.0, 3.0])

@@ -2,7 +2,7 @@
 
 records, tables, record_reader                     measurements, whatever they come as
 parameters, unknowns                               what is to be found
-prediction, problem, shooting                      what would be measured, and how far it is from what was
+prediction, fit_problem, shooting                  what would be measured, and how far it is from what was
 loop_consistency                                   whether parameters fit the mechanism's loops
 least_squares, optimizer                           minimization
 growing_records, search                            from guesses that lead to the minimum

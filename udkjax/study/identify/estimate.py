@@ -1,4 +1,4 @@
-"""What an identification returns: the values, how well they are known, what the records do not show, and how it was found."""
+"""The result of an identification: values, their uncertainty, what the records do not show, and how it was found."""
 
 import html
 import json
@@ -18,11 +18,11 @@ from udkjax.integrate.solution import scene_text, versions
 from udkjax.printing import PrintedTable, align_columns, html_table
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
 from udkjax.study.identify.optimizer import Loss, squares, weighted_residuals
 from udkjax.study.identify.outliers import Outlier, outlier_sentences
 from udkjax.study.identify.prediction import Tolerances
-from udkjax.study.identify.problem import Problem
 from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikelihood, profile_likelihood, profiles_dataset
 from udkjax.study.identify.records import IdentificationError, dataset_of_fit, label_prefixes
 from udkjax.study.identify.uncertainty import Uncertainty
@@ -91,7 +91,7 @@ class Estimate:
     seconds: float
     tol: Tolerances
     z: Float[np.ndarray, "K"]
-    problem: Problem
+    problem: FitProblem
     loss: Loss
 
     @cached_property
@@ -116,12 +116,12 @@ class Estimate:
 
     @property
     def success(self) -> bool:
-        """Whether the fit has settled, and the records show every parameter."""
+        """True if the fit has settled, and the records show every parameter."""
         return self.converged and not self.uncertainty.dead and not self.uncertainty.flat
 
     @property
     def message(self) -> str:
-        """What there is to say of the estimate, one sentence a line."""
+        """Remarks on the estimate, one sentence a line."""
         prefixes = label_prefixes(self.problem.records)
         lines = [] if self.converged else ["the fit has not settled: these are the best values that were found"]
         lines += self.uncertainty.messages

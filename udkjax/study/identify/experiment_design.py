@@ -1,4 +1,4 @@
-"""Which experiment to make next: what records that are not measured yet would show of parameters.
+"""The choice of the next experiment: by what records that are not measured yet would show of parameters.
 
 With J the derivatives of what would be measured, each divided by the standard deviation of its noise, a candidate adds J^T J to
 the information M that there is: M^-1 is the covariance of an estimate, to first order in the noise. What is not asked for
@@ -20,11 +20,11 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
+from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, FitProblem, build_problem
 from udkjax.study.identify.parameters import Asked
-from udkjax.study.identify.prediction import MEDIUM, Tolerances
-from udkjax.study.identify.problem import INVISIBLE, Problem, build_problem
+from udkjax.study.identify.prediction import MEDIUM_TOL, Tolerances
 from udkjax.study.identify.records import IdentificationError, Key, Noise, Record, Start
-from udkjax.study.identify.uncertainty import PART
+from udkjax.study.identify.uncertainty import SMALLEST_PART
 
 Criterion = Literal["D", "A", "E"]
 
@@ -46,7 +46,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What N candidates would show of P parameters; each alone, with what was known before.
+    """A ranking of N candidates by what they would show of P parameters; each alone, with what was known before.
 
     Attributes:
         criterion: by which they were ranked.
@@ -94,7 +94,7 @@ def design_experiment(
     pick: int = 1,
     of: Sequence[str] | None = None,
     given: Estimate | None = None,
-    tol: float = MEDIUM,
+    tol: float = MEDIUM_TOL,
     **settings: Any,
 ) -> Design:
     """Rank experiments by what they would show of parameters, and pick some to be made together.
@@ -136,7 +136,7 @@ def design_experiment(
     before = _prior_information(problem, given)
     dx_dz = problem.unknowns.dx_dz(np.zeros(len(names)))[wanted]
     roots = _information_of_records(problem, (tol, tol))
-    floor = INVISIBLE * np.linalg.norm(np.concatenate([before, *roots]), 2)
+    floor = INVISIBLE_RATIO * np.linalg.norm(np.concatenate([before, *roots]), 2)
 
     def evaluate(which: Sequence[int]) -> tuple[tuple[int, float], np.ndarray]:
         every = np.concatenate([before, *(roots[k] for k in which)])
@@ -180,7 +180,7 @@ def _select_parameters(names: Sequence[str], of: Sequence[str] | None) -> np.nda
     return np.array([names.index(name) for name in asked])
 
 
-def _information_of_records(problem: Problem, tol: Tolerances) -> list[np.ndarray]:
+def _information_of_records(problem: FitProblem, tol: Tolerances) -> list[np.ndarray]:
     """Return for each record rows J (., P) whose J^T J is its information; none for one that cannot be computed."""
     P = len(problem.unknowns.names)
     J = problem.evaluate(np.zeros((1, problem.K)), tol).J[0, : len(problem.index)]
@@ -188,11 +188,13 @@ def _information_of_records(problem: Problem, tol: Tolerances) -> list[np.ndarra
     for k in range(len(problem.records)):
         own = J[problem.index[:, 0] == k]
         fine = np.isfinite(own).all()
-        found.append(_eliminate(own, np.arange(P, problem.K), INVISIBLE * np.linalg.norm(own, 2)) if fine else np.zeros((0, P)))
+        found.append(
+            _eliminate(own, np.arange(P, problem.K), INVISIBLE_RATIO * np.linalg.norm(own, 2)) if fine else np.zeros((0, P))
+        )
     return found
 
 
-def _prior_information(problem: Problem, given: Estimate | None) -> np.ndarray:
+def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarray:
     """Return rows J whose J^T J is known already: from the records of an estimate, and from priors."""
     u = problem.unknowns
     which = problem.priors
@@ -205,7 +207,7 @@ def _prior_information(problem: Problem, given: Estimate | None) -> np.ndarray:
     P, old = len(u.names), given.problem.unknowns
     scale = np.append(given.uncertainty.noise, 1.0)[given.problem.noise_groups()]
     J = given.problem.evaluate(given.z[None], given.tol).J[0] / scale[:, None]
-    rows = _eliminate(J, np.arange(P, given.problem.K), INVISIBLE * np.linalg.norm(J, 2))
+    rows = _eliminate(J, np.arange(P, given.problem.K), INVISIBLE_RATIO * np.linalg.norm(J, 2))
     same = u.dx_dz(np.zeros(P)) / old.dx_dz(given.z[:P])  # unknowns are measured from other first guesses
     return rows * same  # the priors of the estimate are among its rows
 
@@ -225,7 +227,7 @@ def _score(rows: np.ndarray, criterion: Criterion, floor: float) -> tuple[tuple[
     K = rows.shape[1]
     _, s, vt = np.linalg.svd(np.concatenate([rows, np.zeros((K, K))]))
     known = s > floor
-    s, lost = s[known], np.any(np.abs(vt[~known]) > PART, axis=0)
+    s, lost = s[known], np.any(np.abs(vt[~known]) > SMALLEST_PART, axis=0)
     value = {"D": 2.0 * np.log(s).sum(), "A": -np.sum(s**-2.0), "E": float(np.min(s, initial=np.inf) ** 2) if len(s) else 0.0}
     errors = np.sqrt(np.sum((vt[known] / s[:, None]) ** 2, axis=0))
     return (int(known.sum()), float(value[criterion])), np.where(lost, np.inf, errors)

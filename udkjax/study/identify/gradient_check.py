@@ -24,22 +24,22 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, differences, leave_out_far_steps, sizes
 from udkjax.study.identify import prediction
+from udkjax.study.identify.fit_problem import FitProblem, Residuals, build_problem
 from udkjax.study.identify.parameters import Asked
-from udkjax.study.identify.prediction import TIGHT, Tolerances
-from udkjax.study.identify.problem import Problem, Residuals, build_problem
+from udkjax.study.identify.prediction import TIGHT_TOL, Tolerances
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
 from udkjax.study.report import join_names
 
 AGREEMENT = 3.0  # floors: a floor is a sum of sizes, each of which was measured once
-USEFUL = 0.1  # of the derivative's size: where the floor is higher, agreement says little
+USEFUL_PRECISION = 0.1  # of the derivative's size: where the floor is higher, agreement says little
 RANDOM_DIRECTIONS = 3  # in which all unknowns move
 OTHER_TOL = 0.01, 10.0  # of the tolerance: where errors are measured; the second where runs fail at the first
 SMALLEST_TOL = 1e-14  # below it, step control follows rounding errors
 
 
 class Place(NamedTuple):
-    """Where a derivative is furthest from the difference, with both, in the channel's units per unit of z, at that time (s)."""
+    """A time (s) at which a derivative differs most from its difference; both are in units of the channel per unit of z."""
 
     record: int
     channel: str
@@ -50,7 +50,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GradientCheck:
-    """How derivatives compare with differences, in D directions of z and S series: what one channel of one record shows.
+    """A comparison of derivatives with differences, in D directions of z and S series: what one channel of one record shows.
 
     All sizes are root mean squares over the times of a series, in the channel's units per unit of z; not a number where runs did
     not come to their end. `print` shows, for each direction, the series that agrees worst.
@@ -88,12 +88,12 @@ class GradientCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether derivatives and differences agree, up to the floor."""
+        """True if derivatives and differences agree, up to the floor."""
         return bool(self.agrees.all())
 
     @property
     def agrees(self) -> Bool[np.ndarray, "D S"]:
-        """Whether they agree, of each."""
+        """For each direction and series, True if they agree."""
         return self.ratio <= AGREEMENT
 
     @cached_property
@@ -129,7 +129,7 @@ class GradientCheck:
 
     @property
     def message(self) -> str:
-        """What there is to say of the check, one sentence a line."""
+        """Remarks on the check, one sentence a line."""
         return "\n".join(_sentences(self)) or "derivatives agree with differences as far as differences can tell"
 
     def __str__(self) -> str:
@@ -145,7 +145,7 @@ def check_gradients(
     data: Data,
     parameters: Asked,
     *,
-    tol: float = TIGHT,
+    tol: float = TIGHT_TOL,
     ignore: Sequence[str] = (),
     seed: int = 0,
     **settings: Any,
@@ -174,7 +174,7 @@ def check_gradients(
     return compare_gradients(problem, np.zeros(problem.K), (tol, tol), seed)
 
 
-def compare_gradients(problem: Problem, z: Float[np.ndarray, "K"], tol: Tolerances, seed: int = 0) -> GradientCheck:
+def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, seed: int = 0) -> GradientCheck:
     """Compare the derivatives of a problem at z with differences, at tolerances of the integration."""
     rows, names = len(problem.index), problem.all_names[: problem.K - problem.constrained]
     _, residuals = _evaluate_first(problem, z, [tol])
@@ -213,7 +213,7 @@ def compare_gradients(problem: Problem, z: Float[np.ndarray, "K"], tol: Toleranc
     )
 
 
-def _evaluate_first(problem: Problem, z: np.ndarray, tols: Sequence[Tolerances]) -> tuple[Tolerances, Residuals]:
+def _evaluate_first(problem: FitProblem, z: np.ndarray, tols: Sequence[Tolerances]) -> tuple[Tolerances, Residuals]:
     """Return the first of some tolerances at which runs come to their end, and the residuals with it."""
     for tol in tols:
         found = problem.evaluate(z[None], tol)
@@ -224,18 +224,18 @@ def _evaluate_first(problem: Problem, z: np.ndarray, tols: Sequence[Tolerances])
     raise IdentificationError([f"there are no derivatives to be checked: {cause}"])
 
 
-def _predict(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> Float[np.ndarray, "B R"]:
+def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> Float[np.ndarray, "B R"]:
     """Return what channels show, in their units; no numbers where a run does not come to its end."""
     rows = len(problem.index)
     # As many at a time as are computed one by one: lanes would have to be compiled.
-    together = max(1, (prediction.LANES_FROM - 1) // len(problem.columns))
+    together = max(1, (prediction.FEWEST_IN_LANES - 1) // len(problem.columns))
     parts = [problem.evaluate(z[k : k + together], tol) for k in range(0, len(z), together)]
     r, code = np.concatenate([part.r for part in parts]), np.concatenate([part.code for part in parts])
     seen = r[:, :rows] * problem.sigma + problem.y[problem.present]
     return np.where((code == Result.successful)[:, None], seen, np.nan)
 
 
-def _places(problem: Problem, series: Sequence[np.ndarray], slope: np.ndarray, found: Differences) -> tuple[Place, ...]:
+def _places(problem: FitProblem, series: Sequence[np.ndarray], slope: np.ndarray, found: Differences) -> tuple[Place, ...]:
     places = []
     for rows, best in zip(series, best_steps((found.noise + found.truncation).T), strict=True):
         difference = found.values[best][rows]
@@ -273,7 +273,7 @@ def _sentence(check: GradientCheck, d: int, s: int) -> str:
         return f"at t = {place.time:.6g} s{of} {values}{apart}"
     if floor > size:
         return f"the derivative is below {floor:.1g} {check.units[s]}".rstrip() + ", which is all that differences tell of it"
-    if floor > USEFUL * size:
+    if floor > USEFUL_PRECISION * size:
         return f"differences tell the derivative to {floor / size:.0%}; with a smaller tolerance they tell more"
     return ""
 

@@ -19,21 +19,21 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Residuals
 from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, Fit, History
 from udkjax.study.identify.optimizer import Minimizer, huber, robust
 from udkjax.study.identify.prediction import Tolerances
-from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals
 from udkjax.study.noise import noise_of_differences
 
-SPREAD = 1.0  # of an unknown: how far it is taken to be from its guess; a positive one by a factor of e
+GUESS_SPREAD = 1.0  # of an unknown: how far it is taken to be from its guess; a positive one by a factor of e
 # Of what a channel shows: up to there what is predicted is nearly a linear function of the unknowns. A sine of the wrong phase is
 # off by sqrt(2) times the error of the phase: it is 0.2 rad, and five times that still leads to the right minimum.
-LINEAR = 0.3
+LINEAR_PART = 0.3
 LEAST_GROWTH, MOST_GROWTH = 1.3, 30.0  # from one part to the next: what has no end is not waited for
 MOST_PARTS = 30
-WRONG = 4.0  # standard deviations: on the way larger residuals count as by Huber's loss
-LOST = 3.0  # times the root mean square of residuals of the part before: the larger part has led to another minimum
-SAME_BEGINNING = 0.02  # of an unknown: fits of first parts this near lead to the same fit of the whole
+HUBER_LIMIT = 4.0  # standard deviations: on the way larger residuals count as by Huber's loss
+LOST_RATIO = 3.0  # times the root mean square of residuals of the part before: the larger part has led to another minimum
+SAME_BEGINNING_DISTANCE = 0.02  # of an unknown: fits of first parts this near lead to the same fit of the whole
 LEAST_NOISE = 1e-4  # of what a channel shows: less is not used of what is known, so that a model that lacks something still fits
 
 Known: TypeAlias = list[tuple[np.ndarray, Fit]]
@@ -49,28 +49,28 @@ class HeldProblem:
         noise: standard deviation of the noise of each residual (R,), over what the problem divides it by.
     """
 
-    problem: Problem
+    problem: FitProblem
     guess: Float[np.ndarray, "K"]
     noise: Float[np.ndarray, "R"]
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
         """Compute residuals and their Jacobian: see `Problem.evaluate`. Single wrong numbers count less."""
-        return robust(self.plain(z, tol, horizon), partial(huber, c=WRONG), len(self.noise))
+        return robust(self.plain(z, tol, horizon), partial(huber, c=HUBER_LIMIT), len(self.noise))
 
     def plain(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
         """Compute the same with all numbers counted alike."""
         found = self.problem.evaluate(z, tol, horizon)
         scale = np.concatenate([1.0 / self.noise, np.ones(found.r.shape[1] - len(self.noise))])
-        hold = np.broadcast_to(np.eye(len(self.guess)) / SPREAD, (len(z), len(self.guess), len(self.guess)))
+        hold = np.broadcast_to(np.eye(len(self.guess)) / GUESS_SPREAD, (len(z), len(self.guess), len(self.guess)))
         return Residuals(
-            np.concatenate([found.r * scale, (z - self.guess) / SPREAD], axis=1),
+            np.concatenate([found.r * scale, (z - self.guess) / GUESS_SPREAD], axis=1),
             np.concatenate([found.J * scale[:, None], hold], axis=1),
             found.code,
         )
 
 
 def fit_growing_records(
-    problem: Problem, z: Float[np.ndarray, "K"], tol: Tolerances, minimizer: Minimizer, known: Known | None = None
+    problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, minimizer: Minimizer, known: Known | None = None
 ) -> Fit:
     """Fit longer and longer parts of the records from a guess, and then the whole records.
 
@@ -93,7 +93,7 @@ def fit_growing_records(
         history += fit.history
         own = times <= ahead
         found = np.sqrt(2.0 * fit.cost[0] / max(own.sum(), 1))
-        if fitted and not found <= LOST * max(size, 1.0) and ahead > LEAST_GROWTH * fitted:
+        if fitted and not found <= LOST_RATIO * max(size, 1.0) and ahead > LEAST_GROWTH * fitted:
             ahead = np.sqrt(ahead * fitted)  # too far: from the same unknowns again, less far
             continue
         if np.isfinite(fit.cost[0]):
@@ -101,7 +101,7 @@ def fit_growing_records(
         if not fitted:
             begun = at
             for beginning, same in known or ():
-                if np.abs(at - beginning).max() <= SAME_BEGINNING:
+                if np.abs(at - beginning).max() <= SAME_BEGINNING_DISTANCE:
                     return same._replace(history=history)
         fitted, size, ahead = ahead, found, 0.0
     fit = minimizer.with_label("whole records").minimize(problem, at[None], tol, None, STEPS, LOOSE_STEP)
@@ -110,7 +110,7 @@ def fit_growing_records(
     return fit._replace(history=history + fit.history)
 
 
-def noise_of_records(problem: Problem) -> Float[np.ndarray, "R"]:
+def noise_of_records(problem: FitProblem) -> Float[np.ndarray, "R"]:
     """Return the standard deviation of each residual's noise: what was given, or is seen in the differences of neighbours."""
     found = problem.sigma.copy()
     for places in problem.series():
@@ -140,11 +140,11 @@ def _predictable(held: HeldProblem, z: np.ndarray, tol: Tolerances, fitted: floa
     with np.errstate(invalid="ignore", over="ignore"):
         deviation = np.linalg.norm(data @ (vt.T / s), axis=1)
     scale = problem.channel_scale[problem.index[:, 2]] / (held.noise * problem.sigma)
-    beyond = ~(usable[:R] & (deviation <= LINEAR * scale)) & (times > fitted)
+    beyond = ~(usable[:R] & (deviation <= LINEAR_PART * scale)) & (times > fitted)
     return float(times[beyond].min()) if beyond.any() else np.inf
 
 
-def _times(problem: Problem) -> Float[np.ndarray, "R"]:
+def _times(problem: FitProblem) -> Float[np.ndarray, "R"]:
     """Return the time of each residual since its record began."""
     record, time, _ = problem.index.T
     return problem.ts[record, time] - problem.ts[record, 0]

@@ -12,12 +12,12 @@ from udkjax.integrate.solution import CAUSES, Result
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
+from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, FitProblem, Residuals, Strategy, build_problem
 from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History
 from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
 from udkjax.study.identify.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
 from udkjax.study.identify.parameters import Asked
-from udkjax.study.identify.prediction import LOOSE, TIGHT, Tolerances
-from udkjax.study.identify.problem import INVISIBLE, Problem, Residuals, Strategy, build_problem
+from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Tolerances
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
 from udkjax.study.identify.search import N_STARTS, SearchResult, search
@@ -25,8 +25,8 @@ from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertaint
 from udkjax.study.progress import ProgressOption, report_progress
 from udkjax.study.whiteness import Whiteness, whiteness_of
 
-REWEIGHTED = 2  # fits, each with the noise that the one before left
-SAME_WEIGHTS = 1.05  # ratio of weights, compared with each other, that moves no estimate by what counts beside its error
+MOST_REWEIGHTINGS = 2  # fits, each with the noise that the one before left
+SAME_WEIGHT_RATIO = 1.05  # ratio of weights, compared with each other, that moves no estimate by what counts beside its error
 ROUNDING = 1e-8  # of what a channel shows: smaller residuals are errors of the integration, which need not be noise
 
 
@@ -43,7 +43,7 @@ def identify(
     loss: str | UserLoss = "least_squares",
     optimizer: Optimizer = None,
     strategy: Strategy = "auto",
-    tol: float = TIGHT,
+    tol: float = TIGHT_TOL,
     seed: int = 0,
     ignore: Sequence[str] = (),
     progress: ProgressOption = None,
@@ -98,7 +98,7 @@ def identify(
     return _estimate_of(fit, found, history, (tol, tol), residual_loss, time.perf_counter() - start)
 
 
-def _first_guesses(problem: Problem, n_starts: int, guesses: ArrayLike | None) -> Float[np.ndarray, "B K"]:
+def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None) -> Float[np.ndarray, "B K"]:
     """Return first guesses of all unknowns."""
     first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
     if n_starts < 0:
@@ -118,9 +118,9 @@ def _first_guesses(problem: Problem, n_starts: int, guesses: ArrayLike | None) -
     return np.concatenate([first, np.concatenate([z, np.zeros((len(z), problem.K - P))], 1)])
 
 
-def _require_finite(problem: Problem, found: SearchResult) -> None:
+def _require_finite(problem: FitProblem, found: SearchResult) -> None:
     if not np.isfinite(found.fit.cost).any():
-        code = problem.evaluate(found.fit.z, (LOOSE, LOOSE)).code[0]
+        code = problem.evaluate(found.fit.z, (LOOSE_TOL, LOOSE_TOL)).code[0]
         raise IdentificationError([f"no first guess could be simulated along the records: {CAUSES[Result(int(code))]}"])
 
 
@@ -134,7 +134,7 @@ def _refit(found: SearchResult, tol: Tolerances, minimizer: Minimizer) -> tuple[
     history = [*found.history, *fit.history]
     unknown = np.unique(problem.index[~problem.noise_given, 2])
     robust = minimizer.loss is not squares  # what is an outlier depends on the noise
-    for _ in range(REWEIGHTED if len(unknown) + problem.noise_given.any() > 1 or (robust and len(unknown)) else 0):
+    for _ in range(MOST_REWEIGHTINGS if len(unknown) + problem.noise_given.any() > 1 or (robust and len(unknown)) else 0):
         if not reweigh(problem, fit.z, tol, minimizer.loss, NOISE_FLOOR):
             break
         fit = _polish(problem, fit.z, tol, minimizer)
@@ -142,7 +142,7 @@ def _refit(found: SearchResult, tol: Tolerances, minimizer: Minimizer) -> tuple[
     return fit, history
 
 
-def _polish(problem: Problem, z: np.ndarray, tol: Tolerances, minimizer: Minimizer) -> Fit:
+def _polish(problem: FitProblem, z: np.ndarray, tol: Tolerances, minimizer: Minimizer) -> Fit:
     """Fit from beside a minimum; with damped steps where other weights have moved it far along what hardly shows."""
     near = minimizer.minimize(problem, z, tol, steps=FEW_STEPS, undamped=True)
     if near.settled[0] or near.history[-1][1] <= LOOSE_STEP:
@@ -151,7 +151,7 @@ def _polish(problem: Problem, z: np.ndarray, tol: Tolerances, minimizer: Minimiz
     return fit._replace(history=near.history + fit.history)
 
 
-def reweigh(problem: Problem, z: Float[np.ndarray, "1 K"], tol: Tolerances, loss: Loss, least: float = 0.0) -> bool:
+def reweigh(problem: FitProblem, z: Float[np.ndarray, "1 K"], tol: Tolerances, loss: Loss, least: float = 0.0) -> bool:
     """Take what a fit leaves of each channel as its noise, where that is not known, and `least` of what the channel shows.
 
     Returns:
@@ -170,7 +170,7 @@ def reweigh(problem: Problem, z: Float[np.ndarray, "1 K"], tol: Tolerances, loss
             every = (problem.index[:, 2] == c) & ~problem.noise_given
             problem.sigma[every] = max(size, max(least, np.finfo(float).tiny ** 0.25) * problem.channel_scale[c])
     ratio = problem.sigma / before
-    return bool(ratio.max() > SAME_WEIGHTS * ratio.min()) or loss is not squares or bool(len(problem.priors))
+    return bool(ratio.max() > SAME_WEIGHT_RATIO * ratio.min()) or loss is not squares or bool(len(problem.priors))
 
 
 def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerances, loss: Loss, seconds: float) -> Estimate:
@@ -239,8 +239,8 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
     )
 
 
-def _residuals_of_others(problem: Problem, found: Residuals, outlying: np.ndarray) -> Float[np.ndarray, "R"]:
+def _residuals_of_others(problem: FitProblem, found: Residuals, outlying: np.ndarray) -> Float[np.ndarray, "R"]:
     """Return what a fit without the outliers would leave of all other residuals, to first order; nan in the place of outliers."""
     r, J, kept = found.r[0], found.J[0], np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
-    left = r - J @ np.linalg.lstsq(J[kept], r[kept], rcond=INVISIBLE)[0]
+    left = r - J @ np.linalg.lstsq(J[kept], r[kept], rcond=INVISIBLE_RATIO)[0]
     return np.where(outlying, np.nan, left[: len(outlying)])

@@ -15,8 +15,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udkjax.study.identify.problem import INVISIBLE, Residuals
-from udkjax.study.identify.unknowns import FAR
+from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
+from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN
 
 # Gauss-Newton steps, the largest change of a dimensionless unknown, at which a fit has settled: on the way; where the integration
 # is loose too; where costs have to be exact to the square of it; and at the end, where smaller steps change nothing that shows.
@@ -26,14 +26,14 @@ COARSE_STEP, LOOSE_STEP, FINE_STEP, EXACT_STEP = 1e-3, 1e-5, 1e-6, 1e-10
 FEW_STEPS, SOME_STEPS, STEPS = 15, 30, 60
 # Cosine of the angle between residuals and what the unknowns can change of them, at which a fit has settled: times the root of
 # their number it is a Gauss-Newton step in standard errors, of which a thousandth changes nothing either.
-ORTHOGONAL = 1e-5
+ORTHOGONAL_COSINE = 1e-5
 # The first damping, of the square of the largest singular value of J. Where a minimum is near there is none to speak of. Of first
 # dampings from 1e-2 to 1e-6 and factors of 3.5 or 10, with these the most fits from 50 % off settle along the whole record.
 FIRST_DAMPING, NO_DAMPING = 1e-3, 1e-16
 SHORT_STEP = 0.3  # of an unknown: where the first Gauss-Newton step is no longer, a minimum is taken to be near
 # Part of the decrease promised from which on the damping falls, and by how much; and by how much it rises after a refused step.
 GOOD_DECREASE, LESS_DAMPING, MORE_DAMPING = 0.75, 0.1, 4.0
-MOST_REFUSED = 8  # steps one after another, before a fit is given up
+MOST_REFUSED_STEPS = 8  # steps one after another, before a fit is given up
 
 Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
 Report: TypeAlias = Callable[[str], None]  # is called with a text after each step
@@ -41,7 +41,7 @@ History: TypeAlias = list[tuple[float, float]]  # cost, and largest change of an
 
 
 class End(NamedTuple):
-    """Where one fit ended."""
+    """The end of one fit: unknowns, cost r.r / 2, whether it settled, and how it went."""
 
     z: Float[np.ndarray, "K"]
     cost: float
@@ -50,7 +50,7 @@ class End(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Where B fits ended: unknowns, costs r.r / 2, whether they settled, and how the best of them went."""
+    """The ends of B fits: unknowns, costs r.r / 2, whether they settled, and how the best of them went."""
 
     z: Float[np.ndarray, "B K"]
     cost: Float[np.ndarray, "B"]
@@ -119,7 +119,7 @@ class _Linear(NamedTuple):
 
     def gauss_newton(self) -> tuple[float, float]:
         """Return the largest entry of the Gauss-Newton step in directions that show, and the cosine of the angle of r to J."""
-        shows = self.singular > INVISIBLE * self.singular.max(initial=0.0)
+        shows = self.singular > INVISIBLE_RATIO * self.singular.max(initial=0.0)
         if not shows.any():
             return np.inf, np.inf
         step = (self.part[shows] / self.singular[shows]) @ self.vt[shows]
@@ -147,13 +147,13 @@ def _minimize(
     while True:
         size, cosine = linear.gauss_newton()
         history.append((linear.cost, size))
-        if size <= settled or cosine <= ORTHOGONAL or (size <= FINE_STEP and refused >= 2):
+        if size <= settled or cosine <= ORTHOGONAL_COSINE or (size <= FINE_STEP and refused >= 2):
             return End(at, linear.cost, True, history)
-        if refused >= MOST_REFUSED or len(history) >= steps:
+        if refused >= MOST_REFUSED_STEPS or len(history) >= steps:
             return End(at, linear.cost, False, history)
         step, promised = linear.damped(damping)
         trial = at + step
-        found = (yield trial) if np.abs(trial).max() < FAR else None
+        found = (yield trial) if np.abs(trial).max() < FARTHEST_UNKNOWN else None
         kept = -np.inf if found is None else (linear.cost - found.cost) / max(promised, np.finfo(float).tiny)
         if found is not None and found.cost < linear.cost:
             at, linear, refused = trial, found, 0

@@ -1,4 +1,4 @@
-"""Which parameters may move: those that leave the loops of an overconstrained mechanism closed.
+"""Parameters that may move: those that leave the loops of an overconstrained mechanism closed.
 
 Rows of Psi that depend on each other hold for some values of all parameters only: three cranks carry one coupler as long as they
 are equal. With N the left null space of Psi_q at a closed position, a change dp of parameters keeps it closed to first order if
@@ -33,7 +33,7 @@ from udkjax.study.row_spaces import SMALLEST_COEFFICIENT, connected_columns, ech
 
 # Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions
 # that are closed to 1e-11 leave 5e-12 of it; a parameter that opens a loop leaves a tenth or more.
-DEPENDENT = 1e-6
+DEPENDENT_PART = 1e-6
 DIFFERENCE_STEP = 1e-5  # of a parameter's value: the step of the central differences
 # Of a parameter's size, which is its value, or less where that changes a row by more than the row's own size: the step after
 # which a mechanism must close again. What opens to second order does so by 1e-4 of the size, ten million times what is left of
@@ -165,7 +165,7 @@ class RedundantLoops:
     def problems(self, names: Sequence[str]) -> list[str]:
         """Return a message for each set of parameters that depend on each other."""
         found = []
-        relations = row_space(self._unclosed, DEPENDENT)
+        relations = row_space(self._unclosed, DEPENDENT_PART)
         sets = connected_columns(relations)
         free = sorted(set(range(len(self.x))) - {i for members in sets for i in members})
         if free and not self._closes(np.eye(len(self.x))[free]):
@@ -175,7 +175,7 @@ class RedundantLoops:
                 inside = [i for i in range(len(ties)) if np.any(ties[i, part])]
                 found.append(self._message(names, members, ties[np.ix_(inside, part)]))
         for members in sets:
-            ties = self._ties(members, null_space(self._unclosed[:, members], DEPENDENT))
+            ties = self._ties(members, null_space(self._unclosed[:, members], DEPENDENT_PART))
             found.append(self._message(names, members, ties))
         return found
 
@@ -247,7 +247,7 @@ class RedundantLoops:
     def _loop_text(self, members: Sequence[int]) -> str:
         """Name the constraints that close what these parameters would open."""
         opened = np.einsum("srk,srm->skm", self._circuits, self._effect[:, :, members])
-        part_of = np.abs(opened).max((0, 2)) > DEPENDENT
+        part_of = np.abs(opened).max((0, 2)) > DEPENDENT_PART
         circuits = self._circuits[:, :, part_of if part_of.any() else slice(None)]
         involved = np.abs(circuits).max((0, 2)) > SMALLEST_COEFFICIENT
         constraints = list(dict.fromkeys(name for name, there in zip(self._names, involved, strict=True) if there))

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.extras import OptionalImport
+from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
 from udkjax.study.identify.least_squares import EXACT_STEP, FINE_STEP, STEPS, End, Fit, Objective, Report, minimize_squares
 from udkjax.study.identify.prediction import Tolerances
-from udkjax.study.identify.problem import INVISIBLE, Residuals
 from udkjax.study.identify.records import IdentificationError
 
 if TYPE_CHECKING:  # imported where a fit begins: it takes a second
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # imported where a fit begins: it takes a second
 
 GRADIENT_STEPS = 2000  # at most, of an optimizer that knows no curvature
 FAILED_COST = 100.0  # times the first cost: what is taken for the cost where nothing can be computed
-TUNING = 1.345  # standard deviations: of noise that is Gaussian after all, estimates lose a twentieth of their precision
+TUNING_CONSTANT = 1.345  # standard deviations: of noise that is Gaussian after all, estimates lose a twentieth of their precision
 
 Loss: TypeAlias = Callable[[Residuals], Residuals]  # residuals whose squares are minimized, of plain ones
 UserLoss: TypeAlias = Callable[[Array], Array]
@@ -87,7 +87,7 @@ def robust(found: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.nd
     )
 
 
-def huber(size: np.ndarray, c: float = TUNING) -> tuple[np.ndarray, np.ndarray]:
+def huber(size: np.ndarray, c: float = TUNING_CONSTANT) -> tuple[np.ndarray, np.ndarray]:
     """Return rho(r) = r^2 up to |r| = c, and 2 c |r| - c^2 beyond; and half of its derivative.
 
     Source: P. J. Huber, Robust estimation of a location parameter, 1964.
@@ -95,7 +95,7 @@ def huber(size: np.ndarray, c: float = TUNING) -> tuple[np.ndarray, np.ndarray]:
     return np.where(size > c, 2.0 * c * size - c**2, size**2), np.minimum(size, c)
 
 
-def soft_l1(size: np.ndarray, c: float = TUNING) -> tuple[np.ndarray, np.ndarray]:
+def soft_l1(size: np.ndarray, c: float = TUNING_CONSTANT) -> tuple[np.ndarray, np.ndarray]:
     """Return rho(r) = 2 c^2 ((1 + (r / c)^2)^(1/2) - 1), and half of its derivative."""
     root = np.sqrt(1.0 + (size / c) ** 2)
     return 2.0 * size**2 / (root + 1.0), size / root
@@ -108,7 +108,7 @@ ROBUST = {"huber": huber, "soft_l1": soft_l1}
 
 
 class Evaluated(Protocol):
-    """What has residuals and a Jacobian: a `Problem`, or what is made of one."""
+    """An object that has residuals and a Jacobian: a `FitProblem`, or what is made of one."""
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
         """Compute residuals and their Jacobian: see `Problem.evaluate`."""
@@ -122,7 +122,7 @@ def weighted_residuals(problem: Evaluated, tol: Tolerances, loss: Loss, horizon:
 
 @dataclass(frozen=True)
 class Minimizer:
-    """How all fits of an identification are made: by Levenberg-Marquardt (None), or by gradients."""
+    """The method of all fits of an identification: Levenberg-Marquardt (None), or by gradients."""
 
     method: GradientMethod | None = None
     loss: Loss = squares
@@ -223,7 +223,7 @@ class _Descent:
             self.failed_cost = FAILED_COST * (abs(value) + 1.0)
         if value < self.end.cost:
             _, s, vt = np.linalg.svd(found.J[0], full_matrices=False)
-            shows = s > INVISIBLE * s.max(initial=0.0)
+            shows = s > INVISIBLE_RATIO * s.max(initial=0.0)
             self.step = float(np.abs(vt[shows].T @ (vt[shows] @ gradient / s[shows] ** 2)).max(initial=0.0))
             self.end = End(z.copy(), value, self.step <= self.settled, self.end.history)
         return value, gradient

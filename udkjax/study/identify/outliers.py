@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udkjax.study.identify.problem import Problem
+from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.records import label_prefixes, output_times
 from udkjax.study.noise import outlier_rows
 from udkjax.study.report import plural
@@ -30,7 +30,7 @@ class Outlier(NamedTuple):
     deviations: float
 
 
-def find_outlier_rows(problem: Problem, r: Float[np.ndarray, "R"]) -> Bool[np.ndarray, "R"]:
+def find_outlier_rows(problem: FitProblem, r: Float[np.ndarray, "R"]) -> Bool[np.ndarray, "R"]:
     """Return which measured numbers are outliers, by weighted residuals: each channel by its own, of all records together."""
     found, channel = np.zeros(len(problem.index), bool), problem.index[:, 2]
     shows = np.abs(r * problem.sigma) > NOISE_FLOOR * problem.channel_scale[channel]
@@ -41,7 +41,7 @@ def find_outlier_rows(problem: Problem, r: Float[np.ndarray, "R"]) -> Bool[np.nd
 
 
 def list_outliers(
-    problem: Problem, rows: Bool[np.ndarray, "R"], residuals: Float[np.ndarray, "R"], sigma: Float[np.ndarray, "R"]
+    problem: FitProblem, rows: Bool[np.ndarray, "R"], residuals: Float[np.ndarray, "R"], sigma: Float[np.ndarray, "R"]
 ) -> tuple[Outlier, ...]:
     """List the outliers among measured numbers, with residuals in the units of their channels and the noise of the others."""
     found = []
@@ -53,7 +53,7 @@ def list_outliers(
     return tuple(found)
 
 
-def outlier_sentences(problem: Problem, outliers: Sequence[Outlier], robust: bool) -> Iterator[str]:
+def outlier_sentences(problem: FitProblem, outliers: Sequence[Outlier], robust: bool) -> Iterator[str]:
     """Iterate over sentences that name the outliers of each channel of each record, with the cure."""
     prefixes = label_prefixes(problem.records)
     for k, name in dict.fromkeys((one.record, one.channel) for one in outliers):

@@ -30,7 +30,7 @@ def length(*bodies: str, as_rod: bool = False) -> Length:
 
 @dataclass(frozen=True)
 class Parameter:
-    """What is to be identified.
+    """A parameter to be identified.
 
     Attributes:
         of: the name of a number of the scene (`body.link1.mass`, `joint.A.points[1][0]`), a `length`, several of either that are
@@ -60,7 +60,7 @@ Asked = TypeAliasType("Asked", OneAsked | Sequence[OneAsked])
 
 
 class _Part(NamedTuple):
-    """What one unknown is assigned to, the scene's value of it, and whether all that is tied has that value."""
+    """The target of one unknown, the scene's value of it, and whether all that is tied has that value."""
 
     target: Target
     value: float | None

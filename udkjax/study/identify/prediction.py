@@ -1,4 +1,4 @@
-"""What members would show, and its exact derivatives by everything that is to be found: one compiled function.
+"""Predictions of what members would show, with exact derivatives by everything that is to be found.
 
 A member is a mechanism with parameters of its own on the way of one record. Parameters, initial states, times and tolerances are
 numbers; a mechanism, its targets, its channels and the length of a record are compiled for. Derivatives are taken forward, of all
@@ -22,14 +22,13 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure
 from udkjax.study.channels import Channel, Quantity
 from udkjax.study.identify.unknowns import Target, apply_values
-from udkjax.study.machine import CHUNKED, MEMBERS
-from udkjax.study.members import Program
+from udkjax.study.machine import CHUNKED_PLATFORMS, PIECE_MEMBERS
+from udkjax.study.members import MOST_PROGRAMS, Program
 
 # Tolerances of the integration, relative and absolute: of final estimates (parameters are known to that much where there is no
 # noise); where singular values or the continuity of pieces are all that is asked for; and on the way to a fit.
-TIGHT, MEDIUM, LOOSE = 1e-11, 1e-9, 1e-7
-LANES_FROM = 1024  # members that are computed together in vector lanes; fewer one by one, which needs no second compilation
-PROGRAMS = 64  # in memory at most
+TIGHT_TOL, MEDIUM_TOL, LOOSE_TOL = 1e-11, 1e-9, 1e-7
+FEWEST_IN_LANES = 1024  # members that are computed together in vector lanes; fewer one by one, which needs no second compilation
 CACHE_SIZE, CACHE_BYTES = 6, 2**24  # predictions stored, since a fit goes back to its best one, and the largest of them
 
 Numbers: TypeAlias = np.ndarray | Array
@@ -55,7 +54,7 @@ class Members(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """What would be measured of members, its derivatives by (x, shift), and how the runs ended.
+    """Values that would be measured of members, their derivatives by (x, shift), and how the runs ended.
 
     The last two are the states at the first and at the last time, and their derivatives, where these are asked for.
     """
@@ -90,7 +89,7 @@ class Predictor:
         if key in self._cache:
             return self._cache[key]
         self.evaluations += size
-        piece = size if jax.default_backend() not in CHUNKED else MEMBERS if size >= LANES_FROM else 1
+        piece = size if jax.default_backend() not in CHUNKED_PLATFORMS else PIECE_MEMBERS if size >= FEWEST_IN_LANES else 1
         shapes = tuple((x.shape[1:], str(x.dtype)) for x in jax.tree.leaves(members))
         program = _program(self._run, members.x.shape[1] + members.shift.shape[1], piece, shapes)
         values, slopes = program((self._arrays, np.array(tol)), members, on_threads=True)
@@ -108,7 +107,7 @@ class Predictor:
 
 
 class _MemberRun:
-    """What is computed of one member. Equal ones have the same programs, whatever their numbers are."""
+    """The computation of one member. Equal ones have the same programs, whatever their numbers are."""
 
     def __init__(self, static: PyTree, *choices: Hashable):
         leaves, structure = jax.tree.flatten(static)
@@ -149,7 +148,7 @@ class _MemberRun:
         return found
 
 
-@lru_cache(maxsize=PROGRAMS)
+@lru_cache(maxsize=MOST_PROGRAMS)
 def _program(run: _MemberRun, slopes: int, piece: int, shapes: Hashable) -> Program:
     """Return the program of what is computed of members with numbers of these shapes."""
     del shapes

@@ -17,10 +17,10 @@ from jaxtyping import Float
 from scipy.special import chdtri, fdtri
 
 from udkjax.extras import OptionalImport
+from udkjax.study.identify.fit_problem import Residuals
 from udkjax.study.identify.least_squares import FINE_STEP, Objective, minimize_squares
-from udkjax.study.identify.problem import Residuals
 from udkjax.study.identify.uncertainty import Uncertainty
-from udkjax.study.identify.unknowns import FAR, Unknowns
+from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN, Unknowns
 
 if TYPE_CHECKING:
     import xarray
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 CONFIDENCE = 0.95
 STEPS_TO_END = 4.0  # from the estimate to the end of the interval, where the curve is a straight line
 UNKNOWN_ERROR = 0.5  # of a dimensionless unknown: taken for a standard error that is not known
-TINY = 1e-300  # in the place of a zero that is divided by: quotients stay finite
-STRETCH, SHRINK = 2.0, 0.1  # by how much a step may be longer than the one before, and by how much shorter
-AT_END = 1e-3  # of psi at the end of the interval: near enough to it
+MOST_STRETCH, MOST_SHRINK = 2.0, 0.1  # by how much a step may be longer than the one before, and by how much shorter
+END_DISTANCE = 1e-3  # of psi at the end of the interval: near enough to it
 MOST_FITS = 30  # to one side
 BETTER_FIT = 1e-6  # of the rise: costs that are lower than the estimate's by this are not rounding, nor a fit's last digits
 
@@ -153,7 +152,7 @@ def trace_profile(
     level: float = CONFIDENCE,
     noise: float = 1.0,
     degrees_of_freedom: float | None = None,
-    bounds: tuple[float, float] = (-FAR, FAR),
+    bounds: tuple[float, float] = (-FARTHEST_UNKNOWN, FARTHEST_UNKNOWN),
     value: Callable[[float], float] = lambda z: z,
     name: str = "z",
     units: str = "",
@@ -209,12 +208,14 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
         current, psi = inside
         if outside is not None:
             far, beyond = outside
-            step = (far[index] - current[index]) * (max((end - psi) / (beyond - psi), SHRINK) if np.isfinite(beyond) else 0.5)
+            step = (far[index] - current[index]) * (
+                max((end - psi) / (beyond - psi), MOST_SHRINK) if np.isfinite(beyond) else 0.5
+            )
         fixed = sign * min(sign * (current[index] + step), sign * bound)
         part = 0.0 if before is None else (fixed - current[index]) / (current[index] - before[index])
         guess = current + part * (current - before) if before is not None else current.copy()
         guess[index] = fixed
-        narrow = outside is not None and abs(fixed - current[index]) <= AT_END * abs(fixed - z[index])
+        narrow = outside is not None and abs(fixed - current[index]) <= END_DISTANCE * abs(fixed - z[index])
         trial, value = fit(index, float(fixed), guess)
         if not np.isfinite(value):
             outside, reason = (guess, np.inf), "no fit was found beyond"
@@ -223,7 +224,7 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
             continue
         found.append((trial, value))
         reached = np.sqrt(max(2.0 * (value - cost), 0.0))
-        if abs(reached - end) <= AT_END * end:
+        if abs(reached - end) <= END_DISTANCE * end:
             inside, reason = (trial, reached), ""
             break
         if reached > end:
@@ -233,8 +234,8 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
             continue
         slope = (reached - psi) / abs(fixed - current[index])
         # Where the curve falls there may be another minimum: no longer steps there.
-        wanted = abs(step) if slope < 0.0 else min(end / STEPS_TO_END, end - reached) / max(slope, TINY)
-        step = sign * np.clip(wanted, SHRINK * abs(step), STRETCH * abs(step))
+        wanted = abs(step) if slope < 0.0 else min(end / STEPS_TO_END, end - reached) / max(slope, np.finfo(float).tiny)
+        step = sign * np.clip(wanted, MOST_SHRINK * abs(step), MOST_STRETCH * abs(step))
         before, inside = current, (trial, reached)
         if fixed == bound:
             reason = _AT_BOUND

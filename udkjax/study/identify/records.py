@@ -62,7 +62,7 @@ class Start:
 
 
 class Record:
-    """What was measured at some times, and the state that the motion began with.
+    """Values measured at some times, and the state that the motion began with.
 
     Args:
         times: increasing (T,), s.
@@ -114,7 +114,7 @@ class Record:
 
     @property
     def place(self) -> str:
-        """What messages about it begin with."""
+        """The text that messages about it begin with."""
         return f"record {quote(self.name)}: " if self.name else ""
 
     def with_start(self, start: Start) -> "Record":

@@ -1,4 +1,4 @@
-"""Which first guesses a fit sets out from, and along which parts of the records: no more than a fit needs.
+"""The search of a fit: first guesses, and parts of the records along which they are followed, no more than it needs.
 
 A fit that does not explain the whole records from its first guess, since phases were wrong by too much, begins with their first
 parts and follows them as they grow: see `growing_records`. Where that fails too, it does so from other guesses beside the first,
@@ -11,26 +11,26 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Strategy
 from udkjax.study.identify.growing_records import Known, fit_growing_records
 from udkjax.study.identify.least_squares import LOOSE_STEP, SOME_STEPS, Fit, History
 from udkjax.study.identify.optimizer import Minimizer
-from udkjax.study.identify.prediction import LOOSE, MEDIUM, Tolerances
-from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Strategy
+from udkjax.study.identify.prediction import LOOSE_TOL, MEDIUM_TOL, Tolerances
 from udkjax.study.identify.shooting import PieceFailed, fit_pieces
 from udkjax.study.identify.unknowns import sample_guesses
 
 N_STARTS = 15  # guesses besides the first, where it does not lead to a fit
-MOST_PIECEWISE = 4  # guesses from which the records are fitted in pieces
-SAMPLED = 8  # times as many guesses are looked at: one evaluation each, where a fit takes some fifty; many begin alike
-AGREED = 4  # guesses that lead to the best fit: where it shows most of the motion, others will hardly lead to a better one
-MOST_SHOWN = 0.3  # of what the channels show: residuals below it are of a fit that shows most of the motion
+MOST_GUESSES_IN_PIECES = 4  # guesses from which the records are fitted in pieces
+SAMPLES_PER_GUESS = 8  # times as many guesses are looked at: one evaluation each, where a fit takes some fifty; many begin alike
+ENOUGH_AGREEING = 4  # guesses that lead to the best fit: where it shows most of the motion, others will hardly find a better one
+SHOWN_PART = 0.3  # of what the channels show: residuals below it are of a fit that shows most of the motion
 PART_GROWTH = 2.0  # from one part of the records by which guesses are ranked to the next
 SHORTEST_PART = 1e-6  # of the records: the first of these, where all was measured when they began
 CHAOTIC_GROWTH = 100.0  # of derivatives, from the first halves of records to the second: t^2 makes 4 of it
 EXPLAINED_PART = 1e-3  # of what the channels show: smaller residuals are taken for a fit, where their noise is not known
 LIKELY_SQUARE = 2.0  # mean square of residuals whose noise is known, up to which they are taken for a fit
 WHITE_CORRELATION = 4.0  # standard deviations of the correlation of neighbours, up to which residuals are taken for noise
-SAME_MINIMUM = 1e-4  # of an unknown: fits this near are at one minimum
+SAME_MINIMUM_DISTANCE = 1e-4  # of an unknown: fits this near are at one minimum
 
 
 class SearchResult(NamedTuple):
@@ -41,11 +41,11 @@ class SearchResult(NamedTuple):
     guesses: int
     ways: tuple[str, ...]
     history: History
-    problem: Problem  # that the unknowns of the fit are of
+    problem: FitProblem  # that the unknowns of the fit are of
 
 
 def search(
-    problem: Problem,
+    problem: FitProblem,
     z: Float[np.ndarray, "B K"],
     tol: Tolerances,
     minimizer: Minimizer,
@@ -59,7 +59,7 @@ def search(
     motion is chaotic, the records are cut into pieces; with the strategy "pieces" at once. The tolerances `tol` are those at the
     end: on the way they are looser.
     """
-    loose = max(tol[0], LOOSE), max(tol[1], LOOSE)
+    loose = max(tol[0], LOOSE_TOL), max(tol[1], LOOSE_TOL)
     if strategy == "pieces":
         along = fit_growing_records(problem, z[0], loose, minimizer)
         if found := fit_in_pieces(problem, np.concatenate([along.z, z]), tol, minimizer):
@@ -78,7 +78,7 @@ def search(
     count = len(z)
     if more and not explains(problem, fit, loose):
         ways.append("more first guesses")
-        sampled = sample_guesses(problem.unknowns, z[0], SAMPLED * more, seed)
+        sampled = sample_guesses(problem.unknowns, z[0], SAMPLES_PER_GUESS * more, seed)
         for guess in rank_guesses(problem, sampled, loose):
             one = fit_growing_records(problem, guess, loose, minimizer, known)
             history += one.history
@@ -87,7 +87,7 @@ def search(
             if (
                 explains(problem, fit, loose)
                 or len(known) >= len(z) + more
-                or (_agreeing(fit) >= AGREED and _shows_most(problem, fit))
+                or (_agreeing(fit) >= ENOUGH_AGREEING and _shows_most(problem, fit))
             ):
                 break
     best, agreeing = int(np.argmin(fit.cost)), _agreeing(fit)
@@ -95,7 +95,7 @@ def search(
     if more and not explains(problem, only, loose):
         # Where half of the guesses agree, the mechanism does not move like that.
         chaotic = is_chaotic(problem, only.z, loose)
-        pieces = MOST_PIECEWISE if chaotic else 2 * agreeing < count
+        pieces = MOST_GUESSES_IN_PIECES if chaotic else 2 * agreeing < count
         found = fit_in_pieces(problem, np.concatenate(tried), tol, minimizer, pieces)
         if found:
             return found._replace(guesses=count, ways=(*ways, *found.ways), history=history + found.history)
@@ -105,24 +105,24 @@ def search(
 def _agreeing(fit: Fit) -> int:
     """Return how many fits are at the best minimum."""
     best = int(np.argmin(fit.cost))
-    there = np.abs(fit.z - fit.z[best]).max(1) <= SAME_MINIMUM * (1.0 + np.abs(fit.z[best]).max())
+    there = np.abs(fit.z - fit.z[best]).max(1) <= SAME_MINIMUM_DISTANCE * (1.0 + np.abs(fit.z[best]).max())
     return int((there & np.isfinite(fit.cost)).sum())
 
 
-def _shows_most(problem: Problem, fit: Fit) -> bool:
+def _shows_most(problem: FitProblem, fit: Fit) -> bool:
     """Return whether the best fit shows most of the motion."""
     scale = problem.channel_scale[problem.index[:, 2]] / problem.sigma
-    return bool(2.0 * fit.cost.min() < MOST_SHOWN**2 * np.sum(scale**2))
+    return bool(2.0 * fit.cost.min() < SHOWN_PART**2 * np.sum(scale**2))
 
 
 def fit_in_pieces(
-    problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances, minimizer: Minimizer, most: int = MOST_PIECEWISE
+    problem: FitProblem, z: Float[np.ndarray, "B K"], tol: Tolerances, minimizer: Minimizer, most: int = MOST_GUESSES_IN_PIECES
 ) -> SearchResult | None:
     """Fit the records in pieces, from the `most` promising guesses until one explains them; None: none does.
 
     Where the motion is not so chaotic that whole records are beyond the errors of their integration, the fit is of these.
     """
-    loose = max(tol[0], MEDIUM), max(tol[1], MEDIUM)
+    loose = max(tol[0], MEDIUM_TOL), max(tol[1], MEDIUM_TOL)
     for k, guess in enumerate(rank_guesses(problem, z, loose)[:most] if most else ()):
         try:
             pieces, fit = fit_pieces(problem, guess, loose, minimizer)
@@ -138,7 +138,7 @@ def fit_in_pieces(
     return None
 
 
-def is_chaotic(problem: Problem, z: Float[np.ndarray, "1 K"], tol: Tolerances) -> bool:
+def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "1 K"], tol: Tolerances) -> bool:
     """Return whether derivatives grow along a record faster than where motions only fall out of step: like t or t^2."""
     record, time, _ = problem.index.T
     late = problem.ts[record, time] > 0.5 * (problem.ts[record, 0] + problem.ts[record, -1])
@@ -147,7 +147,7 @@ def is_chaotic(problem: Problem, z: Float[np.ndarray, "1 K"], tol: Tolerances) -
         return bool((J[late].max(0, initial=0.0) / J[~late].max(0, initial=0.0) > CHAOTIC_GROWTH).any())
 
 
-def rank_guesses(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> Float[np.ndarray, "B K"]:
+def rank_guesses(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> Float[np.ndarray, "B K"]:
     """Return guesses, the best first: those that leave least of the records and of their first parts, which all count alike."""
     record, time, _ = problem.index.T
     r, since = problem.evaluate(z, tol).r[:, : len(record)], problem.ts[record, time] - problem.ts[record, 0]
@@ -158,7 +158,7 @@ def rank_guesses(problem: Problem, z: Float[np.ndarray, "B K"], tol: Tolerances)
     return z[np.argsort(np.sum(np.nan_to_num(logs, nan=worst), axis=0), kind="stable")]
 
 
-def horizons(problem: Problem) -> list[float]:
+def horizons(problem: FitProblem) -> list[float]:
     """Return parts of the records, s since their beginnings, one longer than the other: the last is all of them."""
     record, time, _ = problem.index.T
     passed = np.sort(problem.ts[record, time] - problem.ts[record, 0])
@@ -169,7 +169,7 @@ def horizons(problem: Problem) -> list[float]:
     return [*(begin + length * PART_GROWTH ** (k - count) for k in range(count)), problem.duration]
 
 
-def explains(problem: Problem, fit: Fit, tol: Tolerances) -> bool:
+def explains(problem: FitProblem, fit: Fit, tol: Tolerances) -> bool:
     """Return whether the best of some fits leaves nothing but noise."""
     best = int(np.argmin(fit.cost))
     if not (np.isfinite(fit.cost[best]) and fit.settled[best]):

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.integrate.assembly import State
+from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Residuals
 from udkjax.study.identify.least_squares import (
     COARSE_STEP,
     FEW_STEPS,
@@ -32,11 +33,11 @@ from udkjax.study.identify.least_squares import (
 )
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import Prediction, Predictor, Runs, Tolerances
-from udkjax.study.identify.problem import RESIDUALS_PER_UNKNOWN, Problem, Residuals
 from udkjax.study.identify.unknowns import InitialStateUnknowns, apply_values, state_unknowns, with_conditions
 
 MOST_PIECES = 60  # of all records: the algebra is that of dense matrices
-CONTINUED = 1e-2  # of the largest singular value: what a piece shows less of its initial state stays as the piece before leads to
+# Of the largest singular value: what a piece shows less of its initial state stays as the piece before leads to.
+CONTINUED_PART = 1e-2
 LEAST_MOTION = 1e-3  # of the largest: how little a coordinate is taken to move in a piece
 # w of defects over how far coordinates move in a piece, where residuals are over how far their channels move.
 WEIGHTS = tuple(10.0**k for k in range(-2, 5))
@@ -50,7 +51,7 @@ class Piece(NamedTuple):
     end: int
 
 
-class MultipleShooting(Problem):
+class MultipleShooting(FitProblem):
     """A problem in pieces. Its first residuals are those of the whole problem, in the same order; defects follow.
 
     The unknowns z are those of the whole problem, then those of the initial states of pieces.
@@ -63,7 +64,7 @@ class MultipleShooting(Problem):
         scale: how far coordinates move in a piece (S,).
     """
 
-    def __init__(self, whole: Problem, z: Float[np.ndarray, "K"], tol: Tolerances, samples: float = RESIDUALS_PER_UNKNOWN):
+    def __init__(self, whole: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, samples: float = RESIDUALS_PER_UNKNOWN):
         """Cut the records, and find initial states of all pieces along them with the unknowns z of the whole problem."""
         super().__init__(whole.mechanism, whole.unknowns, whole.records, whole.settings)
         self.predictor = Predictor(whole.mechanism, whole.unknowns.targets, whole.channels, whole.settings, ends=True)
@@ -145,7 +146,7 @@ class MultipleShooting(Problem):
             nonlocal damping
             found = self._predict_piece(p, x, shift, tol)
             r, J = (found.y[:, *at] - measured) / sigma, found.dy[:, *at, len(x) :] / sigma[:, None]
-            damping = float(CONTINUED * np.linalg.norm(J[0], 2)) if damping is None else damping
+            damping = float(CONTINUED_PART * np.linalg.norm(J[0], 2)) if damping is None else damping
             damped = np.broadcast_to(damping * np.eye(S), (len(shift), S, S))
             return Residuals(np.concatenate([r, damping * shift], 1), np.concatenate([J, damped], 1), found.code)
 
@@ -182,7 +183,7 @@ class PieceFailed(Exception):
 
 
 def fit_pieces(
-    problem: Problem,
+    problem: FitProblem,
     z: Float[np.ndarray, "K"],
     tol: Tolerances,
     minimizer: Minimizer,
@@ -210,7 +211,7 @@ def fit_pieces(
     return shooting, fit._replace(history=history)
 
 
-def cut_records(problem: Problem, least: float) -> tuple[Piece, ...]:
+def cut_records(problem: FitProblem, least: float) -> tuple[Piece, ...]:
     """Cut the records into pieces of at least as many residuals."""
     found = []
     for k in range(len(problem.records)):
@@ -227,7 +228,7 @@ def cut_records(problem: Problem, least: float) -> tuple[Piece, ...]:
     return tuple(found)
 
 
-def _piece_tables(problem: Problem, pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _piece_tables(problem: FitProblem, pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times of all pieces, padded, the last where the next piece begins; and the piece and time of each residual."""
     length = max(piece.end - piece.first for piece in pieces) + 1
     record, time, _ = problem.index.T

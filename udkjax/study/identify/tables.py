@@ -30,7 +30,7 @@ _DELIMITERS = (";", "\t", ",")
 _STATES = {"q": dict(zip(COORDINATES, COORDINATES, strict=True)), "v": dict(zip(COORDINATES, RATES, strict=True))}
 
 
-class Column(NamedTuple):
+class TableColumn(NamedTuple):
     """The values under one heading, numbers or text, and their units if the heading names some."""
 
     values: Sequence[str | float | None] | np.ndarray
@@ -41,7 +41,7 @@ class Table(NamedTuple):
     """Columns by their names; `source` and `rows` are what messages call the table and its rows."""
 
     source: str
-    columns: Mapping[str, Column]
+    columns: Mapping[str, TableColumn]
     rows: Sequence[str]
     name: str = ""  # of the record, where the table holds one
     padded: bool = False  # whether rows at the ends in which nothing was measured are there for longer records
@@ -129,7 +129,7 @@ def _table_of_columns(
     source: str, given: Sequence[tuple[str, ArrayLike]], problems: list[str], rows: Sequence[str] | None = None, name: str = ""
 ) -> Table:
     """Return the table of columns whose headings may name their units; one value stands for all rows."""
-    columns: dict[str, Column] = {}
+    columns: dict[str, TableColumn] = {}
     for text, values in given:
         heading, units = _heading(text)
         if heading in columns or not heading:
@@ -137,7 +137,7 @@ def _table_of_columns(
             problems.append(f"{source}: {what}")
         else:
             cells = np.asarray(values) if hasattr(values, "dtype") else cast("Sequence[str | float | None]", values)
-            columns[heading] = Column(cells, units)
+            columns[heading] = TableColumn(cells, units)
     alone = {h for h, c in columns.items() if isinstance(c.values, str) or np.ndim(cast(ArrayLike, c.values)) == 0}
     if rows is None:
         rows = [f"entry {k}" for k in range(max((len(c.values) for h, c in columns.items() if h not in alone), default=0))]
@@ -175,12 +175,12 @@ def _read_record(data: "xarray.Dataset", bodies: Sequence[str], source: str, pro
         problems.append(f"{source}: there is no coordinate {quote(TIME[0])}")
         return Table(source, {}, [], name)
     dims, count = data[time].dims, data[time].size
-    columns = {time: Column(data[time].values, data[time].attrs.get("units"))}
+    columns = {time: TableColumn(data[time].values, data[time].attrs.get("units"))}
     for key, variable in data.data_vars.items():
         if key in _STATES and set(variable.dims) == {*dims, "body", "coordinate"}:
             columns |= _state_columns(str(key), variable.transpose(*dims, "body", "coordinate"), bodies, source, problems)
         elif variable.dims in ((), dims):
-            columns[str(key)] = Column(np.broadcast_to(variable.values, count), variable.attrs.get("units"))
+            columns[str(key)] = TableColumn(np.broadcast_to(variable.values, count), variable.attrs.get("units"))
         else:
             problems.append(
                 f"{source}, {quote(str(key))}: must be along {quote(time)}, is along {abbreviate(list(variable.dims))}"
@@ -190,7 +190,7 @@ def _read_record(data: "xarray.Dataset", bodies: Sequence[str], source: str, pro
 
 def _state_columns(
     key: str, values: "xarray.DataArray", bodies: Sequence[str], source: str, problems: list[str]
-) -> dict[str, Column]:
+) -> dict[str, TableColumn]:
     """Return coordinates or velocities of bodies as columns."""
     found = {}
     for i, body in enumerate(map(str, values["body"].values)):
@@ -198,5 +198,5 @@ def _state_columns(
             problems.append(f"{source}, {quote(key)}: no body named {quote(body)}{suggestion(body, bodies)}")
             continue
         for k, coordinate in enumerate(map(str, values["coordinate"].values)):
-            found[f"body.{body}.{_STATES[key].get(coordinate, coordinate)}"] = Column(values.values[:, i, k], None)
+            found[f"body.{body}.{_STATES[key].get(coordinate, coordinate)}"] = TableColumn(values.values[:, i, k], None)
     return found

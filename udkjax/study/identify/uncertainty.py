@@ -1,4 +1,4 @@
-"""How well the unknowns are known from measured motion, and which of them do not show in it at all.
+"""The uncertainty of unknowns that are found from measured motion, and those that do not show in it at all.
 
 With r the residuals (R,) divided by the standard deviations of the noise, and J = dr/dz (R, K), the Fisher information is J^T J,
 and the covariance of the unknowns z its inverse; both from the singular values of J = U S V^T. A direction of z whose singular
@@ -18,19 +18,19 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import chdtr, chdtrc
 
-from udkjax.study.identify.problem import INVISIBLE
+from udkjax.study.identify.fit_problem import INVISIBLE_RATIO
 from udkjax.study.report import join_names
 from udkjax.study.row_spaces import echelon, null_space
 from udkjax.study.whiteness import SIGNIFICANCE
 
-POOR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
-CORRELATED = 0.98  # of two parameters: their difference is known ten times worse than their sum
+POOR_ERROR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
+HIGH_CORRELATION = 0.98  # of two parameters: their difference is known ten times worse than their sum
 LEAST_NOISE = 1e-15  # of what residuals were divided by: noise below it is rounding
-NOISE_ITERATIONS, EQUAL = 50, 1e-10  # of the noise and what is determined with such noise, in turn, until both stay
+NOISE_ITERATIONS, EQUAL_NOISE = 50, 1e-10  # of the noise and what is determined with such noise, in turn, until both stay
 # Of the largest coefficient of a direction: unknowns with less of it take no part. Directions are that exact where their singular
 # value is that much above the errors of the Jacobian.
-PART = 1e-3
-COMMON = 1e-2  # relative: by how much factors may differ that are called a common one
+SMALLEST_PART = 1e-3
+COMMON_FACTOR_TOL = 1e-2  # relative: by how much factors may differ that are called a common one
 
 
 class UnknownValues(NamedTuple):
@@ -60,7 +60,7 @@ class Direction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How well P parameters are known.
+    """The uncertainty of P parameters.
 
     Attributes:
         values: all K unknowns at the estimate.
@@ -101,13 +101,13 @@ class Uncertainty:
     def poor(self) -> tuple[str, ...]:
         """Names of parameters whose standard error is more than half of their value."""
         errors = enumerate(self.standard_errors)
-        return tuple(self.values.names[k] for k, error in errors if POOR * self.values.typical(k) < error < np.inf)
+        return tuple(self.values.names[k] for k, error in errors if POOR_ERROR * self.values.typical(k) < error < np.inf)
 
     @property
     def correlated(self) -> tuple[tuple[str, str, float], ...]:
         """Pairs of parameters that are hardly known apart, and their correlation."""
         with np.errstate(invalid="ignore"):
-            pairs = np.argwhere(np.triu(np.abs(self.correlation) > CORRELATED, 1))
+            pairs = np.argwhere(np.triu(np.abs(self.correlation) > HIGH_CORRELATION, 1))
         return tuple((self.names[i], self.names[j], float(self.correlation[i, j])) for i, j in pairs)
 
     def notes(self, name: str) -> list[str]:
@@ -123,7 +123,7 @@ class Uncertainty:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """What is to be known before the numbers are used, one sentence each; nothing where all is well."""
+        """Remarks on what to know before the numbers are used, one sentence each; none where all is well."""
         return tuple(_sentences(self))
 
 
@@ -143,13 +143,13 @@ def estimate_uncertainty(
     """
     K, P = len(values.names), len(values.names) if parameters is None else parameters
     size, before = np.linalg.norm(J, axis=0), J[len(J) - priors :]
-    alive = np.flatnonzero((size > INVISIBLE * size.max(initial=0.0)) | np.any(before != 0.0, axis=0))
+    alive = np.flatnonzero((size > INVISIBLE_RATIO * size.max(initial=0.0)) | np.any(before != 0.0, axis=0))
     group = np.full(len(r), -1) if noise_group is None else np.asarray(noise_group, int)
     noise = _noise_scales(J[:, alive], r, group)
     scale = np.append(noise, 1.0)[group]
     known = np.isfinite(scale).all()
     u, sigma, vt = np.linalg.svd(J[:, alive] / (scale[:, None] if known else 1.0), full_matrices=False)
-    shown = sigma > INVISIBLE * sigma.max(initial=0.0)
+    shown = sigma > INVISIBLE_RATIO * sigma.max(initial=0.0)
     sigma, vt, u, shown = _with_priors(before[:, alive], sigma, vt, u, shown)
     x, dx_dz = (np.asarray(part, float)[alive] for part in (values.x, values.dx_dz))
     free = simplest_basis(null_space(vt[shown], 0.5), x, dx_dz, [values.kinds[k] for k in alive.tolist()])
@@ -189,7 +189,7 @@ def _with_priors(
     if not len(none) or not len(before):
         return sigma, vt, u, shown
     _, own, w = np.linalg.svd(before @ none.T, full_matrices=False)
-    some = own > INVISIBLE * np.linalg.norm(before, axis=1).max(initial=0.0)
+    some = own > INVISIBLE_RATIO * np.linalg.norm(before, axis=1).max(initial=0.0)
     rows = np.concatenate([np.zeros((len(u) - len(before), int(some.sum()))), (before @ none.T @ w[some].T) / own[some]])
     sigma, vt = np.concatenate([sigma[shown], own[some]]), np.concatenate([vt[shown], w[some] @ none])
     return sigma, vt, np.concatenate([u[:, shown], rows], axis=1), np.ones(len(sigma), bool)
@@ -211,12 +211,12 @@ def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray
     for _ in range(NOISE_ITERATIONS if groups else 0):
         scaled = [part / s for part, s in zip(parts, [*np.sqrt(np.where(s2 > 0, s2, 1.0)), 1.0], strict=True)]
         u, sigma, _ = np.linalg.svd(np.concatenate(scaled), full_matrices=False)
-        leverage = np.sum(u[:, sigma > INVISIBLE * sigma.max(initial=0.0)] ** 2, axis=1)
+        leverage = np.sum(u[:, sigma > INVISIBLE_RATIO * sigma.max(initial=0.0)] ** 2, axis=1)
         ends = np.cumsum([len(part) for part in parts])[:-1]
         determined = np.array([part.sum() for part in np.split(leverage, ends)[: len(groups)]])
         left = counts - determined
-        before, s2 = s2, np.where(left > EQUAL * counts, sums / np.where(left > 0, left, 1.0), np.nan)
-        if np.isnan(s2).any() or np.all(np.abs(s2 - before) <= EQUAL * s2):
+        before, s2 = s2, np.where(left > EQUAL_NOISE * counts, sums / np.where(left > 0, left, 1.0), np.nan)
+        if np.isnan(s2).any() or np.all(np.abs(s2 - before) <= EQUAL_NOISE * s2):
             break
     return np.maximum(np.sqrt(s2), LEAST_NOISE)
 
@@ -225,13 +225,13 @@ def simplest_basis(
     free: Float[np.ndarray, "D K"], x: Float[np.ndarray, "K"], dx_dz: Float[np.ndarray, "K"], kinds: Sequence[str]
 ) -> Float[np.ndarray, "D K"]:
     """Return rows of few unknowns each that span the same as the orthonormal rows `free`; a common factor first, if it is one."""
-    found = echelon(free, PART)
+    found = echelon(free, SMALLEST_PART)
     relative = np.array([kind != "free" for kind in kinds], bool) & (x != 0.0) & np.any(found != 0.0, axis=0)
     if len(found) < 2 or not relative.any():
         return found
     factor = np.where(relative, x / dx_dz, 0.0)
     outside = factor - free.T @ (free @ factor)
-    if np.linalg.norm(outside) > PART * np.linalg.norm(factor):
+    if np.linalg.norm(outside) > SMALLEST_PART * np.linalg.norm(factor):
         return found
     # The factor takes the place of the direction that it is most of.
     share = np.abs(np.linalg.lstsq(found.T, factor, rcond=None)[0]) * np.linalg.norm(found, axis=1)
@@ -286,7 +286,7 @@ def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Dir
     names, kinds = [values.names[k] for k in there], [values.kinds[k] for k in there]
     relative = np.array([kind != "free" and value != 0.0 for kind, value in zip(kinds, x, strict=True)])
     factors = np.where(relative, change / np.where(relative, x, 1.0), 0.0)
-    if len(there) > 1 and relative.all() and np.all(np.abs(factors / factors[0] - 1.0) < COMMON):
+    if len(there) > 1 and relative.all() and np.all(np.abs(factors / factors[0] - 1.0) < COMMON_FACTOR_TOL):
         text = f"{join_names(names)} by a common factor"
     else:
         reference = factors if relative.any() else coefficients[there]

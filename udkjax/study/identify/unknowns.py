@@ -24,17 +24,17 @@ from udkjax.study.identify.records import Estimated, IdentificationError, Record
 from udkjax.study.quantities import Setter, parameter_value
 
 Transform = Literal["positive", "bounded", "free"]
-AT_BOUND = 1e-3  # of the distance between the bounds: a value as near to one of them is said to be at it
-FAR = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
+BOUND_DISTANCE = 1e-3  # of the distance between the bounds: a value as near to one of them is said to be at it
+FARTHEST_UNKNOWN = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
 # How far other guesses are from the first: positive parameters by a factor, others by a part of their scale.
 GUESS_FACTOR, GUESS_RADIUS = 2.5, 0.5
 BOUND_MARGIN = 0.02  # of the distance between the bounds: no guess is nearer, since bounds themselves are infinitely far
-READABLE = 1e-3  # of the largest: how much of a free motion the coordinates that are taken as its unknowns must show at least
+SMALLEST_READABLE_PART = 1e-3  # of the largest: the least that coordinates taken as unknowns of a free motion must show of it
 STATE_RADIUS = 0.05  # of the scene's length, time and one radian: how far guesses of initial states are from the first
 
 
 class Target(NamedTuple):
-    """What a value is assigned to: hashable, so that what is compiled for it serves all values."""
+    """The numbers that a value is assigned to: hashable, so that what is compiled for it serves all values."""
 
     names: tuple[str, ...] = ()
     scaled: bool = False
@@ -116,7 +116,7 @@ class Unknowns:
 
     def at_bounds(self, x: Float[np.ndarray, "P"]) -> tuple[str, ...]:
         """Return the names of those that are at one of their bounds."""
-        near = np.minimum(x - self.low, self.high - x) <= AT_BOUND * (self.high - self.low)
+        near = np.minimum(x - self.low, self.high - x) <= BOUND_DISTANCE * (self.high - self.low)
         return tuple(name for name, at, kind in zip(self.names, near, self.kinds, strict=True) if at and kind == "bounded")
 
 
@@ -253,7 +253,7 @@ def _independent_rows(free: np.ndarray) -> list[int]:
         for _ in range(free.shape[1]):
             sizes = np.linalg.norm(left[rows], axis=1)
             k = int(rows[np.argmax(sizes)])
-            if sizes.max() < READABLE:
+            if sizes.max() < SMALLEST_READABLE_PART:
                 break
             chosen.append(k)
             unit = left[k] / np.linalg.norm(left[k])

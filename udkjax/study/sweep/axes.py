@@ -82,7 +82,7 @@ AxisValues: TypeAlias = "Axis | Zipped | Values"
 
 
 @dataclass(frozen=True, eq=False)
-class Column:
+class AxisColumn:
     """An axis with its values laid out along a dimension."""
 
     name: str
@@ -93,7 +93,7 @@ class Column:
 
     @property
     def is_choice(self) -> bool:
-        """Whether its values are choices, not numbers."""
+        """True if its values are choices, not numbers."""
         return bool(self.labels)
 
     @property
@@ -110,7 +110,7 @@ class Column:
 
     @property
     def setting(self) -> str:
-        """What its choices are of."""
+        """The setting that its choices are of."""
         assert self.is_choice and not callable(self.of)
         return self.of[0]
 
@@ -130,7 +130,7 @@ class Dimension:
 
     name: str
     size: int
-    columns: tuple[Column, ...]
+    columns: tuple[AxisColumn, ...]
 
 
 def labels_of(setting: str, choices: Sequence[AxisChoice]) -> tuple[str, ...]:
@@ -163,7 +163,7 @@ def structure_of(choice: PyTree) -> Hashable:
 
 
 @dataclass(frozen=True)
-class Design(abc.ABC):
+class SweepDesign(abc.ABC):
     """`n` members in the ranges of the axes; the same `seed` gives the same members.
 
     Args:
@@ -183,7 +183,7 @@ class Design(abc.ABC):
         """Points of the unit cube."""
 
 
-class Sobol(Design):
+class Sobol(SweepDesign):
     """A scrambled Sobol sequence: it fills the ranges most evenly where `n` is a power of two."""
 
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
@@ -194,7 +194,7 @@ class Sobol(Design):
             return qmc.Sobol(dimensions, rng=np.random.default_rng(self.seed)).random(self.n)
 
 
-class LatinHypercube(Design):
+class LatinHypercube(SweepDesign):
     """Each axis is cut into `n` parts of equal probability, with one member in each."""
 
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
@@ -203,7 +203,7 @@ class LatinHypercube(Design):
         return qmc.LatinHypercube(dimensions, rng=np.random.default_rng(self.seed)).random(self.n)
 
 
-class Random(Design):
+class Random(SweepDesign):
     """Independent members."""
 
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:

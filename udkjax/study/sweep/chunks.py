@@ -15,21 +15,21 @@ from jaxtyping import Float, Int
 from udkjax.study.machine import concurrent_chunks
 from udkjax.study.sweep.dataset import bytes_per_member
 from udkjax.study.sweep.executors import Done, Engine, run
-from udkjax.study.sweep.plan import Chunk, Plan
-from udkjax.study.sweep.program import group_run
+from udkjax.study.sweep.groups import group_run
+from udkjax.study.sweep.plan import Chunk, SweepPlan
 
 MEMORY = 2**30  # bytes that members in computation take at most, by default
-COPIES = 4  # of what is stored of a chunk, in memory while it is computed: its parts on the device, joined, and other chunks'
-SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
-TURNS = 4  # chunks for each that computes at a time, so that all have something to do to the end
-SHORTEST = 0.05  # s of work in a chunk for that: to call a program and to store what it gave takes a few hundredths of it
-GROUPS = 3  # whose programs are compiled and tried to estimate a cost, at most; others are taken to be as fast, on average
+CHUNK_COPIES = 4  # of what is stored of a chunk, in memory while it is computed: parts on the device, joined, of other chunks
+CHUNK_SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
+CHUNKS_FOR_EACH = 4  # chunks for each that computes at a time, so that all have something to do to the end
+SHORTEST_CHUNK = 0.05  # s of work in a chunk for that: to call a program and to store what it gave takes a few hundredths of it
+MOST_TRIED_GROUPS = 3  # whose programs are tried to estimate a cost; others are taken to be as fast, on average
 # Steps that a run takes grow by this power of the reciprocal of its tolerances, about: by methods of 8th order, rtol and atol.
-POWER = 1 / 16
+TOLERANCE_POWER = 1 / 16
 
 
 def compute_members(
-    plan: Plan,
+    plan: SweepPlan,
     engine: Engine,
     done: Int[np.ndarray, "n"] | Sequence[int] = (),
     memory: int = MEMORY,
@@ -51,7 +51,7 @@ def compute_members(
         yield from engine(plan, chunks)
 
 
-def members_to_compute(plan: Plan, done: Int[np.ndarray, "n"] | Sequence[int] = ()) -> dict[int, np.ndarray]:
+def members_to_compute(plan: SweepPlan, done: Int[np.ndarray, "n"] | Sequence[int] = ()) -> dict[int, np.ndarray]:
     """Return the members of each group that are not done, the longest first; no group that has none."""
     found = {}
     for group in plan.groups:
@@ -61,7 +61,7 @@ def members_to_compute(plan: Plan, done: Int[np.ndarray, "n"] | Sequence[int] = 
     return found
 
 
-def first_chunks(plan: Plan, orders: Mapping[int, np.ndarray]) -> list[Chunk]:
+def first_chunks(plan: SweepPlan, orders: Mapping[int, np.ndarray]) -> list[Chunk]:
     """Return chunks of one piece that tell how long the members of each group take: as many as are computed at a time."""
     found: list[Chunk] = []
     for index, members in orders.items():
@@ -73,25 +73,27 @@ def first_chunks(plan: Plan, orders: Mapping[int, np.ndarray]) -> list[Chunk]:
 
 
 def cut_chunks(
-    plan: Plan, orders: Mapping[int, np.ndarray], measured: Sequence[tuple[Chunk, float]], memory: int = MEMORY
+    plan: SweepPlan, orders: Mapping[int, np.ndarray], measured: Sequence[tuple[Chunk, float]], memory: int = MEMORY
 ) -> list[Chunk]:
     """Cut members of each group, in their order, into chunks of a few seconds of work and of at most `memory` bytes.
 
     `measured` are chunks of which it is known how long they took (s); groups without one are taken to be as fast as the others.
     """
-    most = max(1, memory // (COPIES * max(1, bytes_per_member(plan))))
+    most = max(1, memory // (CHUNK_COPIES * max(1, bytes_per_member(plan))))
     pace = {index: [seconds / chunk.work for chunk, seconds in measured if chunk.group == index] for index in orders}
     usual = float(np.mean([seconds / chunk.work for chunk, seconds in measured])) if measured else 0.0
     seconds = {k: expected_steps(plan, members) * (np.mean(pace[k]) if pace[k] else usual) for k, members in orders.items()}
-    share = sum(float(each.sum()) for each in seconds.values()) / (TURNS * concurrent_chunks())
+    share = sum(float(each.sum()) for each in seconds.values()) / (CHUNKS_FOR_EACH * concurrent_chunks())
     found: list[Chunk] = []
     for index, members in orders.items():
-        for part in _cut(seconds[index], group_run(plan, index).program.size, most, min(SECONDS, max(SHORTEST, share))):
+        for part in _cut(
+            seconds[index], group_run(plan, index).program.size, most, min(CHUNK_SECONDS, max(SHORTEST_CHUNK, share))
+        ):
             found.append(Chunk(len(measured) + len(found), index, members[part], float(seconds[index][part].sum())))
     return found
 
 
-def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = SECONDS) -> list[slice]:
+def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = CHUNK_SECONDS) -> list[slice]:
     """Cut members into consecutive parts of whole pieces, each of at most `limit` seconds and of at most so many members."""
     most = max(piece, most // piece * piece)
     parts, start = [], 0
@@ -105,11 +107,11 @@ def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = 
     return parts
 
 
-def _chunk(plan: Plan, index: int, group: int, members: np.ndarray) -> Chunk:
+def _chunk(plan: SweepPlan, index: int, group: int, members: np.ndarray) -> Chunk:
     return Chunk(index, group, members, float(expected_steps(plan, members).sum()))
 
 
-def expected_steps(plan: Plan, members: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def expected_steps(plan: SweepPlan, members: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Estimate the steps of members, up to a common factor: by the length of their runs, and a little by their tolerances."""
     places, steps = plan.places(members), np.ones(len(members))
     for column in plan.columns:
@@ -118,7 +120,7 @@ def expected_steps(plan: Plan, members: Int[np.ndarray, "n"]) -> Float[np.ndarra
             if "t1" in column.of:
                 steps = steps * (values / values.max())[places[column.name]]
             if tolerances := len({"rtol", "atol"} & set(column.of)):
-                steps = steps * ((values / values.max()) ** (-tolerances * POWER))[places[column.name]]
+                steps = steps * ((values / values.max()) ** (-tolerances * TOLERANCE_POWER))[places[column.name]]
     return steps
 
 
@@ -127,7 +129,7 @@ def expected_steps(plan: Plan, members: Int[np.ndarray, "n"]) -> Float[np.ndarra
 
 @dataclass(frozen=True)
 class SweepCost:
-    """What a sweep will take in this process, on its devices."""
+    """The cost of a sweep in this process, on its devices."""
 
     members: int
     groups: int  # programs, each compiled once
@@ -139,11 +141,11 @@ class SweepCost:
     computing: float  # s
 
 
-def estimate_cost(plan: Plan, memory: int = MEMORY) -> SweepCost:
+def estimate_cost(plan: SweepPlan, memory: int = MEMORY) -> SweepCost:
     """Compile and run a piece of some groups of a plan, and say what all of it will take."""
     orders, compiling, measured = members_to_compute(plan), [], []
     count = len(plan.groups)
-    for k in np.unique(np.linspace(0, count - 1, min(count, GROUPS)).astype(int)).tolist():
+    for k in np.unique(np.linspace(0, count - 1, min(count, MOST_TRIED_GROUPS)).astype(int)).tolist():
         begun = time.perf_counter()
         group_run(plan, k).compile()
         compiling.append(time.perf_counter() - begun)

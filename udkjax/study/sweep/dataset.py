@@ -11,11 +11,11 @@ from jaxtyping import Int, PyTree
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.units import units_of
-from udkjax.study.sweep.axes import Column, Dimension
-from udkjax.study.sweep.layout import SweepError
+from udkjax.study.sweep.axes import AxisColumn, Dimension
+from udkjax.study.sweep.dimensions import SweepError
+from udkjax.study.sweep.groups import END, RESULT, STEPS, group_run
 from udkjax.study.sweep.measures import Label, guess_label
-from udkjax.study.sweep.plan import Group, Plan, Variable
-from udkjax.study.sweep.program import END, RESULT, STEPS, group_run
+from udkjax.study.sweep.plan import Group, StoredVariable, SweepPlan
 
 if TYPE_CHECKING:
     import xarray
@@ -31,7 +31,7 @@ LABELS = {
 NOT_COMPUTED = -1  # the result of a member that is not among what is finished
 
 
-def describe_group(plan: Plan, group: Group) -> dict[str, Variable]:
+def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
     """Return the variables that are stored of each member of a group."""
     bodies, found = len(plan.mechanism_of(group).body_names), {}
     known = {name: label for measure in plan.measures for name, label in measure.variables.items()} | LABELS
@@ -43,11 +43,11 @@ def describe_group(plan: Plan, group: Group) -> dict[str, Variable]:
             label = Label(found[of].dims, _per(found[of].units, by, plan), f"derivative of {of} by {by}")
         else:
             label = known.get(name) or guess_label(name, info.shape, len(plan.ts), bodies)
-        found[name] = Variable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
+        found[name] = StoredVariable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
     return found
 
 
-def _per(units: str, by: str, plan: Plan) -> str:
+def _per(units: str, by: str, plan: SweepPlan) -> str:
     """Return the unit of a derivative; an empty text where it has none."""
     below = next((column.units for column in plan.columns if column.name == by), None)
     below = units_of(plan.mechanism, by) if below is None else below
@@ -55,12 +55,12 @@ def _per(units: str, by: str, plan: Plan) -> str:
 
 
 @lru_cache(maxsize=8)
-def variables_of(plan: Plan) -> Mapping[str, Variable]:
+def variables_of(plan: SweepPlan) -> Mapping[str, StoredVariable]:
     """Return the variables that are stored of each member. `result`, `end_time` and `steps` are always among them.
 
     Where mechanisms have other bodies, the dimension "body" has all of them, and any other is as long as the longest.
     """
-    found: dict[str, Variable] = {}
+    found: dict[str, StoredVariable] = {}
     for group in plan.groups:
         for name, variable in describe_group(plan, group).items():
             other = found.setdefault(name, variable)
@@ -68,16 +68,16 @@ def variables_of(plan: Plan) -> Mapping[str, Variable]:
                 raise SweepError([f"measure {name!r} has {other.shape} entries for some members and {variable.shape} for others"])
             longest = map(max, other.shape, variable.shape)
             shape = tuple(len(plan.bodies) if d == "body" else size for d, size in zip(variable.dims, longest, strict=True))
-            found[name] = Variable(other.dims, shape, other.dtype, other.units, other.long_name)
+            found[name] = StoredVariable(other.dims, shape, other.dtype, other.units, other.long_name)
     return found
 
 
-def bytes_per_member(plan: Plan) -> int:
+def bytes_per_member(plan: SweepPlan) -> int:
     """Return how many bytes the stored variables of one member take."""
     return sum(int(np.prod(v.shape)) * v.dtype.itemsize for v in variables_of(plan).values())
 
 
-def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> "xarray.Dataset":
+def assemble(plan: SweepPlan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> "xarray.Dataset":
     """Return the xarray Dataset of a plan, from (members, what was stored of them) in any order.
 
     What is not among them is not a number, and has the result -1.
@@ -106,13 +106,15 @@ def assemble(plan: Plan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[
     return data
 
 
-def _fill_value(name: str, variable: Variable) -> float | int | bool:
+def _fill_value(name: str, variable: StoredVariable) -> float | int | bool:
     if name == RESULT:
         return NOT_COMPUTED
     return np.nan if variable.dtype.kind in "fc" else False if variable.dtype.kind == "b" else -1
 
 
-def _put(into: np.ndarray, variable: Variable, members: np.ndarray, values: np.ndarray, places: Sequence[int] | None) -> None:
+def _put(
+    into: np.ndarray, variable: StoredVariable, members: np.ndarray, values: np.ndarray, places: Sequence[int] | None
+) -> None:
     """Write the values of members; those of bodies in their places among all bodies."""
     if "body" in variable.dims and places is not None:
         axis = variable.dims.index("body")
@@ -122,14 +124,14 @@ def _put(into: np.ndarray, variable: Variable, members: np.ndarray, values: np.n
         into[(members, *(slice(n) for n in values.shape[1:]))] = values
 
 
-def _places(plan: Plan) -> dict[int, list[int]]:
+def _places(plan: SweepPlan) -> dict[int, list[int]]:
     """Return for each group the places of its bodies among all bodies, where it has not all of them."""
     everyone = list(plan.bodies)
     own = {group.index: list(plan.mechanism_of(group).body_names) for group in plan.groups}
     return {index: [everyone.index(name) for name in names] for index, names in own.items() if names != everyone}
 
 
-def _coordinates(plan: Plan) -> dict[str, Labelled]:
+def _coordinates(plan: SweepPlan) -> dict[str, Labelled]:
     """Return the values of axes along their dimensions; times, bodies and coordinates where a variable lies along them."""
     found: dict[str, Labelled] = {}
     for dimension in plan.dimensions:
@@ -148,7 +150,7 @@ def _coordinates(plan: Plan) -> dict[str, Labelled]:
     return found
 
 
-def _coordinate(dimension: Dimension, column: Column) -> dict[str, Labelled]:
+def _coordinate(dimension: Dimension, column: AxisColumn) -> dict[str, Labelled]:
     attributes = {"units": column.units} if column.units else {}
     if not callable(column.of) and column.of != (column.name,):
         attributes["of"] = ", ".join(column.of)
@@ -159,7 +161,7 @@ def _coordinate(dimension: Dimension, column: Column) -> dict[str, Labelled]:
     return {dimension.name: np.arange(dimension.size), f"{column.name}_value": (dims, values, attributes)}
 
 
-def _attributes(plan: Plan) -> dict[str, str | int | float]:
+def _attributes(plan: SweepPlan) -> dict[str, str | int | float]:
     settings = {name: value if isinstance(value, str | int | float) else _shown(value) for name, value in plan.settings.items()}
     return {
         "title": plan.mechanism.name,

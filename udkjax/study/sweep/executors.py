@@ -14,21 +14,21 @@ from udkjax.equations.analysis import analyse
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result, versions
 from udkjax.study.machine import concurrent_chunks, cores
-from udkjax.study.sweep.plan import Chunk, Plan
-from udkjax.study.sweep.program import RESULT, GroupRun, group_run
+from udkjax.study.sweep.groups import RESULT, GroupRun, group_run
+from udkjax.study.sweep.plan import Chunk, SweepPlan
 
 if TYPE_CHECKING:
     import distributed
 
 Done: TypeAlias = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, what it gave, and how long that took (s)
-Engine: TypeAlias = Callable[[Plan, Sequence[Chunk]], Generator[Done, None, None]]  # hands over chunks as they are done
+Engine: TypeAlias = Callable[[SweepPlan, Sequence[Chunk]], Generator[Done, None, None]]  # hands over chunks as they are done
 
-RETRIES = 2  # of a chunk that raised: on another worker there may be memory, or room on the disk
-AHEAD = 2  # tasks for each thread of the cluster, so that none waits for the next; more would only fill the workers' memory
-AT_LEAST = 16  # tasks, so that a cluster that grows by what is asked of it sees that something is
+CHUNK_RETRIES = 2  # of a chunk that raised: on another worker there may be memory, or room on the disk
+TASKS_AHEAD = 2  # tasks for each thread of the cluster, so that none waits for the next; more would only fill the workers' memory
+LEAST_TASKS = 16  # tasks, so that a cluster that grows by what is asked of it sees that something is
 
 
-def run(plan: Plan, chunk: Chunk) -> Done:
+def run(plan: SweepPlan, chunk: Chunk) -> Done:
     """Compute the members of a chunk: each stored variable (members, ...), with "result". A failing member has a code, and NaN.
 
     Where a member's numbers made rows independent that the mechanism leaves out as redundant, it is run again without them.
@@ -58,7 +58,7 @@ def _other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarr
 # --- where chunks are computed
 
 
-def compute_on_devices(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
+def compute_on_devices(plan: SweepPlan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
     """Compute chunks, and hand each over when it is done."""
     waiting, width = deque(chunks), concurrent_chunks()
     with ThreadPoolExecutor(width, thread_name_prefix="sweep") as pool:
@@ -97,17 +97,17 @@ def dask_engine(client: "distributed.Client | None" = None) -> Engine:
                 'processes are on this machine (in a script: below `if __name__ == "__main__":`)'
             ) from None
 
-    def engine(plan: Plan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
+    def engine(plan: SweepPlan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
         wanted = _deciding_versions()
         # Not scattered: data that was scattered is gone with the worker that held it, what a task returned is made again.
         shared = client.submit(_same, plan, pure=False)
         waiting, running, results = deque(chunks), {}, distributed.as_completed()
 
         def fill() -> None:
-            room = max(AT_LEAST, AHEAD * sum(cast("dict[str, int]", client.nthreads()).values())) - len(running)
+            room = max(LEAST_TASKS, TASKS_AHEAD * sum(cast("dict[str, int]", client.nthreads()).values())) - len(running)
             for _ in range(min(room, len(waiting))):
                 chunk = waiting.popleft()
-                future = client.submit(_run, shared, chunk, wanted, pure=False, retries=RETRIES, priority=-chunk.index)
+                future = client.submit(_run, shared, chunk, wanted, pure=False, retries=CHUNK_RETRIES, priority=-chunk.index)
                 running[future.key] = chunk, future
                 results.add(future)
 
@@ -152,11 +152,11 @@ def start_client(scheduler: str | None = None) -> Iterator["distributed.Client"]
         yield client
 
 
-def _same(plan: Plan) -> Plan:
+def _same(plan: SweepPlan) -> SweepPlan:
     return plan
 
 
-def _run(plan: Plan, chunk: Chunk, wanted: dict[str, str]) -> Done:
+def _run(plan: SweepPlan, chunk: Chunk, wanted: dict[str, str]) -> Done:
     """Compute a chunk on a worker."""
     if (found := _deciding_versions()) != wanted:
         differing = ", ".join(f"{name} {found[name]} instead of {wanted[name]}" for name in wanted if found[name] != wanted[name])

@@ -1,4 +1,4 @@
-"""What decides the results of a sweep, as JSON takes it, and how two of them differ, in words."""
+"""The fingerprint of a sweep: all that decides its results, as JSON; and the differences of two of them, in words."""
 
 import difflib
 import hashlib
@@ -15,17 +15,17 @@ from jaxtyping import PyTree
 from udkjax.integrate.solution import Solution, scene_text, versions
 from udkjax.scene.checks import abbreviate
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.sweep.axes import Column
+from udkjax.study.sweep.axes import AxisColumn
 from udkjax.study.sweep.measures import Measure
-from udkjax.study.sweep.plan import Plan
+from udkjax.study.sweep.plan import SweepPlan
 
 Json: TypeAlias = "str | int | float | bool | Sequence[Json] | Mapping[str, Json] | None"
 MOST_LINES = 24  # on differences; more are counted
-SHORT = 64  # numbers that are spelled out; of more, how many, the first, the last, and a digest
+MOST_NUMBERS = 64  # numbers that are spelled out; of more, how many, the first, the last, and a digest
 STATS = ("steps", "accepted", "rejected", "right_hand_sides", "projections")
 
 
-def fingerprint(plan: Plan) -> dict[str, Json]:
+def fingerprint(plan: SweepPlan) -> dict[str, Json]:
     """Return everything that two plans of the same results have in common."""
     return {
         **_mechanism(plan.mechanism),
@@ -39,14 +39,14 @@ def fingerprint(plan: Plan) -> dict[str, Json]:
     }
 
 
-def _axis(plan: Plan, column: Column) -> dict[str, Json]:
+def _axis(plan: SweepPlan, column: AxisColumn) -> dict[str, Json]:
     of: Json = None if callable(column.of) else column.of
     if callable(column.of):
         of = _function(column.of, plan.mechanism, np.zeros(column.numbers.shape[1:]))
     return {"of": of, "values": [_value(value) for value in column.values] if column.is_choice else _value(column.values)}
 
 
-def _measure(plan: Plan, measure: Measure) -> dict[str, Json]:
+def _measure(plan: SweepPlan, measure: Measure) -> dict[str, Json]:
     found: dict[str, Json] = {"under": measure.renamed}
     if measure.function is not None:
         found["function"] = _function(measure.function, plan.mechanism, _solution(plan))
@@ -57,7 +57,7 @@ def _measure(plan: Plan, measure: Measure) -> dict[str, Json]:
     return found
 
 
-def _solution(plan: Plan) -> Solution:
+def _solution(plan: SweepPlan) -> Solution:
     """Return a solution of the right shapes."""
     number, states = np.zeros(()), np.zeros((len(plan.ts), len(plan.mechanism.body_names), 3))
     count = np.zeros((), int)
@@ -87,7 +87,7 @@ def _value(value: PyTree) -> Json:
         return _mechanism(value)
     if isinstance(value, float | np.ndarray | np.number | jax.Array):
         array = np.asarray(value)
-        if array.size <= SHORT:
+        if array.size <= MOST_NUMBERS:
             return array.tolist()
         first, last = float(array.flat[0]), float(array.flat[-1])
         return {

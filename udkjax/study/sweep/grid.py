@@ -14,7 +14,7 @@ from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion
 from udkjax.scene.toml_text import parse_toml
 from udkjax.study.choices import CHOICES, Choice, choice
 from udkjax.study.quantities import Angle, Length, Scaled, Setter
-from udkjax.study.sweep.axes import Axis, Design, Distribution, LatinHypercube, Random, Sobol, Values, Zipped
+from udkjax.study.sweep.axes import Axis, Distribution, LatinHypercube, Random, Sobol, SweepDesign, Values, Zipped
 
 Toml: TypeAlias = "str | int | float | bool | list[Toml] | dict[str, Toml]"
 Table: TypeAlias = Mapping[str, Toml]
@@ -209,7 +209,7 @@ class _GridReader:
                 found[name] = self.number(place, value)
         return found
 
-    def design(self, given: Table) -> Design | None:
+    def design(self, given: Table) -> SweepDesign | None:
         self.check_keys("design", given, ("type", "members", "seed"))
         kind = given.get("type")
         members, seed = self.whole("design.members", given.get("members"), 1), self.whole("design.seed", given.get("seed", 0), 0)

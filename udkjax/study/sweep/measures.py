@@ -27,10 +27,10 @@ MeasureChoice = TypeAliasType("MeasureChoice", OneMeasure | Sequence[OneMeasure]
 # Coordinates (T, bodies, 3) that runs are compared with, or a function (mechanism, ts) of them.
 Reference = TypeAliasType("Reference", Solution | Numbers | Callable[[Mechanism, Array], Numbers] | None)
 
-NOT_REACHED = -1  # the rank at output times that a run has not reached
+RANK_NOT_REACHED = -1  # the rank at output times that a run has not reached
 
 
-class Run(NamedTuple):
+class MeasuredRun(NamedTuple):
     """A member that has been run, as a measure sees it."""
 
     mechanism: Mechanism
@@ -40,7 +40,7 @@ class Run(NamedTuple):
 
 
 class Label(NamedTuple):
-    """How a dataset labels a variable."""
+    """The labels of a variable in a dataset."""
 
     dims: tuple[str, ...]
     units: str
@@ -49,23 +49,23 @@ class Label(NamedTuple):
 
 @dataclass(frozen=True)
 class Measure:
-    """What to store of a run: `compute(run)` gives arrays by name."""
+    """The part of a run to be stored: `compute(run)` gives arrays by name."""
 
     name: str
     along: bool  # whether it needs all output times, not only the end
-    compute: Callable[[Run], Mapping[str, Array]]
+    compute: Callable[[MeasuredRun], Mapping[str, Array]]
     labels: Mapping[str, Label]  # empty: of a user's function
     reference: Reference = None
     renamed: str = ""  # the key that it was given under
 
     def of(self, mechanism: Mechanism, solution: Solution, method: Pseudoinverse | None) -> dict[str, Array]:
         """Return the arrays that are stored, under their names in the dataset."""
-        found = self.compute(Run(mechanism, solution, method, self.reference))
+        found = self.compute(MeasuredRun(mechanism, solution, method, self.reference))
         return {self._key(name): jnp.asarray(value) for name, value in found.items()}
 
     @property
     def variables(self) -> dict[str, Label]:
-        """How its variables are labelled, by their names in the dataset; those of a user's function are not known."""
+        """The labels of its variables, by their names in the dataset; those of a user's function are not known."""
         return {self._key(name): label for name, label in self.labels.items()}
 
     @property
@@ -137,7 +137,7 @@ class _ChannelMeasure:
 
     channel: Channel
 
-    def __call__(self, run: Run) -> dict[str, Array]:
+    def __call__(self, run: MeasuredRun) -> dict[str, Array]:
         return {self.channel.name: evaluate_channels(run.mechanism, run.solution, (self.channel,))[:, 0]}
 
 
@@ -148,7 +148,7 @@ class _UserMeasure:
     function: UserMeasure
     name: str
 
-    def __call__(self, run: Run) -> dict[str, Array]:
+    def __call__(self, run: MeasuredRun) -> dict[str, Array]:
         found = self.function(run.mechanism, run.solution)
         if isinstance(found, Mapping):
             return {f"{self.name}_{key}": jnp.asarray(value) for key, value in found.items()}
@@ -173,34 +173,34 @@ def _largest(x: Array) -> Array:
     return jnp.max(jnp.where(jnp.isnan(x), 0.0, jnp.abs(x)), initial=0.0)
 
 
-def _final(run: Run) -> dict[str, Array]:
+def _final(run: MeasuredRun) -> dict[str, Array]:
     return {"q_end": run.solution.q[-1], "v_end": run.solution.v[-1]}
 
 
-def _states(run: Run) -> dict[str, Array]:
+def _states(run: MeasuredRun) -> dict[str, Array]:
     return {"q": run.solution.q, "v": run.solution.v}
 
 
-def _violation(run: Run) -> dict[str, Array]:
+def _violation(run: MeasuredRun) -> dict[str, Array]:
     return {"violation": _largest(violation(run.mechanism, run.solution))}
 
 
-def _energy_drift(run: Run) -> dict[str, Array]:
+def _energy_drift(run: MeasuredRun) -> dict[str, Array]:
     total = energy(run.mechanism, run.solution).total
     return {"energy_drift": _largest(total - total[0])}
 
 
-def _error(run: Run) -> dict[str, Array]:
+def _error(run: MeasuredRun) -> dict[str, Array]:
     reference = run.reference(run.mechanism, run.solution.ts) if callable(run.reference) else run.reference
     error = run.solution.q - jnp.asarray(getattr(reference, "q", reference))
     return {"position_error": _largest(error[..., :2]), "angle_error": _largest(error[..., 2])}
 
 
-def _counts(run: Run) -> dict[str, Array]:
+def _counts(run: MeasuredRun) -> dict[str, Array]:
     return {name: count for name, count in run.solution.stats.items() if name != "steps"}
 
 
-def _rank(run: Run) -> dict[str, Array]:
+def _rank(run: MeasuredRun) -> dict[str, Array]:
     """Compute ranks by the method's own rule; that of `Auto` is the rule of the singular values that it falls back to."""
     method = Auto() if run.method is None else run.method
     method = method.rank_revealing if isinstance(method, Auto) else method
@@ -209,12 +209,12 @@ def _rank(run: Run) -> dict[str, Array]:
     equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))
     reached = jnp.all(jnp.isfinite(q), axis=1)
     ranks = jax.vmap(lambda t, q: method.rank(equations.weighted_rows(t, q)[0]))(ts, jnp.where(reached[:, None], q, q[0]))
-    return {"rank": jnp.where(reached, ranks, NOT_REACHED)}
+    return {"rank": jnp.where(reached, ranks, RANK_NOT_REACHED)}
 
 
 _STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
 # Whether all output times are needed, the function, and its variables.
-MEASURES: dict[str, tuple[bool, Callable[[Run], dict[str, Array]], dict[str, Label]]] = {
+MEASURES: dict[str, tuple[bool, Callable[[MeasuredRun], dict[str, Array]], dict[str, Label]]] = {
     "final": (
         False,
         _final,

@@ -18,16 +18,16 @@ from udkjax.integrate.simulate import simulate
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import require_output_times
-from udkjax.study.sweep.axes import AxisChoice, AxisValues, Column, Design, Dimension, structure_of
-from udkjax.study.sweep.layout import Settings, SweepError, check_settings, check_tangents, lay_out
+from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimension, SweepDesign, structure_of
+from udkjax.study.sweep.dimensions import Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
 
 OUTSIDE = ("throw", "progress", "adjoint")  # arguments of simulate that a sweep decides about
 
 
 @dataclass(frozen=True, eq=False)
-class Variable:
-    """What is stored of each member under one name."""
+class StoredVariable:
+    """A variable that is stored of each member."""
 
     dims: tuple[str, ...]  # besides those of the sweep
     shape: tuple[int, ...]
@@ -57,8 +57,8 @@ class Chunk:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """What a sweep is. Immutable; it pickles, so that other processes can compute parts of it. Made by `make_plan`."""
+class SweepPlan:
+    """The plan of a sweep. Immutable; it pickles, so that other processes can compute parts of it. Made by `make_plan`."""
 
     mechanism: Mechanism
     dimensions: tuple[Dimension, ...]
@@ -66,27 +66,27 @@ class Plan:
     settings: Settings  # of simulate, those that are no axes
     measures: tuple[Measure, ...]
     derivatives: tuple[str, ...] = ()
-    design: Design | None = None
+    design: SweepDesign | None = None
     token: str = field(default_factory=lambda: uuid.uuid4().hex)  # the same in every copy: what was compiled for one serves all
 
     def __hash__(self) -> int:
         return hash(self.token)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Plan) and self.token == other.token
+        return isinstance(other, SweepPlan) and self.token == other.token
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """How many values each dimension has."""
+        """The number of values along each dimension."""
         return tuple(dimension.size for dimension in self.dimensions)
 
     @property
     def size(self) -> int:
-        """How many members there are."""
+        """The number of members."""
         return int(np.prod(self.shape))
 
     @property
-    def columns(self) -> tuple[Column, ...]:
+    def columns(self) -> tuple[AxisColumn, ...]:
         """All axes, in their order."""
         return tuple(column for dimension in self.dimensions for column in dimension.columns)
 
@@ -148,11 +148,11 @@ def make_plan(
     ts: ArrayLike,
     measure: MeasureChoice = "final",
     *,
-    design: Design | None = None,
+    design: SweepDesign | None = None,
     reference: Reference = None,
     derivatives: Sequence[str] = (),
     **settings: Any,
-) -> Plan:
+) -> SweepPlan:
     """Make the plan of a sweep; arguments as those of `udkjax.sweep`. Raises `SweepError`, which lists every mistake."""
     problems = [f"{name}: a sweep has no such setting" for name in settings if name in OUTSIDE]
     wrong = argument_problems(make_plan, {"mechanism": mechanism})
@@ -183,10 +183,10 @@ def make_plan(
     if problems:
         raise SweepError(problems)
     stored = ts if any(measure.along for measure in measures) else ts[[0, -1]]
-    return Plan(mechanism, dimensions, stored, settings, measures, tuple(derivatives), design)
+    return SweepPlan(mechanism, dimensions, stored, settings, measures, tuple(derivatives), design)
 
 
-def _number_structures(column: Column) -> np.ndarray:
+def _number_structures(column: AxisColumn) -> np.ndarray:
     """Return for each of the choices of an axis the number of its structure."""
     structures = [
         (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in column.choices

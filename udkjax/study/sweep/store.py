@@ -1,4 +1,4 @@
-"""What a sweep has finished, on disk: whatever ends the process, what is there is whole, and what is there is not computed again.
+"""The finished chunks of a sweep, on disk: whatever ends the process, what is there is whole, and is not computed again.
 
 A folder holds `sweep.json`, which says what the sweep is, and `chunks/`, one file for each chunk. A file comes into being under
 its name only when all of it is on the disk; the name ends with digests of the sweep and of the file. So where `sweep.json` is
@@ -22,9 +22,9 @@ from udkjax.study.sweep.fingerprint import Json, differences
 from udkjax.study.sweep.plan import Chunk
 
 FORMAT = 2
-UNFINISHED = ".unfinished"  # what a file's name ends with while it is written
+UNFINISHED_SUFFIX = ".unfinished"  # what a file's name ends with while it is written
 MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
-MEMBERS, STORED = "members", "stored/"  # in a file: whom its numbers belong to, and what goes before the names of these
+MEMBERS, STORED_PREFIX = "members", "stored/"  # in a file: whom its numbers belong to, and what goes before the names of these
 ADVICE = "choose another folder, or remove this one to begin anew"
 
 Data = Mapping[str, np.ndarray]
@@ -35,7 +35,7 @@ class StoreError(OSError):
 
 
 class MemoryStore:
-    """What a sweep has finished, where nothing is to outlive the process."""
+    """The finished chunks of a sweep, where nothing is to outlive the process."""
 
     def __init__(self):
         self._done: list[tuple[np.ndarray, Data]] = []
@@ -56,7 +56,7 @@ class MemoryStore:
 
 
 class FolderStore:
-    """What a sweep has finished, in a folder that only one process may write to at a time.
+    """The finished chunks of a sweep, in a folder that only one process may write to at a time.
 
     `fingerprint` says what decides the result. A folder in which another sweep was begun is refused, and the difference spelled
     out. Raises `StoreError`.
@@ -93,7 +93,7 @@ class FolderStore:
     def write(self, chunk: Chunk, data: Data) -> None:
         """Write what a chunk gave, whole or not at all: one array for each name, whose first axis is the chunk's members."""
         stream = io.BytesIO()
-        np.savez(stream, allow_pickle=False, **{MEMBERS: chunk.members}, **{STORED + name: x for name, x in data.items()})
+        np.savez(stream, allow_pickle=False, **{MEMBERS: chunk.members}, **{STORED_PREFIX + name: x for name, x in data.items()})
         content = stream.getvalue()
         self._write(f"{CHUNKS}/{chunk.index:06d}-{self._sweep}-{digest(content)}.npz", content)
 
@@ -110,11 +110,11 @@ class FolderStore:
                 continue
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
                 data = dict(archive)
-            yield data.pop(MEMBERS), {name.removeprefix(STORED): values for name, values in data.items()}
+            yield data.pop(MEMBERS), {name.removeprefix(STORED_PREFIX): values for name, values in data.items()}
 
     def _begin(self, sweep: dict[str, Json]) -> None:
         """Say what the sweep is; where something is there already, compare."""
-        for file in (*self.folder.glob(f"*{UNFINISHED}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED}")):
+        for file in (*self.folder.glob(f"*{UNFINISHED_SUFFIX}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED_SUFFIX}")):
             file.unlink(missing_ok=True)  # of a process that was killed while it wrote
         manifest = self.folder / MANIFEST
         try:
@@ -175,7 +175,7 @@ def _cannot_use(folder: Path, error: OSError) -> str:
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that, whenever the process or the machine stops, it is there as it was before, or all of it is."""
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED}")
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED_SUFFIX}")
     try:
         with open(unfinished, "wb") as file:
             file.write(content)

@@ -10,15 +10,15 @@ from udkjax.extras import require
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.progress import ProgressOption, report_progress
-from udkjax.study.sweep.axes import AxisValues, Design
+from udkjax.study.sweep.axes import AxisValues, SweepDesign
 from udkjax.study.sweep.chunks import MEMORY, compute_members
 from udkjax.study.sweep.dataset import assemble
 from udkjax.study.sweep.executors import Engine as Compute
 from udkjax.study.sweep.executors import compute_on_devices, dask_engine
 from udkjax.study.sweep.fingerprint import fingerprint
+from udkjax.study.sweep.groups import RESULT
 from udkjax.study.sweep.measures import MeasureChoice, Reference
 from udkjax.study.sweep.plan import make_plan
-from udkjax.study.sweep.program import RESULT
 from udkjax.study.sweep.store import open_store, read_variable
 from udkjax.study.sweep.sweep_progress import Watch
 
@@ -36,7 +36,7 @@ def sweep(
     ts: ArrayLike,
     measure: MeasureChoice = "final",
     *,
-    design: Design | None = None,
+    design: SweepDesign | None = None,
     reference: Reference = None,
     derivatives: Sequence[str] = (),
     engine: Engine = "auto",

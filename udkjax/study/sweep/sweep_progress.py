@@ -1,4 +1,4 @@
-"""How far a sweep is: who is done, who failed, who was slowest, and how long the rest will take."""
+"""The progress of a sweep: who is done, who failed, who was slowest, and how long the rest will take."""
 
 import time
 from collections import Counter
@@ -19,7 +19,7 @@ STEPS = "steps"  # the variable by which members are compared
 
 @dataclass(frozen=True)
 class SweepProgress(Progress):
-    """How far a sweep is: `done` of `total` members, those of an earlier run that it goes on with among them.
+    """The progress of a sweep: `done` of `total` members, those of an earlier run that it goes on with among them.
 
     Attributes:
         rate: members a second, in this run; None until something is done.

@@ -1,4 +1,4 @@
-"""What is computed of the members of a group: from their places in the sweep to what is stored of them.
+"""The computation of the members of a group: from their places in the sweep to what is stored of them.
 
 Members of a group differ by numbers alone. These are arguments of its program: those that all members share, and those of each.
 """
@@ -22,22 +22,21 @@ from udkjax.pinv import Auto, Elimination
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import NUMBERS
-from udkjax.study.machine import CHUNKED, MEMBERS
-from udkjax.study.members import Outputs, Program
+from udkjax.study.machine import CHUNKED_PLATFORMS, PIECE_MEMBERS
+from udkjax.study.members import MOST_PROGRAMS, Outputs, Program
 from udkjax.study.quantities import parameter_value
-from udkjax.study.sweep.plan import Plan, stack_choices
+from udkjax.study.sweep.plan import SweepPlan, stack_choices
 
 RESULT, END, STEPS = "result", "end_time", "steps"  # stored of every member
-WIDTH = 8  # members: a piece has a multiple, of what the widest vector units hold
-WIDE = 4096  # members of a piece where a device takes them all at once
-TOGETHER = 8  # times `MEMBERS` in a piece, at most: to call a program takes what ten of its members take
-MANY = 16  # pieces that a group has at least, before they get larger: so that all devices have something to do
-STRAIGHT = (type(None), Auto, Elimination)  # methods by straight-line code, which vector instructions suit
-PROGRAMS = 64  # in memory at most: a program holds its plan
+LANE_WIDTH = 8  # members: a piece has a multiple, of what the widest vector units hold
+DEVICE_PIECE = 4096  # members of a piece where a device takes them all at once
+LARGEST_PIECE = 8  # times `PIECE_MEMBERS` in a piece, at most: to call a program takes what ten of its members take
+LEAST_PIECES = 16  # pieces that a group has at least, before they get larger: so that all devices have something to do
+STRAIGHT_METHODS = (type(None), Auto, Elimination)  # methods by straight-line code, which vector instructions suit
 
 
 class Shared(NamedTuple):
-    """What all members of a group have in common: the numbers of settings, and the closed initial state, where that is one."""
+    """The numbers that all members of a group share: those of settings, and the closed initial state, where that is one."""
 
     settings: Mapping[str, PyTree]
     closure: Closure | None
@@ -51,7 +50,7 @@ class Own(NamedTuple):
     members: np.ndarray | Array
 
 
-class Choices(NamedTuple):
+class GroupChoices(NamedTuple):
     """The choices of an axis that occur in a group: their numbers, one behind the other, what they share, and their places."""
 
     axis: str
@@ -63,21 +62,21 @@ class Choices(NamedTuple):
 class GroupRun:
     """The members of a group, and how they are computed; `redundant`: rows of Psi to leave out, where not the mechanism's."""
 
-    def __init__(self, plan: Plan, index: int, redundant: tuple[int, ...] | None = None):
+    def __init__(self, plan: SweepPlan, index: int, redundant: tuple[int, ...] | None = None):
         group = plan.groups[index]
         self.plan, self.members = plan, group.members
         self.names = tuple(plan.derivatives)
         self.numbers = tuple(column for column in plan.columns if not column.is_choice)
         fixed: dict[str, PyTree] = {"mechanism": plan.mechanism, **plan.settings}
         fixed |= {name: number(value) for name, value in plan.settings.items() if name in NUMBERS and value is not None}
-        self._own: dict[str, Choices] = {}
+        self._own: dict[str, GroupChoices] = {}
         for column in plan.columns:
             if column.is_choice:
                 setting, places = column.setting, group.choices[column.name]
                 fixed[setting] = column.choices[places[0]]
                 if len(places) > 1 and jax.tree.leaves(eqx.filter(fixed[setting], eqx.is_array)):
                     arrays, static = stack_choices([column.choices[k] for k in places])
-                    self._own[setting] = Choices(column.name, arrays, static, np.array(places))
+                    self._own[setting] = GroupChoices(column.name, arrays, static, np.array(places))
         analysis = analyse(fixed["mechanism"])
         self.redundant = analysis.redundant_rows if redundant is None else redundant
         fixed["analysis"] = dataclasses.replace(analysis, redundant_rows=self.redundant)
@@ -86,7 +85,7 @@ class GroupRun:
             column = next(column for column in plan.columns if column.name == own.axis)
             analyses = [analyse(cast(Mechanism, column.choices[k])) for k in own.places]
             found = [dataclasses.replace(one, redundant_rows=self.redundant) for one in analyses]
-            self._own["analysis"] = Choices(own.axis, *stack_choices(found), own.places)
+            self._own["analysis"] = GroupChoices(own.axis, *stack_choices(found), own.places)
         given = {setting for setting in fixed if setting not in self._own}
         arrays, self._static = eqx.partition({setting: fixed[setting] for setting in given}, eqx.is_array)
         targets = [target for column in self.numbers for target in (("",) if callable(column.of) else column.of)]
@@ -97,7 +96,7 @@ class GroupRun:
         self.shared = jax.tree.map(np.asarray, Shared(arrays, closure))
         in_lanes = (
             is_explicit(fixed.get("solver"))
-            and isinstance(fixed.get("method"), STRAIGHT)
+            and isinstance(fixed.get("method"), STRAIGHT_METHODS)
             and self.redundant is not None
             and fixed.get("formulation") is None
         )
@@ -180,7 +179,7 @@ class GroupRun:
 
     @property
     def outputs(self) -> dict[str, jax.ShapeDtypeStruct]:
-        """What is stored of one member: shapes and types."""
+        """The shapes and types of what is stored of one member."""
         stored, slopes = self.program.shapes(self.shared, self.own(self.members[:1]))
         return stored | {name: stored[of] for name, (of, _) in self._names_of_slopes(slopes).items()}
 
@@ -205,13 +204,13 @@ def _with(choice: PyTree, name: str, value: np.ndarray | Array) -> PyTree:
 
 def _piece(members: int, in_lanes: bool, platform: str) -> int:
     """Return how many members are computed at once on each device: in vector lanes, or one by one."""
-    full = -(-members // WIDTH) * WIDTH
-    if platform not in CHUNKED:
-        return min(WIDE, full)
-    return min(MEMBERS * max(1, min(TOGETHER, members // (MEMBERS * MANY))), full) if in_lanes else 1
+    full = -(-members // LANE_WIDTH) * LANE_WIDTH
+    if platform not in CHUNKED_PLATFORMS:
+        return min(DEVICE_PIECE, full)
+    return min(PIECE_MEMBERS * max(1, min(LARGEST_PIECE, members // (PIECE_MEMBERS * LEAST_PIECES))), full) if in_lanes else 1
 
 
-@lru_cache(maxsize=PROGRAMS)
-def group_run(plan: Plan, group: int, redundant: tuple[int, ...] | None = None) -> GroupRun:
+@lru_cache(maxsize=MOST_PROGRAMS)
+def group_run(plan: SweepPlan, group: int, redundant: tuple[int, ...] | None = None) -> GroupRun:
     """Return how the members of a group are computed: compiled once for each process."""
     return GroupRun(plan, group, redundant)

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.study.sweep.axes import scale_to_range
+from udkjax.study.sweep.dimensions import lay_out
 from udkjax.study.sweep.fingerprint import fingerprint
-from udkjax.study.sweep.layout import lay_out
 from udkjax.study.sweep.measures import MeasureChoice
 from udkjax.study.sweep.plan import make_plan
 

@@ -25,15 +25,15 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Quantity, channel_of
 from udkjax.study.identify.loop_consistency import nearest_closable, require_consistent_loops
 from udkjax.study.identify.parameters import Asked, unknowns_of
-from udkjax.study.identify.prediction import LOOSE, TIGHT, Members, Prediction, Predictor, Runs, Tolerances
+from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Members, Prediction, Predictor, Runs, Tolerances
 from udkjax.study.identify.record_reader import Data, records_of
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, pad_times, tabulate
 from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, initial_state_unknowns, with_conditions
 
-STILL = 1e-12  # of the largest number in a channel: with a smaller deviation the channel does not move
+STILL_DEVIATION = 1e-12  # of the largest number in a channel: with a smaller deviation the channel does not move
 # Of the largest singular value of a Jacobian: directions below it do not show in what was measured. A change that leaves the
 # equations of motion as they are has 1e-16, whatever the tolerance; derivatives integrated at 1e-7 have errors of 1e-8.
-INVISIBLE = 1e-8
+INVISIBLE_RATIO = 1e-8
 RESIDUALS_PER_UNKNOWN = 3.0  # in the first part of a record that is fitted, and in a piece: fewer would follow the noise
 # Arguments of `simulate` that an identification decides about.
 DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress", "analysis")
@@ -49,12 +49,12 @@ class Residuals(NamedTuple):
 
     @property
     def ok(self) -> np.ndarray:
-        """Whether all of it is finite, of runs that came to their end (B,)."""
+        """True (B,) where all of it is finite, of runs that came to their end."""
         return (self.code == Result.successful) & np.isfinite(self.r).all(1) & np.isfinite(self.J).all((1, 2))
 
 
-class Problem:
-    """What is to be minimized, as a function of the unknowns z (K,): P of parameters, then those of initial states.
+class FitProblem:
+    """The residuals to be minimized, as a function of the unknowns z (K,): P of parameters, then those of initial states.
 
     Attributes:
         ts: times (records, times) of the records, from their beginning on (s).
@@ -195,7 +195,7 @@ def _size_of(values: np.ndarray) -> float:
     found = values[np.isfinite(values)]
     size = np.abs(found).max(initial=0.0)
     deviation = found.std() if found.size else 0.0
-    return float(deviation if deviation > STILL * size else size or 1.0)
+    return float(deviation if deviation > STILL_DEVIATION * size else size or 1.0)
 
 
 def _times_until(ts: np.ndarray, horizon: float) -> np.ndarray:
@@ -217,8 +217,8 @@ def build_problem(
     seed: int = 0,
     strategy: Strategy = "auto",
     initial_state: Start | Estimated | None = None,
-    tol: float = TIGHT,
-) -> Problem:
+    tol: float = TIGHT_TOL,
+) -> FitProblem:
     """Build the problem that arguments of `identify` pose.
 
     Raises:
@@ -267,7 +267,7 @@ def _check_settings(mechanism: Mechanism, settings: Mapping[str, Any]) -> None:
 
 def _closable_problem(
     mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any], seed: int, tol: float
-) -> Problem:
+) -> FitProblem:
     """Build the problem at the first guess; where that cannot be closed, at the nearest that can.
 
     Whether a mechanism without redundant rows closes is seen by the first run, which the fit begins with: to look before would
@@ -275,8 +275,8 @@ def _closable_problem(
     """
     if unknowns.at_scene_values and analyse(mechanism).redundant_rows == ():
         try:
-            problem = Problem(mechanism, unknowns, records, settings)
-            first = problem.evaluate(np.zeros((1, problem.K)), (max(tol, LOOSE), max(tol, LOOSE)))
+            problem = FitProblem(mechanism, unknowns, records, settings)
+            first = problem.evaluate(np.zeros((1, problem.K)), (max(tol, LOOSE_TOL), max(tol, LOOSE_TOL)))
             if first.code[0] != Result.could_not_assemble:
                 return problem
         except AssemblyError:
@@ -284,4 +284,4 @@ def _closable_problem(
     analysis, unknowns = nearest_closable(mechanism, unknowns, seed)
     if analysis.redundant_rows:
         require_consistent_loops(mechanism, unknowns)
-    return Problem(mechanism, unknowns, records, {**settings, "analysis": analysis})
+    return FitProblem(mechanism, unknowns, records, {**settings, "analysis": analysis})

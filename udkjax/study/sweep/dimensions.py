@@ -21,10 +21,10 @@ from udkjax.study.sweep.axes import (
     CHOICES,
     Axis,
     AxisChoice,
+    AxisColumn,
     AxisValues,
-    Column,
-    Design,
     Dimension,
+    SweepDesign,
     Values,
     Zipped,
     labels_of,
@@ -48,7 +48,7 @@ class SweepError(Mistakes):
     subject = "sweep"
 
 
-def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: Design | None = None) -> tuple[Dimension, ...]:
+def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: SweepDesign | None = None) -> tuple[Dimension, ...]:
     """Return the dimensions of a sweep over `axes`. Raises `SweepError`."""
     problems: list[str] = []
     ranges = [name for name, given in axes.items() if design is not None and not isinstance(given, Zipped) and _is_range(given)]
@@ -83,12 +83,14 @@ def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: Design
 
 
 def _is_range(given: "Axis | Values") -> bool:
-    """Whether a design fills this axis: all but choices."""
+    """Return whether a design fills this axis: all but choices."""
     values = given.values if isinstance(given, Axis) else given
     return hasattr(values, "ppf") or _numbers(values) is not None
 
 
-def _column(mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray | None, problems: list[str]) -> Column | None:
+def _column(
+    mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray | None, problems: list[str]
+) -> AxisColumn | None:
     """Lay out one axis; None: its mistake is among the problems."""
     assert not isinstance(given, Zipped), "its axes come one by one"
     axis = given if isinstance(given, Axis) else Axis(given)
@@ -114,10 +116,10 @@ def _column(mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray
     if not callable(of):
         problems += _misfits(mechanism, name, of, numbers)
     units = axis.units if axis.units is not None else "" if callable(of) else units_of(mechanism, of[0])
-    return Column(name, numbers, of, units)
+    return AxisColumn(name, numbers, of, units)
 
 
-def _choices(name: str, of: tuple[str, ...], values: Values, problems: list[str]) -> Column | None:
+def _choices(name: str, of: tuple[str, ...], values: Values, problems: list[str]) -> AxisColumn | None:
     if len(of) != 1:
         problems.append(f"axis {quote(name)}: choices cannot be tied, but it is of {', '.join(map(quote, of))}; zip them instead")
         return None
@@ -129,7 +131,7 @@ def _choices(name: str, of: tuple[str, ...], values: Values, problems: list[str]
         problems.append(f"axis {quote(name)}: must be States, as `assemble` returns them")
     if of == ("mechanism",) and not all(isinstance(choice, Mechanism) for choice in choices):
         problems.append(f"axis {quote(name)}: must be Mechanisms")
-    return Column(name, choices, of, "", labels_of(of[0], choices))
+    return AxisColumn(name, choices, of, "", labels_of(of[0], choices))
 
 
 def _states(stacked: State) -> tuple[State, ...]:
