@@ -1,4 +1,4 @@
-"""Which geoms of an MJCF model may touch each other when it moves."""
+"""Pairs of geoms of an MJCF model that may touch each other when it moves."""
 
 from itertools import combinations
 

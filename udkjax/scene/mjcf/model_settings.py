@@ -1,4 +1,4 @@
-"""What holds for a whole MJCF model: its compiler's settings, what its options switch off, and its defaults."""
+"""Settings of a whole MJCF model: its compiler's, what its options switch off, and its defaults."""
 
 import math
 

@@ -23,7 +23,7 @@ class MotionPlane(NamedTuple):
 
 
 class PlaneMotion(NamedTuple):
-    """How far a body has moved in the plane from where it is written down, and how it moves."""
+    """Motion of a body in the plane from where it is written down, and its velocity."""
 
     angle: float = 0.0  # rad
     shift: complex = 0j  # m; a point z is at exp(i angle) z + shift

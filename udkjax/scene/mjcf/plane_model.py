@@ -31,7 +31,7 @@ class Ends(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """From one point to the other (m)."""
+        """The vector from one point to the other (m)."""
         return abs(self.points[1] - self.points[0])
 
 

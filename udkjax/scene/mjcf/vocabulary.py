@@ -1,4 +1,4 @@
-"""What of MJCF is taken over, what has no effect on a motion, and what is refused wherever it says more than nothing.
+"""Vocabulary of MJCF: what is taken over, what has no effect on a motion, and what is refused wherever it says more than nothing.
 
 An element or an attribute that stands nowhere here is refused by its name.
 """

@@ -18,7 +18,7 @@ class XmlElement:
 
     @property
     def where(self) -> str:
-        """What the element is and where, as in error messages."""
+        """The element and its place, as in error messages."""
         name = self.attributes.get("name", "")
         return f"<{self.tag}> {f'{quote(name)} ' if name else ''}(line {self.line}{f' of {self.file}' if self.file else ''})"
 

@@ -30,7 +30,7 @@ KINK_RATIO = 2.0  # a minimum is one of zero where it is at most so many times t
 TIGHT_TOL = 1e-12  # rtol and atol of an interval that is integrated anew
 
 
-class RankChange(NamedTuple):
+class TimedRankChange(NamedTuple):
     """An instant at which the rank is another one than before and after."""
 
     time: float  # s
@@ -46,7 +46,7 @@ class Timeline(NamedTuple):
     ts: Float[np.ndarray, "T"]
     singular_values: Float[np.ndarray, "T k"]
     rank: Int[np.ndarray, "T"]
-    changes: tuple[RankChange, ...]
+    changes: tuple[TimedRankChange, ...]
     closest: tuple[float, float]  # the time (s), and the smallest relative singular value that counts, over all samples
 
     @property
@@ -103,7 +103,7 @@ def _kinks(sigma: np.ndarray) -> list[int]:
     return np.flatnonzero((sigma < before) & (sigma <= after) & (sigma <= KINK_RATIO * rise)).tolist()
 
 
-def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> RankChange | None:
+def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> TimedRankChange | None:
     """Return the minimum of a singular value in a bracket, if the rank is lower there."""
     start, end, at, values = low, high, low, np.zeros(0)
     while True:
@@ -117,7 +117,7 @@ def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, 
     found = int(np.sum(values > rank_tol * values[0]))
     if found >= rank:
         return None
-    return RankChange(
+    return TimedRankChange(
         float(at), float(max(start, at - tol)), float(min(end, at + tol)), found, float(values[rank - 1] / values[0])
     )
 
