@@ -251,7 +251,7 @@ class SceneTerms:
 
         return self.over_bodies(("add", x == "free", sign), write, **{"change": change, "from": x, "to": to})
 
-    # --- derivatives of a linear system (`ImplicitDerivative`)
+    # --- derivatives of a linear system, by the implicit rule
 
     def residuals(self, output: str, v: str = "v") -> Parts:
         """right1 = b - Psi_q z, and jt_x0 = Psi_q^T x0, as functions of all but z = M^(-1) Psi_q^T x0 and x0."""

@@ -62,7 +62,7 @@ class ClosingForward(ClosingDerivative):
             self._write_push(x)
 
     def _write_push(self, x: str):
-        """`push_x(work, scale, limited)`: the change of the state by so much of a correction, which was limited or not."""
+        """Write push_x(work, scale, limited): the change of the state by so much of a correction, which was limited or not."""
         f, _ = self.function(f"push_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._evaluate(f, x)
         longest, which = self._longest(f, x)
@@ -147,7 +147,7 @@ class ClosingReverse(ClosingDerivative):
             self._write_pull(x)
 
     def _write_pull(self, x: str):
-        """`pull_x(work, scale, limited)`: from the cotangent B of the state behind a correction to that before it, in X."""
+        """Write pull_x(work, scale, limited): from the cotangent B of the state behind a correction to that before it, in X."""
         f, _ = self.function(f"pull_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._evaluate(f, x)
         longest, which = self._longest(f, x)

@@ -1,7 +1,7 @@
 """The functions of the derivatives of a scene's programs, written out or as loops.
 
-For the accelerations (no suffix), for the projection of a state on the manifold (`_projection`) and for the corrections that
-close a mechanism (`_newton_q`, `_newton_v`) there are
+For the accelerations (no suffix), for the projection of a state on the manifold ("_projection") and for the corrections that
+close a mechanism ("_newton_q", "_newton_v") there are
 
     evaluation(work, out, stored)   what it returns, and what its derivatives know of the state in X
     forward(work, stored, tangent, out)   the change of what it returns, from those of the constants, of X q and X v of a tangent

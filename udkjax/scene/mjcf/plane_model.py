@@ -31,7 +31,7 @@ class Ends(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """The vector from one point to the other (m)."""
+        """Distance of one point from the other (m)."""
         return abs(self.points[1] - self.points[0])
 
 
