@@ -281,6 +281,7 @@ TWO = '<body name="b"><joint name="h2" axis="0 1 0" pos="1 0 0"/><joint name="h1
         (model(geom="euler='0 0 1' quat='1 0 0 0'"), "has several orientations: quat, euler"),
         (model(rest="<default class='robot'/>"), 'class="robot": it is main at the top'),
         (model(geom="class='c'"), 'no default has the class "c"'),
+        (model(body=2 * "<inertial pos='0 0 0' mass='1' diaginertia='1 1 1'/>"), "<inertial> (line 3): its body has another one"),
         (model(geom="mass='0'"), '<body> "a" (line 3): must have mass and inertia'),
         (model(world=TWO, rest="<actuator><motor joint='h1'/></actuator>"), "one of two hinges of a body: not taken over"),
         (model(rest="<equality><joint joint1='h' joint2='x'/></equality>"), 'joint2="x": no joint has this name'),

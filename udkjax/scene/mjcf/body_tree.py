@@ -118,6 +118,8 @@ class BodyTree:
         return len(self.bodies) - 1
 
     def _add_inertial(self, read: AttributeReader, body: int, frame: SpaceFrame) -> None:
+        if self.bodies[body].given:
+            read.refuse("its body has another one")
         self.bodies[body].given.append(inertial_mass(read, frame.within(self.settings.frame(read))))
 
     def _add_joint(self, read: AttributeReader, body: int, frame: SpaceFrame) -> None:
