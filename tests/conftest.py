@@ -17,6 +17,7 @@ CACHE = os.environ.setdefault("UDKJAX_CACHE", str(Path(__file__).parents[1] / ".
 CACHE_SIZE = 2**30  # bytes; a cache that is larger before a run begins anew
 # XLA compiles in less than half of the time what it does not optimize; no test is about how fast that runs.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+import udkjax as udk
 from udkjax.native import code_cache, operation
 
 if folder := code_cache.cache_folder():  # what one process has compiled, however small, serves the other
@@ -88,3 +89,9 @@ def placed():
         return jax.jvp(q, (jnp.asarray(theta, float),), (jnp.asarray(rate, float),))
 
     return pose
+
+
+@pytest.fixture(scope="session")
+def linkage():
+    """The paper's."""
+    return udk.library.parallelogram()

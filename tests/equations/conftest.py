@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import udkjax as udk
 from udkjax.equations import constraints, loads
 
 
@@ -38,3 +39,9 @@ def closed():
         return q, v - jnp.linalg.pinv(A, rtol=1e-9) @ rate
 
     return state
+
+
+@pytest.fixture(scope="session")
+def linkage():
+    """The paper's, at an ordinary angle."""
+    return udk.library.parallelogram(np.deg2rad(-50))

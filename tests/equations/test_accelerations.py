@@ -22,11 +22,6 @@ LARGE = "n_four_bar scissor_lift peaucellier planetary_gear".split()
 
 
 @pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram(np.deg2rad(-50))
-
-
-@pytest.fixture(scope="module")
 def mechanisms():
     return {name: getattr(udk.library, name)() for name in SMALL + LARGE}
 

@@ -138,11 +138,6 @@ def test_what_partitioning_refuses():
 # --- redundant rows, and singular configurations: the paper's linkage
 
 
-@pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram(np.deg2rad(-50))
-
-
 def test_plain_LU_divides_by_rounding_errors(linkage, placed):
     """Rank 23 of 24: what LU takes for a pivot is a rounding error, and so is what it makes of the multipliers."""
     q, v = (x.ravel() for x in placed(-0.8, 1.3))

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import udkjax as udk
@@ -52,11 +51,6 @@ def uses_time(mechanism) -> bool:
 def joined(mechanism, joints=None, drivers=None, forces=None):
     joints, drivers = mechanism.joints | (joints or {}), mechanism.drivers | (drivers or {})
     return udk.Mechanism(mechanism.bodies, joints, drivers, mechanism.forces | (forces or {}))
-
-
-@pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram(np.deg2rad(-50))
 
 
 @pytest.fixture(scope="module")

@@ -36,3 +36,9 @@ def hung():
         "thread": udk.Distance(["ground", "rod"], [[0.0, 0.3], [-0.75, 0.0]], 1.0),
     }
     return udk.Mechanism(bodies, joints, forces={"motor": Until("rod", 99.0)})
+
+
+@pytest.fixture(scope="session")
+def linkage():
+    """The paper's, at an ordinary angle."""
+    return udk.library.parallelogram(np.deg2rad(-50))

@@ -14,11 +14,6 @@ TS = np.linspace(0.0, 20.0, 401)
 COARSE = np.linspace(0.0, 20.0, 41)
 
 
-@pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram(np.deg2rad(-50))
-
-
 def error(mech, sol):
     return np.nanmax(np.abs(exact(mech, sol.ts, sol.q[0], sol.v[0]) - sol.q))
 

@@ -12,11 +12,6 @@ from udkjax.integrate import assembly, check
 
 
 @pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram(np.deg2rad(-50))
-
-
-@pytest.fixture(scope="module")
 def motor():
     """A rod, its centre 0.75 m from its pin, turned by a motor at 4 rad/s from 0.3 rad."""
     rod = udk.library.compound_pendulum(np.pi / 2 + 0.3)

@@ -17,11 +17,6 @@ from udkjax.show.plots import attachments, farthest_instants, outline, to_ground
 from udkjax.study import exact_coordinates
 
 
-@pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram()
-
-
 def solution(mech, q, v=None, code=Result.successful):
     q = jnp.asarray(q)
     ts = jnp.linspace(0.0, 1.0, len(q))

@@ -129,11 +129,6 @@ def scaled(mechanism, unit):
 
 
 @pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram()
-
-
-@pytest.fixture(scope="module")
 def found(linkage):
     return udk.diagnose(linkage)
 

@@ -36,11 +36,6 @@ def entry(values, name):
     return float(np.asarray(values[owner])[tuple(map(int, index))])
 
 
-@pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram()
-
-
 ALL = 'joints "A1", "A2", "A3", "B1", "B2" and "B3" close a loop'
 
 

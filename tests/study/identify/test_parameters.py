@@ -10,11 +10,6 @@ from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.unknowns import apply_values
 
 
-@pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram()
-
-
 def _values(mechanism, unknowns, x):
     return apply_values(mechanism, unknowns.targets, jnp.asarray(x)).parameters()
 

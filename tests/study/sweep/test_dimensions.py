@@ -17,11 +17,6 @@ from udkjax.study.sweep.plan import make_plan
 TS = [0.0, 1.0]
 
 
-@pytest.fixture(scope="module")
-def linkage():
-    return udk.library.parallelogram()
-
-
 def problems(mechanism, axes, measure="final", **arguments):
     with pytest.raises(udk.SweepError) as raised:
         make_plan(mechanism, axes, TS, measure, **arguments)
