@@ -18,7 +18,7 @@ MOST_NUMBERS = 6  # numbers of an array that are written out; of more, their sha
 MOST_CHARACTERS = 96  # of a cell
 MOST_LINE = 400  # characters of what prints as one line
 DIGITS = 6
-ROUNDING = 4096 * np.finfo(float).eps  # of the largest number beside it: what thousands of operations leave prints as 0
+PRINTED_AS_ZERO = 4096 * np.finfo(float).eps  # of the largest number beside it: what thousands of operations leave prints as 0
 
 Plain = bool | int | float | complex | np.ndarray | np.generic
 
@@ -94,7 +94,7 @@ def _is_stored(leaf: object) -> bool:
 def format_number(value: Any, unit: str = "", scale: float = 0.0) -> str:
     """Return one number to six digits with its unit; 0 where it is rounding beside `scale`, of the same unit."""
     number = complex(value) if np.iscomplexobj(value) else float(value)
-    text = f"{0.0 if abs(number) <= ROUNDING * scale else number:.{DIGITS}g}"
+    text = f"{0.0 if abs(number) <= PRINTED_AS_ZERO * scale else number:.{DIGITS}g}"
     return f"{text} {unit}" if unit else text
 
 

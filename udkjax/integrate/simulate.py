@@ -171,7 +171,7 @@ def simulate(
         solution = simulate_events(mechanism, events, analysis, ts, state, closure, Choices(*given))
         if not _has_failed(solution) or not mechanism.is_concrete or int(solution.stats["events"]):
             return _required(solution, throw)  # events may have changed what moved
-        return _required(explained(solution, mechanism, analysis, drift), throw)
+        return _required(explained(solution, mechanism, analysis, drift, solver), throw)
 
     def run(analysis: Analysis | None) -> tuple[Solution, Any, Any]:
         return _run(bare, analysis, ts, state, closure, *settings, *choices, engine)
@@ -183,7 +183,7 @@ def simulate(
         analysis = analyse(mechanism)
         solution, _, end = run(analysis)  # the analysis was of other numbers, in which a row depended
     if isinstance(mechanism, Mechanism) and mechanism.is_concrete and _has_failed(solution):
-        solution = explained(solution, mechanism, analysis, drift, end)
+        solution = explained(solution, mechanism, analysis, drift, solver, end)
     return _required(solution, throw)
 
 

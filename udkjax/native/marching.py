@@ -8,6 +8,7 @@ one before, and no row is near dependence. From there on, the caller goes on by 
 
 import numpy as np
 
+from udkjax.equations.position_closure import ROUNDING_UNITS
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
@@ -18,7 +19,6 @@ from udkjax.native.tableau import EULER
 CORRECTIONS = 2
 STRAIGHT = 0.95  # cosine of the angle by which the tangent may turn in a step
 SLACK = 0.1  # of a step: how far a position may lie from its prediction
-ROUNDING = 32.0  # units of rounding of the coordinates: what closed positions leave of a residual
 DISTANT = 1e-2  # from dependence: nearer, elimination loses more than half of the digits of q''
 
 
@@ -101,7 +101,7 @@ class Marching(Module):
             along_s, one_s, other_s = along.value + per_unit, one.value + per_unit, other.value + per_unit
             straight = along_s > f.intrinsic("sqrt", one_s * other_s) * STRAIGHT
             near = off.value < f.abs(h) * f.intrinsic("sqrt", one_s) * SLACK + largest.value * (64 * eps)
-            closed = ~(violated.value > largest.value * (ROUNDING * eps)) & f.is_finite(violated.value)
+            closed = ~(violated.value > largest.value * (ROUNDING_UNITS * eps)) & f.is_finite(violated.value)
             begins = f.compare("lt", k, 1)
             moves = (straight & near) | f.repeat(begins, width) if width > 1 else (straight & near) | begins
             fine = closed & (s.distance > DISTANT) & moves

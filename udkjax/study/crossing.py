@@ -14,11 +14,16 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.study.curve import Curve, derivatives, plus
 
-NEAR_LOSS = 1e-2  # of the largest singular value of E: nearer to a loss of rank, q'' has lost more than its sixth digit
-LOST_RANK = 1e-5  # of it: q'' has no digit left
+# Singular values of E, relative to the largest. Rounding errors of q, 1e-16 over sigma, are over sigma once more in q' and over
+# its square in q'': below NEAR_LOSS q'' has lost more than its sixth digit and is found from both sides; below LOST_RANK it has none.
+NEAR_LOSS, LOST_RANK = 1e-2, 1e-5
 CLOSE_DISTANCE = 0.02  # scaled: how far the point before may lie, whose tangent leads across; it turns by a degree or so
-SPACINGS = (0.04, 0.015, 0.005)  # h, scaled values
-FIRST, LAST = 2, 7  # steps from the point to the nearest and to the farthest of the others
+# h, scaled values. Where the next singularity of q(s) is one unit away, the polynomials err by 3e-10, 3e-15 and less; rounding
+# leaves 2e-13, 2e-12 and 1e-11 in q'' if sigma grows by one in a unit, and with the smallest h the nearest point is at NEAR_LOSS.
+SPACINGS = (0.04, 0.015, 0.005)
+# Steps h from the point to the nearest and to the farthest of the others, twelve in all: they multiply errors by 13. With fewer
+# the polynomials err more, with more or nearer ones rounding does.
+FIRST, LAST = 2, 7
 # How far the polynomials through twelve and through ten values may differ in q, q' and q'', scaled: a hundred times their error.
 ACCEPTED = (1e-9, 1e-7, 1e-5)
 

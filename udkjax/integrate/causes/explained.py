@@ -9,12 +9,13 @@ from udkjax.equations.analysis import Analysis
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.integrate.causes.find import FoundCause
 from udkjax.integrate.solution import Solution
+from udkjax.integrate.solvers import is_explicit
 from udkjax.scene.mechanism import Mechanism
 
-EXPLICIT = ("Dopri8", "Dopri5", "Tsit5", "Bosh3", "Heun", "Verner65", "Adams")
 
-
-def explained(solution: Solution, mechanism: Mechanism, analysis: Analysis | None, drift_tol: Any, end: Any = None) -> Solution:
+def explained(
+    solution: Solution, mechanism: Mechanism, analysis: Analysis | None, drift_tol: Any, solver: Any, end: Any = None
+) -> Solution:
     """Return a failed solution of a single run that can say why it failed.
 
     Args:
@@ -22,6 +23,7 @@ def explained(solution: Solution, mechanism: Mechanism, analysis: Analysis | Non
         mechanism: what moved.
         analysis: that of the run.
         drift_tol: that of the run.
+        solver: that of the run; None is the default.
         end: the last state (t, (q, v)) of the integrator, if it is known.
     """
     assert analysis is not None  # a mechanism has one
@@ -45,7 +47,7 @@ def explained(solution: Solution, mechanism: Mechanism, analysis: Analysis | Non
         atol=float(solution.atol),
         drift_tol=float(drift_tol),
         is_projected=chosen["stabilization"] == "Projection",
-        is_explicit=chosen["solver"] in EXPLICIT,
+        is_explicit=is_explicit(solver) or chosen["solver"] == "Adams",  # whose corrector is not solved, but applied once
         drops_rows=chosen["method"] in ("Auto", "Elimination"),
         formulation=chosen["formulation"],
     )

@@ -21,15 +21,16 @@ INTERVALS = 32  # of a window
 _shift = 0.2 * np.sin(np.arange(INTERVALS + 1) * 2.4)
 _shift[[0, -1]] = 0.0
 NODES = (np.arange(INTERVALS + 1) + _shift) / INTERVALS
-# Of what a condition changes in an interval: if the cubic's error may be more, the interval is too coarse. An oscillation has
-# then 7 intervals in a period.
+# Of what a condition changes in an interval: if the cubic's error may be more, the interval is too coarse. So an oscillation has
+# 7 intervals in a period at least, and no two of its zeros lie in one; smaller numbers take more windows for the same events.
 RESOLVED = 0.05
-# Of the error over two intervals: the error that counts for one, four times what it is for a small one. Where the rates are only
-# differences, it counts as it is.
+# Of the error over two intervals: the error that counts for one. Of a cubic it is 1/16, by the fourth power of the length, where
+# the interval is fine; four times that is on the safe side where it is not yet. Where rates are differences, it counts whole.
 MISS = 1 / 4
 BENDS = 3.0  # times as much as beside it a smooth condition bends in an interval that is fine enough, at most
-# Errors: where the interval is too coarse, a condition that is farther from zero has none in it all the same.
-FAR = 20.0
+# Errors: where the interval is too coarse, a condition that is farther from zero has none in it all the same: what it would have
+# to change to get there would be resolved.
+FAR = 1 / RESOLVED
 INTERVALS_OF_JUMP = 6  # that are too coarse for a jump or a kink, at every scale
 
 BESIDE = 4  # intervals before one that is too coarse that are done again

@@ -40,20 +40,22 @@ from udkjax.integrate.events.crossings import ZERO_RATE, ZERO_RATE_2
 from udkjax.integrate.events.hybrid import ConditionValues, Hybrid, RunState
 from udkjax.integrate.gradients import stop_gradients
 
-# (u . u) / (n M^(-1) n): the square of the sine between a contact's row and those of the constraints, in the metric of M.
+# (u . u) / (n M^(-1) n): the square of the sine between a contact's row and those of the constraints, in the metric of M. At a
+# sine of 1e-8, half of the digits, u is what rounding leaves of the difference of two rows, and no impulse follows from it.
 BLOCKED = 1e-16
-# The same between the row of a contact and those of contacts that are held: below it they hold it, too.
-CARRIED = 1e-12
-# Of a condition's scale per T: an impact slower than this, where the contact is pressed on, is rest. Its rebound rises by 1e-10
-# of that scale.
-REST = 1e-5
 # Of a condition's scale: contacts that are no farther from zero when another one hits are hit with it. It is above the errors of
-# a run at ordinary tolerances in what is symmetric, and what is done too early by it lasts 1e-9 T.
-CLOSED = 1e-9
-# Of |u_i| |u_j|: two contacts whose W_ij is below that do not act on one another; each has an event of its own.
+# a run at ordinary tolerances in what is symmetric, and what is done too early by it lasts 1e-9 T. Of the fastest approach in an
+# impact, or of the strongest pull: what that leaves of another is zero, since the rows of these contacts are known that well.
+CLOSED = STILL = 1e-9
+# The square of the sine between the row of a contact and those of contacts that are held: below it they hold it, too. A row that
+# depends on others in theory has a sine of some CLOSED over the distance of the contacts, here down to a thousandth of L.
+CARRIED = (1e3 * CLOSED) ** 2
+# Of a condition's scale per T: an impact slower than this, where the contact is pressed on, is rest. Its rebound rises by 1e-10
+# of that scale, a hundredth of what ordinary tolerances tell from zero.
+REST = 1e-5
+# Of |u_i| |u_j|: two contacts whose W_ij is below that do not act on one another; each has an event of its own. It is a cosine,
+# of which rounding leaves 1e-15, or more by the condition number of the constraints, up to a thousand.
 COUPLED = 1e-12
-# Of the fastest approach in an impact: a rate that it leaves below that is zero.
-STILL = 1e-9
 
 OPEN, TOUCHES, SLOW = 0, 1, 2  # the states of a contact at an event: not closed, closed, closed and without restitution
 

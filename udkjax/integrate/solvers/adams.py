@@ -48,7 +48,7 @@ LOST = 0.05  # a step that so small a part of the one planned has to replace beg
 NEGLIGIBLE = 1e-4  # relative to the tolerance: estimates below are of rounding errors, and say nothing about the order
 EVEN = 1e-2  # relative: two steps that differ by less count as of one size
 # Of rounding.
-ROUNDING = 1e-14  # relative: a compiler may compute the same state twice, and not quite the same
+SAME_STATE = 1e-14  # relative: a compiler may compute the same state twice, and not quite the same
 TINY = 1e-300  # in the place of zero, where an error divides
 
 
@@ -244,7 +244,7 @@ class Adams(Multistep):
 
         Where y was displaced, it will be again: then f at the end of a step is left for the next step to call.
         """
-        displaced = jnp.max(jnp.abs(y - state.y), initial=0.0) > ROUNDING * jnp.max(jnp.abs(y), initial=0.0)
+        displaced = jnp.max(jnp.abs(y - state.y), initial=0.0) > SAME_STATE * jnp.max(jnp.abs(y), initial=0.0)
         stale = displaced | ~state.exact | made_jump
         value = jax.lax.cond(stale, lambda: f(t0, y), lambda: state.phi[0])
         calls = state.evaluations + stale

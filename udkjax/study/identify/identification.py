@@ -27,7 +27,7 @@ from udkjax.study.whiteness import Whiteness, whiteness_of
 
 MOST_REWEIGHTINGS = 2  # fits, each with the noise that the one before left
 SAME_WEIGHT_RATIO = 1.05  # ratio of weights, compared with each other, that moves no estimate by what counts beside its error
-ROUNDING = 1e-8  # of what a channel shows: smaller residuals are errors of the integration, which need not be noise
+INTEGRATION_ERROR = 1e-8  # of what a channel shows: smaller residuals are errors of the integration, which need not be noise
 
 
 @checked
@@ -207,7 +207,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
     white: dict[tuple[int, str], Whiteness] = {}
     for places in problem.series():
         record, _, channel = problem.index[places[0]]
-        if np.abs(left[places]).max() > ROUNDING * problem.channel_scale[channel]:
+        if np.abs(left[places]).max() > INTEGRATION_ERROR * problem.channel_scale[channel]:
             times = problem.ts[record, problem.index[places, 1]]
             white[int(record), problem.channel_names[channel]] = whiteness_of(
                 times, (seen / scale[:rows])[places], projection[places]

@@ -25,12 +25,12 @@ from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN, Unknowns
 if TYPE_CHECKING:
     import xarray
 
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # of an interval, where none is given: the usual one, two standard errors to either side
 STEPS_TO_END = 4.0  # from the estimate to the end of the interval, where the curve is a straight line
 UNKNOWN_ERROR = 0.5  # of a dimensionless unknown: taken for a standard error that is not known
 MOST_STRETCH, MOST_SHRINK = 2.0, 0.1  # by how much a step may be longer than the one before, and by how much shorter
 END_DISTANCE = 1e-3  # of psi at the end of the interval: near enough to it
-MOST_FITS = 30  # to one side
+MOST_FITS = 30  # to one side: a straight curve takes STEPS_TO_END of them, and one that bends more
 BETTER_FIT = 1e-6  # of the rise: costs that are lower than the estimate's by this are not rounding, nor a fit's last digits
 
 _AT_BOUND = "the end of what was looked at"
