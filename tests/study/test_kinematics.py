@@ -190,23 +190,69 @@ def test_a_slider_passes_the_pivot_of_its_crank(r):
             np.testing.assert_allclose(x[:, 0:, 2, 0] / r, 2 * exact(values), atol=atol)
 
 
+def parallelogram_of_one_loop():
+    """Two cranks of 1 m, a coupler and a ground of 2 m: the coupler's centre is at (cos(s) + 1, sin(s)) on the branch."""
+    c, d = 0.5 * np.cos(0.5), 0.5 * np.sin(0.5)
+    places = {"crank": ([c, d], 0.5), "coupler": ([2 * c + 1.0, 2 * d], 0.0), "rocker": ([2.0 + c, d], 0.5)}
+    joints = {
+        "A": udk.Revolute(["ground", "crank"], [[0.0, 0.0], [-0.5, 0.0]]),
+        "B": udk.Revolute(["crank", "coupler"], [[0.5, 0.0], [-1.0, 0.0]]),
+        "C": udk.Revolute(["coupler", "rocker"], [[1.0, 0.0], [0.5, 0.0]]),
+        "D": udk.Revolute(["ground", "rocker"], [[2.0, 0.0], [-0.5, 0.0]]),
+    }
+    return udk.Mechanism({name: udk.Body(1.0, 0.1, *place) for name, place in places.items()}, joints)
+
+
+SAME = {"A": (1, -0.5), "B": (0, 0.5), "C": (1, 0.5), "D": (1, -0.5)}  # the pins of both cranks, halves of their lengths
+VALUES_ACROSS = np.array([0.5, 2.0, np.pi, 4.0])
+COS, SIN, ZERO = np.cos(VALUES_ACROSS), np.sin(VALUES_ACROSS), np.zeros(4)
+MEETING = {  # numbers that change, and what that changes of the coupler's x and y, q, q' and q''; None: the branches part
+    "both cranks": (
+        lambda x: {f"joint.{n}.points[{k}][0]": r * (1 + x) for n, (k, r) in SAME.items()},
+        [[COS, SIN], [-SIN, COS], [-COS, -SIN]],
+    ),
+    "one crank": (lambda x: {"joint.B.points[0][0]": 0.5 + x}, None),
+    "pins of the coupler": (
+        lambda x: {"joint.B.points[1][1]": x, "joint.C.points[0][1]": x},
+        [[ZERO, ZERO - 1], [ZERO, ZERO], [ZERO, ZERO]],
+    ),
+    "mass": (lambda x: {"body.crank.mass": 1.0 + x}, np.zeros((3, 2, 4))),
+}
+
+
 @pytest.mark.slow
-def test_derivatives_where_branches_meet_are_right_or_not_numbers():
-    mech = udk.library.parallelogram(-0.8)
+@pytest.mark.parametrize("name", MEETING)
+def test_where_branches_meet_derivatives_are_right_or_not_numbers(name):
+    """They are numbers where the change leaves the branches together; in reverse mode, where each number by itself does."""
+    numbers, exact = MEETING[name]
+    mech = parallelogram_of_one_loop()
 
-    def f(number, x, first):
-        values = jnp.array([-0.8, first, 4.0])
-        found = udk.kinematics(mech.with_parameters({number: x}), "body.link1.angle", values)
-        return jnp.stack([found.q[:, 1, 2], found.v[:, 1, 2]])
+    def f(x):
+        found = udk.kinematics(mech.with_parameters(numbers(x)), "body.crank.angle", VALUES_ACROSS)
+        return jnp.stack([found.q[:, 1], found.v[:, 1], found.a[:, 1]])
 
-    by_value = jax.jit(jax.jacfwd(lambda s: f("body.link1.mass", 1.0, s)))(np.pi)
-    np.testing.assert_allclose(by_value, [[0, 1, 0], [0, 0, 0]], atol=1e-8)
-    for jac in (jax.jacfwd, jax.jacrev):
-        by_mass = jax.jit(jac(lambda m: f("body.link1.mass", m, np.pi)))(1.0)
-        np.testing.assert_array_equal(by_mass, 0.0)
-        by_length = jax.jit(jac(lambda x: f("joint.A1.points[0][0]", x, np.pi)))(mech.parameters()["joint.A1.points"][0, 0])
-        assert np.all(np.isnan(by_length[:, 1]))  # in reverse mode also of the values beside: zero times what is not a number
-        assert jac is jax.jacrev or np.all(np.isfinite(by_length[:, [0, 2]]))
+    forward, reverse = (np.asarray(jax.jit(jac(f))(0.0)) for jac in (jax.jacfwd, jax.jacrev))
+    crossing = np.arange(4) == 2
+    assert np.array_equal(np.isnan(forward).any((0, 2)), crossing & (exact is None))
+    assert np.array_equal(np.isnan(reverse).any((0, 2)), crossing & (name in ("one crank", "both cranks")))
+    np.testing.assert_allclose(reverse, np.where(np.isnan(reverse), np.nan, forward), atol=1e-12)
+    if exact is not None:
+        np.testing.assert_allclose(forward[..., :2], np.moveaxis(exact, 1, 2), atol=1e-9)
+        np.testing.assert_allclose(forward[..., 2], 0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_where_branches_meet_derivatives_by_the_value_go_to_the_third_of_q():
+    mech = parallelogram_of_one_loop()
+
+    def f(s):
+        found = udk.kinematics(mech, "body.crank.angle", jnp.array([0.5, 2.0, s]))
+        return jnp.stack([found.q[2, 1], found.v[2, 1], found.a[2, 1]])
+
+    first, second = jax.jit(jax.jacfwd(f))(np.pi), jax.jit(jax.jacrev(jax.jacfwd(f)))(np.pi)
+    np.testing.assert_allclose(first, [[0, -1, 0], [1, 0, 0], [0, 1, 0]], atol=1e-9)
+    np.testing.assert_allclose(second[:2], [[1, 0, 0], [0, 1, 0]], atol=1e-9)
+    assert np.isnan(second[2]).all()
 
 
 @pytest.mark.slow

@@ -105,8 +105,10 @@ def completion_mistakes(where: str, before: eqx.Module, after: eqx.Module) -> It
         conditions = [Requirement("must be finite", np.isfinite), *field.metadata.get("require", ())]
         unmet = next((c.text for c in conditions if not np.all(c.holds(known))), None)
         if unmet:
-            given = f"{where}.{field.name}: {unmet}, and is {abbreviate(known)} in the initial guess"
-            yield f"{given}, from which it is taken: give it, or other positions of the bodies"
+            given = (f.name for f in dataclasses.fields(before) if isinstance(getattr(before, f.name), np.ndarray | jax.Array))
+            cure = " or ".join(["other positions of the bodies", *(f"other {name}" for name in given)])
+            found = f"{where}.{field.name}: {unmet}, and is {abbreviate(known)} in the initial guess, from which it is taken"
+            yield f"{found}: give it, or {cure}"
 
 
 def traced_numbers_hold(elements: Iterable[eqx.Module]) -> Bool[Array, ""]:

@@ -77,9 +77,11 @@ def keys(cls: type) -> dict[str, Key]:
 
 
 def table_of(element: eqx.Module) -> dict[str, object]:
-    """Return an element as a table; absent values (None) are left out, and nested modules stay modules."""
+    """Return an element as a table; absent values are left out, None where it may stand, and nested modules stay modules."""
     table = {name: getattr(element, name) for name in keys(type(element))}
-    return {name: value for name, value in table.items() if value is not None}
+    defaults = {f.name: f.default for f in dataclasses.fields(element)}
+    may_be_absent = [name for name in table if defaults[name] is None or defaults[name] is dataclasses.MISSING]
+    return {name: value for name, value in table.items() if value is not None or name not in may_be_absent}
 
 
 def build(annotation: Any, value: object) -> Any:

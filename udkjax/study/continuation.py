@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.printing import PrintsWords
-from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, across
+from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, across
 from udkjax.study.curve import Curve, derivatives
 from udkjax.study.sequential import sequential
 
@@ -59,6 +59,8 @@ class Points(NamedTuple):
     dq: Float[Array, "T n"]
     ddq: Float[Array, "T n"]
     status: Int[Array, "T"]
+    dddq: Float[Array, "T n"]  # where branches meet
+    spacing: Float[Array, "T"]  # of the points of the branch beside it, likewise: h in crossing.py
     limit: Float[Array, ""]  # the value at the toggle; infinite where none was met
     limit_q: Float[Array, "n"]
 
@@ -166,21 +168,22 @@ def _record(curve: Curve, state: _State) -> _State:
     X, tau, k, points, lands = state.X, state.tau, state.k, state.points, state.event == _LANDS
     stores = lands & (state.trials > 0)
     clearance = curve.clearance(X)
-    here = X, tau, *derivatives(curve, X[-1] * curve.units[-1], X[:-1] * curve.units[:-1])
+    dq, ddq, rank = derivatives(curve, X[-1] * curve.units[-1], X[:-1] * curve.units[:-1])
+    here = Crossing(X, tau, dq, ddq, jnp.zeros_like(dq), jnp.zeros((), X.dtype))
 
-    def beside() -> tuple[Array, ...]:
-        at, slope, dq, ddq, is_known = across(curve, X, tau)
-        other = at, slope, dq, ddq, here[4]
-        return (*(jnp.where(is_known, x, y) for x, y in zip(other, here, strict=True)), is_known)
+    def beside() -> tuple[Crossing, Array]:
+        other, is_known = across(curve, X, tau)
+        return jax.tree.map(lambda x, y: jnp.where(is_known, x, y), other, here), is_known
 
-    X, tau, dq, ddq, rank, is_known = jax.lax.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (*here, jnp.asarray(False)))
+    found, is_known = jax.lax.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (here, jnp.asarray(False)))
+    X, tau, dq, ddq, dddq, spacing = found
     deficient = rank < len(X) - 1
     doubtful = ~is_known & (deficient | (clearance < LOST_RANK))
     status = jnp.where(doubtful, Reached.not_determined, jnp.where(deficient, Reached.singular, Reached.closed))
     dq, ddq = (jnp.where(doubtful, jnp.nan, x) for x in (dq, ddq))
-    new = X[:-1] * curve.units[:-1], dq, ddq, status
-    q, dq, ddq, status = (x.at[k].set(jnp.where(stores, y, x[k])) for x, y in zip(points[:4], new, strict=True))
-    points = Points(q, dq, ddq, status, points.limit, points.limit_q)
+    new = {"q": X[:-1] * curve.units[:-1], "dq": dq, "ddq": ddq, "status": status, "dddq": dddq, "spacing": spacing}
+    old = points._asdict()
+    points = points._replace(**{name: old[name].at[k].set(jnp.where(stores, x, old[name][k])) for name, x in new.items()})
     event = jnp.where(lands, Reached.closed, state.event)
     return state._replace(X=X, tau=tau, k=k + stores, event=event, points=points)
 
@@ -248,4 +251,4 @@ def no_points(count: int, n: int) -> Points:
     """Return points of which none is known yet."""
     nothing = jnp.zeros((count, n))
     status = jnp.full(count, int(Reached.lost))
-    return Points(nothing, nothing, nothing, status, jnp.asarray(np.inf), jnp.full(n, np.inf))
+    return Points(nothing, nothing, nothing, status, nothing, jnp.zeros(count), jnp.asarray(np.inf), jnp.full(n, np.inf))

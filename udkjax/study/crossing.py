@@ -7,6 +7,8 @@ The difference from ten values bounds them; of several h the one where it is lea
 position closes to rounding. Where branches merely come close to each other, the curve turns between them, and it does not.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.study.curve import Curve, derivatives, plus
 
 # Singular values of E, relative to the largest. Rounding errors of q, 1e-16 over sigma, are over sigma once more in q' and over
-# its square in q'': below NEAR_LOSS q'' has lost more than its sixth digit and is found from both sides; below LOST_RANK it has none.
+# its square in q'': below NEAR_LOSS q'' has lost more than its sixth digit and is found from both sides; below LOST_RANK all.
 NEAR_LOSS, LOST_RANK = 1e-2, 1e-5
 CLOSE_DISTANCE = 0.02  # scaled: how far the point before may lie, whose tangent leads across; it turns by a degree or so
 # h, scaled values. Where the next singularity of q(s) is one unit away, the polynomials err by 3e-10, 3e-15 and less; rounding
@@ -28,19 +30,37 @@ FIRST, LAST = 2, 7
 ACCEPTED = (1e-9, 1e-7, 1e-5)
 
 
-def _weights(last: int) -> np.ndarray:
+def weights(last: int) -> np.ndarray:
     """Return Lagrange's weights at zero of the nodes -last..-FIRST and FIRST..last."""
-    nodes = _nodes(last)
-    return np.array([np.prod([-m / (k - m) for m in nodes if m != k]) for k in nodes])
+    steps = nodes(last)
+    return np.array([np.prod([-m / (k - m) for m in steps if m != k]) for k in steps])
 
 
-def _nodes(last: int) -> np.ndarray:
+def _slope_weights() -> np.ndarray:
+    """Return the weights with which values at the nodes, a unit apart, make the derivative at zero."""
+    steps = nodes(LAST)
+    return weights(LAST) * np.array([sum(-1 / m for m in steps if m != k) for k in steps])
+
+
+def nodes(last: int) -> np.ndarray:
+    """Return the numbers of steps from the point to the others, up to the `last` one on either side."""
     side = np.arange(FIRST, last + 1)
     return np.concatenate([-side[::-1], side])
 
 
-def across(curve: Curve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Array, Array, Array, Array, Bool[Array, ""]]:
-    """Find a point, q' and q'' from both sides of it.
+class Crossing(NamedTuple):
+    """A point of a branch where branches meet, as its points on both sides say."""
+
+    at: Float[Array, "n+1"]
+    slope: Float[Array, "n+1"]  # the tangent
+    dq: Float[Array, "n"]
+    ddq: Float[Array, "n"]
+    dddq: Float[Array, "n"]
+    spacing: Float[Array, ""]  # h
+
+
+def across(curve: Curve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
+    """Find a point, q', q'' and q''' from both sides of it.
 
     Args:
         curve: the curve.
@@ -48,21 +68,22 @@ def across(curve: Curve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tu
         tau: the direction of the branch there, roughly.
 
     Returns:
-        The point and the tangent (n + 1,), q' and q'' (n,), and whether they are known.
+        What was found, and whether it is to be relied on.
     """
 
-    def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
+    def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array, Array]:
         return _interpolated(curve, X, tau, h)
 
-    at, dq, ddq, doubt = jax.lax.map(tried, jnp.asarray(SPACINGS, X.dtype))
-    at, dq, ddq, doubt = (x[jnp.argmin(doubt)] for x in (at, dq, ddq, doubt))
+    spacings = jnp.asarray(SPACINGS, X.dtype)
+    *found, doubt = jax.lax.map(tried, spacings)
+    at, dq, ddq, dddq, h, doubt = (x[jnp.argmin(doubt)] for x in (*found, spacings, doubt))
     slope = jnp.append(dq * curve.units[-1] / curve.units[:-1], 1.0)
     slope = slope / jnp.linalg.norm(slope) * jnp.where(slope @ tau < 0, -1.0, 1.0)
-    return at, slope, dq, ddq, doubt < 1.0
+    return Crossing(at, slope, dq, ddq, dddq, h), doubt < 1.0
 
 
-def _interpolated(curve: Curve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the point, q' and q'' by values h apart, and how far they are from being accepted: below one they are."""
+def _interpolated(curve: Curve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the point, q', q'' and q''' by values h apart, and how far they are from being accepted: below one they are."""
     slope = tau / jnp.where(tau[-1] != 0, tau[-1], 1.0)
     ends, closed = jax.lax.map(lambda k: curve.correct(X + FIRST * h * k * slope, fixed=True), jnp.array([-1.0, 1.0]))
 
@@ -88,8 +109,9 @@ def _interpolated(curve: Curve, X: Array, tau: Array, h: Array) -> tuple[Array, 
 
     slopes = jax.lax.map(at_point, points)
     scaled = points[:, :-1], slopes[0] * units[-1] / units[:-1], slopes[1] * units[-1] ** 2 / units[:-1]
-    all_of, fewer = _weights(LAST), np.pad(_weights(LAST - 1), 1)
+    all_of, fewer = weights(LAST), np.pad(weights(LAST - 1), 1)
     q, dq, ddq = (jnp.asarray(all_of @ x) for x in scaled)
+    dddq = jnp.asarray(_slope_weights() @ scaled[2]) / h
     doubts = [jnp.max(jnp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED, strict=True)]
     at = jnp.append(q, X[-1])
     E = curve.slopes(at).at[:, -1].set(0.0)
@@ -97,4 +119,5 @@ def _interpolated(curve: Curve, X: Array, tau: Array, h: Array) -> tuple[Array, 
     known = jnp.all(closed) & jnp.all(good) & curve.is_closed(at) & (tau[-1] != 0)
     doubt = jnp.where(known, jnp.max(jnp.stack(doubts)), jnp.inf)
     doubt = jnp.where(jnp.isfinite(doubt), doubt, jnp.inf)
-    return at, dq * units[:-1] / units[-1], ddq * units[:-1] / units[-1] ** 2, doubt
+    dq, ddq, dddq = (x * units[:-1] / units[-1] ** k for k, x in ((1, dq), (2, ddq), (3, dddq)))
+    return at, dq, ddq, dddq, doubt

@@ -1,7 +1,7 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -12,7 +12,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.constraints import psi
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.march import can_march, march, march_at_once, psi_at_once
@@ -24,8 +23,9 @@ from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.continuation import Points, Reached, follow, no_points
-from udkjax.study.curve import Curve, derivatives, plus
+from udkjax.study.curve import Curve
 from udkjax.study.drive import Drive, Driven, drive
+from udkjax.study.position_derivatives import with_derivative, with_derivatives
 
 UNLIMITED_TRAVEL = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
 FULL_TURN = 2.0 * np.pi  # rad
@@ -156,7 +156,9 @@ def kinematics(
     The branch is that of `state`, or of the initial guess, and is followed from there by its arc length. Where it cannot be
     followed, the motion ends, with a `status` that says why. Toggles, where the driver can get no farther, are found to rounding.
     Redundant constraints do no harm. Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any
-    order by every number of the mechanism and by the values.
+    order by every number of the mechanism and by the values. Where branches meet (`Reached.singular`) they have first
+    derivatives, but none, not a number, by what parts the branches, as a length does that one of two equal cranks alone has;
+    where velocities do not follow (`not_determined`) they have none by what moves the position.
 
     Args:
         mechanism: whatever has one degree of freedom once its drivers hold.
@@ -288,77 +290,9 @@ def _solve(driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Fl
     there = Reached.has_position(points.status)
     safe = jnp.where(there[:, None], points.q, jax.lax.stop_gradient(q))
     regular = ~there | (points.status == Reached.closed)
-    found = _with_derivatives(curve, values, safe, points.dq, points.ddq, regular)
+    found = with_derivatives(curve, values, points._replace(q=safe), regular)
     q, dq, ddq = (jnp.where(there[:, None], x, jnp.nan) for x in found)
     limited = jnp.isfinite(points.limit)
     X = jnp.where(limited, jnp.append(points.limit_q, points.limit), jax.lax.stop_gradient(jnp.append(safe[0], values[0])))
-    limit = jnp.where(limited, _limit(curve, X), jnp.inf)
+    limit = jnp.where(limited, with_derivative(curve, X), jnp.inf)
     return points._replace(q=q, dq=dq, ddq=ddq, limit=limit)
-
-
-@eqx.filter_custom_jvp
-def _with_derivatives(
-    curve: Curve, values: Float[Array, "T"], q: Rows, dq: Rows, ddq: Rows, regular: Bool[Array, "T"]
-) -> tuple[Rows, Rows, Rows]:
-    """Return closed positions, whose derivatives are those of one Newton step there.
-
-    Where branches meet (not `regular`), those by the value are q' and q''; those by numbers that move the constraints do not
-    exist, since the branches part, and are not numbers.
-    """
-    return q, dq, ddq
-
-
-@_with_derivatives.def_jvp
-def _(primals, tangents):
-    curve, values, *_, regular = primals
-    found = _with_derivatives(*primals)
-    moving = eqx.combine(tangents[:2], jax.tree.map(jnp.zeros_like, eqx.filter((curve, values), eqx.is_inexact_array)))
-
-    def positions(curve: Curve, values: Float[Array, "T"]) -> tuple[Rows, Rows, Rows]:
-        return jax.vmap(lambda s, q: _newton(curve, s, q))(values, found[0])
-
-    ordinary = eqx.filter_jvp(positions, (curve, values), moving)[1]
-    beside = _changes_beside(curve, values, found, regular, *tangents[:2])
-    return found, tuple(jnp.where(regular[:, None], x, y) for x, y in zip(ordinary, beside, strict=True))
-
-
-def _changes_beside(
-    curve: Curve, values: Float[Array, "T"], points: tuple[Rows, Rows, Rows], regular: Bool[Array, "T"], moved: PyTree, ds: Any
-) -> tuple[Rows, Rows, Rows]:
-    """Return the changes of q, q' and q'' where branches meet: those with numbers of joints and drivers are not numbers."""
-    (q, dq, ddq), undetermined = points, jnp.where(regular, 0.0, jnp.nan)
-    parts, bends = jnp.zeros_like(values), jnp.zeros_like(values)
-    constraints = lambda m: [*m.joints.values(), *m.drivers.values()]  # noqa: E731  # all others leave positions as they are
-    if jax.tree.leaves(constraints(moved.mechanism)):
-
-        def residual(mechanism: Mechanism) -> Float[Array, "T"]:
-            return jax.vmap(lambda s, q: jnp.sum(curve.weights * psi(mechanism, s, q)))(values, q)
-
-        still = jax.tree.map(jnp.zeros_like, eqx.filter(curve.mechanism, eqx.is_inexact_array))
-        parts = undetermined * eqx.filter_jvp(residual, (curve.mechanism,), (eqx.combine(moved.mechanism, still),))[1]
-    ds, bends = (bends, bends) if ds is None else (ds, undetermined * ds)
-    changes = dq * ds[:, None], ddq * ds[:, None], jnp.broadcast_to(bends[:, None], q.shape)
-    return tuple(x + parts[:, None] for x in changes)  # pyright: ignore[reportReturnType]
-
-
-def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
-    X = jnp.append(q, s) / curve.units
-    E = curve.slopes(X)
-    q = ((X - plus(E.at[:, -1].set(0.0)) @ curve.residual(X)) * curve.units)[:-1]
-    dq, ddq, _ = derivatives(curve, s, q)
-    return q, dq, ddq
-
-
-@eqx.filter_custom_jvp
-def _limit(curve: Curve, x: Float[Array, "n+1"]) -> Float[Array, ""]:
-    """Return the value at a toggle, which changes by as much as that of the nearest point of the curve."""
-    return x[-1]
-
-
-@_limit.def_jvp
-def _(primals, tangents):
-    curve, x = primals
-    moving = eqx.combine(tangents[0], jax.tree.map(jnp.zeros_like, eqx.filter(curve, eqx.is_inexact_array)))
-    X = x / jax.lax.stop_gradient(curve.units)
-    nearest = lambda curve: ((X - plus(curve.slopes(X)) @ curve.residual(X)) * curve.units)[-1]  # noqa: E731
-    return _limit(*primals), eqx.filter_jvp(nearest, (curve,), (moving,))[1]

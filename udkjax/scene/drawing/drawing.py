@@ -1,6 +1,6 @@
 """A drawing: a mechanism as it stands on paper, pins in world coordinates and links through them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from udkjax.printing import PrintedTable
 from udkjax.scene.bodies import Body
-from udkjax.scene.checks import SceneEntry, SceneError, quote, suggestion
+from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, quote, suggestion
 from udkjax.scene.description import drawing_table
 from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, SECTIONS, known_elements, placement_of, read_drawing
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
@@ -156,7 +156,10 @@ class Drawing(AbstractDrawing):
         forces = {name: part.force for name, part in (*parts.items(), *motors.items()) if part.force is not None}
         own = self.groups
         joints, drivers, forces = joints | own["joint"], drivers | own["driver"], forces | own["force"]
-        return Mechanism(bodies, joints, drivers, forces, self.gravity, self.name, drawing=self)
+        try:
+            return Mechanism(bodies, joints, drivers, forces, self.gravity, self.name, drawing=self)
+        except SceneError as error:
+            raise SceneError([_with_link(problem, placement.drawn) for problem in error.problems], self.name) from None
 
     def _in(self, units: Mapping[str, str]) -> "Drawing":
         """Return the same drawing, to be written in other units."""
@@ -204,3 +207,9 @@ def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> l
             problem = f"{where(section, k, name)}: must be a table or of class {cls.__name__}, is a {type(item).__name__}"
             found.append(SceneEntry(section, k, name, None, {}, problem))
     return found
+
+
+def _with_link(problem: str, links: Iterable[str]) -> str:
+    """Return a mistake with the link that its body's numbers follow from, if it is that of one."""
+    name = next((name for name in links if problem.startswith(f"body {abbreviate(name)} ")), None)
+    return problem if name is None else f"{problem}; it follows from the mass or density, pins and width of link {quote(name)}"
