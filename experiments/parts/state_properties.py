@@ -131,7 +131,7 @@ class Programs:
         self._written_out = WrittenOut(programs, ["accelerations", "tangent_part", "rows_and_loads"])
         self.entries, (self.rows, self.coordinates) = programs.psi_q_entries, (programs.row_count, programs.coordinate_count)
         own = np.concatenate([np.ravel(x) for x in jax.tree.leaves(mechanism)])
-        rows = numbers_of(mechanism, tables) if tables else own[None]
+        rows = _at_start(mechanism, numbers_of(mechanism, tables) if tables else own[None])
         numbers = np.hstack([rows, np.tile([0.0, SAFE], (len(rows), 1))])
         self._constants = _run(self._written_out.prologue, numbers)
 
@@ -168,6 +168,16 @@ def names_of(mechanism: udk.Mechanism) -> list[str]:
     name_of = {id(value): name for name, value in mechanism.parameters().items()}
     name_of |= {id(j.constant): f"joint.{n}.constant" for n, j in mechanism.joints.items() if hasattr(j, "constant")}
     return [name_of[id(leaf)] for leaf in jax.tree.leaves(mechanism)]
+
+
+def _at_start(mechanism: udk.Mechanism, rows: np.ndarray) -> np.ndarray:
+    """Return the numbers that programs take at t = 0, of all numbers of mechanisms of one structure (members, ...)."""
+    if not mechanism.samples:
+        return rows
+    leaves, form = jax.tree.flatten(mechanism)
+    ends = np.cumsum([np.size(x) for x in leaves])[:-1]
+    members = ([x.reshape(np.shape(y)) for x, y in zip(np.split(row, ends), leaves, strict=True)] for row in rows)
+    return np.array([np.concatenate([np.ravel(x) for x in jax.tree.unflatten(form, m).at(0.0).numbers]) for m in members])
 
 
 def numbers_of(mechanism: udk.Mechanism, tables: Sequence[Table]) -> np.ndarray:
@@ -566,7 +576,7 @@ def check_large(tally: Tally, seed: int, structures: Iterable[int]) -> int:
         mechanism, solved = build(scene.table), solve(scene)
         q, v = (x.ravel() for x in state_of(scene.table))
         programs, terms, at = scene_programs(mechanism), solved.terms, scene.label
-        numbers = np.asarray(numbers_as_vector(jax.tree.leaves(mechanism)))
+        numbers = np.asarray(numbers_as_vector(mechanism.at(0.0).numbers))
         row, column, *_ = programs.psi_q_entries
         arrays = SceneArrays(programs, numbers, np)
         (psi, rate, values), (free, b) = arrays.geometry(0.0, q, v), arrays.loads(0.0, q, v)

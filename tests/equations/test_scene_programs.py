@@ -11,9 +11,8 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, P
 from udkjax.equations import constraints, loads, prepare
-from udkjax.equations.scene_arrays import SceneArrays
+from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_vector
 from udkjax.pinv.rank_policy import RankPolicy
 
 
@@ -142,11 +141,10 @@ def states(mech):
 @pytest.fixture(scope="module")
 def terms(mech, states):
     """What the programs say."""
-    programs, numbers = scene_programs(mech), np.asarray(numbers_as_vector(mech.without_origin.numbers))
-    arrays = SceneArrays(programs, numbers, np)
-    row, column, *_ = programs.psi_q_entries
+    arrays_at, (row, column, *_) = arrays_in_time(mech), scene_programs(mech).psi_q_entries
 
     def at(t, q, v):
+        arrays = arrays_at(t)
         psi, psi_dot, values = arrays.geometry(t, q, v)
         free, b = arrays.loads(t, q, v)
         A = np.zeros((len(psi), len(q)))
@@ -203,8 +201,7 @@ def test_one_force_element_alone(mech, states, name):
     alone = udk.Mechanism(mech.bodies, pin, forces={name: mech.forces[name]}, gravity=(0.0, 0.0))
     t, q, v = (s[1] for s in states)
     q = q.at[0].set(-0.5)  # at the stop
-    numbers = np.asarray(numbers_as_vector(alone.without_origin.numbers))
-    free, _ = SceneArrays(scene_programs(alone), numbers, np).loads(float(t), np.asarray(q), np.asarray(v))
+    free, _ = arrays_in_time(alone)(float(t)).loads(float(t), np.asarray(q), np.asarray(v))
     mass, force = jax.jit(lambda t, q, v: (loads.mass(alone), loads.force(alone, t, q, v)))(t, q, v)
     assert np.abs(free).max() > 1e-3
     assert_allclose(free * mass, force, rtol=1e-12, atol=1e-12)

@@ -82,9 +82,7 @@ class At:
         self.t = 0.2
         self.q = np.ravel(state.q) + 1e-2 * random.standard_normal(n)
         self.v = np.ravel(state.v) + 0.3 * random.standard_normal(n)
-        self.numbers = np.concatenate(
-            [np.ravel(x) for x in [*jax.tree.leaves(mechanism.without_origin), *gains, NOTHING, NOTHING]]
-        )
+        self.numbers = np.concatenate([np.ravel(x) for x in [*mechanism.at(self.t).numbers, *gains, NOTHING, NOTHING]])
         self.constants = np.zeros(len(self.code.constants))
         loops.run(self.code.prologue, {"numbers": self.numbers, "constants": self.constants})
         kept = [k for k in range(self.code.row_count) if every or k not in redundant]

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
+from udkjax.scene.held import rows_of, with_row
 
 ONE = udk.Frame(1.0, 2.0, 0.5, np.cos(0.5), np.sin(0.5))
 TWO = udk.Frame(-1.0, 0.5, 2.0, np.cos(2.0), np.sin(2.0))
@@ -47,3 +48,18 @@ def test_a_motion_law_of_ones_own():
     mech = udk.Mechanism({"a": udk.Body(1, 1)}, drivers={"d": udk.Driver(["ground", "a"], "angle", Ramp(2.0))})
     mech = mech.with_parameters({"driver.d.motion.slope": 3.0})
     assert_allclose(mech.drivers["d"].motion(2.0), 6.0)
+
+
+@pytest.mark.parametrize("n", [2, 3, 6])
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_a_spline_in_pieces(n, xp):
+    """Between knots and beyond the ends, with two derivatives."""
+    times = np.array([-0.3, 0.1, 0.4, 1.1, 1.5, 2.6])[:n]
+    spline = udk.Spline(times, np.cos(3.0 * times))
+    pieces = np.asarray(rows_of(spline, xp))
+    assert len(pieces) == (1 if n == 2 else n + 1)
+    for t in (times[0] - 0.4, *((times[1:] + times[:-1]) / 2), times[-1] + 0.7):
+        one, other = spline, with_row(spline, pieces[np.searchsorted(np.asarray(spline.breakpoints, float), t, side="right")])
+        for _ in range(3):
+            assert_allclose(one(t), other(t), rtol=1e-12, atol=1e-12)
+            one, other = jax.grad(one), jax.grad(other)

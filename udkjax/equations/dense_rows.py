@@ -11,9 +11,8 @@ import numpy as np
 from udkjax.equations.abstract_system import Time
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scales import Scales, known_scales, mass_of, rank_tolerance
-from udkjax.equations.scene_arrays import SceneArrays
+from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_vector
 from udkjax.scene.fields import ROUNDING
 from udkjax.scene.mechanism import Mechanism
 
@@ -51,12 +50,17 @@ class DenseRows:
 
     def __init__(self, mechanism: Mechanism, scales: Scales):
         self.scales = jax.tree.map(np.asarray, scales)
-        programs, numbers = scene_programs(mechanism), np.asarray(numbers_as_vector(mechanism.numbers))
+        programs = scene_programs(mechanism)
         self.count, self.size, self.names = programs.row_count, programs.coordinate_count, programs.row_names
-        arrays = SceneArrays(programs, numbers, np)
-        self._geometry, self._psi = arrays.geometry, arrays.psi
+        self._arrays_at = arrays_in_time(mechanism)
         self._entries = tuple(programs.psi_q_entries[:2])
         self.metric, self._tol = 1 / np.sqrt(mass_of(mechanism, np)), float(rank_tolerance(mechanism))
+
+    def _geometry(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self._arrays_at(t).geometry(t, q, v)
+
+    def _psi(self, t: Time, q: np.ndarray) -> np.ndarray:
+        return self._arrays_at(t).psi(t, q)
 
     def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Psi and Psi_dot."""

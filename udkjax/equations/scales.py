@@ -68,7 +68,7 @@ class Scales(PrintsTable):
 
 def known_scales(mechanism: Mechanism) -> Scales:
     """The scales of a mechanism whose numbers are known, by NumPy."""
-    mechanism = jax.tree.map(np.asarray, mechanism)
+    mechanism = jax.tree.map(np.asarray, mechanism.at(0.0))
     q, v = (np.asarray(x, float).ravel() for x in (mechanism.q0, mechanism.v0))
     with np.errstate(all="ignore"):  # what is not finite is no scale
         found = _scales(mechanism, _guess_terms(mechanism, q, v, np), np)
@@ -77,7 +77,7 @@ def known_scales(mechanism: Mechanism) -> Scales:
 
 def traced_scales(mechanism: Mechanism) -> Scales:
     """The same in a trace; without derivatives."""
-    mechanism = jax.lax.stop_gradient(mechanism)
+    mechanism = jax.lax.stop_gradient(mechanism.at(0.0))
     q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
     return jax.lax.stop_gradient(_scales(mechanism, _guess_terms(mechanism, q, v, jnp), jnp))
 

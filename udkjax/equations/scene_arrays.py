@@ -6,9 +6,10 @@ from typing import Any, Generic
 
 import numpy as np
 
-from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.equations.structure import AnyArray, ArrayLibrary, Time
+from udkjax.equations.scene_programs import ScenePrograms, scene_programs
+from udkjax.equations.structure import AnyArray, ArrayLibrary, Time, numbers_as_vector
 from udkjax.expressions.loop_program import NumpyLoops, evaluate_loops
+from udkjax.scene.mechanism import Mechanism
 
 RESULTS = ("psi", "psi_dot", "psi_q", "terms")
 
@@ -48,6 +49,17 @@ class SceneArrays(Generic[AnyArray]):
         sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count}
         blank = {x: xp.zeros(size) for x, size in sizes.items() if x in arrays}
         return evaluate(blank | {"constants": self._constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v})
+
+
+def arrays_in_time(mechanism: Mechanism) -> Callable[[Time], SceneArrays[np.ndarray]]:
+    """Return the arrays of a mechanism with known numbers as a function of time (s), with which what has samples changes."""
+    programs, is_sampled = scene_programs(mechanism), bool(mechanism.samples)
+
+    def at(t: Time) -> SceneArrays[np.ndarray]:
+        return SceneArrays(programs, np.asarray(numbers_as_vector(mechanism.at(t).numbers)), np)
+
+    at_start = at(0.0)
+    return at if is_sampled else lambda t: at_start
 
 
 def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:

@@ -104,6 +104,7 @@ class SceneLayout:
         n = self.coordinate_count
         self.sizes = {
             "sines": 2 * self.body_count,
+            "sines1": 2 * self.body_count,  # of positions after a correction
             "free": n,
             "load": n,
             "z": n,

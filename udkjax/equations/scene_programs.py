@@ -16,7 +16,7 @@ from udkjax.equations.block_elimination import BlockElimination
 from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, SceneLayout, abstract_mechanism
 from udkjax.equations.scene_prologue import write_prologue
 from udkjax.equations.scene_terms import Parts, SceneTerms, compliance
-from udkjax.equations.structure import Shapes, TreeDef, structure
+from udkjax.equations.structure import Shapes, TreeDef, structure, whole_structure
 from udkjax.expressions.loop_derivative import LoopDerivative
 from udkjax.expressions.loop_program import ADD, Kernel, KernelLoop, KernelWriter, LoopProgram, Reset
 from udkjax.pinv.rank_policy import RankPolicy
@@ -96,7 +96,7 @@ class ScenePrograms:
     def stored_sizes(self) -> dict[str, int]:
         """The sizes of all arrays that derivatives may need of a state."""
         n = self.coordinate_count
-        return self.scratch | {"sines1": 2 * (n // 3), "q1": n, "v1": n}
+        return self.scratch | {"q1": n, "v1": n}
 
     @property
     def term_count(self) -> int:
@@ -383,16 +383,19 @@ def scene_programs(
     redundant_rows: tuple[int, ...] = (),
     baumgarte: bool = False,
     policy: RankPolicy = RankPolicy.DROP,
+    in_pieces: bool = True,
 ) -> ScenePrograms:
-    """Return the programs of a mechanism's structure , whatever its numbers are.
+    """Return the programs of a mechanism's structure, whatever its numbers are.
 
     Args:
         mechanism: The scene; its numbers may be traced.
         redundant_rows: Rows of Psi that are left out (`Analysis.redundant_rows`).
         baumgarte: Whether the gains alpha and beta are fed back.
         policy: What is done with a small pivot.
+        in_pieces: Whether the numbers are those of `Mechanism.at` a time, or all samples and knots.
 
     Returns:
         The programs; the same object for the same structure and settings.
     """
-    return _scene_programs(*structure(mechanism), redundant_rows, baumgarte, policy)
+    of = structure(mechanism) if in_pieces else whole_structure(mechanism)
+    return _scene_programs(*of, redundant_rows, baumgarte, policy)

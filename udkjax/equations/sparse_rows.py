@@ -21,9 +21,8 @@ from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
-from udkjax.equations.scene_arrays import SceneArrays
+from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_vector
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
 from udkjax.scene.fields import ROUNDING
@@ -116,9 +115,13 @@ class SparseRows:
         arm = float(self.scales.arm)
         self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
         self.driver_time_step = driver_time_step(self.scales)
-        numbers = np.asarray(numbers_as_vector(mechanism.numbers))
-        arrays = SceneArrays(programs, numbers, np)
-        self._evaluate, self._psi = arrays.geometry, arrays.psi
+        self._arrays_at = arrays_in_time(mechanism)
+
+    def _evaluate(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self._arrays_at(t).geometry(t, q, v)
+
+    def _psi(self, t: Time, q: np.ndarray) -> np.ndarray:
+        return self._arrays_at(t).psi(t, q)
 
     @cached_property
     def _order(self) -> list[int]:

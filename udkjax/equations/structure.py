@@ -32,8 +32,17 @@ Result = TypeVar("Result")
 
 def structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
     """Return the tree of a mechanism, and the shape and the type of each of its numbers: the same for any number of samples."""
-    leaves, tree = jax.tree.flatten(mechanism.without_origin.with_first_samples)
+    return _structure(mechanism.without_origin.without_samples)
+
+
+def _structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
+    leaves, tree = jax.tree.flatten(mechanism)
     return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
+
+
+def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
+    """Return the same of a mechanism with all of its samples, whose programs are functions of time throughout."""
+    return _structure(mechanism.without_origin)
 
 
 def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:

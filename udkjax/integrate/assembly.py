@@ -138,7 +138,7 @@ def close(
     if not _is_known((mechanism, t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
         within_jit = isinstance(jax.device_put(0.0), Tracer)  # where a program of its own would trace the known numbers, too
-        return (_close if within_jit else _close_compiled)(mechanism.without_origin.with_first_samples, analysis, t, state)
+        return (_close if within_jit else _close_compiled)(mechanism.without_origin.at(t), analysis, t, state)
     key, time = id(mechanism), np.asarray(t).item()
     cached = _cache.get(key)
     if state is None and cached is not None and cached.mechanism() is mechanism and cached.time == time:
@@ -161,7 +161,7 @@ def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, 
     if scene_programs(mechanism).is_small:  # for which it takes longer to compile anything
         return DenseRows(mechanism, scales).assemble(t, q, v)
     if native_closing.can_close(mechanism):
-        return native_closing.close_known(mechanism, scales, rank_tolerance(mechanism), t, q, v)
+        return native_closing.close_known(mechanism.at(t), scales, rank_tolerance(mechanism), t, q, v)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 
     return SparseRows(mechanism).assemble(t, q, v)

@@ -1,99 +1,78 @@
-"""Numbers that are held between samples as machine code takes them: one row of samples for each interval between breakpoints."""
+"""What has samples as machine code takes it: one row of numbers for each interval between the breakpoints of a run."""
 
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
 import jax
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float
 
-from udkjax.scene.held import Held, make_held
-
-
-def breakpoints_of(problem: Any, xp: ModuleType) -> Any:
-    """Return the breakpoints of a problem in their order: by NumPy where they are known."""
-    if problem.breakpoints is None:
-        return np.zeros(0)
-    return xp.sort(problem.breakpoints) if isinstance(problem.breakpoints, Tracer) else np.sort(np.asarray(problem.breakpoints))
+from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.native_numbers import leaves_and_none
+from udkjax.scene.held import row_size, rows_of, with_row
+from udkjax.scene.mechanism import Mechanism
 
 
-def first_rows(tree: PyTree) -> PyTree:
-    """Return a tree with the first sample in place of each `Held`: of numbers, of their changes, or of marks."""
-    return jax.tree.map(lambda x: x.first if isinstance(x, Held) else x, tree, is_leaf=_is_held)
+class SampleRows:
+    """The rows of all that has samples in a mechanism, side by side, one for each interval between the breakpoints of a run."""
 
+    def __init__(self, mechanism: Mechanism, breakpoints: Float[Array, "K"] | None):
+        self.samples = mechanism.samples
+        self._breakpoints = breakpoints
 
-def sampled_places(numbers: PyTree) -> tuple[int, ...]:
-    """Return where the numbers that have samples are among all numbers of a tree with the first samples."""
-    found, place = [], 0
-    for x in jax.tree.leaves(first_rows(numbers), is_leaf=_is_held):
-        size = int(np.size(x.values if isinstance(x, Held) else x))
-        if isinstance(x, Held):
-            found += range(place, place + size)
-        place += size
-    return tuple(found)
+    def breakpoints(self, xp: ModuleType) -> Any:
+        """Return the breakpoints of the run in their order: by NumPy where they are known."""
+        if self._breakpoints is None:
+            return np.zeros(0)
+        traced = isinstance(self._breakpoints, Tracer)
+        return xp.sort(stop_gradients(self._breakpoints)) if traced else np.sort(np.asarray(self._breakpoints))
 
+    def stand_in(self, mechanism: Mechanism, marks: bool = False) -> Mechanism:
+        """Return the mechanism that programs are made of, or the tree of its changes, or, with `marks`, of what is active."""
+        found = {}
+        for place, given in mechanism.samples.items():
+            there = [leaf for leaf in leaves_and_none(given) if leaf is not None]
+            zeros = np.zeros(row_size(self.samples[place])) if there else None
+            found[place] = with_row(self.samples[place], any(leaf is True for leaf in there) if marks else zeros)
+        return mechanism.with_samples(found)
 
-def rows_of(numbers: PyTree, samples: PyTree, breakpoints: Float[Array, "K"], xp: ModuleType) -> Float[Array, "K+1 R"]:
-    """Return the samples that hold in each interval, or their changes.
+    def places(self, mechanism: Mechanism) -> tuple[int, ...]:
+        """Return where the numbers of a row are among all numbers of the mechanism that programs are made of."""
+        if not self.samples:
+            return ()
+        blank = jax.tree.map(lambda x: np.zeros(np.shape(x), bool), self.stand_in(mechanism))
+        marked = blank.with_samples({place: with_row(x, np.ones(row_size(x), bool)) for place, x in self.samples.items()})
+        return tuple(np.flatnonzero(np.concatenate([np.ravel(x) for x in marked.numbers])).tolist())
 
-    Args:
-        numbers: the numbers of a run.
-        samples: the same tree, perhaps with other values in each `Held`; None stands for zeros.
-        breakpoints: in their order (s).
-        xp: NumPy or jax.numpy.
-    """
-    columns = []
-    for held, x in zip(_helds(numbers), _helds(samples), strict=True):
-        count, size = len(held.values), int(np.prod(held.values.shape[1:]))
-        if x.values is None:
-            columns.append(xp.zeros((len(breakpoints) + 1, size)))
-        else:
-            values, index = xp.reshape(xp.asarray(x.values), (count, size)), _sample_in_each(held, breakpoints, xp)
-            columns.append(values if index is None else values[index])
-    return xp.concatenate(columns, axis=1)
+    def rows(self, xp: ModuleType, samples: Sequence[Any] | None = None) -> Any:
+        """Return the rows (K + 1, R), of other `samples` if they are given."""
+        breakpoints = self.breakpoints(xp)
+        columns = []
+        for x in self.samples.values() if samples is None else samples:
+            traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x))
+            rows, own = rows_of(x, xp if traced else np), x.breakpoints
+            if any(isinstance(b, Tracer) for b in (breakpoints, own)):
+                after = xp.concatenate([xp.full(1, -np.inf), breakpoints])
+                columns.append(rows[xp.searchsorted(stop_gradients(xp.asarray(own)), after, side="right")])
+            elif np.array_equal(own, breakpoints):
+                columns.append(rows)
+            else:
+                columns.append(rows[np.searchsorted(np.asarray(own, float), np.append(-np.inf, breakpoints), side="right")])
+        return xp.concatenate(columns, axis=1)
 
+    def changes(self, mechanism: Mechanism) -> Array:
+        """Return the change of the rows along that of a mechanism."""
+        leaves, form = jax.tree.flatten(list(self.samples.values()))
+        given = leaves_and_none(list(mechanism.samples.values()))
+        along = [jax.numpy.zeros(np.shape(x)) if dx is None else dx for x, dx in zip(leaves, given, strict=True)]
+        return jax.jvp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), (leaves,), (along,))[1]
 
-def with_cotangents(
-    bars: PyTree,
-    numbers: PyTree,
-    active: PyTree[bool],
-    rows: Float[Array, "K+1 R"],
-    breakpoints: Float[Array, "K"],
-    xp: ModuleType,
-) -> PyTree:
-    """Return cotangents of numbers, with those of the samples from those of the rows that hold in each interval."""
-    start, found = 0, iter(_helds(numbers))
-
-    def replaced(bar: Any, mark: Any) -> Any:
-        nonlocal start
-        if not _is_held(bar):
-            return bar
-        held = next(found)
-        size = int(np.prod(held.values.shape[1:]))
-        mine, start = rows[:, start : start + size], start + size
-        if mark.values is not True:
-            return make_held(None)
-        index = _sample_in_each(held, breakpoints, xp)
-        total = mine if index is None else xp.zeros((len(held.values), size)).at[index].add(mine)
-        return make_held(xp.reshape(total, held.values.shape))
-
-    return jax.tree.map(replaced, bars, active, is_leaf=lambda x: x is None or _is_held(x))
-
-
-def _sample_in_each(held: Held, breakpoints: Float[Array, "K"], xp: ModuleType) -> Int[Array, "K+1"] | None:
-    """Return the index of the sample that holds in each interval; None where there is one interval for each."""
-    own = held.breakpoints
-    if isinstance(breakpoints, Tracer):
-        return xp.searchsorted(xp.asarray(own), xp.concatenate([xp.full(1, -np.inf), breakpoints]), side="right")
-    if np.array_equal(own, breakpoints):
-        return None
-    return np.searchsorted(own, np.append(-np.inf, breakpoints), side="right")  # pyright: ignore[reportReturnType]
-
-
-def _helds(tree: PyTree) -> list[Held]:
-    return [x for x in jax.tree.leaves(tree, is_leaf=_is_held) if _is_held(x)]
-
-
-def _is_held(x: object) -> bool:
-    return isinstance(x, Held)
+    def with_cotangents(self, mechanism: Mechanism, active: Mechanism, bars: Array) -> Mechanism:
+        """Return a mechanism of cotangents with those of what has samples, from those of the rows."""
+        leaves, form = jax.tree.flatten(list(self.samples.values()))
+        marks = leaves_and_none(list(active.samples.values()))
+        (found,) = jax.vjp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), leaves)[1](bars)
+        kept = [bar if mark is True else None for bar, mark in zip(found, marks, strict=True)]
+        return mechanism.with_samples(dict(zip(self.samples, jax.tree.unflatten(form, kept), strict=True)))

@@ -16,11 +16,13 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.native.layout import INPUTS, SETTINGS
 from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
 from udkjax.native.tableau import EULER
+from udkjax.scene.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 
 Scalar = Float[ArrayLike, ""]
 Vector = Float[Array, "..."] | Float[np.ndarray, "..."]
 APPROACH = 16  # steps from where the mechanism is to the first value
+MOST_KNOTS = 100  # of motions by splines: their programs are whole, and take 10 ms to compile for each
 DEPENDENT = 1e-10  # of a row's square: what is left of one that depends on others; march ends long before
 
 
@@ -37,7 +39,8 @@ def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
     """Tell whether machine code can follow a mechanism."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
-    return not unsupported(_kind(mechanism, analysis))
+    knots = sum(len(x.times) for (section, *_), x in mechanism.samples.items() if section == "_drivers")
+    return knots <= MOST_KNOTS and not unsupported(_kind(mechanism, analysis))
 
 
 def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> March:
@@ -75,7 +78,7 @@ def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q
     scales, n = analysis.scales, analysis.coordinates
     approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
     settings = {"length": scales.length, "omega": unit, "rtol": 1.0, "atol": 1.0, "smallest": 1.0}
-    numbers = [xp.ravel(x) for x in _of_unit_masses(mechanism, scales.length, xp).numbers]
+    numbers = [xp.ravel(x) for x in _of_unit_masses(_without_loads(mechanism), scales.length, xp).numbers]
     given = {
         "numbers": xp.concatenate([*numbers, xp.asarray([DEPENDENT, 0.0])]),
         "ts": xp.concatenate([approach, values]),
@@ -88,6 +91,12 @@ def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q
     return [xp.asarray(given[name], float)[None] for name in INPUTS]
 
 
+def _without_loads(mechanism: Mechanism) -> Mechanism:
+    """Loads that have samples are zero: positions do not depend on them."""
+    loads = {place: x for place, x in mechanism.samples.items() if place[0] == "_forces"}
+    return mechanism.with_samples({place: with_row(x, np.zeros(row_size(x))) for place, x in loads.items()})
+
+
 def _of_unit_masses(mechanism: Mechanism, length: Scalar, xp: ModuleType) -> Mechanism:
     """Bodies of 1 kg with the characteristic length for radius of gyration: positions do not depend on masses."""
     bodies = lambda m: [x for b in m.bodies.values() for x in (b.mass, b.inertia)]  # noqa: E731
@@ -96,5 +105,5 @@ def _of_unit_masses(mechanism: Mechanism, length: Scalar, xp: ModuleType) -> Mec
 
 
 def _kind(mechanism: Mechanism, analysis: Analysis) -> Kind:
-    programs = scene_programs(mechanism, analysis.redundant_rows or ())
+    programs = scene_programs(_without_loads(mechanism), analysis.redundant_rows or (), in_pieces=False)
     return Kind(programs, Tableau(EULER), projected=False, breaks=False, mode="marching")

@@ -15,7 +15,7 @@ from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.held_rows import breakpoints_of, first_rows, rows_of, sampled_places, with_cotangents
+from udkjax.integrate.held_rows import SampleRows
 from udkjax.integrate.native_numbers import active_numbers, cotangent_tree, number_tangents
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.solvers import is_explicit, method_of
@@ -83,24 +83,34 @@ def serves_derivatives(active: Problem) -> bool:
     return not any(x is True for x in jax.tree.leaves(others))
 
 
-def _numbers_of(problem: Any) -> tuple[Any, Any]:
-    """The numbers of a run, or what stands for them, with the first of all samples."""
-    return first_rows(_all_numbers_of(problem))
+def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any]:
+    """The numbers of a run, or a change of them; zeros stand for one row of what has samples."""
+    of = problem if change is None else change
+    return _rows_of(problem).stand_in(of.equations.mechanism), of.equations.baumgarte
 
 
-def _all_numbers_of(problem: Any) -> tuple[Any, Any]:
-    return problem.equations.mechanism, problem.equations.baumgarte
+def _marks_of(problem: Any, active: Any) -> tuple[Any, Any]:
+    """Which of these numbers are active."""
+    return _rows_of(problem).stand_in(active.equations.mechanism, marks=True), active.equations.baumgarte
+
+
+def _mechanism_of(problem: Any) -> Mechanism:
+    return problem.equations.mechanism
+
+
+def _rows_of(problem: Any) -> SampleRows:
+    return SampleRows(problem.equations.mechanism, problem.breakpoints)
 
 
 def jvp(problem: Problem, active: Problem, change: Problem) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is active."""
     kind, n = _kind(problem, _active(problem, active), "forward"), len(problem.q)
-    tangents = number_tangents(_numbers_of(problem), _numbers_of(active), _numbers_of(change))
+    tangents = number_tangents(_numbers_of(problem), _marks_of(problem, active), _numbers_of(problem, change))
     along = jnp.asarray(numbers_as_vector(tangents))
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     directions = [along, dq, dv]
     if kind.sampled:
-        directions.insert(0, rows_of(_all_numbers_of(problem), _all_numbers_of(change), breakpoints_of(problem, jnp), jnp))
+        directions.insert(0, _rows_of(problem).changes(_mechanism_of(change)))
     *found, dys, dend = native_p.bind(
         *_inputs(problem, kind.code), *(x[None, None] for x in directions), kind=kind, times=len(problem.ts)
     )
@@ -118,17 +128,17 @@ def vjp(problem: Problem, active: Problem, run: tuple[Sequence[Array], Array], y
     found = native_p.bind(*_inputs(problem, kind.code), *given, kind=kind, times=len(problem.ts))
     numbersbar, qbar, vbar = found[len(OUTPUTS) : len(OUTPUTS) + 3]
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
-    numbers = cotangent_tree(numbersbar[0], _numbers_of(problem), _numbers_of(active))
+    mechanism, baumgarte = cotangent_tree(numbersbar[0], _numbers_of(problem), _marks_of(problem, active))
     if kind.sampled:
-        of_problem, breaks = _all_numbers_of(problem), breakpoints_of(problem, jnp)
-        numbers = with_cotangents(numbers, of_problem, _numbers_of(active), found[len(OUTPUTS) + 3][0], breaks, jnp)
+        mechanism = _rows_of(problem).with_cotangents(mechanism, _mechanism_of(active), found[len(OUTPUTS) + 3][0])
     q, v = qbar[0] if active.q is True else None, vbar[0] if active.v is True else None
-    return eqx.tree_at(lambda p: (*_all_numbers_of(p), p.q, p.v), none, (*numbers, q, v), is_leaf=lambda x: x is None)
+    places = lambda p: (p.equations.mechanism, p.equations.baumgarte, p.q, p.v)  # noqa: E731
+    return eqx.tree_at(places, none, (mechanism, baumgarte, q, v), is_leaf=lambda x: x is None)
 
 
 def _active(problem: Problem, active: Problem) -> tuple[bool, ...]:
     """Of the numbers of a run: which have derivatives."""
-    return active_numbers(_numbers_of(problem), _numbers_of(active))
+    return active_numbers(_numbers_of(problem), _marks_of(problem, active))
 
 
 def _programs(problem: Problem) -> ScenePrograms:
@@ -143,7 +153,7 @@ def _kind(problem: Any, active: tuple[bool, ...] | None = None, mode: str = "run
     programs, mechanism = _programs(problem), problem.equations.mechanism
     breaks = problem.breakpoints is not None or _has_pieces(mechanism)
     method = Tableau(method_of(problem.solver))
-    code, places = programs if active is None else programs.for_derivatives, sampled_places(_all_numbers_of(problem))
+    code, places = programs if active is None else programs.for_derivatives, _rows_of(problem).places(mechanism)
     points = problem.points or STORED + PER_BREAKPOINT * (0 if problem.breakpoints is None else len(problem.breakpoints))
     return Kind(code, method, problem.projected, breaks, active, places, points, mode)
 
@@ -160,7 +170,7 @@ def _inputs(problem: Any, code: Any = None, xp: ModuleType = jnp) -> list[Any]:
     safe_tol: Any = method.branch_tol if isinstance(method, Auto) else rank_tol**2
     programs = _programs(problem) if code is None else code
     drop_tol = (FALLBACK_RANK_SHARE * rank_tol) ** 2 if programs.policy is RankPolicy.FALL_BACK else safe_tol
-    first = 0.0 if problem.h is None else problem.h
+    first, rows = 0.0 if problem.h is None else problem.h, _rows_of(problem)
     numbers: list[Any] = jax.tree.leaves(_numbers_of(problem))
     fallback_tol = FALLBACK_RANK_SHARE * rank_tol
     settings: list[Any] = [
@@ -180,11 +190,11 @@ def _inputs(problem: Any, code: Any = None, xp: ModuleType = jnp) -> list[Any]:
         "v": problem.v,
         "settings": numbers_as_vector(settings),
         "rows": equations.scales.rows,
-        "breaks": breakpoints_of(problem, xp),
+        "breaks": rows.breakpoints(xp),
     }
     arrays = [xp.asarray(given[name], float)[None] for name in INPUTS]
-    if sampled_places(whole := _all_numbers_of(problem)):
-        arrays.append(rows_of(whole, whole, given["breaks"], xp)[None])
+    if rows.samples:
+        arrays.append(xp.asarray(rows.rows(xp), float)[None])
     return arrays if xp is np else stop_gradients(arrays)
 
 

@@ -24,6 +24,7 @@ from udkjax.integrate.simulate import DRIFT_PROJECTED, simulate, units_of_run
 from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto
 from udkjax.scene.arguments import checked
+from udkjax.scene.checks import traced_numbers_hold
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
@@ -115,7 +116,7 @@ def _advance(
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
     raw = differentiable(problem, native=not why)
-    good = usable(*stop_gradients((q, v, rtol, atol, number(DRIFT_PROJECTED), dt)))
+    good = usable(*stop_gradients((q, v, rtol, atol, number(DRIFT_PROJECTED), dt))) & traced_numbers_hold(moved.elements)
     good = stop_gradients(good & raw.reached[-1] & (jnp.max(raw.violation) <= DRIFT_PROJECTED))
     failed = jnp.where(good, 0.0, jnp.nan)  # added: a choice would be one more thing to store for reverse mode
     return State(*((y[-1] + failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))

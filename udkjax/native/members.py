@@ -8,7 +8,7 @@ from udkjax.native.ir import DOUBLE, INT, POINTER, Function
 from udkjax.native.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.manifold import largest_violation, project_output
 from udkjax.native.module import Module
-from udkjax.native.samples import count_breakpoints, write_enter
+from udkjax.native.samples import enter_first_row, write_enter
 from udkjax.native.steps import DONE, LOOK_AHEAD, NOT_FINITE, POINTS, STEP_LIMIT
 
 
@@ -61,8 +61,9 @@ def write_begin(t: Module):
     put("tolerance", settings["atol"])
     put("member", f.op(f"sitofp i64 {member.name} to double", DOUBLE))
     if t.plan.breaks:
-        put("knot", f.like(count_breakpoints(t, f, member, start - settings["smallest"]), DOUBLE, 1))
-    f.call("enter", work, call, k)
+        enter_first_row(t, f, k, member)
+    else:
+        f.call("enter", work, call, k)
     t.begin_member(f, k, member)
 
 
@@ -107,6 +108,8 @@ def write_finish(t: Module):
         with f.each(t.n) as i:
             f.store(f.load(q, i), work, (i + p["X q"]) * width + k)
             f.store(f.load(v, i), work, (i + p["O v"]) * width + k)
+        if t.plan.sampled:
+            enter_first_row(t, f, k, member)
     setattr(s, "X t", s.start)
     with f.each(t.rowcount) as r:
         t.put(f, "X v", r, t.vector(f, "O v", r))

@@ -22,6 +22,14 @@ def count_breakpoints(t: Module, f: Function, member: Value, time: Value) -> Val
     return low.value
 
 
+def enter_first_row(t: Module, f: Function, lane: Value, member: Value):
+    """Give a lane the constants with which its member begins."""
+    work, call = f.given["work"], f.given["call"]
+    start, smallest = (f.load(work, lane + t.places[name] * f.width) for name in ("start", "smallest"))
+    f.store(count_breakpoints(t, f, member, start - smallest), work, lane + t.places["knot"] * f.width)
+    f.call("enter", work, call, lane)
+
+
 def write_next_breakpoint(t: Module):
     """`next_breakpoint(work, call)`: `due` is the first breakpoint that a lane has not passed; infinite where there is none."""
     f, s = t.function("next_breakpoint", ARGUMENTS[:2])

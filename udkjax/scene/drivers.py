@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Point, between
-from udkjax.scene.fields import KNOTS, NOT_EMPTY, Number, given_direction, given_number, given_or_guess
+from udkjax.scene.fields import CALLED, KNOTS, NOT_EMPTY, Number, given_direction, given_number, given_or_guess
 from udkjax.scene.joints import Constraint, fill
 from udkjax.scene.splines import natural_spline
 
@@ -101,7 +101,7 @@ class Driver(Constraint):
     """
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
-    motion: Motion
+    motion: Motion = eqx.field(metadata=CALLED)
     points: Float[Array, "2 2"] = eqx.field(converter=given_or_guess, default=None)
     axis: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # of x, for `x`, `y`; None: that of body 1
 

@@ -162,6 +162,7 @@ class FieldMetadata(TypedDict, total=False):
 
     require: tuple[Requirement, ...]
     at_least: int  # entries
+    called: bool  # the field holds a function of time, of which the element takes nothing but its values
     names: Literal["body", "revolute", "pin", "link", "slide"]  # the field holds names: of bodies, of revolute joints, ...
 
 
@@ -175,6 +176,7 @@ NOT_NEGATIVE: FieldMetadata = {"require": (_NOT_NEGATIVE,)}
 KNOTS: FieldMetadata = {"require": (_INCREASING,), "at_least": 2}
 PROFILE_ANGLES: FieldMetadata = {"require": (_INCREASING, _ONE_TURN), "at_least": 3}
 PROFILE_RADII: FieldMetadata = {"require": (_POSITIVE,), "at_least": 3}
+CALLED: FieldMetadata = {"called": True}
 NOT_EMPTY: FieldMetadata = {"at_least": 1}
 BODY: FieldMetadata = {"names": "body"}  # the field names one or several bodies
 REVOLUTE: FieldMetadata = {"names": "revolute"}  # the field names a revolute joint

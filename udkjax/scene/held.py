@@ -1,18 +1,24 @@
-"""Numbers that are held between samples: what a digital controller puts out, or a table of measured forces."""
+"""Numbers that are held between samples: what a digital controller puts out, or a table of measured forces.
 
+Whatever has samples, splines among them, is constant or a cubic from one breakpoint to the next: programs are made of one such
+interval, and a run changes the numbers of the interval where it begins anew behind a breakpoint.
+"""
+
+import dataclasses
 from collections.abc import Sequence
+from functools import cache
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.printing import PrintsLine
+from udkjax.scene.drivers import Motion, Spline
 from udkjax.scene.fields import NOT_EMPTY, POSITIVE, Number, given_number
-
-Sampled = Float[Array, "..."] | float  # a number or a vector, which may be a `Held`
+from udkjax.scene.splines import spline_pieces
 
 
 class Held(PrintsLine):
@@ -51,33 +57,79 @@ class Held(PrintsLine):
         """The times (s) of the samples but the first."""
         return self.t0 + self.dt * np.arange(1, len(self.values))
 
-    @property
-    def first(self) -> "Held":
-        """The first sample alone, in place of all: that has the structure of every one."""
-        values = self.values[:1] if isinstance(self.values, jax.Array | np.ndarray) else self.values
-        if isinstance(self.values, jax.ShapeDtypeStruct):
-            values = jax.ShapeDtypeStruct((1, *self.values.shape[1:]), self.values.dtype)
-        return make_held(values)
-
 
 def given_sampled(value: Any) -> Any:
     """Convert a number of a field as `given_number` does; a `Held` stays as it is."""
     return value if isinstance(value, Held) else given_number(value)
 
 
-def make_held(values: Any) -> Held:
-    """Return one sample as a `Held`, whatever stands for its values."""
-    held = object.__new__(Held)
-    for name, value in {"values": values, "dt": 1.0, "t0": 0.0}.items():
-        object.__setattr__(held, name, value)
-    return held
-
-
-def value_at(x: Sampled | Held, t: Number) -> Any:
+def value_at(x: Float[Array, "..."] | Held, t: Number) -> Any:
     """Return a number at time t (s): that of a `Held`, or what does not depend on time as it is."""
     return x(t) if isinstance(x, Held) else x
 
 
-def held_fields(elements: Sequence[eqx.Module]) -> list[tuple[int, str]]:
-    """Return where the elements have a `Held`: the index of each with the name of the field."""
-    return [(k, name) for k, e in enumerate(elements) for name, value in vars(e).items() if isinstance(value, Held)]
+# --- what has samples, a number or a motion, as a table: a row of numbers for each interval between its breakpoints
+
+
+class SplinePiece(Motion):
+    """What stands for a spline between two of its knots: c0 + c1 s + c2 s^2 + c3 s^3, with s = t - start.
+
+    Args:
+        row: start (s), c0, c1, c2 and c3.
+    """
+
+    row: Float[Array, "5"]
+
+    def __call__(self, t):
+        start, *c = (self.row[k] for k in range(5))
+        s = t - start
+        return ((c[3] * s + c[2]) * s + c[1]) * s + c[0]
+
+
+Sampled = Held | Spline
+
+
+def sampled_fields(elements: Sequence[eqx.Module]) -> list[tuple[int, str]]:
+    """Return where elements have samples, by index and field: where a field holds a `Held`, or a spline that is only called."""
+    return [
+        (k, name)
+        for k, e in enumerate(elements)
+        for name, value in vars(e).items()
+        if isinstance(value, Held) or (isinstance(value, Spline) and name in _called_fields(type(e)))
+    ]
+
+
+@cache
+def _called_fields(cls: type) -> frozenset[str]:
+    return frozenset(field.name for field in dataclasses.fields(cls) if field.metadata.get("called"))
+
+
+def row_size(x: Sampled) -> int:
+    """Return how many numbers a row has."""
+    return 5 if isinstance(x, Spline) else int(np.prod(x.values.shape[1:]))
+
+
+def rows_of(x: Sampled, xp: ModuleType) -> Any:
+    """Return the rows of all intervals, by NumPy or JAX."""
+    if isinstance(x, Spline):
+        return spline_pieces(xp.asarray(x.times), xp.asarray(x.values), xp)
+    return xp.reshape(xp.asarray(x.values), (len(x.values), row_size(x)))
+
+
+def with_row(x: Sampled, row: Any) -> Any:
+    """Return what stands for one interval, of a row of numbers; or of what stands for one: a mark, or None."""
+    if isinstance(x, Spline):
+        return _make(SplinePiece, row=row)
+    return _make(Held, values=row.reshape(1, *x.values.shape[1:]) if hasattr(row, "reshape") else row, dt=1.0, t0=0.0)
+
+
+def row_at(x: Sampled, t: Any, xp: ModuleType) -> Any:
+    """Return the row that holds at time t (s)."""
+    return rows_of(x, xp)[xp.searchsorted(xp.asarray(x.breakpoints, float), t, side="right")]
+
+
+def _make(cls: type, **fields: Any) -> Any:
+    made = object.__new__(cls)
+    for name, value in fields.items():
+        object.__setattr__(made, name, value)
+    return made

@@ -13,6 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Scalar
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
 from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, check_hashable, completion_mistakes, problems_of
@@ -20,7 +21,7 @@ from udkjax.scene.description import mechanism_table
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Numbers, StaticValue, given_number, number
 from udkjax.scene.forces import ForceElement, Friction
-from udkjax.scene.held import Held, held_fields
+from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
 from udkjax.scene.joints import AnyConstraint, Constraint, Joint
 from udkjax.scene.number_fields import (
     groups_of,
@@ -190,24 +191,42 @@ class Mechanism(PrintsTable):
     def breakpoints(self) -> Float[Array, "k"] | None:
         """The times (s) where the motion is not smooth, as the elements name them, in any order; None where none does."""
         named = [number(e.breakpoints).reshape(-1) for e in (*self.constraints.values(), *self._forces) if len(e.breakpoints)]
-        samples = [getattr(self._forces[k], name).breakpoints for k, name in held_fields(self._forces)]
-        if any(map(len, samples)):
-            named.append(number(np.unique(np.concatenate(samples))))
+        held = [x.breakpoints for x in self.samples.values() if isinstance(x, Held)]
+        if any(map(len, held)):
+            named.append(number(np.unique(np.concatenate(held))))
         if not named:
             return None
         known = not any(isinstance(x, Tracer) for x in named)  # and stays so while something else is traced
         return number(np.concatenate(named)) if known else jnp.concatenate(named)
 
     @property
-    def with_first_samples(self) -> "Mechanism":
-        """The same mechanism with the first sample in place of each `Held`: what programs are made from, one for all samples."""
-        places = held_fields(self._forces)
-        if not places:
+    def samples(self) -> dict[tuple[str, int, str], Any]:
+        """What has samples, a `Held` or a `Spline`, by the place of its element and its field."""
+        sections = {"_drivers": self._drivers, "_forces": self._forces}
+        places = [(section, *place) for section, elements in sections.items() for place in sampled_fields(elements)]
+        return {place: getattr(sections[place[0]][place[1]], place[2]) for place in places}
+
+    def with_samples(self, samples: Mapping[tuple[str, int, str], Any]) -> "Mechanism":
+        """Return the mechanism with something else in the places of `samples`; nothing is checked."""
+        if not samples:
             return self
-        forces = list(self._forces)
-        for k, name in places:
-            forces[k] = _copy(forces[k], {name: getattr(forces[k], name).first})
-        return _copy(self, {"_forces": tuple(forces)})
+        changed = {section: list(getattr(self, section)) for section in ("_drivers", "_forces")}
+        for (section, k, name), value in samples.items():
+            changed[section][k] = _copy(changed[section][k], {name: value})
+        return _copy(self, {section: tuple(elements) for section, elements in changed.items()})
+
+    @property
+    def without_samples(self) -> "Mechanism":
+        """The mechanism that programs are made of: with one interval, of numbers zero, in place of all that has samples."""
+        return self.with_samples({place: with_row(x, np.zeros(row_size(x))) for place, x in self.samples.items()})
+
+    def at(self, t: Scalar) -> "Mechanism":
+        """Return the mechanism with one interval, that at time t (s), in place of all that has samples."""
+        samples = self.samples
+        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((t, samples)))
+        xp, known_stays_known = (jnp, nullcontext()) if traced else (np, jax.ensure_compile_time_eval())
+        with known_stays_known, np.errstate(all="ignore"):
+            return self.with_samples({place: with_row(x, row_at(x, t, xp)) for place, x in samples.items()})
 
     @property
     def without_origin(self) -> "Mechanism":
@@ -219,19 +238,12 @@ class Mechanism(PrintsTable):
     @property
     def is_concrete(self) -> bool:
         """True if no number is traced."""
-        return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self._own_numbers))
+        return not any(isinstance(leaf, Tracer) for leaf in self.numbers)
 
     @property
     def numbers(self) -> list[Array]:
-        """All numbers of the equations, in the order in which programs take them: leaves without those of the drawing.
-
-        Of each `Held` it is the first sample.
-        """
-        return jax.tree.leaves(self.with_first_samples._own_numbers)
-
-    @property
-    def _own_numbers(self) -> tuple[Any, ...]:
-        return self.gravity, self._bodies, self._joints, self._drivers, self._forces
+        """All numbers of the equations, in the order in which programs take them: leaves without those of the drawing."""
+        return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
 
     @property
     def elements(self) -> tuple[Any, ...]:

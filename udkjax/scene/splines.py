@@ -11,11 +11,17 @@ Source: de Boor, A Practical Guide to Splines, chapter 4.
 All of it is arithmetic on numbers, choices between them, and loops of known length, so that it can be part of machine code.
 """
 
+from types import ModuleType
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.scene.fields import Number
+
+AnyArray = TypeVar("AnyArray", Array, np.ndarray)  # of the one library or of the other
 
 
 def natural_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " n"]) -> Array:
@@ -26,6 +32,31 @@ def natural_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " 
     end = jnp.zeros(1, knots.dtype)
     value, slope = _cubic(within, knots, values, jnp.concatenate([end, inner, end]))
     return value + slope * (x - within)
+
+
+def spline_pieces(knots: AnyArray, values: AnyArray, xp: ModuleType) -> AnyArray:
+    """Return the natural cubic spline in pieces, the straight lines before and behind it among them, by NumPy or JAX.
+
+    Args:
+        knots: increasing (n,).
+        values: there (n,).
+        xp: NumPy or jax.numpy.
+
+    Returns:
+        (n + 1, 5): where each piece starts, and the coefficients of the powers of x less that. Of two knots one: a straight line.
+    """
+    steps, slopes = xp.diff(knots), xp.diff(values) / xp.diff(knots)
+    if len(knots) == 2:
+        return xp.stack([knots[0], values[0], slopes[0], 0 * slopes[0], 0 * slopes[0]])[None]
+    system = 2 * (steps[:-1] + steps[1:]), steps[1:-1], 6 * xp.diff(slopes)[:, None]
+    inner = (_tridiagonal_by_numpy if xp is np else _tridiagonal)(*system)[:, 0]
+    m, end = xp.concatenate([xp.zeros(1), inner, xp.zeros(1)]), xp.zeros(1)
+    first = slopes - steps * (2 * m[:-1] + m[1:]) / 6
+    last = slopes[-1:] + steps[-1:] * m[-2:-1] / 6
+    inside = xp.stack([knots[:-1], values[:-1], first, m[:-1] / 2, xp.diff(m) / (6 * steps)], 1)
+    lines = (xp.stack([knots[k], values[k], slope[0], end[0], end[0]])[None] for k, slope in ((0, first), (-1, last)))
+    before, behind = lines
+    return xp.concatenate([before, inside, behind])
 
 
 def periodic_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " n"], period: Number) -> Array:
@@ -70,6 +101,19 @@ def _cubic(
     value = a * y0 + b * y1 + ((a**3 - a) * m0 + (b**3 - b) * m1) * h**2 / 6
     slope = (y1 - y0) / h + ((3 * b**2 - 1) * m1 - (3 * a**2 - 1) * m0) * h / 6
     return value, slope
+
+
+def _tridiagonal_by_numpy(diagonal: np.ndarray, beside: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Do what `_tridiagonal` does, of one column, by numbers of Python: nothing is compiled for each length."""
+    pivots, found, links = diagonal.tolist(), right[:, 0].tolist(), beside.tolist()
+    for k, link in enumerate(links):
+        factor = link / pivots[k]
+        pivots[k + 1] -= factor * link
+        found[k + 1] -= factor * found[k]
+    for k in reversed(range(len(found))):
+        after = links[k] * found[k + 1] if k < len(links) else 0.0
+        found[k] = (found[k] - after) / pivots[k]
+    return np.array(found)[:, None]
 
 
 def _tridiagonal(diagonal: Float[Array, " n"], beside: Float[Array, " n-1"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:

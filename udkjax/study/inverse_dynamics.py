@@ -32,7 +32,7 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.drivers import Motion, Spline
-from udkjax.scene.fields import number, number_called
+from udkjax.scene.fields import CALLED, number, number_called
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Trajectory
@@ -110,7 +110,7 @@ class Effort(ForceElement):
     """
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
-    law: Motion
+    law: Motion = eqx.field(metadata=CALLED)
     points: Float[Array, "2 2"] | None = eqx.field(converter=number_called("points", optional=True), default=None)
 
     def potential(self, t, *frames):
