@@ -26,11 +26,11 @@ import xarray
 from matplotlib.figure import Figure
 
 from experiments.common import data_file, described, load, panels
-from experiments.parts import run_properties, state_properties
+from experiments.parts import contact_properties, run_properties, state_properties
 from experiments.parts.fuzz import KINDS, Fault, cases_of, run, verdict
 from experiments.parts.tally import Found, Tally
 
-PROPERTIES = state_properties.PROPERTIES | run_properties.PROPERTIES
+PROPERTIES = state_properties.PROPERTIES | run_properties.PROPERTIES | contact_properties.PROPERTIES
 MARGINS = 50.0, 10_000.0  # tolerance over worst error: below it a tolerance is nearly met, above it says little
 MEMBERS = 100  # mechanisms of each structure
 LISTED, SHOWN = 100, 60  # faults that the data list, and kinds of faults that the page lists
@@ -58,7 +58,7 @@ def study(
         arguments: How many calls with wrong arguments.
         commands: How many wrong command lines.
         runs: How many structures to integrate; every other one by diffrax, too, every third with derivatives.
-        contacts: How many plates to throw onto a floor, loose ones and pairs of jointed ones.
+        contacts: How many plates and wheels to throw, of each of four kinds.
         seed: Of everything.
         first: The number of the first structure and of the first input.
         minutes: When to stop, if it is not done.
@@ -76,10 +76,10 @@ def study(
         choices = 24, structure % 2 == 0, structure % 3 == 0
         count["runs"] += run_properties.check_runs(tally, seed, [structure], *choices)
     if contacts and time.time() < end:
-        count["contacts"] += run_properties.check_contacts(tally, seed + first, contacts)
+        count["contacts"] += contact_properties.check_contacts(tally, seed + first, contacts)
     faults: list[Fault] = []
     done = dict.fromkeys(KINDS, 0)
-    for kind, wanted in zip(KINDS, (files, arguments, commands), strict=True):
+    for kind, wanted in {"commands": commands, "arguments": arguments, "files": files}.items():  # the quickest last
         found: list[Fault] = []
         for done[kind], found in run(kind, seed, first, wanted, max(1.0, end - time.time())):  # noqa: B020
             print(f"{kind}: {done[kind]} of {wanted}, {len(found)} faults", file=sys.stderr, flush=True)
@@ -120,7 +120,11 @@ def _dataset(tally: Tally, count: dict[str, int], done: dict[str, int], faults: 
 
 
 def _merged(old: xarray.Dataset, new: xarray.Dataset) -> xarray.Dataset:
-    """Return what two runs found together."""
+    """Return what two runs found together; what the older one did not look for, it found in no case."""
+    at = dict(zip(old.property.values, json.loads(old.worst_at), strict=True))
+    old = old.assign_coords(property=old.property.astype(object)).reindex(property=new.property, fill_value=0).assign_attrs(
+        worst_at=json.dumps([at.get(name, "") for name in new.property.values])
+    )
     both = new.copy()
     for name in ("cases", "mechanisms", "inputs", "faults"):
         both[name] = old[name] + new[name]
@@ -196,10 +200,10 @@ def page(data: xarray.Dataset) -> str:
         "",
         f"{sets['mechanisms']:,} mechanisms at states, by programs that NumPy runs, and {sets['large']} large ones by loops; "
         f"{sets['runs']} integrated by machine code, a part of them by diffrax and with derivatives; {sets['contacts']} thrown "
-        "onto a floor. A case is drawn again by what stands beside its error: `random_scene(seed, structure, numbers)` of "
-        "experiments/parts/random_scenes.py. Margin: tolerance over worst error; `!` where it is under 50, `?` where it is over "
-        "10,000. Errors are relative, in the scene's own units; where the condition number of the rows exceeds "
-        f"{state_properties.ORDINARY:g}, they are over what it makes of rounding.",
+        "onto a floor and other bodies. A case is drawn again by what stands beside its error: "
+        "`random_scene(seed, structure, numbers)` of experiments/parts/random_scenes.py. Margin: tolerance over worst error; `!` "
+        "where it is under 50, `?` where it is over 10,000. Errors are relative, in the scene's own units; where the condition "
+        f"number of the rows exceeds {state_properties.ORDINARY:g}, they are over what it makes of rounding.",
         "",
         "| Property | Claim | Cases | Worst error | Tolerance | Margin | Because | Worst at |",
         "|---|---|---|---|---|---|---|---|",

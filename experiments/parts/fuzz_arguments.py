@@ -14,6 +14,7 @@ import numpy as np
 
 import udkjax as udk
 from experiments.parts.fuzz import Case
+from udkjax.scene.checks import quote
 
 POINTS = [[0.0, 0.0], [0.1, 0.2]]
 ELEMENTS: dict[str, dict[str, Any]] = {
@@ -295,7 +296,7 @@ def draw(rng: np.random.Generator) -> Case:
 def _names(wrong: dict[str, Any]) -> list[str]:
     """Return how a message may call what is wrong: the arguments, texts among their values, and what they name."""
     called = {"values": ["parameter"], "bodies": ["body"], "value": ["mass"], "driver": ["drivers"]}
-    texts = [value for value in wrong.values() if isinstance(value, str) and value.strip()]
+    texts = [quote(value).strip('"') for value in wrong.values() if isinstance(value, str) and value.strip()]
     return [*wrong, *texts, *(other for p in wrong for other in called.get(p, ()))]
 
 

@@ -143,7 +143,11 @@ def mutated(table: Table, rng: np.random.Generator) -> tuple[Table, str, tuple[s
         case 4:
             new = str(rng.choice([key + "x", key.upper(), "lenght", "", "ü", key + "."]))
             entry[new] = value
-            return table, f"{kind}: an unknown key", (new or ": unknown key", place or "gravity")
+            return (
+                table,
+                f"{kind}: an unknown key",
+                (new or "non-empty", ": unknown key", place or "gravity"),
+            )
         case _:
             if isinstance(entry[key], list) and entry[key] and not isinstance(entry[key][0], dict):
                 entry[key][int(rng.integers(len(entry[key])))] = value

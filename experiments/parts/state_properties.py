@@ -73,6 +73,7 @@ PROPERTIES = {
             ("NullSpaceQR", 1e-11, "rounding, times the square of the condition number"),
             ("NullSpaceSVD", 1e-11, "rounding, times the square of the condition number"),
             ("Augmented by SVD", 1e-10, "rounding, times the square of the condition number"),
+            ("Augmented by LU", 1e-10, "rounding, times the square of the condition number of the rows that are independent"),
         )
     },
 }
@@ -462,25 +463,27 @@ RANK_TOL = 1e-7  # between the singular values that count here and those that do
 
 
 @eqx.filter_jit
-def _by_all(D: Any, b: Any, M: Any, F: Any, A: Any, c: Any) -> dict[str, Any]:
+def _by_all(D: Any, b: Any, M: Any, F: Any, A: Any, c: Any, independent: Any) -> dict[str, Any]:
     found = {name: jax.vmap(lambda D, b, m=getattr(udk, name)(RANK_TOL): m.solve(D, b).x)(D, b) for name in METHODS}
     formulations = {
         "NullSpaceQR": udk.NullSpaceQR(RANK_TOL),
         "NullSpaceSVD": udk.NullSpaceSVD(RANK_TOL),
         "Augmented by SVD": udk.Augmented(udk.SVD(1e-12)),
     }
+    found["Augmented by LU"] = jax.vmap(udk.Augmented().solve)(M, F, *independent)
     return found | {name: jax.vmap(f.solve)(M, F, A, c) for name, f in formulations.items()}
 
 
-def check_methods(tally: Tally, cases: Sequence[tuple[RandomScene, Solved]]) -> None:
-    """Solve many states by all pseudoinverses and formulations, and compare with the reference."""
-    cases = [(scene, s) for scene, s in cases if len(s.terms.psi) <= ROWS and s.condition < 1e3]
+def check_methods(tally: Tally, cases: Sequence[tuple[RandomScene, Solved, Sequence[int]]]) -> None:
+    """Solve many states, each with its redundant rows, by all pseudoinverses and formulations, and compare with the reference."""
+    cases = [case for case in cases if len(case[1].terms.psi) <= ROWS and case[1].condition < 1e3]
     for first in range(0, len(cases), BATCH):
         part = cases[first : first + BATCH]
         D, A = np.zeros((2, BATCH, ROWS, COORDINATES))
-        b, c = np.zeros((2, BATCH, ROWS))
+        b, c, c_independent = np.zeros((3, BATCH, ROWS))
+        independent = np.tile(np.eye(ROWS, COORDINATES, COORDINATES - ROWS), (BATCH, 1, 1))  # of coordinates that nothing moves
         M, F = np.tile(np.eye(COORDINATES), (BATCH, 1, 1)), np.zeros((BATCH, COORDINATES))
-        for k, (scene, s) in enumerate(part):
+        for k, (scene, s, redundant) in enumerate(part):
             m, n = s.terms.psi_q.shape
             u = s.unit * scene.time**2
             mass = s.terms.mass * u**2 / (scene.mass * scene.length**2)
@@ -489,15 +492,19 @@ def check_methods(tally: Tally, cases: Sequence[tuple[RandomScene, Solved]]) -> 
             A[k, :m, :n], c[k, :m] = rows, s.weights * s.terms.gamma * scene.time**2
             D[k, :m, :n], b[k, :m] = rows / np.sqrt(mass), c[k, :m] - rows @ free
             M[k, range(n), range(n)], F[k, :n] = mass, mass * free
-        for name, x in _by_all(*map(jnp.asarray, (D, b, M, F, A, c))).items():
-            for k, (scene, s) in enumerate(part):
+            kept = np.delete(np.arange(m), list(redundant))
+            independent[k, : len(kept)], c_independent[k, : len(kept)] = A[k, kept], c[k, kept]
+        given = jax.tree.map(jnp.asarray, (D, b, M, F, A, c, (independent, c_independent)))
+        for name, x in _by_all(*given).items():
+            for k, (scene, s, redundant) in enumerate(part):
                 right, free = s.a / s.unit, s.terms.force / s.terms.mass / s.unit
                 mass = s.terms.mass * (s.unit * scene.time**2) ** 2 / (scene.mass * scene.length**2)
                 found = np.asarray(x[k])[: len(right)]
                 found = free + found / np.sqrt(mass) if name in METHODS else found
                 power = 1 if name in METHODS[:4] else 2
                 size = max(np.max(abs(free)), np.max(abs(right)), 1e-3)
-                tally.add(name, np.max(abs(found - right)) / size / growth(s, power), scene.label)
+                without = redundant if name == "Augmented by LU" else ()
+                tally.add(name, np.max(abs(found - right)) / size / growth(s, power, without), scene.label)
 
 
 def check_states(tally: Tally, seed: int, structures: Iterable[int], members: int, other_structures: bool = True) -> int:
@@ -524,7 +531,7 @@ def check_states(tally: Tally, seed: int, structures: Iterable[int], members: in
         if redundant is None:
             tally.leave_out("closed positions nearby are not found, or all are singular", len(both))
             continue
-        cases += _check_structure(tally, both, redundant, rng, other_structures)[::4]
+        cases += [(*case, redundant) for case in _check_structure(tally, both, redundant, rng, other_structures)[::4]]
     check_methods(tally, cases)
     return count
 
