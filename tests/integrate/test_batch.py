@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
 from udkjax.equations.written_out import WrittenOut
-from udkjax.native import operation
+from udkjax.native import operations, primitive
 from udkjax.study.exact import exact_coordinates
 
 TS = np.linspace(0.0, 2.0, 21)
@@ -180,15 +180,15 @@ def test_one_direction_for_all_members(pendulum):
 
 def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
     """A link's mass is one number of many, and stands in few of the constants of a linkage; no other has a derivative."""
-    linkage, kinds, machine_code = udk.library.parallelogram(np.deg2rad(-45)), [], operation.machine_code
+    linkage, found, machine_code = udk.library.parallelogram(np.deg2rad(-45)), [], primitive.machine_code
 
     def angle(mass):
         changed = linkage.with_parameters({"body.link1.mass": mass})
         return udk.simulate(changed, jnp.linspace(0.0, 1.0, 3), adjoint=diffrax.ForwardMode()).q[-1, 0, 2]
 
-    monkeypatch.setattr(operation, "machine_code", lambda kind, *lanes: kinds.append(kind) or machine_code(kind, *lanes))
+    monkeypatch.setattr(primitive, "machine_code", lambda kind, *lanes: found.append(kind) or machine_code(kind, *lanes))
     jax.jit(jax.jacfwd(angle)).lower(1.0)
-    (run,) = (kind for kind in kinds if kind.mode == "forward")
+    (run,) = (x for x in found if isinstance(x, operations.RunTangents))
     assert sum(run.active) == 1 and len(run.active) > 30
     written_out = WrittenOut(run.code, [], ["accelerations"], run.active)
     assert 1 <= len(written_out.moving) <= 8 < len(run.code.constants)

@@ -1,5 +1,6 @@
 """Numbers held between samples, in a run and step by step: the same motion, and its derivatives by every sample."""
 
+import dataclasses
 from itertools import pairwise
 from typing import Any
 
@@ -11,9 +12,10 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.equations.textbook import prepare
-from udkjax.integrate.native_engine import _kind
+from udkjax.integrate import native_engine
 from udkjax.integrate.problem import Problem
-from udkjax.native.operation import generate
+from udkjax.native.operations import RunCotangents
+from udkjax.native.primitive import generate
 
 TORQUE, FORCE = np.array([1.0, 2.0, -1.0, 0.5]), np.array([[1.0, 0.0], [-2.0, 0.5], [3.0, 0.0]])
 NAMES = ("force.motor.value", "force.push.vector")
@@ -123,9 +125,10 @@ def code_of(samples: int) -> list[str]:
     tolerances = map(jnp.asarray, (1e-8, 1e-8, 1e-14))
     numbers: Any = (equations, TS, state.q.ravel(), state.v.ravel(), *tolerances, None, None, jnp.ones(()))
     problem = Problem(*numbers, solver=None, projected=True, max_steps=100, breakpoints=mechanism.breakpoints)
-    kind = _kind(problem)
-    reverse = kind._replace(code=kind.code.for_derivatives, active=(True,) * kind.code.number_count, mode="reverse")
-    return [generate(k, 1, False).module for k in (kind, reverse)]
+    run = native_engine._run(problem)
+    settings = {field.name: getattr(run, field.name) for field in dataclasses.fields(run)} | {"code": run.code.for_derivatives}
+    reverse = RunCotangents(**settings, active=(True,) * run.code.number_count)
+    return [generate(operation, 1, False).module for operation in (run, reverse)]
 
 
 def test_the_code_does_not_depend_on_how_many_samples_there_are():

@@ -13,9 +13,9 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.native.layout import INPUTS, SETTINGS
-from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
-from udkjax.native.tableau import EULER
+from udkjax.integrate.packing import pack
+from udkjax.native import operations
+from udkjax.native.primitive import call_known, native_p, unsupported
 from udkjax.scene.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 
@@ -40,7 +40,7 @@ def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     knots = sum(len(x.times) for (section, *_), x in mechanism.samples.items() if section == "_drivers")
-    return knots <= MOST_KNOTS and not unsupported(_kind(mechanism, analysis))
+    return knots <= MOST_KNOTS and not unsupported(_operation(mechanism, analysis))
 
 
 def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> March:
@@ -49,15 +49,15 @@ def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: 
     The mechanism's driver has the value for its time; `unit` is what values are measured by.
     """
     inputs = _inputs(mechanism, analysis, unit, s, q, values, jnp)
-    return _march(native_p.bind(*inputs, kind=_kind(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
+    return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
 
 
 def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> March:
     """As `march`, of known numbers, by NumPy: nothing is traced or compiled for it."""
-    kind = _kind(mechanism, analysis)
+    operation = _operation(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
     inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
-    return _march(machine_code(kind, 1, False)(inputs, shapes_of(inputs, kind, APPROACH + len(values))), np)
+    return _march(call_known(operation, inputs, APPROACH + len(values)), np)
 
 
 def psi_at_once(mechanism: Mechanism, analysis: Analysis, q: np.ndarray) -> np.ndarray:
@@ -75,20 +75,12 @@ def _march(found: Sequence, xp: ModuleType) -> March:
 
 
 def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector, xp: ModuleType) -> list:
-    scales, n = analysis.scales, analysis.coordinates
+    scales = analysis.scales
     approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
-    settings = {"length": scales.length, "omega": unit, "rtol": 1.0, "atol": 1.0, "smallest": 1.0}
-    numbers = [xp.ravel(x) for x in _of_unit_masses(_without_loads(mechanism), scales.length, xp).numbers]
-    given = {
-        "numbers": xp.concatenate([*numbers, xp.asarray([DEPENDENT, 0.0])]),
-        "ts": xp.concatenate([approach, values]),
-        "q": q,
-        "v": xp.zeros(n),
-        "settings": xp.stack([xp.asarray(settings.get(name, 0.0), float) for name in SETTINGS]),
-        "rows": scales.rows,
-        "breaks": xp.zeros(0),
-    }
-    return [xp.asarray(given[name], float)[None] for name in INPUTS]
+    ts, settings = xp.concatenate([approach, values]), {"length": scales.length, "omega": unit}
+    numbers = [*_of_unit_masses(_without_loads(mechanism), scales.length, xp).numbers, DEPENDENT, 0.0]
+    still = xp.zeros(analysis.coordinates)
+    return pack(_operation(mechanism, analysis), numbers, ts, q, still, settings, scales.rows, xp.zeros(0), xp)
 
 
 def _without_loads(mechanism: Mechanism) -> Mechanism:
@@ -104,6 +96,5 @@ def _of_unit_masses(mechanism: Mechanism, length: Scalar, xp: ModuleType) -> Mec
     return eqx.tree_at(bodies, mechanism, [one, length**2] * len(mechanism.body_names))
 
 
-def _kind(mechanism: Mechanism, analysis: Analysis) -> Kind:
-    programs = scene_programs(_without_loads(mechanism), analysis.redundant_rows or (), in_pieces=False)
-    return Kind(programs, Tableau(EULER), projected=False, breaks=False, mode="marching")
+def _operation(mechanism: Mechanism, analysis: Analysis) -> operations.March:
+    return operations.March(scene_programs(_without_loads(mechanism), analysis.redundant_rows or (), in_pieces=False))

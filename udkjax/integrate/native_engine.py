@@ -14,13 +14,13 @@ from udkjax.equations.elements import has_pieces
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.held_rows import SampleRows
-from udkjax.integrate.native_numbers import active_numbers, cotangent_tree, number_tangents
+from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.solvers import is_explicit, method_of
-from udkjax.native.layout import INFO, INPUTS, OUTPUTS
-from udkjax.native.operation import Kind, Tableau, machine_code, native_p, shapes_of, unsupported
+from udkjax.native.layout import INFO, OUTPUTS
+from udkjax.native.operations import Run, RunCotangents, RunTangents, Tableau
+from udkjax.native.primitive import call_known, native_p, unsupported
 from udkjax.native.record import PER_BREAKPOINT, STORED
 from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
 from udkjax.pinv import Auto, Elimination
@@ -47,26 +47,27 @@ def reason_for_diffrax(problem: Problem, adjoint: Any = None, meter: Any = None)
         return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
     if not jax.config.jax_enable_x64:
         return "it computes in float64, which JAX is told not to"
-    missing = unsupported(_kind(problem))
+    missing = unsupported(_run(problem))
     return f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
 
 
 def integrate_known(problem: Problem) -> IntegratorOutput:
     """Integrate a problem whose numbers are all known, without tracing anything: `IntegratorOutput` of NumPy's arrays."""
-    kind, inputs = _kind(problem), _inputs(problem, xp=np)
-    return _output(machine_code(kind, 1, False)(inputs, shapes_of(inputs, kind, len(problem.ts))))
+    operation = _run(problem)
+    return _output(call_known(operation, _inputs(problem, operation, np), len(problem.ts)))
 
 
 def integrate(problem: Problem) -> IntegratorOutput:
     """Integrate one problem; under vmap, as many as there are, in lanes."""
-    return _output(native_p.bind(*_inputs(problem), kind=_kind(problem), times=len(problem.ts)))
+    operation = _run(problem)
+    return _output(native_p.bind(*_inputs(problem, operation), operation=operation, times=len(problem.ts)))
 
 
 def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, Array]:
     """Integrate a problem by the code that `vjp` takes: no other is compiled. Return the record that it walks back from, too."""
-    kind, n, times = _kind(problem, _active(problem, active), "reverse"), len(problem.q), len(problem.ts)
+    operation, n, times = _run(problem, active, reverse=True), len(problem.q), len(problem.ts)
     none = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
-    found = native_p.bind(*_inputs(problem, kind.code), *none, kind=kind, times=times)
+    found = native_p.bind(*_inputs(problem, operation), *none, operation=operation, times=times)
     return _output(found[: len(OUTPUTS)]), found[-1][0]
 
 
@@ -104,15 +105,15 @@ def _rows_of(problem: Any) -> SampleRows:
 
 def jvp(problem: Problem, active: Problem, change: Problem) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is active."""
-    kind, n = _kind(problem, _active(problem, active), "forward"), len(problem.q)
+    operation, n = _run(problem, active), len(problem.q)
     tangents = number_tangents(_numbers_of(problem), _marks_of(problem, active), _numbers_of(problem, change))
     along = jnp.asarray(numbers_as_vector(tangents))
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     directions = [along, dq, dv]
-    if kind.sampled:
+    if operation.sampled:
         directions.insert(0, _rows_of(problem).changes(_mechanism_of(change)))
     *found, dys, dend = native_p.bind(
-        *_inputs(problem, kind.code), *(x[None, None] for x in directions), kind=kind, times=len(problem.ts)
+        *_inputs(problem, operation), *(x[None, None] for x in directions), operation=operation, times=len(problem.ts)
     )
     return _output(found), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
 
@@ -122,23 +123,18 @@ def vjp(problem: Problem, active: Problem, run: tuple[Sequence[Array], Array], y
 
     `run` is what `integrate_for_vjp` has left: q and v (T, n), if there are outputs between the first and the last; the record.
     """
-    kind, (states, record) = _kind(problem, _active(problem, active), "reverse"), run
+    operation, (states, record) = _run(problem, active, reverse=True), run
     states = states or [np.zeros((len(problem.ts), len(problem.q)))] * 2
     given = [x[None] for x in (record, *states, ys, end)]
-    found = native_p.bind(*_inputs(problem, kind.code), *given, kind=kind, times=len(problem.ts))
+    found = native_p.bind(*_inputs(problem, operation), *given, operation=operation, times=len(problem.ts))
     numbersbar, qbar, vbar = found[len(OUTPUTS) : len(OUTPUTS) + 3]
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
     mechanism, baumgarte = cotangent_tree(numbersbar[0], _numbers_of(problem), _marks_of(problem, active))
-    if kind.sampled:
+    if operation.sampled:
         mechanism = _rows_of(problem).with_cotangents(mechanism, _mechanism_of(active), found[len(OUTPUTS) + 3][0])
     q, v = qbar[0] if active.q is True else None, vbar[0] if active.v is True else None
     places = lambda p: (p.equations.mechanism, p.equations.baumgarte, p.q, p.v)  # noqa: E731
     return eqx.tree_at(places, none, (mechanism, baumgarte, q, v), is_leaf=lambda x: x is None)
-
-
-def _active(problem: Problem, active: Problem) -> tuple[bool, ...]:
-    """Of the numbers of a run: which have derivatives."""
-    return active_numbers(_numbers_of(problem), _marks_of(problem, active))
 
 
 def _programs(problem: Problem) -> ScenePrograms:
@@ -149,53 +145,51 @@ def _programs(problem: Problem) -> ScenePrograms:
     return scene_programs(mechanism, rows, baumgarte, policy)
 
 
-def _kind(problem: Any, active: tuple[bool, ...] | None = None, mode: str = "run") -> Kind:
-    programs, mechanism = _programs(problem), problem.equations.mechanism
-    breaks = problem.breakpoints is not None or _has_pieces(mechanism)
-    method = Tableau(method_of(problem.solver))
-    code, places = programs if active is None else programs.for_derivatives, _rows_of(problem).places(mechanism)
-    points = problem.points or STORED + PER_BREAKPOINT * (0 if problem.breakpoints is None else len(problem.breakpoints))
-    return Kind(code, method, problem.projected, breaks, active, places, points, mode)
+def _run(problem: Any, active: Problem | None = None, reverse: bool = False) -> Run:
+    """The operation of a problem: a run, or one with tangents or cotangents of what is active."""
+    programs, mechanism, breaks = _programs(problem), problem.equations.mechanism, problem.breakpoints
+    settings: dict[str, Any] = {
+        "code": programs if active is None else programs.for_derivatives,
+        "method": Tableau(method_of(problem.solver)),
+        "projected": problem.projected,
+        "breaks": breaks is not None or _has_pieces(mechanism),
+        "sampled": _rows_of(problem).places(mechanism),
+    }
+    if active is None:
+        return Run(**settings)
+    settings["active"] = active_numbers(_numbers_of(problem), _marks_of(problem, active))
+    if not reverse:
+        return RunTangents(**settings)
+    points = problem.points or STORED + PER_BREAKPOINT * (0 if breaks is None else len(breaks))
+    return RunCotangents(**settings, points=points)
 
 
 def _has_pieces(mechanism: Mechanism) -> bool:
     return any(has_pieces(e) for e in (*mechanism.constraints.values(), *mechanism.forces.values()))
 
 
-def _inputs(problem: Any, code: Any = None, xp: ModuleType = jnp) -> list[Any]:
+def _inputs(problem: Any, operation: Run, xp: ModuleType = jnp) -> list[Any]:
     """Those of a run, of one member."""
     equations: TextbookEquations = problem.equations
     method: Any = equations.method
     rank_tol = method.rank_tol
     safe_tol: Any = method.branch_tol if isinstance(method, Auto) else rank_tol**2
-    programs = _programs(problem) if code is None else code
-    drop_tol = (FALLBACK_RANK_SHARE * rank_tol) ** 2 if programs.policy is RankPolicy.FALL_BACK else safe_tol
-    first, rows = 0.0 if problem.h is None else problem.h, _rows_of(problem)
-    numbers: list[Any] = jax.tree.leaves(_numbers_of(problem))
     fallback_tol = FALLBACK_RANK_SHARE * rank_tol
-    settings: list[Any] = [
-        problem.rtol,
-        problem.atol,
-        problem.smallest,
-        first,
-        problem.length,
-        problem.rate,
-        fallback_tol,
-        problem.max_steps,
-    ]
-    given = {
-        "numbers": numbers_as_vector([*numbers, drop_tol, safe_tol]),
-        "ts": problem.ts,
-        "q": problem.q,
-        "v": problem.v,
-        "settings": numbers_as_vector(settings),
-        "rows": equations.scales.rows,
-        "breaks": rows.breakpoints(xp),
+    drop_tol = fallback_tol**2 if operation.code.policy is RankPolicy.FALL_BACK else safe_tol
+    settings = {
+        "rtol": problem.rtol,
+        "atol": problem.atol,
+        "smallest": problem.smallest,
+        "first": 0.0 if problem.h is None else problem.h,
+        "length": problem.length,
+        "omega": problem.rate,
+        "fallback_tol": fallback_tol,
+        "max_steps": problem.max_steps,
     }
-    arrays = [xp.asarray(given[name], float)[None] for name in INPUTS]
-    if rows.samples:
-        arrays.append(xp.asarray(rows.rows(xp), float)[None])
-    return arrays if xp is np else stop_gradients(arrays)
+    numbers, samples = [*jax.tree.leaves(_numbers_of(problem)), drop_tol, safe_tol], _rows_of(problem)
+    further = [samples.rows(xp)] if samples.samples else []
+    breaks, rows = samples.breakpoints(xp), equations.scales.rows
+    return pack(operation, numbers, problem.ts, problem.q, problem.v, settings, rows, breaks, xp, further)
 
 
 def _output(found: Sequence[Any]) -> IntegratorOutput:

@@ -13,6 +13,7 @@ How the code of a run is made, and where to look:
 5. `tangents` (forward mode) and `backpropagation` (reverse mode) add derivatives, with the programs of `linearization` and
    `prologue`; `closing`, `closing_derivatives` and `corrections` are a module that assembles a mechanism instead, `marching` one
    that follows its positions.
-6. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operation` makes it a primitive
-   of JAX with its batching rule. `udkjax.integrate` calls that and knows the rules of differentiation.
+6. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operations` says what modules
+   and shapes there are; `primitive` makes them a primitive of JAX with its batching rule. `udkjax.integrate` calls that and knows
+   the rules of differentiation.
 """

@@ -25,10 +25,11 @@ CORRECTED = "qv"  # what a correction is of, by its number in a record
 class Closing(Module):
     """The text of a module whose `run` closes members, from their guesses q and v at the time ts[0]."""
 
+    settings = ("length", "fallback_tol")
     results = ("state", "residuals", "rank")
 
     def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool] = ()):
-        plan = Plan(code, EULER, False, False, 1, vector, written_out=False, steps=False)
+        plan = Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector, written_out=False, steps=False)
         super().__init__(plan, active=active)
         self.active, self.count = active, len(self.moving)
         correction = LeastNormCorrection if code.is_small else EliminationCorrection

@@ -25,10 +25,14 @@ DISTANT = 1e-2  # from dependence: nearer, elimination loses more than half of t
 class Marching(Module):
     """The text of a module whose `run` follows members from their positions q at the value ts[0] over all values ts."""
 
+    settings = ("length", "omega")
     results = ("qs", "dqs", "ddqs", "trusted")
 
     def __init__(self, code: ScenePrograms, width: int, vector: int):
-        super().__init__(Plan(code, EULER, False, False, width, vector, code.is_small, steps=False))
+        plan = Plan(
+            code, EULER, projected=False, breaks=False, width=width, vector=vector, written_out=code.is_small, steps=False
+        )
+        super().__init__(plan)
         for name in ("M dq0", "M ddq0", "M dddq", "M p"):
             self.places.add(name, self.n)
 

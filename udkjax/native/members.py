@@ -27,7 +27,7 @@ def write_begin(t: Module):
         if name not in SETTINGS and name not in ("stepping", "call", "tangents"):
             put(name, 0.0)
     given = t.member_address(f, call, "settings", member)
-    settings = {name: f.load(given, j) for j, name in enumerate(SETTINGS)}
+    settings = dict.fromkeys(SETTINGS, f.const(1.0)) | {name: f.load(given, j) for j, name in enumerate(t.settings)}
     for name, value in settings.items():
         put(name, value)
     q, v = t.member_address(f, call, "q", member), t.member_address(f, call, "v", member)

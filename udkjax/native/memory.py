@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
-from udkjax.native.layout import INPUTS, OUTPUTS, Lane, Layout, Plan
+from udkjax.native.layout import INPUTS, OUTPUTS, SETTINGS, Lane, Layout, Plan
 
 
 class Memory:
@@ -23,6 +23,7 @@ class Memory:
     rowcount: int  # registers that they take
     stage_accelerations: list[str]
 
+    settings: tuple[str, ...] = SETTINGS  # that it takes
     inputs: tuple[str, ...] = ()  # besides those of every run
     results: tuple[str, ...] = OUTPUTS
     outputs: tuple[str, ...] = ()

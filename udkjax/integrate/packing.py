@@ -1,10 +1,51 @@
-"""Numbers of a scene as machine code takes them: in one vector, and those with derivatives among them."""
+"""Numbers as machine code takes them: its inputs, all numbers of a scene in one vector, their changes and cotangents."""
 
+from collections.abc import Mapping, Sequence
+from types import ModuleType
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
+
+from udkjax.equations.structure import numbers_as_vector
+from udkjax.integrate.gradients import stop_gradients
+from udkjax.native.operations import Operation
+
+
+def pack(
+    operation: Operation,
+    numbers: Sequence[ArrayLike],
+    ts: ArrayLike,
+    q: ArrayLike,
+    v: ArrayLike,
+    settings: Mapping[str, ArrayLike],
+    rows: ArrayLike,
+    breaks: ArrayLike,
+    xp: ModuleType,
+    further: Sequence[ArrayLike] = (),
+) -> list[Any]:
+    """Pack the inputs of an operation, of one member.
+
+    Args:
+        operation: The operation.
+        numbers: All numbers of the scene, and two thresholds of pivots.
+        ts: Times (s).
+        q: Positions (n,).
+        v: Velocities (n,).
+        settings: By name; those of the operation are taken.
+        rows: The scales of the rows of Psi.
+        breaks: Times (s) where the motion is not smooth, in their order.
+        xp: jax.numpy, without derivatives, or NumPy, where all is known.
+        further: Further inputs.
+
+    Returns:
+        Arrays with the member first.
+    """
+    values = [settings[name] for name in operation.settings]
+    given = (numbers_as_vector(numbers), ts, q, v, numbers_as_vector(values), rows, breaks, *further)
+    arrays = [xp.asarray(x, float)[None] for x in given]
+    return arrays if xp is np else stop_gradients(arrays)
 
 
 def active_numbers(numbers: PyTree[Array], active: PyTree[bool]) -> tuple[bool, ...]:

@@ -1,0 +1,203 @@
+"""What machine code does: one class for each operation, with the module that it is made of and the shapes of what it returns.
+
+An operation is all that its code depends on but the number of lanes. Inputs and outputs have the members first; an input that
+all members share has only one.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.native import machine
+from udkjax.native.backpropagation import Reverse
+from udkjax.native.closing import Closing
+from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
+from udkjax.native.layout import INFO, INPUTS, OUTPUTS, SETTINGS, Plan
+from udkjax.native.marching import Marching
+from udkjax.native.module import Module
+from udkjax.native.record import STORED, record_length
+from udkjax.native.tableau import Method
+from udkjax.native.tangents import Forward
+from udkjax.native.trajectory import Trajectory
+
+Shape = tuple[int, ...]
+
+
+class Tableau:
+    """A method, to be looked up by its numbers."""
+
+    def __init__(self, method: Method):
+        self.method = method
+        self._key = tuple(np.asarray(x).tobytes() for x in method)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tableau) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+@dataclass(frozen=True)
+class Operation(ABC):
+    """What code does with members of a scene."""
+
+    code: ScenePrograms
+
+    settings: ClassVar[tuple[str, ...]] = SETTINGS  # that it takes
+    in_lanes: ClassVar[bool] = True  # whether members run side by side
+    results: ClassVar[int] = len(OUTPUTS)  # the first outputs, which have no directions
+    is_reverse: ClassVar[bool] = False  # whether it runs and walks back in two passes, each without what the other finds
+
+    @property
+    def tangents(self) -> int:
+        """The number of the last inputs, which have directions."""
+        return 0
+
+    @abstractmethod
+    def module(self, width: int, several: bool) -> Module:
+        """Return the module in so many lanes; `several` directions of a single member may be side by side."""
+
+    @abstractmethod
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        """Return the shapes of the outputs."""
+
+    def shapes(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        """Return the shapes of the outputs, from inputs."""
+        return self.outputs(inputs, max(x.shape[0] for x in inputs), times)
+
+    @property
+    def coordinates(self) -> int:
+        """The number of coordinates n."""
+        return self.code.coordinate_count
+
+
+@dataclass(frozen=True)
+class Run(Operation):
+    """Integrate: q, v, the violation of Psi, and how the run ended."""
+
+    method: Tableau
+    projected: bool
+    breaks: bool  # whether there are times, or pieces of the state, where the motion is not smooth
+    sampled: tuple[int, ...] = ()  # places of the numbers that have samples
+
+    def plan(self, width: int) -> Plan:
+        """Return what the module's code depends on."""
+        return Plan(
+            code=self.code,
+            method=self.method.method,
+            projected=self.projected,
+            breaks=self.breaks,
+            width=width,
+            vector=machine.lanes(),
+            written_out=self.code.is_small,
+            sampled=self.sampled,
+        )
+
+    def module(self, width: int, several: bool) -> Module:
+        return Trajectory(self.plan(width))
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        n = self.coordinates
+        return [(members, times, n), (members, times, n), (members, times), (members, len(INFO) + 2 * n)]
+
+
+@dataclass(frozen=True)
+class RunTangents(Run):
+    """Integrate, with the changes of the states and of the end along directions."""
+
+    active: tuple[bool, ...] = ()  # of the numbers of the scene: along which there are derivatives
+
+    @property
+    def tangents(self) -> int:
+        return 4 if self.sampled else 3
+
+    def module(self, width: int, several: bool) -> Module:
+        return Forward(self.plan(width), self.active, machine.lanes() if several else width)
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        directions, n = inputs[-1].shape[1], self.coordinates
+        changes = [(members, directions, times, 2 * n), (members, directions, 2 * n)]
+        return [*super().outputs(inputs, members, times), *changes]
+
+
+@dataclass(frozen=True)
+class RunCotangents(Run):
+    """Integrate and leave a record; or, with cotangents of the states and of the end, walk back to those of all numbers."""
+
+    active: tuple[bool, ...] = ()
+    points: int = STORED  # that the record of a run has room for
+    is_reverse: ClassVar[bool] = True
+
+    def module(self, width: int, several: bool) -> Module:
+        return Reverse(self.plan(width), self.active)
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        n, is_first = self.coordinates, not inputs[-1].shape[0]  # without cotangents
+        bars: list[Shape] = [(members, self.code.number_count), (members, n), (members, n)]
+        if self.sampled:
+            bars.append((members, 0 if is_first else inputs[INPUTS.index("breaks")].shape[1] + 1, len(self.sampled)))
+        record = (members, record_length(n, self.points) if is_first else 0)
+        return [*super().outputs(inputs, members, times), *bars, record]
+
+
+@dataclass(frozen=True)
+class Close(Operation):
+    """Close a mechanism: its state, what is left of Psi and Psi_dot, and the rank of Psi_q."""
+
+    settings: ClassVar[tuple[str, ...]] = Closing.settings
+    in_lanes: ClassVar[bool] = False
+    results: ClassVar[int] = len(Closing.results)
+
+    def module(self, width: int, several: bool) -> Module:
+        return Closing(self.code, machine.lanes())
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        return [(members, 2 * self.coordinates), (members, 2 * self.code.row_count), (members, 1)]
+
+
+@dataclass(frozen=True)
+class CloseTangents(Close):
+    """Close, with the changes of the state along directions."""
+
+    active: tuple[bool, ...] = ()
+
+    @property
+    def tangents(self) -> int:
+        return 3
+
+    def module(self, width: int, several: bool) -> Module:
+        return ClosingForward(self.code, machine.lanes(), self.active)
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        return [*super().outputs(inputs, members, times), (members, inputs[-1].shape[1], 2 * self.coordinates)]
+
+
+@dataclass(frozen=True)
+class CloseCotangents(Close):
+    """Close, and walk back from cotangents of the state to those of all numbers and of the guess."""
+
+    active: tuple[bool, ...] = ()
+
+    def module(self, width: int, several: bool) -> Module:
+        return ClosingReverse(self.code, machine.lanes(), self.active)
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        n = self.coordinates
+        return [*super().outputs(inputs, members, times), (members, self.code.number_count), (members, n), (members, n)]
+
+
+@dataclass(frozen=True)
+class March(Operation):
+    """Follow the positions of a driven mechanism over values: q, q', q'', and how many are to be relied on."""
+
+    settings: ClassVar[tuple[str, ...]] = Marching.settings
+
+    def module(self, width: int, several: bool) -> Module:
+        return Marching(self.code, width, machine.lanes())
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        return [*[(members, times, self.coordinates)] * 3, (members, 1)]

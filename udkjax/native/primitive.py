@@ -1,0 +1,181 @@
+"""Machine code of operations: compiled once for each, called at once or, as a primitive of JAX, from compiled programs."""
+
+import ctypes
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from threading import Lock
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+from jaxtyping import Array
+
+from udkjax.native import machine
+from udkjax.native.ffi import handler
+from udkjax.native.layout import INPUTS, OUTPUTS
+from udkjax.native.module import Module
+from udkjax.native.operations import Operation
+from udkjax.native.program import UnsupportedError
+
+FEW = 2  # members up to which one follows another: eight lanes take as long as two members
+
+
+@lru_cache(maxsize=256)
+def generate(operation: Operation, width: int, several: bool) -> Module:
+    """The module of an operation in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it.
+
+    `several`: whether there may be more than one direction of a single member, which then are side by side.
+    """
+    module = operation.module(width, several)
+    handlers = handler(module, "call_frame")
+    declared = sorted(set().union(*(f.declared for f in handlers)))
+    module.module = "\n".join([module.text(), *declared, *(f.text() for f in handlers)])
+    return module
+
+
+def unsupported(operation: Operation) -> str:
+    """Return what an operation takes that machine code has no instruction for; empty where there is nothing."""
+    try:
+        generate(operation, 1, False)
+    except UnsupportedError as error:
+        return str(error)
+    return ""
+
+
+class Compiled:
+    """The machine code of one operation, in so many lanes."""
+
+    def __init__(self, operation: Operation, width: int, several: bool):
+        self._module, self._in_passes = generate(operation, width, several), operation.is_reverse
+        self.name, self._run = load(self._module.module)
+
+    def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
+        """Outputs of these shapes, on as many threads as there are cores."""
+        names, fields = self._module, {}
+        inputs = [np.ascontiguousarray(x, np.float64) for x in inputs]
+        # Of the two passes of reverse mode each leaves out what the other finds: zeros, since NaN would alarm jax.debug_nans.
+        found = [np.full(shape, 0.0 if self._in_passes else np.nan) for shape in shapes]
+        for name, x in zip((*INPUTS, *names.inputs), inputs, strict=True):
+            fields[name] = x.ctypes.data
+            fields[f"{name} stride"] = math.prod(x.shape[1:]) if len(x) > 1 else 0
+        fields |= {name: x.ctypes.data for name, x in zip((*names.results, *names.outputs), found, strict=True)}
+        arrays = dict(zip((*INPUTS, *names.inputs, *names.results, *names.outputs), (*inputs, *found), strict=True))
+        fields |= {f"{name} length": arrays[name].shape[1] for name in names.lengths}
+        members, times = shapes[0][0], inputs[INPUTS.index("ts")].shape[1]
+        following = ctypes.c_int64(0)
+        fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
+        fields |= {"directions": inputs[-1].shape[names.directions_in], "next": ctypes.addressof(following)}
+        call = (ctypes.c_int64 * len(names.call_fields))(*(fields[name] for name in names.call_fields))
+        threads = min(os.cpu_count() or 1, members)
+        if threads == 1:
+            self._run(ctypes.addressof(call))
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(lambda _: self._run(ctypes.addressof(call)), range(threads)))
+        return found
+
+
+_LOADED: dict[str, tuple[machine.Library, Any]] = {}
+_LOADING = Lock()
+
+
+def load(text: str) -> tuple[str, Any]:
+    """Load the code of a module; return the name that XLA knows it by, and `run`.
+
+    XLA takes one address for a name, and programs that it has compiled call that whenever they run: what was loaded once stays,
+    and serves everyone who asks for the same text.
+    """
+    name = f"udkjax_{machine.digest(text)}"
+    with _LOADING:
+        if name not in _LOADED:
+            library = machine.library(text, ("run", "call_frame"))
+            capsule = jax.ffi.pycapsule(ctypes.c_void_p(library["call_frame"]))
+            jax.ffi.register_ffi_target(name, capsule, platform="cpu")
+            _LOADED[name] = library, machine.function(library["run"], ctypes.c_void_p)
+        return name, _LOADED[name][1]
+
+
+@lru_cache(maxsize=256)
+def machine_code(operation: Operation, width: int, several: bool) -> Compiled:
+    """The machine code of an operation."""
+    return Compiled(operation, width, several)
+
+
+def call_known(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
+    """Run an operation on numbers that are known, of one member: nothing is traced for it."""
+    return machine_code(operation, 1, False)(inputs, operation.shapes(inputs, times))
+
+
+# --- as a primitive of JAX
+
+
+def _select_code(inputs: Sequence[Any], operation: Operation) -> Compiled:
+    few = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
+    several = bool(operation.tangents) and few and inputs[-1].shape[1] > 1 and operation.code.is_small
+    return machine_code(operation, 1 if few else machine.lanes(), several)
+
+
+def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:
+    found = _select_code(inputs, operation)([np.asarray(x) for x in inputs], operation.shapes(inputs, times))
+    return [jnp.asarray(x) for x in found]
+
+
+def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
+    results = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in operation.shapes(inputs, times)]
+    found = jax.ffi.ffi_call(_select_code(inputs, operation).name, results)(*inputs)
+    if not operation.is_reverse:
+        return found
+    # What a pass leaves out, as in `Compiled`, is memory as it was.
+    results, (*bars, record) = found[: len(OUTPUTS)], found[len(OUTPUTS) :]
+    if inputs[-1].shape[0]:
+        return [*map(jnp.zeros_like, results), *bars, record]
+    return [*results, *map(jnp.zeros_like, bars), jnp.where(jnp.isfinite(record), record, 0.0)]
+
+
+def _abstract_eval(*inputs: Any, operation: Operation, times: int) -> list[Any]:
+    return [ShapedArray(shape, np.dtype(float)) for shape in operation.shapes(inputs, times)]
+
+
+def _batch(
+    inputs: Sequence[Any], axes: Sequence[int | None], operation: Operation, times: int
+) -> tuple[list[Any], list[int | None]]:
+    """A batch is more members; but one of directions alone, more directions."""
+    size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
+    first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
+    shared, results = len(inputs) - operation.tangents, operation.results
+    if operation.tangents and all(axis is None for axis in axes[:shared]):
+
+        def directions(x: Any, axis: int | None) -> Any:
+            x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else x
+            x = jnp.moveaxis(x, 0, 1)
+            return x.reshape(x.shape[0], x.shape[1] * x.shape[2], *x.shape[3:])
+
+        given = [directions(x, axis) for x, axis in zip(first[shared:], axes[shared:], strict=True)]
+        found = native_p.bind(*first[:shared], *given, operation=operation, times=times)
+        changes = [x.reshape(x.shape[0], size, x.shape[1] // size, *x.shape[2:]) for x in found[results:]]
+        return [*found[:results], *changes], [*[None] * results, *[1] * len(changes)]
+    members = max(x.shape[0 if axis is None else 1] for x, axis in zip(first, axes, strict=True))
+
+    def each(x: Any, axis: int | None) -> Any:
+        if axis is None and x.shape[0] <= 1:
+            return x
+        x = x[None] if axis is None else x
+        return jnp.broadcast_to(x, (size, members, *x.shape[2:])).reshape(size * members, *x.shape[2:])
+
+    found = native_p.bind(*(each(x, axis) for x, axis in zip(first, axes, strict=True)), operation=operation, times=times)
+    return [x.reshape(size, members, *x.shape[1:]) for x in found], [0] * len(found)
+
+
+native_p = Primitive("native_trajectory")
+native_p.multiple_results = True
+native_p.def_impl(_call)
+native_p.def_abstract_eval(_abstract_eval)
+batching.primitive_batchers[native_p] = _batch
+mlir.register_lowering(native_p, mlir.lower_fun(_lower), platform="cpu")
