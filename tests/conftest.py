@@ -18,7 +18,7 @@ CACHE_SIZE = 2**30  # bytes; a cache that is larger before a run begins anew
 # XLA compiles in less than half of the time what it does not optimize; no test is about how fast that runs.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 import udkjax as udk
-from udkjax.native import code_cache, operation
+from udkjax.native import code_cache, primitive
 
 if folder := code_cache.cache_folder():  # what one process has compiled, however small, serves the other
     jax.config.update("jax_compilation_cache_dir", f"{folder}/jax")
@@ -69,9 +69,9 @@ def compilations():
 
     def during(run) -> list[float]:
         seen.clear()
-        before = operation.machine_code.cache_info().misses
+        before = primitive.machine_code.cache_info().misses
         run()
-        return [*seen, *[0.0] * (operation.machine_code.cache_info().misses - before)]
+        return [*seen, *[0.0] * (primitive.machine_code.cache_info().misses - before)]
 
     return during
 
