@@ -126,7 +126,9 @@ def code_of(samples: int) -> list[str]:
     numbers: Any = (equations, TS, state.q.ravel(), state.v.ravel(), *tolerances, None, None, jnp.ones(()))
     problem = Problem(*numbers, solver=None, projected=True, max_steps=100, breakpoints=mechanism.breakpoints)
     run = native_engine._run(problem)
-    settings = {field.name: getattr(run, field.name) for field in dataclasses.fields(run)} | {"code": run.code.for_derivatives}
+    settings: dict[str, Any] = {field.name: getattr(run, field.name) for field in dataclasses.fields(run)} | {
+        "code": run.code.for_derivatives
+    }
     reverse = RunCotangents(**settings, active=(True,) * run.code.number_count)
     return [generate(operation, 1, False).module for operation in (run, reverse)]
 
