@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.native_numbers import leaves_and_none
+from udkjax.integrate.packing import leaves_and_none
 from udkjax.scene.held import row_size, rows_of, with_row
 from udkjax.scene.mechanism import Mechanism
 
