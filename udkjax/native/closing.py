@@ -123,8 +123,7 @@ class Closing(Module):
             self.invoke(f, name)
             with f.each(self.m) as i:
                 f.store(f.load(work, i + self.places["psi"]), residuals, i + offset)
-        self._evaluate(f, "q")
-        self.corrections["q"].find_rank(f)
+        self.corrections["v"].find_rank(f)
         f.store(s.rank, address("rank", 1))
         self._finish_closing(f, member)
 

@@ -58,6 +58,7 @@ class ClosingForward(ClosingDerivative):
     def write_derivatives(self):
         write_prologue_derivative(self, self.active, False)
         for x, correction in self.corrections.items():
+            correction.write_adjoint()
             correction.forward()
             self._write_push(x)
 
@@ -65,6 +66,7 @@ class ClosingForward(ClosingDerivative):
         """Write push_x(work, scale, limited): the change of the state by so much of a correction, which was limited or not."""
         f, _ = self.function(f"push_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._evaluate(f, x)
+        self.corrections[x].prepare_derivative(f)
         longest, which = self._longest(f, x)
         limits = (f.given["limited"] > 0.5) & (longest > 0.0)
         with self._each_tangent(f):
@@ -143,6 +145,7 @@ class ClosingReverse(ClosingDerivative):
     def write_derivatives(self):
         write_prologue_derivative(self, self.active, True)
         for x, correction in self.corrections.items():
+            correction.write_adjoint()
             correction.reverse()
             self._write_pull(x)
 
@@ -150,6 +153,7 @@ class ClosingReverse(ClosingDerivative):
         """Write pull_x(work, scale, limited): from the cotangent B of the state behind a correction to that before it, in X."""
         f, _ = self.function(f"pull_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._evaluate(f, x)
+        self.corrections[x].prepare_derivative(f)
         longest, which = self._longest(f, x)
         along = f.variable(0.0)
         with f.each(self.n) as i:

@@ -28,6 +28,12 @@ from udkjax.native.module import Module
 class EliminationCorrection(Linearization):
     """A correction by elimination."""
 
+    def write_adjoint(self):
+        """Nothing: derivatives know all that they need from an evaluation."""
+
+    def prepare_derivative(self, f: Function):
+        """Nothing."""
+
     def find_rank(self, f: Function):
         """Leave the rank of Psi_q in `rank`, after an evaluation."""
         t = self._in
@@ -121,12 +127,22 @@ class LeastNormCorrection:
         t.loops.write(LoopProgram([t.code.sincos, *self._parts]), f"rows_{self._x}", ("work", "out"), at)
         f, _ = t.function(f"evaluation_{self._name}", [(POINTER, "work"), (POINTER, "out"), (POINTER, "stored")])
         self._load_rows(f)
-        z, y = (f.at(f.given["stored"], self.place(name)) for name in "zy")
+        z = f.at(f.given["stored"], self.place("z"))
         self._solve(f, "psi", z)
         with f.each(t.n) as i:
-            self._put(f, "right", i, self._stored(f, "z", i))
             f.store(self._at(f, f"X {self._x}", i) - self._at(f, "root", i) * self._stored(f, "z", i), f.given["stored"], i)
-        self._solve(f, "right", y, transposed=True)
+
+    def write_adjoint(self):
+        """`adjoint_...(work, stored)`: y, which derivatives need besides."""
+        t = self._in
+        f, _ = t.function(f"adjoint_{self._name}", [(POINTER, "work"), (POINTER, "stored")])
+        with f.each(t.n) as i:
+            self._put(f, "right", i, self._stored(f, "z", i))
+        self._solve(f, "right", f.at(f.given["stored"], self.place("y")), transposed=True)
+
+    def prepare_derivative(self, f: Function):
+        """Compute what derivatives need besides, behind an evaluation."""
+        f.call(f"adjoint_{self._name}", f.given["work"], self._in.address(f, "correction"))
 
     def forward(self):
         t, w = self._in, self._in.tangents
