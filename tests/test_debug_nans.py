@@ -32,6 +32,11 @@ def fall(m, *events):
     return udk.simulate(BALL.with_parameters({"body.b.mass": m.bodies["b"].mass}), TS, events=events)
 
 
+def times(solution):
+    assert solution.events is not None
+    return solution.events.time
+
+
 def crosses(action):
     return udk.Event(lambda t, at: at["b"].y, action, -1)
 
@@ -45,7 +50,7 @@ CALLS = {
     "inverse_dynamics": lambda m: udk.inverse_dynamics(m, ANGLES, motion=motion(MECH), drivers=["body.b.angle"]).power,
     "equilibrium": lambda m: udk.equilibrium(m).q,
     "accelerations": lambda m: udk.accelerations(m, 0.0, MECH.q0, MECH.v0, formulation=udk.CoordinatePartitioning()),
-    "events": lambda m: fall(m, udk.Contact("b", restitution=0.5), crosses(udk.Log())).events.time,
+    "events": lambda m: times(fall(m, udk.Contact("b", restitution=0.5), crosses(udk.Log()))),
 }
 CALLED = {"kinematics": motion, "travel": lambda m: udk.travel(m, "body.c.angle"), "stop": lambda m: fall(m, crosses(udk.Stop()))}
 
