@@ -257,8 +257,23 @@ def _simulate(
     # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
     loose_rtol, loose_atol = (xp.where(good & closed, tol, 1e3) for tol in (rtol, xp.maximum(atol, LEAST_ATOL)))
     ulp = np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1]))
-    numbers: Any = (equations, ts, q, v, loose_rtol, loose_atol, SMALLEST_STEP * ulp, dt0, *units_of_run(analysis, ts, v, xp))
-    problem = Problem(*numbers, solver=solver, projected=projected, max_steps=max_steps, breakpoints=mechanism.breakpoints)
+    length, rate = units_of_run(analysis, ts, v, xp)
+    problem = Problem(
+        equations=equations,
+        ts=ts,  # pyright: ignore[reportArgumentType]
+        q=q,
+        v=v,
+        rtol=loose_rtol,
+        atol=loose_atol,
+        smallest=SMALLEST_STEP * ulp,
+        h=dt0,
+        length=length,
+        rate=rate,
+        solver=solver,
+        projected=projected,
+        max_steps=max_steps,
+        breakpoints=mechanism.breakpoints,
+    )
     why = "it was asked for" if engine == "diffrax" else reason_for_diffrax(problem, adjoint, meter)
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')

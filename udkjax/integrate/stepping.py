@@ -103,9 +103,18 @@ def _advance(
     ts = number(np.array([float(t), float(t) + float(dt)])) if known else jnp.stack([t, t + dt])
     equations, q, v = equations_of(moved, Auto(), analysis=analysis), jnp.ravel(state.q), jnp.ravel(state.v)
     smallest = SMALLEST_STEP * np.finfo(float).eps * jnp.max(jnp.abs(ts))
-    given: Any = (equations, ts, q, v, rtol, jnp.maximum(atol, LEAST_ATOL), smallest, dt, *units_of_run(analysis, ts, v, jnp))
+    length, rate = units_of_run(analysis, ts, v, jnp)
     problem = Problem(
-        *given,
+        equations=equations,
+        ts=ts,
+        q=q,
+        v=v,
+        rtol=rtol,
+        atol=jnp.maximum(atol, LEAST_ATOL),
+        smallest=smallest,
+        h=dt,
+        length=length,
+        rate=rate,
         solver=None,
         projected=equations.constrained,
         max_steps=max_steps,
