@@ -122,8 +122,10 @@ def _dataset(tally: Tally, count: dict[str, int], done: dict[str, int], faults: 
 def _merged(old: xarray.Dataset, new: xarray.Dataset) -> xarray.Dataset:
     """Return what two runs found together; what the older one did not look for, it found in no case."""
     at = dict(zip(old.property.values, json.loads(old.worst_at), strict=True))
-    old = old.assign_coords(property=old.property.astype(object)).reindex(property=new.property, fill_value=0).assign_attrs(
-        worst_at=json.dumps([at.get(name, "") for name in new.property.values])
+    old = (
+        old.assign_coords(property=old.property.astype(object))
+        .reindex(property=new.property, fill_value=0)
+        .assign_attrs(worst_at=json.dumps([at.get(name, "") for name in new.property.values]))
     )
     both = new.copy()
     for name in ("cases", "mechanisms", "inputs", "faults"):
