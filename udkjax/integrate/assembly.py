@@ -86,14 +86,7 @@ class Closure(NamedTuple):
     psi_dot: Float[Array, "m"]
     rank: Int[Array, ""]
     scales: Scales
-
-    @property
-    def is_closed(self) -> Bool[Array | np.ndarray, ""]:
-        """Whether the residuals are within `CLOSED_TOL` of the scene's scales, or rounding."""
-        given = self.scales, self.state.q, self.state.v, self.psi, self.psi_dot
-        xp = np if _is_known(given) else jnp
-        scales, q, v, psi, psi_dot = jax.tree.map(xp.asarray, given)
-        return is_closed(scales, q.ravel(), v.ravel(), psi, psi_dot, xp)
+    is_closed: Bool[Array, ""]  # whether the residuals are within `CLOSED_TOL` of the scene's scales, or rounding
 
 
 @checked
@@ -149,8 +142,10 @@ def close(
         q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
         with np.errstate(all="ignore"):  # what is not finite does not close
             q, v, psi, psi_dot, rank = _close_known(mechanism, scales, time, q, v)
+            closed = is_closed(jax.tree.map(np.asarray, scales), q, v, psi, psi_dot, np)
         state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
-        found = Closure(state_found, number(psi), number(psi_dot), jax.device_put(np.asarray(rank)), scales)
+        rank, closed = (jax.device_put(np.asarray(x)) for x in (rank, closed))
+        found = Closure(state_found, number(psi), number(psi_dot), rank, scales, closed)
     if state is None:
         _cache[key] = CachedClosure(weakref.ref(mechanism, lambda _: _cache.pop(key, None)), time, found)
     return found
@@ -172,7 +167,8 @@ def _close(mechanism: Mechanism, analysis: Analysis, t: Scalar, state: State | N
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
     close = close_by_machine_code if native_closing.can_close(mechanism) else close_by_jax
     q, v, psi, psi_dot, rank = close(mechanism, analysis, number(t), q, v)
-    return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales)
+    closed = is_closed(analysis.scales, q, v, psi, psi_dot, jnp)
+    return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales, closed)
 
 
 _close_compiled = eqx.filter_jit(_close)
