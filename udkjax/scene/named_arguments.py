@@ -118,7 +118,20 @@ def _are_names(x: Any) -> bool:
     return isinstance(x, Sequence) and not isinstance(x, str) and all(isinstance(name, str) for name in x)
 
 
-_require_mapping = _of_kind("map names to numbers, such as {name: number}", lambda x: x is None or isinstance(x, Mapping))
+_require_mapping = _of_kind(
+    "map names to numbers, such as {name: number}",
+    lambda x: x is None or (isinstance(x, Mapping) and all(isinstance(name, str) for name in x)),
+)
+
+
+def _is_coordinate(x: Any) -> bool:
+    """Whether something is the name of a driver or a coordinate, or a `Coordinate`."""
+    return bool(x) if isinstance(x, str) else hasattr(x, "bodies")
+
+
+def _is_parameter(x: Any) -> bool:
+    """Whether something is the name of a parameter, a `Parameter`, or names that are tied."""
+    return isinstance(x, str | list | tuple) or callable(x) or dataclasses.is_dataclass(x)
 
 
 def _require_point(name: str, value: Any, given: Given) -> None:
@@ -134,7 +147,12 @@ def _require_drivers(name: str, value: Any, given: Given) -> None:
     if isinstance(value, Mapping):
         for driver, values in value.items():
             require_finite(f"{name}[{driver!r}]", values)
-    elif "body" in given or isinstance(value, str | np.ndarray) or not isinstance(value, Sequence | None):
+    elif (
+        "body" in given
+        or isinstance(value, str | np.ndarray)
+        or not isinstance(value, Sequence | None)
+        or (value is not None and not all(map(_is_coordinate, value)))
+    ):
         meant = "map two drivers to their values" if "body" in given else "be a list of names"
         raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
 
@@ -145,9 +163,11 @@ CHECKS: dict[str, Check] = {
     "drivers": _require_drivers,
     "parameters": _of_kind(
         "be the name of a parameter, a Parameter, or a list of these",
-        lambda x: isinstance(x, str | list | tuple) or callable(x) or dataclasses.is_dataclass(x),
+        lambda x: _is_parameter(x) and (not isinstance(x, list | tuple) or all(map(_is_parameter, x))),
     ),
     "ignore": _of_kind("be a list of names", _are_names),
+    "output": _of_kind("be the name of a coordinate, such as body.crank.angle, or a Coordinate", _is_coordinate),
+    "guesses": _optional(require_finite),
     "client": _of_kind("be a dask.distributed.Client, or None", _has("submit")),
     "optimizer": _of_kind("be an optimizer of optax's, or None", lambda x: isinstance(x, str) or _has("update")(x)),
     "mechanism": _check_mechanism,

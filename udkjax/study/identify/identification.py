@@ -98,11 +98,14 @@ def identify(
     return _estimate_of(fit, found, history, (tol, tol), residual_loss, time.perf_counter() - start)
 
 
+MOST_STARTS = 10**6  # first guesses: of more, not even their numbers fit into memory at once
+
+
 def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None) -> Float[np.ndarray, "B K"]:
     """Return first guesses of all unknowns."""
     first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
-    if n_starts < 0:
-        raise IdentificationError([f"n_starts: must be a number of guesses from 0 on, is {n_starts}"])
+    if not 0 <= n_starts <= MOST_STARTS:
+        raise IdentificationError([f"n_starts: must be a number of guesses from 0 to {MOST_STARTS:,}, is {n_starts}"])
     if guesses is None:
         return first
     given = np.asarray(guesses, float)
