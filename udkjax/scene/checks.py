@@ -129,12 +129,17 @@ def gravity_mistakes(gravity: object) -> list[str]:
     return list(_check_number("gravity", ["2"], gravity, {}, {}))
 
 
+def _short(key: Any) -> str:
+    """Return a key of a table as a text that is not long."""
+    return abbreviate(key) if isinstance(key, str) and len(key) > LONGEST_QUOTE else f"{key}"
+
+
 def check_table(where: str, cls: type, table: Table, known: KnownNames) -> Iterator[str]:
     """Iterate over the mistakes of one table, read as an element of class `cls`."""
     expected, sizes = keys(cls), {}
     for name in table:
         if name not in expected:
-            yield f"{where}.{name if len(name) <= LONGEST_QUOTE else abbreviate(name)}: unknown key{suggestion(name, expected)}"
+            yield f"{where}.{_short(name)}: unknown key{suggestion(name, expected)}"
     for name, key in expected.items():
         if name in table:
             yield from _check_value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes)
@@ -284,8 +289,8 @@ def _check_bodies(where: str, cls: type, table: Table) -> Iterator[str]:
         yield f"{where}.bodies: must name {n} {'body' if n == 1 else 'bodies'}, is {abbreviate(bodies)}"
     named = table.get("carrier", GROUND)
     carrier = [named] if isinstance(named, str) and named != GROUND else []
-    attached = [*bodies, *carrier]
-    twice = {name: None for name in attached if isinstance(name, str) and attached.count(name) > 1}
+    attached = [name for name in (*bodies, *carrier) if isinstance(name, str)]
+    twice = {name: None for name in attached if attached.count(name) > 1}
     yield from (f"{where}.{'carrier' if name in carrier else 'bodies'}: {quote(name)} is connected to itself" for name in twice)
 
 

@@ -168,6 +168,10 @@ CHECKS: dict[str, Check] = {
     "ignore": _of_kind("be a list of names", _are_names),
     "output": _of_kind("be the name of a coordinate, such as body.crank.angle, or a Coordinate", _is_coordinate),
     "guesses": _optional(require_finite),
+    "tol": _optional(require_number, sign="not negative"),
+    "loss": _of_kind(
+        'be a name, such as "huber", or a function', lambda x: isinstance(x, str) or (callable(x) and not isclass(x))
+    ),
     "client": _of_kind("be a dask.distributed.Client, or None", _has("submit")),
     "optimizer": _of_kind("be an optimizer of optax's, or None", lambda x: isinstance(x, str) or _has("update")(x)),
     "mechanism": _check_mechanism,

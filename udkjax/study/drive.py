@@ -106,7 +106,10 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Sc
         return Driven(mechanism.without_origin, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
     names: dict[str, str] = {}  # of what is held, by the drivers that hold it
     for key, value in (held or {}).items():
-        holder, element = _element(mechanism, key)
+        try:
+            holder, element = _element(mechanism, key)
+        except SceneError as error:
+            raise SceneError([f"held: {problem}" for problem in error.problems], mechanism.name) from None
         names[holder] = f"{quote(key)}, which `held` gives"
         mechanism = _with_driver(mechanism, holder, element, _constant(value))
     name, element = _element(mechanism, driver)

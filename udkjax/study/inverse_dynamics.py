@@ -153,7 +153,7 @@ def inverse_dynamics(
         motion = found = kinematics(mechanism, None, ts)
     chosen = list(mechanism.driver_names) if drivers is None else list(drivers)
     if not chosen:
-        raise SceneError(["nothing drives it: name coordinates that do, such as body.crank.angle"], mechanism.name)
+        raise SceneError(["drivers: nothing drives it; name coordinates that do, such as body.crank.angle"], mechanism.name)
     named = {d if isinstance(d, str) else f"{d.coordinate} of {' and '.join(d.bodies)}": d for d in chosen}
     unknown = [name for name in weights or {} if name not in named]
     if unknown:
