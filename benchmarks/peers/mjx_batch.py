@@ -1,6 +1,7 @@
 """MJX: MuJoCo's model of the linkage in JAX, many trajectories at once."""
 
 from functools import partial
+from importlib import import_module
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +15,8 @@ TRAJECTORIES = 64
 
 def setup(batch: Batch) -> Run:
     """One program for all steps: from the step and their number between outputs, and the angles at the start."""
-    import mujoco  # pyright: ignore[reportMissingImports]
-    from mujoco import mjx  # pyright: ignore[reportMissingImports]
+    mujoco = import_module("mujoco")
+    mjx = import_module("mujoco.mjx")
 
     plain = mujoco.MjModel.from_xml_string(mjcf())
     plain.opt.iterations, plain.opt.ls_iterations = 1, 4  # without inequalities the first Newton step solves it

@@ -1,6 +1,7 @@
 """MuJoCo: a tree of four hinges, two points connected as stiffly as the step allows, the Runge-Kutta method of order four."""
 
 from functools import partial
+from importlib import import_module
 
 import numpy as np
 
@@ -53,7 +54,7 @@ def stiffened(model, step: float, impedance: float):
 
 def setup(problem: Problem, impedance: float = HARD) -> Run:
     """The coupler hangs on link 1."""
-    import mujoco  # pyright: ignore[reportMissingImports]
+    mujoco = import_module("mujoco")
 
     mujoco.set_mju_user_warning(lambda message: None)  # of what is unstable: the error says it, and no log is left behind
     model = mujoco.MjModel.from_xml_string(mjcf())
