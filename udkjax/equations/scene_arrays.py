@@ -11,7 +11,7 @@ from udkjax.equations.structure import AnyArray, ArrayLibrary, Time, numbers_as_
 from udkjax.expressions.loop_program import NumpyLoops, evaluate_loops
 from udkjax.scene.mechanism import Mechanism
 
-RESULTS = ("psi", "psi_dot", "psi_q", "terms")
+ROWS_AND_LOADS = ("psi", "psi_dot", "psi_q", "terms")
 
 
 class SceneArrays(Generic[AnyArray]):
@@ -76,5 +76,5 @@ Evaluate = Callable[[dict[str, Any]], dict[str, Any]]
 def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> tuple[Evaluate, set[str]]:
     """Return a program as a function of its arrays, and the names of those: made once."""
     program = getattr(programs, name)
-    arrays = program.arrays | set(RESULTS)
+    arrays = program.arrays | set(ROWS_AND_LOADS)
     return (NumpyLoops(program) if xp is np else lambda given: evaluate_loops(program, given)), arrays

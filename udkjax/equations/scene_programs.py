@@ -26,10 +26,11 @@ from udkjax.scene.mechanism import Mechanism
 # size, but take the longer to trace and compile, the larger the scene is (python -m benchmarks scaling).
 WRITTEN_OUT_OPERATIONS = 2800
 
+# Corrections of a solution by its residual: each takes back what the rounding of the factors left, as long as eps times the
+# square of the condition number of the rows is below one.
 REFINEMENTS = 2
 
-# The arrays that programs take, and those that they return; all others are scratch.
-INPUTS = ("constants", "t", "q", "v", "dq", "dv")
+# The arrays that programs return; all others are scratch.
 RESULTS = ("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root")
 
 # Arrays that derivatives take as fixed. Sines and cosines are known functions of q to every kernel that reads them.
@@ -60,7 +61,7 @@ class DifferentiableProgram(NamedTuple):
 
 
 class ScenePrograms:
-    """Programs over arrays of numbers: the results `RESULTS` from the `INPUTS` that each needs.
+    """Programs over arrays of numbers: the results `RESULTS` from constants, t, q, v, dq and dv, as each needs them.
 
     What a program computes on the way stays in arrays of its own, of the sizes `scratch`: no number is written again once it has
     been read. `safe` is whether all pivots exceed `safe_tol`, `distance` the root of the smallest pivot relative to its diagonal

@@ -2,8 +2,8 @@
 
 It has two functions of `work`, for the lanes that are `wanted`, at the state in X:
 
-    fallback        accelerations a, and q and v after a Newton step each, in arrays of their own
-    tangent_part    what is within the manifold of X dq and X dv, in O dq and O dv
+    fallback                 accelerations a, and q and v after a Newton step each, in arrays of their own
+    fallback_tangent_part    what is within the manifold of X dq and X dv, in arrays of their own
 
 For small scenes the method is the pseudoinverse by singular values (least_norm.py), lane by lane; for large ones elimination
 of all rows, without those that depend on others, which near singular configurations has about half as many digits.
