@@ -177,7 +177,7 @@ RESULTS = {"accelerations": ["a"], "projection": ["q1", "v1"], "newton_q": ["q1"
 def test_no_number_is_written_once_it_was_read():
     """Derivatives rely on it."""
     code = At(loaded()).code
-    programs = [getattr(code, f"differentiable_{name}").program for name in RESULTS]
+    programs = [code.differentiable[name].program for name in RESULTS]
     for program in programs:
         read: set[tuple[str, int]] = set()
         for part in program.parts:
@@ -200,7 +200,7 @@ def test_no_number_is_written_once_it_was_read():
 @pytest.mark.parametrize("name", RESULTS)
 def test_derivatives_against_differences(at, name):
     code, random = at.code, np.random.default_rng(4)
-    results, evaluated = RESULTS[name], getattr(code, f"differentiable_{name}")
+    results, evaluated = RESULTS[name], code.differentiable[name]
     q, v = at.q, at.v
     for _ in range(6 if name == "projection" else 0):  # its derivatives are those of a state on the manifold
         state = at.run("newton_q", q=q)

@@ -1,24 +1,23 @@
 """The programs of a scene: each computes its results, and nothing else.
 
 Terms come from loops over elements of the same structure (scene_terms.py), linear systems from elimination by blocks
-(block_elimination.py), and derivatives from loops, too (`DifferentiableProgram`). Small scenes run them written out
-(written_out.py).
+(block_elimination.py, scene_solver.py), and derivatives from loops, too (differentiable_programs.py). Small scenes run them
+written out (written_out.py).
 """
 
-from collections.abc import Collection, Hashable, Iterable, Sequence
+from collections.abc import Hashable
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from udkjax.equations.block_elimination import BlockElimination
+from udkjax.equations.differentiable_programs import DifferentiablePrograms
 from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, SceneLayout, abstract_mechanism
 from udkjax.equations.scene_prologue import write_prologue
-from udkjax.equations.scene_terms import Parts, SceneTerms, compliance
+from udkjax.equations.scene_solver import SceneSolver, program
+from udkjax.equations.scene_terms import SceneTerms, compliance
 from udkjax.equations.structure import Shapes, TreeDef, structure, whole_structure
-from udkjax.expressions.loop_derivative import LoopDerivative
-from udkjax.expressions.loop_program import ADD, Kernel, KernelLoop, KernelWriter, LoopProgram, Reset
+from udkjax.expressions.loop_program import Kernel, KernelLoop, KernelWriter, LoopProgram, Reset
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
@@ -26,38 +25,8 @@ from udkjax.scene.mechanism import Mechanism
 # size, but take the longer to trace and compile, the larger the scene is (python -m benchmarks scaling).
 WRITTEN_OUT_OPERATIONS = 2800
 
-# Corrections of a solution by its residual: each takes back what the rounding of the factors left, as long as eps times the
-# square of the condition number of the rows is below one.
-REFINEMENTS = 2
-
 # The arrays that programs return; all others are scratch.
 RESULTS = ("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root")
-
-# Arrays that derivatives take as fixed. Sines and cosines are known functions of q to every kernel that reads them.
-NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
-
-
-class DifferentiableProgram(NamedTuple):
-    """A program, and loops whose derivative is its own, with respect to all arrays but those `NOT_DIFFERENTIATED`.
-
-    No factorization is differentiated. With M^(-1) = C and J = Psi_q, accelerations, and corrections such as q - C J^T x, are
-
-        a = a_F + z,        z = C J^T x,        J C J^T x = b,
-
-    and along a change of the inputs, by the factors at hand,
-
-        dz = d(C J^T) x + C J^T dx,        J C J^T dx = db - dJ z - J d(C J^T) x.
-
-    The loops say so in terms of x1, which is zero and changes by dx. A projection is differentiated where all residuals vanish,
-    and with them whatever they multiply.
-    """
-
-    program: LoopProgram
-    parts: Sequence[KernelLoop | Reset]
-
-    def derivative(self, fixed: Collection[str] = ()) -> LoopDerivative:
-        """Return the derivative, with further arrays fixed."""
-        return LoopDerivative(self.parts, {*NOT_DIFFERENTIATED, *fixed})
 
 
 class ScenePrograms:
@@ -84,7 +53,7 @@ class ScenePrograms:
         self.policy, self.redundant_rows = policy, redundant_rows
         layout = self._layout = SceneLayout(abstract_mechanism(tree, shapes), redundant_rows, baumgarte, every_row)
         self._terms = SceneTerms(layout, self._kernels)
-        self._elimination = BlockElimination(self._terms)
+        self._solver = SceneSolver(self._terms, policy)
         self.scratch, self.row_names = layout.sizes, layout.row_names
         self.coordinate_count, self.row_count = layout.coordinate_count, layout.row_count
         self.constants = range(layout.constant_count)
@@ -142,27 +111,28 @@ class ScenePrograms:
     @cached_property
     def accelerations(self) -> LoopProgram:
         """a; safe."""
-        solve = [*self._factorize, *self._elimination.solve(), self._terms.add_solution("free", "a", 0), self._safe]
-        return _program(self._acceleration_system, solve)
+        solver = self._solver
+        solve = [*solver.factorize, *solver.solve(), self._terms.add("a", start="free", solution=0), solver.safe]
+        return program(solver.acceleration_system, solve)
 
     @cached_property
     def newton_q(self) -> LoopProgram:
         """q1, q after a Newton step to Psi = 0; safe."""
-        return _program(self._newton("psi", "q"), [self._safe])
+        return program(self._solver.newton("psi", "q"), [self._solver.safe])
 
     @cached_property
     def newton_v_and_psi(self) -> LoopProgram:
         """v1, v after the Newton step to Psi_dot = 0; and psi, of all rows."""
-        return _program(self._newton("psi_dot", "v"), self._terms.row_terms("psi", "psi"))
+        return program(self._solver.newton("psi_dot", "v"), self._terms.row_terms("psi", "psi"))
 
     @cached_property
     def corrections_and_accelerations(self) -> LoopProgram:
         """q1 and v1, corrected by a Newton step each, and a: the three of one state, by the same factors."""
-        terms, right = self._terms, ("b", "psi", "psi_dot")
+        terms, solver, right = self._terms, self._solver, ("b", "psi", "psi_dot")
         system = [terms.sincos(), *terms.free_accelerations("v"), *terms.element_terms(("psi_q", *right))]
-        solves = [part for k in range(3) for part in self._refined_solve(k, 3)]
-        results = [terms.add_solution("free", "a", 0), *(terms.add_solution(x, f"{x}1", k, -1) for k, x in enumerate("qv", 1))]
-        return _program(system, self._factorize_dropping, solves, results)
+        solves = [part for k in range(3) for part in solver.refined_solve(k, 3)]
+        corrected = [terms.add(f"{x}1", start=x, solution=k, sign=-1) for k, x in enumerate("qv", 1)]
+        return program(system, solver.factorize_dropping, solves, [terms.add("a", start="free", solution=0), *corrected])
 
     @cached_property
     def project(self) -> LoopProgram:
@@ -170,51 +140,46 @@ class ScenePrograms:
 
         Where the step in q is small, what it turns Psi_q by is a small part of the step in v, which is as small.
         """
-        return _program(self._project, self._terms.row_terms("psi", "psi", q="q1", sines="sines1"))
+        return program(self._solver.project, self._terms.row_terms("psi", "psi", q="q1", sines="sines1"))
 
     @cached_property
     def project_and_accelerate(self) -> LoopProgram:
         """v1, and a there; safe."""
-        return _program(self._project_and_accelerate)
+        return program(self._solver.project_and_accelerate)
 
     @cached_property
     def tangent_part(self) -> LoopProgram:
         """dq1 and dv1: the parts of the changes dq and dv within the manifold; distance."""
-        return _program(self._position_terms("psi_q"), self._factorize_dropping, self._tangent_parts(0))
+        return program(self._solver.position_terms("psi_q"), self._solver.factorize_dropping, self._solver.tangent_parts(0))
 
     @cached_property
     def end_of_step(self) -> LoopProgram:
         """The results of `project_and_accelerate` and `tangent_part`, by the same factors."""
-        return _program(self._project_and_accelerate, self._tangent_parts(2))
+        return program(self._solver.project_and_accelerate, self._solver.tangent_parts(2))
 
     @cached_property
     def psi(self) -> LoopProgram:
         """psi: Psi of all rows."""
-        return _program([self._terms.sincos()], self._terms.row_terms("psi", "psi"))
+        return program([self._terms.sincos()], self._terms.row_terms("psi", "psi"))
 
     @cached_property
     def psi_dot(self) -> LoopProgram:
         """psi: Psi_dot of all rows."""
-        return _program([self._terms.sincos()], self._terms.row_terms("psi_dot", "psi"))
+        return program([self._terms.sincos()], self._terms.row_terms("psi_dot", "psi"))
 
     @cached_property
     def equation_terms(self) -> LoopProgram:
         """terms: a_F, and b of all rows."""
         terms = self._terms
-
-        def write(w: KernelWriter):
-            for k in range(3):
-                w.write(terms.read_free(w, k), "terms", BODY_COORDINATES, k)
-
-        free = [terms.sincos(), *terms.free_accelerations("v"), terms.over_bodies("copy free", write)]
-        return _program(free, terms.row_terms("b", "terms", self.coordinate_count))
+        free = [terms.sincos(), *terms.free_accelerations("v"), terms.add("terms", start="free")]
+        return program(free, terms.row_terms("b", "terms", self.coordinate_count))
 
     @cached_property
     def geometry(self) -> LoopProgram:
         """psi, psi_dot and psi_q, of all rows."""
         terms = self._terms
         rows = [*terms.row_terms("psi", "psi"), *terms.row_terms("psi_dot", "psi_dot")]
-        return _program([terms.sincos(), *terms.every_entry()], rows)
+        return program([terms.sincos(), *terms.every_entry()], rows)
 
     @property
     def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -225,7 +190,7 @@ class ScenePrograms:
     def rows_and_loads(self) -> LoopProgram:
         """What rank-revealing methods take, of all rows: psi_q, psi, psi_dot, terms; and root, M^(-1/2)."""
         psi_dot = self._terms.row_terms("psi_dot", "psi_dot")
-        return _program(self.equation_terms.parts, self.rows("psi"), psi_dot)
+        return program(self.equation_terms.parts, self.rows("psi"), psi_dot)
 
     @property
     def sincos(self) -> KernelLoop:
@@ -245,12 +210,12 @@ class ScenePrograms:
     @cached_property
     def pieces(self) -> LoopProgram:
         """pieces: the number of the smooth piece of each element that has several."""
-        return _program([self._terms.sincos()], self._terms.pieces())
+        return program([self._terms.sincos()], self._terms.pieces())
 
     @cached_property
     def rank(self) -> LoopProgram:
         """rank: how many rows the last factorization did not leave out."""
-        return LoopProgram(list(self._elimination.rank()))
+        return program(self._solver.elimination.rank())
 
     @cached_property
     def value_derivatives(self) -> LoopProgram:
@@ -258,118 +223,21 @@ class ScenePrograms:
 
         They solve Psi_q q' = -Psi_t and Psi_q q'' = gamma, which is of the velocities q'.
         """
-        terms, solve, count = self._terms, self._elimination.solve, self.coordinate_count
-        at_rest = [Reset("rest", 0, count), *self._position_terms("psi_q", "psi_dot", v="rest"), *self._factorize]
-        first = [*solve(0), terms.scaled_solution("dq1", 0, sign=-1), *terms.element_terms(("gamma",), "dq1", 1)]
-        second = [*solve(1), terms.scaled_solution("dv1", 1), *terms.row_terms("psi", "psi"), self._elimination.distance()]
-        return _program(at_rest, first, second)
+        terms, solver, solve, count = self._terms, self._solver, self._solver.solve, self.coordinate_count
+        at_rest = [Reset("rest", 0, count), *solver.position_terms("psi_q", "psi_dot", v="rest"), *solver.factorize]
+        first = [*solve(0), terms.add("dq1", solution=0, sign=-1), *terms.element_terms(("gamma",), "dq1", 1)]
+        second = [*solve(1), terms.add("dv1", solution=1), *terms.row_terms("psi", "psi"), solver.elimination.distance()]
+        return program(at_rest, first, second)
 
     @cached_property
     def prologue(self) -> LoopProgram:
         """`constants`, from `numbers`: all numbers of the scene, the gains, `drop_tol` and `safe_tol`."""
         return write_prologue(self._layout, self._places, self._number_count)
 
-    # --- parts of programs
-
-    @property
-    def _safe(self) -> KernelLoop | Reset:
-        return self._elimination.safe() if self.policy.reports else Reset("safe", 0, 1, 1.0)
-
-    @property
-    def _factorize(self) -> Parts:
-        return self._elimination.factorize(self.policy.drops)
-
-    @property
-    def _factorize_dropping(self) -> Parts:
-        return self._elimination.factorize(True)
-
-    def _position_terms(self, *outputs: str, v: str = "v") -> list[KernelLoop | Reset]:
-        return [self._terms.sincos(), *self._terms.element_terms(outputs, v)]
-
-    @property
-    def _acceleration_system(self) -> list[KernelLoop | Reset]:
-        """Psi_q, a_F, and b as the right-hand side."""
-        return [self._terms.sincos(), *self._terms.free_accelerations("v"), *self._terms.element_terms(("psi_q", "b"))]
-
-    def _newton(self, residual: str, x: str, dropping: bool = True) -> list[KernelLoop | Reset]:
-        """x - M^(-1) Psi_q^T y, of q or v, so that a residual vanishes."""
-        factorize = self._factorize_dropping if dropping else self._factorize
-        step = [*self._elimination.solve(), self._terms.add_solution(x, f"{x}1", 0, -1)]
-        return [*self._position_terms("psi_q", residual), *factorize, *step]
-
-    def _refined_solve(self, solve: int, further: int) -> Parts:
-        """A linear system, refined by the solution of `further` ones (corrected seminormal equations, Bjorck 1987)."""
-        terms, elimination = self._terms, self._elimination
-        yield from elimination.solve(solve)
-        for _ in range(REFINEMENTS):
-            yield from terms.remainder(solve, further)
-            yield from elimination.solve(further)
-            yield terms.copy(f"jt_x{further}", f"jt_x{solve}", update=ADD)
-
-    @property
-    def _project(self) -> list[KernelLoop | Reset]:
-        terms = self._terms
-        at_q1 = terms.element_terms(("psi_dot",), "v", 1, q="q1", sines="sines1")
-        velocity = [*at_q1, *self._elimination.solve(1), terms.add_solution("v", "v1", 1, -1)]
-        return [*self._newton("psi", "q"), terms.sincos("q1", "sines1"), *velocity]
-
-    @property
-    def _project_and_accelerate(self) -> list[KernelLoop | Reset]:
-        terms = self._terms
-        system = [*terms.free_accelerations("v1"), *terms.element_terms(("b",), "v1", 1)]
-        solve = [*self._elimination.solve(1), terms.add_solution("free", "a", 1), self._safe]
-        return [*self._newton("psi_dot", "v", dropping=False), *system, *solve]
-
-    def _tangent_parts(self, solve: int) -> Parts:
-        for k, change in enumerate(("dq", "dv"), solve):
-            yield from self._terms.rates(change, k)
-            yield from self._elimination.solve(k)
-            yield self._terms.add_solution(change, f"{change}1", k, -1)
-        yield self._elimination.distance()
-
-    # --- derivatives
-
     @cached_property
-    def differentiable_accelerations(self) -> DifferentiableProgram:
-        """a; safe."""
-        return self._implicit(list(self._terms.free_accelerations("v")), "b", "free", "a", 1)
-
-    @cached_property
-    def differentiable_newton_q(self) -> DifferentiableProgram:
-        """q1."""
-        return self._implicit([], "psi", "q", "q1", -1)
-
-    @cached_property
-    def differentiable_newton_v(self) -> DifferentiableProgram:
-        """v1."""
-        return self._implicit([], "psi_dot", "v", "v1", -1)
-
-    @cached_property
-    def differentiable_projection(self) -> DifferentiableProgram:
-        """q1 and v1, of a state on the manifold: where they are q and v."""
-        terms, solve = self._terms, self._elimination.solve
-        copies = [terms.copy("q", "q1"), terms.copy("v", "v1"), terms.copy("sines", "sines1", 2)]
-        program = _program(self._position_terms("psi_q"), self._factorize_dropping, copies)
-        position = [*terms.element_terms(("psi",), "v", 1), *solve(1), self._correction("q", 1)]
-        at_q1 = terms.element_terms(("psi_dot",), "v", 2, q="q1", sines="sines1")
-        return DifferentiableProgram(program, [*position, *at_q1, *solve(2), self._correction("v", 2)])
-
-    def _correction(self, x: str, solve: int) -> KernelLoop:
-        return self._terms.add_solution(x, f"{x}1", solve, -1, fixed=("constants",))
-
-    def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, to: str, sign: int) -> DifferentiableProgram:
-        """x + z or x - z, with z = C J^T y and J C J^T y = `right`."""
-        terms, elimination = self._terms, self._elimination
-        z, result = terms.scaled_solution("z", 0), terms.add("z", x, to, sign)
-        system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *self._factorize]
-        program = _program(system, elimination.solve(), [z, result], [self._safe] if to == "a" else [])
-        implicit = [*terms.residuals(right), z, *terms.subtract_rates("z", 1), *elimination.solve(1)]
-        parts = [*loads, *implicit, terms.scaled_solution("z", 1, ADD, fixed=("constants",)), result]
-        return DifferentiableProgram(program, parts)
-
-
-def _program(*parts: Iterable[KernelLoop | Reset]) -> LoopProgram:
-    return LoopProgram([part for some in parts for part in some])
+    def differentiable(self) -> DifferentiablePrograms:
+        """The programs whose derivatives are taken."""
+        return DifferentiablePrograms(self._solver)
 
 
 @lru_cache(maxsize=16)

@@ -1,6 +1,6 @@
 """Loops over the bodies and the elements of a scene: the terms of its equations, and products with Psi_q and its transpose."""
 
-from collections.abc import Callable, Collection, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -121,10 +121,20 @@ class SceneTerms:
         """Read a coordinate of a_F of a body."""
         return w.read("free", BODY_COORDINATES, k) if self.layout.forces else self._gravity(w, k)
 
-    def element_terms(self, outputs: tuple[str, ...], v: str = "v", solve: int = 0, **names: str) -> Parts:
-        """Psi_q, where `outputs` has it, and others as right-hand sides of the linear system `solve` and of those after it."""
+    def element_terms(
+        self,
+        outputs: tuple[str, ...],
+        v: str = "v",
+        solve: int = 0,
+        groups: Sequence[ConstraintGroup] | None = None,
+        **names: str,
+    ) -> Parts:
+        """Psi_q, where `outputs` has it, and others as right-hand sides of the linear system `solve` and of those after it.
+
+        `groups` are those whose rows are eliminated, unless others are given.
+        """
         rights = [name for name in outputs if name != "psi_q"]
-        for group in self.layout.eliminated:
+        for group in self.layout.eliminated if groups is None else groups:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 if "psi_q" in outputs:
@@ -140,13 +150,7 @@ class SceneTerms:
     def every_entry(self) -> Parts:
         """Psi_q of all rows; behind its entries a one, for those that are constants."""
         yield Reset("psi_q", self.layout.one, 1, 1.0)
-        for group in self.layout.constraints:
-
-            def write(w: KernelWriter, group: ConstraintGroup = group):
-                for index, place in group.entry_index.items():
-                    w.write(Scalar(group.programs.graph, index), "psi_q", ENTRIES, place)
-
-            yield self.over_group("psi_q", group, write)
+        yield from self.element_terms(("psi_q",), groups=self.layout.constraints)
 
     def row_terms(self, name: str, array: str, start: int = 0, **names: str) -> Parts:
         """Psi, Psi_dot or b of all rows in their order, into an array."""
@@ -171,17 +175,18 @@ class SceneTerms:
 
     # --- products with Psi_q and its transpose, of the eliminated rows
 
-    def rates(self, name: str, solve: int) -> Parts:
-        """Psi_q times a change of coordinates, as the right-hand side of a linear system."""
+    def rates(self, change: str, solve: int, subtract: bool = False) -> Parts:
+        """Psi_q times a change of coordinates, as the right-hand side of a linear system, or subtracted from that."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
-                change = [w.read("change", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
+                dq = [w.read("change", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
                 for i, row in enumerate(group.rows):
-                    w.write(dot(w.graph, group.entries(w, row), change), "right", RIGHT, i)
+                    rate = dot(w.graph, group.entries(w, row), dq)
+                    w.write(-rate if subtract else rate, "right", RIGHT, i, ADD if subtract else SET)
 
-            names = {"change": name, "right": f"right{solve}"}
-            yield KernelLoop(self.kernel(("rates", group), write), group.table, names)
+            names = {"change": change, "right": f"right{solve}"}
+            yield KernelLoop(self.kernel(("rates", group, subtract), write), group.table, names)
 
     def jt(self, solve: int) -> Parts:
         """jt_x = Psi_q^T x of a linear system."""
@@ -208,48 +213,39 @@ class SceneTerms:
             names = {"jt_x": f"jt_x{solve}", "right": f"right{solve}", "remainder": f"right{to}"}
             yield KernelLoop(self.kernel(("remainder", group), write), group.table, names)
 
-    def add_solution(self, x: str, to: str, solve: int, sign: int = 1, fixed: Collection[str] = ()) -> KernelLoop:
-        """x + M^(-1) Psi_q^T y, or minus that, with the solution y of a linear system; x is an array, or `free`."""
+    def add(
+        self,
+        to: str,
+        start: str | None = None,
+        change: str | None = None,
+        solution: int | None = None,
+        sign: int = 1,
+        update: str = SET,
+        fixed: Collection[str] = (),
+    ) -> KernelLoop:
+        """to = start + change, of each body, or start - change, with zero for what is not given.
 
-        def write(w: KernelWriter):
-            for k in range(3):
-                part = compliance(w, k) * w.read("jt_x", BODY_COORDINATES, k)
-                start = self.read_free(w, k) if x == "free" else w.read("from", BODY_COORDINATES, k)
-                w.write(start + part if sign > 0 else start - part, "to", BODY_COORDINATES, k)
-
-        key = ("add solution", x == "free", sign)
-        return self.over_bodies(key, write, fixed, **{"from": x, "to": to, "jt_x": f"jt_x{solve}"})
-
-    def scaled_solution(self, to: str, solve: int, update: str = SET, sign: int = 1, fixed: Collection[str] = ()) -> KernelLoop:
-        """M^(-1) Psi_q^T y, or minus that, with the solution y of a linear system."""
-
-        def write(w: KernelWriter):
-            for k in range(3):
-                part = compliance(w, k) * w.read("jt_x", BODY_COORDINATES, k)
-                w.write(part if sign > 0 else -part, "to", BODY_COORDINATES, k, update)
-
-        return self.over_bodies(("scaled solution", update, sign), write, fixed, to=to, jt_x=f"jt_x{solve}")
-
-    def copy(self, x: str, to: str, size: int = 3, update: str = SET) -> KernelLoop:
-        """An array of so many numbers of each body, in another one or added to it."""
+        `start` is an array, or `free`; `change` an array, or M^(-1) Psi_q^T y with the solution y of a linear system.
+        """
+        base, size = (SINE, 2) if start == "sines" else (BODY_COORDINATES, 3)
 
         def write(w: KernelWriter):
             for k in range(size):
-                base = SINE if size == 2 else BODY_COORDINATES
-                w.write(w.read("from", base, k), "to", base, k, update)
+                part = total = w.graph.constant(0.0)
+                if solution is not None:
+                    part = compliance(w, k) * w.read("change", base, k)
+                elif change is not None:
+                    part = w.read("change", base, k)
+                if start is not None:
+                    total = self.read_free(w, k) if start == "free" else w.read("start", base, k)
+                total = total + part if sign > 0 else total - part
+                w.write(total, "to", base, k, update)
 
-        return self.over_bodies(("copy", size, update), write, **{"from": x, "to": to})
-
-    def add(self, change: str, x: str, to: str, sign: int) -> KernelLoop:
-        """x plus or minus a change; x is an array, or `free`."""
-
-        def write(w: KernelWriter):
-            for k in range(3):
-                part = w.read("change", BODY_COORDINATES, k)
-                start = self.read_free(w, k) if x == "free" else w.read("from", BODY_COORDINATES, k)
-                w.write(start + part if sign > 0 else start - part, "to", BODY_COORDINATES, k)
-
-        return self.over_bodies(("add", x == "free", sign), write, **{"change": change, "from": x, "to": to})
+        key = "add", size, start if start in (None, "free") else "array", change is None, solution is None, sign, update
+        added = change if solution is None else f"jt_x{solution}"
+        return self.over_bodies(
+            key, write, fixed, to=to, **{"start": start} if start else {}, **{"change": added} if added else {}
+        )
 
     # --- derivatives of a linear system, by the implicit rule
 
@@ -267,18 +263,6 @@ class SceneTerms:
                 _write_jt(w, group, entries, [w.read("x0", RIGHT, i) for i in rows(group)], "jt_x0")
 
             yield self.over_group(("residual", output), group, write, fixed=("x0", "z"), v=v)
-
-    def subtract_rates(self, name: str, solve: int) -> Parts:
-        """Subtract Psi_q times a change of coordinates from the right-hand side of a linear system; a function of the change."""
-        for group in self.layout.eliminated:
-
-            def write(w: KernelWriter, group: ConstraintGroup = group):
-                change = [w.read("change", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
-                for i, row in enumerate(group.rows):
-                    w.write(-dot(w.graph, group.entries(w, row), change), "right", RIGHT, i, ADD)
-
-            names = {"change": name, "right": f"right{solve}"}
-            yield KernelLoop(self.kernel(("subtract rates", group), write), group.table, names)
 
 
 def rows(group: ConstraintGroup) -> range:

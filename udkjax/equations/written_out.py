@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
-from udkjax.equations.scene_programs import RESULTS, DifferentiableProgram, ScenePrograms
+from udkjax.equations.differentiable_programs import DifferentiableProgram
+from udkjax.equations.scene_programs import RESULTS, ScenePrograms
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
 from udkjax.expressions.loop_program import LoopProgram
@@ -38,7 +39,7 @@ class WrittenOut:
     Args:
         programs: The programs as loops.
         names: Which of them.
-        differentiated: Which of the differentiable ones: `accelerations` for `differentiable_accelerations`, and so on.
+        differentiated: Which of the differentiable ones: the names of `ScenePrograms.differentiable`.
         active: Of the numbers that the prologue takes: along which there are derivatives.
         reverse: Whether derivatives are transposed: from cotangents of the results to those of q, v and the constants.
     """
@@ -67,7 +68,7 @@ class WrittenOut:
         moved = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])
         self.moving = [k for k, s in sorted(layout.items()) if s.index in moved]
         """The constants of the loops along which there are derivatives; programs count these alone."""
-        self._derivatives = {x: self._differentiate(getattr(programs, f"differentiable_{x}"), n, reverse) for x in differentiated}
+        self._derivatives = {x: self._differentiate(programs.differentiable[x], n, reverse) for x in differentiated}
         wanted = [
             s for found in (*self._results.values(), *(x for d in self._derivatives.values() for x in d)) for s in found.values()
         ]

@@ -45,7 +45,8 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
     joined: dict[Place, _Joined] = {}
     zero = graph.constant(0.0)
 
-    sums: set[Place] = set()  # places that numbers were added to since they were read
+    # Places that numbers were added to since they were read, in order: equal programs are equal texts, which are compiled once.
+    sums: dict[Place, None] = {}
     atoms: set[int] = set()  # numbers of a linear program that sums are combinations of
 
     def read(name: str, place: int) -> Scalar:
@@ -53,7 +54,7 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
             found.setdefault(name, {})[place] = joined.pop((name, place)).value()
         s = found.get(name, {}).get(place, zero)
         if (name, place) in sums:
-            sums.remove((name, place))
+            del sums[name, place]
             if linear in s.node.depends:
                 s = found[name][place] = collect(s, linear, atoms)
         if linear in s.node.depends:
@@ -85,10 +86,10 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
                     joined[key].append(value)
                 elif x.update == ADD:
                     found.setdefault(name, {})[place] = found.get(name, {}).get(place, zero) + value
-                    sums.add((name, place))
+                    sums[name, place] = None
                 else:
                     found.setdefault(name, {})[place] = value
-                    sums.discard((name, place))
+                    sums.pop((name, place), None)
                     if linear in value.node.depends:
                         atoms.add(value.index)
     for name, place in [*sums, *joined]:

@@ -10,7 +10,7 @@ close a mechanism ("_newton_q", "_newton_v") there are
 where all but the accelerations leave their changes in O of a tangent, and find their cotangents in Y.
 """
 
-from udkjax.equations.scene_programs import DifferentiableProgram
+from udkjax.equations.differentiable_programs import DifferentiableProgram
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
 from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.module import Module
@@ -26,7 +26,7 @@ class Linearization:
     def __init__(self, module: Module, name: str):
         self._in, self._name = module, name
         self._suffix = "" if name == "accelerations" else f"_{name}"
-        self._evaluated: DifferentiableProgram = getattr(module.code, f"differentiable_{name}")
+        self._evaluated: DifferentiableProgram = module.code.differentiable[name]
         self._derivative = self._evaluated.derivative([] if module.moving else ["constants"])
         self._stored: dict[str, int] = {}  # the arrays of loops, and where they begin
         self.stored = 0

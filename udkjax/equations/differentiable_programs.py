@@ -1,0 +1,86 @@
+"""Programs of a scene whose derivatives are taken: accelerations, Newton steps and the projection of a state."""
+
+from collections.abc import Collection, Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+from udkjax.equations.scene_solver import SceneSolver, program
+from udkjax.expressions.loop_derivative import LoopDerivative
+from udkjax.expressions.loop_program import ADD, KernelLoop, LoopProgram, Reset
+
+# Arrays that derivatives take as fixed. Sines and cosines are known functions of q to every kernel that reads them.
+NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
+
+
+class DifferentiableProgram(NamedTuple):
+    """A program, and loops whose derivative is its own, with respect to all arrays but those `NOT_DIFFERENTIATED`.
+
+    No factorization is differentiated. With M^(-1) = C and J = Psi_q, accelerations, and corrections such as q - C J^T x, are
+
+        a = a_F + z,        z = C J^T x,        J C J^T x = b,
+
+    and along a change of the inputs, by the factors at hand,
+
+        dz = d(C J^T) x + C J^T dx,        J C J^T dx = db - dJ z - J d(C J^T) x.
+
+    The loops say so in terms of x1, which is zero and changes by dx. A projection is differentiated where all residuals vanish,
+    and with them whatever they multiply.
+    """
+
+    program: LoopProgram
+    parts: Sequence[KernelLoop | Reset]
+
+    def derivative(self, fixed: Collection[str] = ()) -> LoopDerivative:
+        """Return the derivative, with further arrays fixed."""
+        return LoopDerivative(self.parts, {*NOT_DIFFERENTIATED, *fixed})
+
+
+class DifferentiablePrograms:
+    """The differentiable programs of a scene, by their names."""
+
+    def __init__(self, solver: SceneSolver):
+        self._solver = solver
+
+    def __getitem__(self, name: str) -> DifferentiableProgram:
+        return getattr(self, name)
+
+    @cached_property
+    def accelerations(self) -> DifferentiableProgram:
+        """a; safe."""
+        return self._implicit(list(self._solver.terms.free_accelerations("v")), "b", "free", "a", 1)
+
+    @cached_property
+    def newton_q(self) -> DifferentiableProgram:
+        """q1."""
+        return self._implicit([], "psi", "q", "q1", -1)
+
+    @cached_property
+    def newton_v(self) -> DifferentiableProgram:
+        """v1."""
+        return self._implicit([], "psi_dot", "v", "v1", -1)
+
+    @cached_property
+    def projection(self) -> DifferentiableProgram:
+        """q1 and v1, of a state on the manifold: where they are q and v."""
+        solver, terms = self._solver, self._solver.terms
+        copies = [terms.add(f"{x}1", start=x) for x in ("q", "v", "sines")]
+        position = [*terms.element_terms(("psi",), "v", 1), *solver.solve(1), self._correction("q", 1)]
+        at_q1 = terms.element_terms(("psi_dot",), "v", 2, q="q1", sines="sines1")
+        return DifferentiableProgram(
+            program(solver.position_terms("psi_q"), solver.factorize_dropping, copies),
+            [*position, *at_q1, *solver.solve(2), self._correction("v", 2)],
+        )
+
+    def _correction(self, x: str, solve: int) -> KernelLoop:
+        return self._solver.terms.add(f"{x}1", start=x, solution=solve, sign=-1, fixed=("constants",))
+
+    def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, to: str, sign: int) -> DifferentiableProgram:
+        """x + z or x - z, with z = C J^T y and J C J^T y = `right`."""
+        solver, terms = self._solver, self._solver.terms
+        z, result = terms.add("z", solution=0), terms.add(to, start=x, change="z", sign=sign)
+        system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *solver.factorize]
+        implicit = [*terms.residuals(right), z, *terms.rates("z", 1, subtract=True), *solver.solve(1)]
+        return DifferentiableProgram(
+            program(system, solver.solve(), [z, result], [solver.safe] if to == "a" else []),
+            [*loads, *implicit, terms.add("z", solution=1, update=ADD, fixed=("constants",)), result],
+        )

@@ -1,0 +1,92 @@
+"""Sequences of loops that the programs of a scene have in common: linear systems, Newton steps, parts within the manifold."""
+
+from collections.abc import Iterable
+
+from udkjax.equations.block_elimination import BlockElimination
+from udkjax.equations.scene_terms import Parts, SceneTerms
+from udkjax.expressions.loop_program import ADD, KernelLoop, LoopProgram, Reset
+from udkjax.pinv.rank_policy import RankPolicy
+
+# Corrections of a solution by its residual: each takes back what the rounding of the factors left, as long as eps times the
+# square of the condition number of the rows is below one.
+REFINEMENTS = 2
+
+
+class SceneSolver:
+    """The linear systems of a scene: J M^(-1) J^T x = right with J = Psi_q, by elimination, numbered from zero in each program.
+
+    What the `policy` does with small pivots concerns the accelerations; corrections leave out the rows whose pivots do not exceed
+    `drop_tol`.
+    """
+
+    def __init__(self, terms: SceneTerms, policy: RankPolicy):
+        self.terms, self.policy = terms, policy
+        self.elimination = BlockElimination(terms)
+        self.solve = self.elimination.solve
+
+    @property
+    def factorize(self) -> Parts:
+        """The factorization of accelerations, under the policy."""
+        return self.elimination.factorize(self.policy.drops)
+
+    @property
+    def factorize_dropping(self) -> Parts:
+        """The factorization of corrections, without rows that depend on others."""
+        return self.elimination.factorize(True)
+
+    @property
+    def safe(self) -> KernelLoop | Reset:
+        """Whether all pivots exceed `safe_tol`, where the policy asks for that."""
+        return self.elimination.safe() if self.policy.reports else Reset("safe", 0, 1, 1.0)
+
+    def position_terms(self, *outputs: str, v: str = "v") -> list[KernelLoop | Reset]:
+        """Sines and cosines, and terms that no force enters."""
+        return [self.terms.sincos(), *self.terms.element_terms(outputs, v)]
+
+    @property
+    def acceleration_system(self) -> list[KernelLoop | Reset]:
+        """Psi_q, a_F, and b as the right-hand side."""
+        return [self.terms.sincos(), *self.terms.free_accelerations("v"), *self.terms.element_terms(("psi_q", "b"))]
+
+    def newton(self, residual: str, x: str, dropping: bool = True) -> list[KernelLoop | Reset]:
+        """x - M^(-1) Psi_q^T y, of q or v, so that a residual vanishes."""
+        factorize = self.factorize_dropping if dropping else self.factorize
+        step = [*self.solve(), self.terms.add(f"{x}1", start=x, solution=0, sign=-1)]
+        return [*self.position_terms("psi_q", residual), *factorize, *step]
+
+    def refined_solve(self, solve: int, further: int) -> Parts:
+        """A linear system, refined by the solution of `further` ones (corrected seminormal equations, Bjorck 1987)."""
+        yield from self.solve(solve)
+        for _ in range(REFINEMENTS):
+            yield from self.terms.remainder(solve, further)
+            yield from self.solve(further)
+            yield self.terms.add(f"jt_x{solve}", start=f"jt_x{further}", update=ADD)
+
+    @property
+    def project(self) -> list[KernelLoop | Reset]:
+        """q1 and v1 after a Newton step to Psi = 0 and Psi_dot = 0, by the same factors."""
+        terms = self.terms
+        at_q1 = terms.element_terms(("psi_dot",), "v", 1, q="q1", sines="sines1")
+        velocity = [*at_q1, *self.solve(1), terms.add("v1", start="v", solution=1, sign=-1)]
+        return [*self.newton("psi", "q"), terms.sincos("q1", "sines1"), *velocity]
+
+    @property
+    def project_and_accelerate(self) -> list[KernelLoop | Reset]:
+        """v1 after a Newton step to Psi_dot = 0, and a there, by the same factors."""
+        terms = self.terms
+        system = [*terms.free_accelerations("v1"), *terms.element_terms(("b",), "v1", 1)]
+        solve = [*self.solve(1), terms.add("a", start="free", solution=1), self.safe]
+        return [*self.newton("psi_dot", "v", dropping=False), *system, *solve]
+
+    def tangent_parts(self, solve: int) -> Parts:
+        """dq1 and dv1, the parts of dq and dv within the manifold, by the systems `solve` and the one after it; distance."""
+        for k, change in enumerate(("dq", "dv"), solve):
+            yield from self.terms.rates(change, k)
+            yield from self.solve(k)
+            yield self.terms.add(f"{change}1", start=change, solution=k, sign=-1)
+        yield self.elimination.distance()
+
+
+def program(*parts: Iterable[KernelLoop | Reset]) -> LoopProgram:
+    """Return the program of several sequences of loops, one after another."""
+    return LoopProgram([part for some in parts for part in some])
